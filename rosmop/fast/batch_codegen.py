@@ -152,6 +152,8 @@ class WasmModule(CompiledModule):
     """By function: the places at which it leaves a message to the interpreter."""
     routines: Mapping[str, int]
     """Numbers of functions that the proof knows only by their results."""
+    names: Sequence[Sequence[str]]
+    """The names of the local variables of each function, by number: a hint for the proof."""
 
 
 def written(
@@ -228,6 +230,7 @@ def written(
             for name, write in (("mismatch", mismatch), ("seconds", in_seconds))
             if (number := writer.routine_of(write)) is not None
         },
+        [function.names for function in writer.written],
     )
 
 

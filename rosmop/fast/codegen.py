@@ -127,7 +127,8 @@ class WasmFunction:
     `brief`: it has no loops. `passes`: conditions may end it early for some messages. `says`: it may print lines.
     `early`: it may write to the first bytes of the message, where a header is. `changes_elements`: it may change an
     element of an array. `replaces`: it may replace the message by the safe one. `references` pairs each reference
-    parameter with the address where the function stores its value before it returns.
+    parameter with the address where the function stores its value before it returns. `names` are those of the local
+    variables, by number.
     """
 
     number: int
@@ -144,6 +145,7 @@ class WasmFunction:
     changes_elements: bool
     replaces: bool = False
     references: tuple[tuple[str, int], ...] = ()
+    names: tuple[str, ...] = ()
 
 
 class ModuleCodegen(MemoryLayout):
@@ -276,6 +278,7 @@ class _FunctionCodegen(StringCodegen):
             self._changes_elements,
             self._safe is not None,
             tuple(self._references.items()),
+            tuple(self._locals),
         )
 
     def _routine(

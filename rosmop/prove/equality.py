@@ -21,19 +21,21 @@ from typing import Any
 
 import z3
 
-from rosmop.fast.abi import AREA, MOST_KEPT, SENDER, kept_size
+from rosmop.fast.abi import AREA, SENDER, kept_size, most_kept
 from rosmop.fast.batch_codegen import WasmModule, written
 from rosmop.form import nodes
 from rosmop.form.compiled import Compiled
 from rosmop.form.specification_groups import groups
 from rosmop.prove.decoding import functions_of
 from rosmop.prove.form_terms import FormTerms, wrapped
-from rosmop.prove.module_terms import ModuleExecution, ModuleResult, Pointer
+from rosmop.prove.loops import BUDGET_SLOT, assumed, loop_conditions
+from rosmop.prove.module_terms import LoopGuess, ModuleExecution, ModuleResult, Pointer, ReadableBytes
 from rosmop.prove.terms import (
     DOUBLE,
     MISMATCH,
     SECONDS,
     SINGLE,
+    Abstraction,
     DiffersError,
     FormResult,
     LineTerm,
@@ -41,7 +43,6 @@ from rosmop.prove.terms import (
     StartTerms,
     Term,
     TextTerm,
-    abstracted,
     as_bits,
     both,
     either,
@@ -60,9 +61,19 @@ IN_PYTHON = "not compiled: Python evaluates the messages of this topic"
 PATIENCE = 30.0
 """The default time for each event, in seconds."""
 
+_TOGETHER = 0.2
+"""The part of the time in which all conditions are asked at once."""
+
+_UNROLLED = (1, 2, 3)
+"""Iterations of each loop in which a difference is looked for."""
+
 _NOW, _REST = 16, 32  # addresses of the time and of the number of bytes that are not shown
 _HAPPENED, _DROPPED, _CHANGED, _ELSEWHERE, _REPLACED = 1, 2, 4, 8, 32
 _LATEST = 1 << 62
+
+
+class _MayDifferError(Exception):
+    """The induction over the iterations of a loop fails for a state that may not occur."""
 
 
 @dataclass(frozen=True)
@@ -115,15 +126,12 @@ class Validation:
         self._clock = clock
         self._patience = patience
         self.codes = functions_of(module.code)
-        self._strings = [
-            range(at, at + 8)
-            for own in module.cells
-            for at, kind in own.variables.values()
-            if kept_size(kind) and not isinstance(kind, value_types.StringType)
-        ]
-        self._strings += [range(at, at + len(raw)) for raw, at in module.strings.items()]
+        kept = {at: kind for own in module.cells for at, kind in own.variables.values() if kept_size(kind)}
+        self._strings = [range(at, at + len(raw)) for raw, at in module.strings.items()]
         self._strings += [
-            range(begin, begin + 2 * MOST_KEPT) for own in module.cells for begin in own.texts.values()
+            range(begin, begin + 2 * most_kept(kept[at]) * kept_size(kept[at]))
+            for own in module.cells
+            for at, begin in own.texts.items()
         ]
         self._strings += module.references
         self._strings += [range(at + 16, at + SENDER) for at in module.senders.values()]
@@ -142,15 +150,34 @@ class Validation:
             return ProofFinding(topic, event, str(error))
 
     def _compared(self, name: str, number: int, topic: str) -> str:
+        """For each number of iterations; a difference must also be one after few iterations."""
+        begun = self._clock()
+        try:
+            return self._answer(name, number, topic, begun)
+        except _MayDifferError as error:
+            for most in _UNROLLED:
+                self._answer(name, number, topic, begun, most)
+            raise NotProvedError(f"its loops are not known to be equal: {error}") from None
+
+    def _answer(self, name: str, number: int, topic: str, begun: float, unrolled: int = 0) -> str:
         begin, cells, known = self._beginning()
         module = self._module
-        meant = FormTerms(self._forms, self._values, begin, name, topic=topic, lines=module.lines).result()
+        meant = FormTerms(
+            self._forms, self._values, begin, name, topic=topic, lines=module.lines, unrolled=unrolled
+        ).result()
+        form_cuts = meant.loops.cuts
+        guess = LoopGuess(form_cuts, self._names(self._forms[name].context), module.names, unrolled)
         done = ModuleExecution(
-            self.codes, number, begin.message, begin.size, cells, self._strings, self._routines
-        ).done()
+            self.codes, number, begin.message, begin.size, cells, self._strings, self._routines,
+            self._spans(begin), guess,
+        ).done()  # fmt: skip
         self._check_undone(done, topic)
-        left = either(done.trapped, done.bits == _ELSEWHERE)
+        known += assumed(form_cuts)
+        going_on = either(meant.loops.again, done.loops.again)
+        left = either(done.trapped, both(done.bits == _ELSEWHERE, opposite(done.loops.again)))
         unknown = either(*meant.unknown.values())
+        if unrolled:
+            known.append(opposite(going_on))
         wrong = {
             "it reads beyond the message": done.outside,
             "it continues where the specification faults": both(opposite(left), meant.left),
@@ -172,41 +199,75 @@ class Validation:
                 for place, noted in enumerate(meant.noted)
             },
         }
-        decided = both(opposite(left), opposite(meant.left), opposite(unknown))
+        decided = both(opposite(left), opposite(meant.left), opposite(unknown), opposite(going_on))
         wrong |= {text: both(decided, condition) for text, condition in others.items()}
-        answer = self._first(known, wrong)
+        wrong |= loop_conditions(form_cuts, done.loops.cuts, either(meant.left, unknown), left)
+        answer = self._first(known, wrong, begun, found=_MayDifferError if form_cuts else DiffersError)
         if answer is not None:
             return answer
-        begun = self._clock()
         for what, condition in meant.unknown.items():
-            if self._asked([*known, opposite(left), opposite(meant.left), condition], begun)[0] != z3.unsat:
+            question = [*known, opposite(left), opposite(meant.left), opposite(going_on), condition]
+            if all(
+                self._asked(one, begun)[0] != z3.unsat
+                for one in (Abstraction(floats=True).of(question), question)
+            ):
                 return f"uses {what}"
         return EQUAL
 
-    def _first(self, known: Sequence[Term], wrong: Mapping[str, Term]) -> str | None:
-        """Return why the two are not known to be equal, or None. Raises `DiffersError`."""
-        begun = self._clock()
-        undecided = False
+    def _names(self, context: str) -> Mapping[int, Any]:
+        """Return the form's names of variables by their addresses."""
+        names: dict[int, Any] = {
+            address: ("shared", name)
+            for own in self._module.cells
+            for name, (address, _) in own.variables.items()
+        }
+        return names | {self._module.budgets[context]: BUDGET_SLOT}
+
+    def _spans(self, begin: StartTerms) -> Sequence[ReadableBytes]:
+        """Return the bytes of arrays of numbers: constants, and those of variables."""
+        spans = [
+            ReadableBytes(integer(at, 32), integer(len(raw), 64), z3.BoolVal(True))
+            for raw, at in self._module.strings.items()
+        ]
+        for own in self._module.cells:
+            for name, (_, kind) in own.variables.items():
+                if kept_size(kind) and not isinstance(kind, value_types.StringType):
+                    kept = begin.variables[name]
+                    known = z3.ULE(kept.count, most_kept(kind))
+                    spans.append(ReadableBytes(kept.place, kept.count * kept_size(kind), known))
+        return spans
+
+    def _first(
+        self, known: Sequence[Term], wrong: Mapping[str, Term], begun: float, *, found: type[Exception]
+    ) -> str | None:
+        """Return why the two are not known to be equal, or None. Raises `found` for a difference."""
         possible = {
             text: simple for text, one in wrong.items() if not z3.is_false(simple := z3.simplify(one))
         }
+        coarse, fine = Abstraction(floats=True), Abstraction()
+        every = [*known, either(*possible.values())]
+        if self._asked(coarse.of(every), begun, part=_TOGETHER)[0] == z3.unsat:
+            return None
+        undecided = False
         for text, condition in possible.items():
             question = [*known, condition]
-            if self._asked(abstracted(question, floats=True), begun)[0] == z3.unsat:
+            if self._asked(coarse.of(question), begun)[0] == z3.unsat:
                 continue
-            answer, guess = self._asked(abstracted(question), begun)
+            answer, guess = self._asked(fine.of(question), begun)
             if answer != z3.unsat:
                 if guess is not None and _holds(question, guess):
-                    raise DiffersError(f"{text}, for {_example(guess)}")
+                    raise found(f"{text}, for {_example(guess)}")
                 answer, model = self._asked(question, begun)
                 if model is not None:
-                    raise DiffersError(f"{text}, for {_example(model)}")
+                    raise found(f"{text}, for {_example(model)}")
                 undecided = undecided or answer != z3.unsat
         return "not decided in time" if undecided else None
 
-    def _asked(self, conditions: Sequence[Term], begun: float) -> tuple[Any, Any]:
-        """Return whether the conditions are satisfiable, and a model. The event's first question was at `begun`."""
-        rest = int(1000 * (begun + self._patience - self._clock()))
+    def _asked(self, conditions: Sequence[Term], begun: float, *, part: float = 1) -> tuple[Any, Any]:
+        """Return whether the conditions are satisfiable, and a model. The event's first question was at `begun`.
+        The question may take this part of the time that is left.
+        """
+        rest = int(1000 * part * (begun + self._patience - self._clock()))
         if rest <= 0:
             return z3.unknown, None
         solver = z3.Solver()
@@ -223,10 +284,8 @@ class Validation:
         variables: dict[str, Any] = {}
         for component in self._module.cells:
             for name, (address, kind) in component.variables.items():
-                if isinstance(kind, value_types.StringType):
-                    variables[name] = _text(name, address, cells)
-                    continue
                 if kept_size(kind):
+                    variables[name] = _text(name, address, cells)
                     continue
                 variables[name] = cells[address] = _variable(name, kind)
                 if isinstance(kind, value_types.TimeType | value_types.DurationType):

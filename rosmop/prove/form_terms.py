@@ -13,18 +13,21 @@ It follows `run/interpreter.py` line by line, for all messages at once.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from math import inf
 from types import MappingProxyType
 from typing import Any
 
 import z3
 
-from rosmop.fast.abi import MOST_KEPT
+from rosmop.fast.abi import kept_size, most_kept
 from rosmop.fast.deferred_output import BYTES, HEAD, OutputLine
 from rosmop.form import nodes
+from rosmop.prove.loops import BUDGET_SLOT, Loops, constant_for
 from rosmop.prove.terms import (
     AT,
     DOUBLE,
     FRAME,
+    MEMORY,
     MISMATCH,
     MIXED,
     NEAREST,
@@ -57,9 +60,7 @@ from rosmop.runtime.wire import MAX_EMPTY
 from rosmop.types import value_types
 from rosmop.types.value_types import Type
 
-_MESSAGE, _DROPPED, _REPLACED, _CHANGED, _BUDGET, _SAID = (
-    "message", "dropped", "replaced", "changed", "budget", "said",
-)  # fmt: skip
+_MESSAGE, _DROPPED, _REPLACED, _CHANGED, _SAID = "message", "dropped", "replaced", "changed", "said"
 
 
 @dataclass(frozen=True)
@@ -71,9 +72,10 @@ class _View:
     count: Term
 
 
+_LONG = value_types.IntegerType(64, True, "long")
+
 _LOOPS: Mapping[type[nodes.FormNode], str] = MappingProxyType(
     {
-        nodes.Loop: "it has a loop",
         nodes.ForEach: "it has a loop over an array",
         nodes.Accumulate: "it adds up the elements of an array",
         nodes.Skip: "a field comes after strings or arrays in an array",
@@ -123,6 +125,7 @@ class FormTerms:
         *,
         topic: str,
         lines: Sequence[OutputLine] = (),
+        unrolled: int = 0,
     ) -> None:
         self._lines = lines
         self._noted: list[LineTerm] = []
@@ -133,8 +136,11 @@ class FormTerms:
         self._topic = topic
         self._safe: nodes.SafeMessage | None = None
         self._function = functions[name]
+        self._loops = Loops(unrolled)
+        self._breaks: list[State] = []
+        self._continues: list[State] = []
         self._left: list[Term] = []
-        self._unknown: dict[str, list[Term]] = {}
+        self._unknown: list[tuple[str, Term]] = []
         self._exits: list[tuple[State, Term]] = []
         self._returned: list[tuple[State, Term]] | None = None
         self._calls = 0
@@ -142,11 +148,11 @@ class FormTerms:
         self._shared: Sequence[str] = self._function.shared
 
     def result(self) -> FormResult:
-        """Return the result of the event. Raises `NotProvedError` for a loop."""
+        """Raises `NotProvedError` for a loop that is not translated."""
         begin, no = self._beginning, z3.BoolVal(False)
         budget = begin.budgets[self._function.context]
         slots: dict[Any, Any] = {_MESSAGE: begin.message, _DROPPED: no, _REPLACED: no, _CHANGED: no}
-        slots |= {_BUDGET: budget, _SAID: integer(0, 32)}
+        slots |= {BUDGET_SLOT: budget, _SAID: integer(0, 32)}
         slots |= {("shared", name): value for name, value in begin.variables.items()}
         state = State(z3.BoolVal(True), slots)
         self._block(self._function.body, state)
@@ -155,11 +161,14 @@ class FormTerms:
         for left, value in self._exits:
             happened = choice(left.alive, value, happened)
             end = merged(left.alive, left, State(opposite(left.alive), end))
-        unknown = {name: either(*conditions) for name, conditions in self._unknown.items()}
+        unknown: dict[str, Term] = {}
+        for what, condition in self._unknown:
+            unknown[what] = either(unknown.get(what, no), condition)
         variables = {name: end["shared", name] for name in begin.variables}
         return FormResult(
             either(*self._left), unknown, happened, end[_DROPPED], end[_REPLACED], end[_CHANGED], end[_MESSAGE],
-            variables, {**begin.budgets, self._function.context: end[_BUDGET]}, end[_SAID], self._noted,
+            variables, {**begin.budgets, self._function.context: end[BUDGET_SLOT]}, end[_SAID], self._noted,
+            self._loops,
         )  # fmt: skip
 
     # Ends
@@ -169,7 +178,7 @@ class FormTerms:
         state.require(opposite(condition))
 
     def _ignore(self, state: State, what: str) -> None:
-        self._unknown.setdefault(what, []).append(state.alive)
+        self._unknown.append((what, state.alive))
         state.alive = z3.BoolVal(False)
 
     def _exit(self, state: State, happened: bool) -> None:
@@ -200,6 +209,34 @@ class FormTerms:
         self._block(node.no, no)
         state.join(test, yes, no)
 
+    def _loop(self, node: nodes.Loop, state: State) -> None:
+        def body(state: State) -> tuple[Sequence[State], Sequence[State]]:
+            outer = self._breaks, self._continues
+            self._breaks, self._continues = [], []
+            try:
+                self._block(node.body, state)
+                return [*self._continues, state], self._breaks
+            finally:
+                self._breaks, self._continues = outer
+
+        logs = [self._left, self._unknown, self._exits, self._noted, self._returned or []]
+        self._loops.run(state, body, self._frame, self._at_head, logs)
+
+    def _at_head(self, _number: int, key: Any, value: Any) -> Any:
+        if key in (_MESSAGE, _SAID):
+            raise NotProvedError("not loop-free: a loop changes the message or prints")
+        return constant_for(key, value)
+
+    def _break(self, _node: nodes.Break, state: State) -> None:
+        self._end(state, self._breaks)
+
+    def _continue(self, _node: nodes.Continue, state: State) -> None:
+        self._end(state, self._continues)
+
+    def _end(self, state: State, ends: list[State]) -> None:
+        ends.append(state.where(z3.BoolVal(True)))
+        state.alive = z3.BoolVal(False)
+
     def _repeat(self, node: nodes.Statement | nodes.Expression, _state: State) -> None:
         raise NotProvedError(f"not loop-free: {_LOOPS[type(node)]}")
 
@@ -224,8 +261,8 @@ class FormTerms:
         self._spend(integer(node.instructions, 64), state)
 
     def _spend(self, instructions: Term, state: State) -> None:
-        state.slots[_BUDGET] = state.slots[_BUDGET] - instructions
-        self._leave_to_python(state, state.slots[_BUDGET] < 0)
+        state.slots[BUDGET_SLOT] = state.slots[BUDGET_SLOT] - instructions
+        self._leave_to_python(state, state.slots[BUDGET_SLOT] < 0)
 
     def _allocate(self, node: nodes.Allocate, state: State) -> None:
         if node.size is not None:
@@ -457,18 +494,18 @@ class FormTerms:
     def _literal(self, node: nodes.Literal, _state: State) -> Any:
         if node.value is None:
             return None
-        if isinstance(node.value, bytes) and isinstance(node.type, value_types.StringType):
-            return self._constant_text(node.value)
+        if isinstance(node.value, bytes) and kept_size(node.type):
+            return self._constant(node.value, kept_size(node.type))
         if isinstance(node.value, bytes | str):
             raise UnknownError("a constant string or array")
         if isinstance(node.type, value_types.FloatingType):
             return floating(node.value, node.type.bits)
         return self._whole_number(int(node.value), node.type)
 
-    def _constant_text(self, raw: bytes) -> TextTerm:
+    def _constant(self, raw: bytes, size: int = 1) -> TextTerm:
         if raw not in self._beginning.constants:
             raise UnknownError("a constant string or array")
-        return TextTerm(integer(self._beginning.constants[raw], 32), integer(len(raw), 64))
+        return TextTerm(integer(self._beginning.constants[raw], 32), integer(len(raw) // size, 64))
 
     def _whole_number(self, value: int, kind: Type) -> Term:
         return (
@@ -479,7 +516,10 @@ class FormTerms:
         if isinstance(node.type, value_types.FloatingType):
             return self._literal(nodes.Literal(node.type, 0.0), state)
         if isinstance(node.type, value_types.StringType):
-            return self._constant_text(b"")
+            return self._constant(b"")
+        if size := kept_size(node.type):
+            assert isinstance(node.type, value_types.VectorType)  # noqa: S101  strings are above
+            return self._constant(bytes(size * (node.type.length or 0)), size)
         if not isinstance(
             node.type,
             value_types.BoolType | value_types.IntegerType | value_types.TimeType | value_types.DurationType,
@@ -492,11 +532,14 @@ class FormTerms:
         value = state.slots.get(own if own in state.slots else shared)
         if value is None or value is MIXED:
             raise UnknownError(f"a variable of type {node.type}")
-        return value if own in state.slots else self._kept(value, state)
+        return value if own in state.slots else self._kept(value, node.type, state)
 
-    def _kept(self, value: Any, state: State) -> Any:
+    def _kept(self, value: Any, kind: Type, state: State) -> Any:
+        """Leave the message to Python if a string or array is longer than the module keeps."""
+        if isinstance(value, _View) and kept_size(kind):
+            value = TextTerm(AT + z3.Extract(31, 0, value.start), value.count)
         if isinstance(value, TextTerm):
-            self._leave_to_python(state, z3.UGT(value.count, MOST_KEPT))
+            self._leave_to_python(state, z3.UGT(value.count, most_kept(kind)))
         return value
 
     def _assign(self, node: nodes.Assign, state: State) -> Any:
@@ -504,7 +547,7 @@ class FormTerms:
         where: int | str = "shared" if node.name in self._shared else self._frame
         if where == "shared" and node.name not in self._beginning.variables:
             raise UnknownError(f"a variable of type {node.type}")
-        state.slots[where, node.name] = self._kept(value, state) if where == "shared" else value
+        state.slots[where, node.name] = self._kept(value, node.type, state) if where == "shared" else value
         return value
 
     def _convert(self, node: nodes.Convert, state: State) -> Any:
@@ -655,7 +698,7 @@ class FormTerms:
         return same if node.operator == "==" else opposite(same)
 
     def _sender(self, node: nodes.SenderName, state: State) -> Any:
-        return self._kept(self._beginning.senders[self._context, node.part], state)
+        return self._kept(self._beginning.senders[self._context, node.part], node.type, state)
 
     def _logical(self, node: nodes.Logical, state: State) -> Any:
         left = self._value(node.left, state)
@@ -693,12 +736,11 @@ class FormTerms:
         )
         more = z3.fpMul(NEAREST, seconds, floating(1e9, 64))
         until = z3.fpAdd(NEAREST, z3.fpSignedToFP(NEAREST, last, DOUBLE), more)
-        # A whole number is below `until` if it is below the next whole number.
-        whole = z3.fpRoundToIntegral(z3.RTP(), until)
-        first, limit = z3.fpToSBV(z3.RTZ(), whole, z3.BitVecSort(64)), floating(2.0**63, 64)
+        # A whole number is below `until` if it is below the next whole number. A time is from 0 to below 2**62, so the
+        # limits of the type do not matter, and nothing is below NaN.
+        first = self._truncated(z3.fpRoundToIntegral(z3.RTP(), until), _LONG)
         now = self._beginning.now
-        before = z3.If(z3.fpGEQ(whole, limit), True, both(z3.fpGEQ(whole, z3.fpNeg(limit)), now < first))
-        self._leave_to_python(state, opposite(both(last <= now, before)))
+        self._leave_to_python(state, opposite(both(last <= now, now < first)))
         return z3.BoolVal(False)
 
     def _item(self, node: nodes.Item, state: State) -> Any:
@@ -718,6 +760,8 @@ class FormTerms:
 
     def _copy(self, node: nodes.Copy, state: State) -> Any:
         view, kind = self._value(node.value, state), node.type
+        if not isinstance(view, _View | TextTerm):
+            raise UnknownError(f"a copy of type {kind}")
         if isinstance(kind, value_types.VectorType) and struct_code(kind.element) is not None:
             self._make(view.count * self._values.width(kind.element), state)
         elif not isinstance(kind, value_types.RecordType) or any(
@@ -734,12 +778,10 @@ class FormTerms:
             raise NotProvedError("not loop-free: `nearest` reads each element")
         values = [self._value(argument, state) for argument in arguments]
         kind = arguments[0].type if arguments else value_types.VOID
-        if name in _OF_VIEWS and isinstance(values[0], _View):
+        if name in _OF_VIEWS and isinstance(values[0], _View | TextTerm):
             return _OF_VIEWS[name](values[0].count)
-        if name == "l_element" and isinstance(values[0], _View) and isinstance(kind, value_types.VectorType):
-            index = values[1]
-            self._leave_to_python(state, z3.UGE(index, values[0].count))
-            return self._part(values[0], index * self._size(kind.element), node.type)
+        if name == "l_element" and isinstance(values[0], _View | TextTerm):
+            return self._element(values[0], kind, values[1], state)
         rounded = name.removesuffix("f") if kind == value_types.FloatingType(32) else name
         if (
             isinstance(kind, value_types.FloatingType)
@@ -750,8 +792,9 @@ class FormTerms:
         if isinstance(kind, value_types.FloatingType) and name in _QUESTIONS:
             return _QUESTIONS[name](values[0])
         if name in ("h_copysign", "h_copysignf"):
-            self._ignore(state.where(z3.fpIsNaN(values[1])), "the sign of a NaN")
-            state.require(opposite(z3.fpIsNaN(values[1])))
+            none = _QUESTIONS["h_isnan"](values[1])
+            self._ignore(state.where(none), "the sign of a NaN")
+            state.require(opposite(none))
             return with_sign(*values)
         if name in ("h_min", "h_max"):
             return self._chosen(
@@ -769,6 +812,15 @@ class FormTerms:
             return values[0] + values[1] if name == "k_after" else values[0] - values[1]
         raise UnknownError(name.partition("_")[2])
 
+    def _element(self, values: _View | TextTerm, kind: Type, index: Term, state: State) -> Any:
+        if not isinstance(kind, value_types.VectorType):
+            raise UnknownError(f"an element of type {kind}")
+        self._leave_to_python(state, z3.UGE(index, values.count))
+        offset = index * self._size(kind.element)
+        if isinstance(values, TextTerm):
+            return self._number(MEMORY, values.place + z3.Extract(31, 0, offset), kind.element)
+        return self._part(values, offset, kind.element)
+
     def _chosen(self, second: Term, values: Sequence[Term]) -> Term:
         return z3.If(second, values[1], values[0])
 
@@ -776,7 +828,7 @@ class FormTerms:
         moment, part, new = node.arguments
         assert isinstance(part, nodes.Literal)  # noqa: S101  the name of a part
         old = self._value(moment, state)
-        value = self._converted(self._value(new, state), new.type, value_types.IntegerType(64, True, "long"))
+        value = self._converted(self._value(new, state), new.type, _LONG)
         seconds, rest = self._parts(old)
         one, other = (value, rest) if part.value == b"sec" else (seconds, value)
         return self._of_parts(node.type, one, other, state)
@@ -809,6 +861,10 @@ class FormTerms:
             end = State(either(before.alive, end.alive), merged(before.alive, before, end))
         state.alive, state.slots = end.alive, end.slots
         return result
+
+
+def _bits(value: Term) -> int:
+    return 64 if value.sort() == DOUBLE else 32
 
 
 def _compared(operator: str, left: Term, right: Term, kind: Type) -> Term:
@@ -863,11 +919,12 @@ _ROUNDED: Mapping[str, Callable[[Term], Term]] = MappingProxyType(
 )
 _QUESTIONS: Mapping[str, Callable[[Term], Term]] = MappingProxyType(
     {
-        "h_isnan": z3.fpIsNaN,
-        "h_isinf": z3.fpIsInf,
-        "h_isfinite": lambda value: opposite(either(z3.fpIsNaN(value), z3.fpIsInf(value))),
+        "h_isnan": lambda value: opposite(z3.fpLEQ(z3.fpAbs(value), floating(inf, _bits(value)))),
+        "h_isinf": lambda value: z3.fpEQ(z3.fpAbs(value), floating(inf, _bits(value))),
+        "h_isfinite": lambda value: z3.fpLT(z3.fpAbs(value), floating(inf, _bits(value))),
     }
 )
+"""As comparisons with infinity: without a meaning of numbers, z3 knows of nothing else that it is the same."""
 _OF_MOMENTS: Mapping[str, Callable[[FormTerms, Term], Term]] = MappingProxyType(
     {
         "m_is_zero": lambda _, value: value == 0,
@@ -883,10 +940,10 @@ STATEMENTS: Mapping[type[nodes.FormNode], Callable[[FormTerms, Any, State], None
         {
             nodes.Evaluate: FormTerms._evaluate,
             nodes.If: FormTerms._if,
-            nodes.Loop: FormTerms._repeat,
+            nodes.Loop: FormTerms._loop,
             nodes.ForEach: FormTerms._repeat,
-            nodes.Break: nodes.Left("a loop"),
-            nodes.Continue: nodes.Left("a loop"),
+            nodes.Break: FormTerms._break,
+            nodes.Continue: FormTerms._continue,
             nodes.Select: FormTerms._select,
             nodes.Return: FormTerms._return,
             nodes.Leave: FormTerms._leave,

@@ -8,12 +8,13 @@ Memory has these parts; access to any other address counts as a difference:
 - the log, which restores a message that is left. Each write to the message is preceded by an entry with address, size
   and old bytes. Entries are never overwritten.
 
-For strings in variables, names of senders and constant strings, only the addresses and lengths are known. Code that
-reads their bytes is not proved, except that two of them are equal or not by the result of one function. A message that
-is left (`ELSEWHERE`) and a trap are treated alike: the effects are undone.
+For strings and arrays in variables, names of senders and constants, the addresses and lengths are known. An element of
+an array in a variable or of a constant array is a byte of `MEMORY`; code that reads bytes of another one is not proved,
+except that two strings are equal or not by the result of one function. A message that is left (`ELSEWHERE`) and a trap
+are treated alike: the effects are undone.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from types import MappingProxyType
@@ -22,10 +23,12 @@ from typing import Any
 import z3
 
 from rosmop.prove.decoding import Code, WasmInstruction
+from rosmop.prove.loops import Cut, Loops, become, constant_for
 from rosmop.prove.terms import (
     AT,
     DOUBLE,
     FRAME,
+    MEMORY,
     MIXED,
     NEAREST,
     SINGLE,
@@ -74,6 +77,27 @@ class _Note:
 
 
 @dataclass(frozen=True)
+class ReadableBytes:
+    """Bytes of `MEMORY` that code may read, under a condition on their length."""
+
+    begin: Term
+    size: Term
+    known: Term
+
+
+@dataclass(frozen=True)
+class LoopGuess:
+    """Guess what is equal at the head of a loop: `cuts` are the loops of the form, `variables` the form's names of
+    variables by address, and `names` those of the local variables of each function.
+    """
+
+    cuts: Sequence[Cut]
+    variables: Mapping[int, Any]
+    names: Sequence[Sequence[str]]
+    unrolled: int = 0
+
+
+@dataclass(frozen=True)
 class ModuleResult:
     """`bits` are the return value, unless the function has `trapped`. `outside`: it reads beyond the message."""
 
@@ -85,13 +109,14 @@ class ModuleResult:
     stored: frozenset[int]
     lines: Term
     said: Term
+    loops: Loops
 
 
 class ModuleExecution:
     """Executes the function of one event on these cells. Booleans in cells are also numbers.
 
     `strings` are the addresses of strings, and of the cells that refer to arrays. `routines` are functions of z3 for
-    the results of functions that are not translated, by their numbers.
+    the results of functions that are not translated, by their numbers. `spans` are the bytes that code may read there.
     """
 
     def __init__(  # noqa: PLR0917  a function, its message and its cells
@@ -101,12 +126,19 @@ class ModuleExecution:
         message: Term,
         size: Term,
         cells: Mapping[int, Term],
-        strings: Sequence[range] = (),
-        routines: Mapping[int, Any] = MappingProxyType({}),
+        strings: Sequence[range],
+        routines: Mapping[int, Any],
+        spans: Sequence[ReadableBytes],
+        guess: LoopGuess,
     ) -> None:
         self._functions = functions
         self._strings = strings
         self._routines = routines
+        self._spans = spans
+        self._guess = guess
+        self._loops = Loops(guess.unrolled)
+        self._function = number
+        self._labels: list[list[State]] = []
         self._size = size
         self._trapped: list[Term] = []
         self._outside: list[Term] = []
@@ -138,15 +170,15 @@ class ModuleExecution:
         }
         return ModuleResult(
             either(*self._trapped), either(*self._outside), bits, state.slots[_MESSAGE], cells,
-            frozenset(self._stored), state.slots[_LINES], state.slots["cell", SAID].offset,
+            frozenset(self._stored), state.slots[_LINES], state.slots["cell", SAID].offset, self._loops,
         )  # fmt: skip
 
     def _call(self, number: int, arguments: Sequence[Any], state: State) -> Any:
         """Call a function; `state` becomes the state after the call."""
         code = self._functions[number]
         self._frames += 1
-        outer = self._frame, self._returned
-        self._frame, self._returned = self._frames, []
+        outer = self._frame, self._returned, self._function, self._labels
+        self._frame, self._returned, self._function, self._labels = self._frames, [], number, []
         zeros = [integer(0, 32) if kind == "i32" else integer(0, 64) if kind == "i64" else floating(0.0, int(kind[1:]))
                  for kind in code.made]  # fmt: skip
         inner = state.where(z3.BoolVal(True))
@@ -154,7 +186,7 @@ class ModuleExecution:
         stack: list[Any] = []
         self._run(code.body, inner, stack)
         ends = [*self._returned, *([] if z3.is_false(inner.alive) else [(inner, stack[-1])])]
-        self._frame, self._returned = outer
+        self._frame, self._returned, self._function, self._labels = outer
         if not ends:
             state.alive = z3.BoolVal(False)
             return integer(0, 32)
@@ -170,8 +202,6 @@ class ModuleExecution:
             if z3.is_false(state.alive):
                 return
             family, _, rest = instruction.name.partition(".")
-            if instruction.name in ("block", "loop", "br", "br_if"):
-                raise NotProvedError("not loop-free: it compares or copies strings, byte by byte")
             method = _CONTROL.get(instruction.name)
             if method is not None:
                 method(self, instruction, state, stack)
@@ -200,13 +230,60 @@ class ModuleExecution:
         yes, no = state.where(test), state.where(opposite(test))
         one: list[Any] = []
         other: list[Any] = []
+        self._labels.append([])
         self._run(instruction.body, yes, one)
         self._run(instruction.otherwise, no, other)
+        if self._labels.pop():
+            raise NotProvedError("leaves a branch before its end")
         state.join(test, yes, no)
         values = [branch[-1] if branch and not z3.is_false(end.alive) else None
                   for branch, end in ((one, yes), (other, no))]  # fmt: skip
         if any(value is not None for value in values):
             stack.append(choice(test, *values))
+
+    def _block(self, instruction: WasmInstruction, state: State, stack: list[Any]) -> None:
+        self._labels.append([])
+        self._run(instruction.body, state, [])
+        become(state, [*self._labels.pop(), state])
+
+    def _loop(self, instruction: WasmInstruction, state: State, stack: list[Any]) -> None:
+        def body(state: State) -> tuple[Sequence[State], Sequence[State]]:
+            self._labels.append([])
+            try:
+                self._run(instruction.body, state, [])
+            finally:
+                again = self._labels.pop()
+            return again, [state]
+
+        logs = [self._trapped, self._outside, self._returned, *self._labels]
+        self._loops.run(state, body, self._frame, self._at_head, logs)
+
+    def _at_head(self, number: int, key: Any, value: Any) -> Any:
+        """Return the constant of the form's variable of the same name, or a new one."""
+        if key in (_MESSAGE, _LINES, _NOTE, ("cell", SAID), ("cell", UNDO)):
+            raise NotProvedError("not loop-free: a loop changes the message or prints")
+        cut = self._guess.cuts[number] if number < len(self._guess.cuts) else None
+        if cut is None:
+            raise NotProvedError("not loop-free: it compares or copies strings, byte by byte")
+        kind, place = key
+        if kind == "cell":
+            name = self._guess.variables.get(place)
+        else:
+            name = self._guess.names[self._function][place] if kind == self._frame else None
+        for known in ((cut.frame, name), name):
+            meant = cut.head.get(known)
+            if isinstance(meant, z3.ExprRef) and isinstance(value, z3.ExprRef) and _same_sort(meant, value):
+                return meant
+        return constant_for(key, value)
+
+    def _branch(self, instruction: WasmInstruction, state: State, stack: list[Any]) -> None:
+        self._labels[-1 - int(instruction.operands[0])].append(state.where(z3.BoolVal(True)))
+        state.alive = z3.BoolVal(False)
+
+    def _branch_if(self, instruction: WasmInstruction, state: State, stack: list[Any]) -> None:
+        test = _truth(stack.pop())
+        self._labels[-1 - int(instruction.operands[0])].append(state.where(test))
+        state.require(opposite(test))
 
     def _unreachable(self, instruction: WasmInstruction, state: State, stack: list[Any]) -> None:
         self._trapped.append(state.alive)
@@ -254,6 +331,12 @@ class ModuleExecution:
             size = int(how.partition("_")[0] or bits) // 8
             value = number_at(state.slots[_MESSAGE], self._within(address, int(offset), size, state), size)
             return _loaded(value, family, how)
+        span = self._span(address)
+        if span is not None:
+            size = int(how.partition("_")[0] or bits) // 8
+            return _loaded(
+                number_at(MEMORY, self._in_span(address, int(offset), size, span, state), size), family, how
+            )
         place = self._cell(address, int(offset))
         value = state.slots.get(("cell", place))
         if value is MIXED:
@@ -284,6 +367,8 @@ class ModuleExecution:
             self._add_note(value, state)
             return
         before = state.slots.get(("cell", place))
+        if isinstance(value, Pointer) and value.place == "message" and z3.is_bv(before):
+            value = AT + value.offset
         if how or before is None or not _fits(before, family):
             raise DiffersError(
                 f"it writes {each_name(family, how)} at {place}, where no such value is stored"
@@ -303,6 +388,18 @@ class ModuleExecution:
         if not known:
             raise DiffersError("it reads an address outside the message")
         return place
+
+    def _span(self, address: Any) -> ReadableBytes | None:
+        """Return the bytes from whose begin the address is calculated."""
+        if not isinstance(address, z3.ExprRef):
+            return None
+        return next((one for one in self._spans for part in _summands(address) if part.eq(one.begin)), None)
+
+    def _in_span(self, address: Term, offset: int, size: int, span: ReadableBytes, state: State) -> Term:
+        """A place before the begin is a very large offset."""
+        end = z3.ZeroExt(32, address - span.begin) + integer(offset + size, 64)
+        self._outside.append(both(state.alive, either(opposite(span.known), z3.UGT(end, span.size))))
+        return address + integer(offset, 32) if offset else address
 
     def _within(self, pointer: Pointer, offset: int, size: int, state: State) -> Term:
         end = z3.ZeroExt(32, pointer.offset) + integer(offset + size, 64)
@@ -347,6 +444,20 @@ class ModuleExecution:
         state.slots["cell", UNDO] = value
         for part in (0, 4, 8):
             del state.slots["part", part]
+
+
+def _summands(term: Term) -> Iterator[Term]:
+    if z3.is_app_of(term, z3.Z3_OP_BADD):
+        for part in term.children():
+            yield from _summands(part)
+    else:
+        yield term
+
+
+def _same_sort(one: Term, other: Term) -> bool:
+    """Truths are also numbers."""
+    sorts = [z3.BitVecSort(32) if z3.is_bool(value) else value.sort() for value in (one, other)]
+    return bool(sorts[0] == sorts[1])
 
 
 def _loaded(value: Term, family: str, how: str) -> Term:
@@ -435,6 +546,10 @@ _CONTROL: Mapping[str, Callable[[ModuleExecution, WasmInstruction, State, list[A
     MappingProxyType(
         {
             "if": ModuleExecution._if,
+            "block": ModuleExecution._block,
+            "loop": ModuleExecution._loop,
+            "br": ModuleExecution._branch,
+            "br_if": ModuleExecution._branch_if,
             "unreachable": ModuleExecution._unreachable,
             "return": ModuleExecution._return,
             "call": ModuleExecution._called,

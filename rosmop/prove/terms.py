@@ -20,7 +20,8 @@ NEAREST = z3.RNE()
 AT = z3.BitVec("at", 32)
 """The address of the message in the memory."""
 FRAME = z3.BitVec("position", 32)
-
+MEMORY = z3.Array("memory", z3.BitVecSort(32), z3.BitVecSort(8))
+"""The bytes of constants and of arrays in variables, which an event does not change."""
 
 MISMATCH = z3.Function("mismatch", *[z3.BitVecSort(32)] * 4)
 """The place of the first difference of two strings (addresses and length), or the length; not translated."""
@@ -30,7 +31,7 @@ SECONDS = z3.Function("seconds", z3.BitVecSort(64), DOUBLE)
 
 @dataclass(frozen=True)
 class TextTerm:
-    """A string outside the message: address (32 bits) and length (64 bits). Its bytes are not known."""
+    """A string or array outside the message: address (32 bits) and number of elements (64 bits)."""
 
     place: Term
     count: Term
@@ -201,6 +202,8 @@ class FormResult:
     budgets: Mapping[str, Term]
     said: Term
     noted: Sequence[LineTerm]
+    loops: Any
+    """`loops.Loops`, which imports this module."""
 
 
 _SMALL = 1 << 10
@@ -210,33 +213,43 @@ _COSTLY = frozenset((
     z3.Z3_OP_FPA_TO_SBV, z3.Z3_OP_FPA_TO_IEEE_BV, z3.Z3_OP_BMUL, z3.Z3_OP_BSDIV, z3.Z3_OP_BUDIV, z3.Z3_OP_BSREM,
     z3.Z3_OP_BUREM, z3.Z3_OP_BSDIV_I, z3.Z3_OP_BUDIV_I, z3.Z3_OP_BSREM_I, z3.Z3_OP_BUREM_I,
 ))  # fmt: skip
+_COMMUTATIVE = frozenset((z3.Z3_OP_FPA_ADD, z3.Z3_OP_FPA_MUL))
 _FLOATING = frozenset((z3.Z3_FLOATING_POINT_SORT, z3.Z3_ROUNDING_MODE_SORT))
 
 
-def abstracted(terms: Sequence[Term], *, floats: bool = False) -> list[Term]:
-    """Replace the results of costly operations by variables, with the same variable for equal operands.
+class Abstraction:
+    """Replaces the results of costly operations by variables, with the same variable for equal operands.
 
     With `floats`, floating-point numbers become values without a meaning, which are only equal or not, and so do the
     results of all operations on them. If a formula over these variables cannot hold, the original formula cannot hold.
     """
-    known: dict[int, Term] = {}
-    kept: list[Term] = []  # kept alive as long as their numbers are used
-    begin = [z3.simplify(term) for term in terms]
-    waiting = list(begin)
-    while waiting:
-        term = waiting[-1]
-        parts = term.children()
-        missing = [part for part in parts if part.get_id() not in known]
-        if missing:
-            waiting += missing
-            continue
-        waiting.pop()
-        if term.get_id() in known:
-            continue
-        new = [known[part.get_id()] for part in parts]
-        kept.append(term)
-        known[term.get_id()] = _abstracted(term, new, floats=floats)
-    return [known[term.get_id()] for term in begin]
+
+    def __init__(self, *, floats: bool = False) -> None:
+        self._floats = floats
+        self._known: dict[int, tuple[Term, Term]] = {}
+        """By its number, each term with its replacement; a number is used again after its term is gone."""
+        self._laws: list[Term] = []
+        """The simplifier orders the operands of sums and products in no fixed way."""
+
+    def of(self, terms: Sequence[Term]) -> list[Term]:
+        begin = [z3.simplify(term) for term in terms]
+        known, waiting = self._known, list(begin)
+        while waiting:
+            term = waiting[-1]
+            parts = term.children()
+            missing = [part for part in parts if part.get_id() not in known]
+            if missing:
+                waiting += missing
+                continue
+            waiting.pop()
+            if term.get_id() not in known:
+                new = [known[part.get_id()][1] for part in parts]
+                abstract = _abstracted(term, new, floats=self._floats)
+                known[term.get_id()] = term, abstract
+                if term.decl().kind() in _COMMUTATIVE and abstract.decl().kind() == z3.Z3_OP_UNINTERPRETED:
+                    *mode, one, other = new
+                    self._laws.append(abstract == abstract.decl()(*mode, other, one))
+        return [*(known[term.get_id()][1] for term in begin), *self._laws]
 
 
 def _abstracted(term: Term, operands: Sequence[Term], *, floats: bool) -> Term:
@@ -256,7 +269,7 @@ def _abstracted(term: Term, operands: Sequence[Term], *, floats: bool) -> Term:
 
 
 def _is_cheap(kind: int, operands: Sequence[Term]) -> bool:
-    small = any(z3.is_bv_value(operand) and operand.as_long() < _SMALL for operand in operands)
+    small = any(z3.is_bv_value(operand) and abs(operand.as_signed_long()) < _SMALL for operand in operands)
     return (kind == z3.Z3_OP_BMUL and small) or all(map(_is_number, operands))
 
 

@@ -148,14 +148,47 @@ def compiled(text: str, known: Definitions | None = None) -> Compiled:
 
 
 def faulty(text: str, every: int = 1) -> Iterator[tuple[str, str]]:
-    code = compiled(text)
-    (group,) = groups(code.specifications)
-    values = ValueCodec(code.messages)
-    module = written(code.functions, [group.component], values)
-    validation = Validation(code.functions, values, module, time.monotonic, patience=100)
-    ((topic, (one,)),) = group.component.topics
-    assert validation.finding(topic, "s.e", one.function, 0).answer == EQUAL
-    number = module.feeds[topic].functions[0]
-    for kind, wrong in islice(mutants(validation.codes[number]), 0, None, every):
-        validation.codes[number] = wrong
-        yield kind, validation.finding(topic, "s.e", one.function, 0).answer.partition(":")[0]
+    return faulty_event(compiled(text), "e", every)
+
+
+def faulty_event(
+    code: Compiled, event: str, every: int, *, patience: float = 100
+) -> Iterator[tuple[str, str]]:
+    """Yield the kind of each fault in the function of the event, also in those that it calls, and the answer."""
+    [group] = groups(code.specifications)
+    module = written(code.functions, [group.component], ValueCodec(code.messages))
+    validation = Validation(
+        code.functions, ValueCodec(code.messages), module, time.monotonic, patience=patience
+    )
+    [(topic, one, place)] = [
+        (topic, one, place)
+        for (topic, events), numbers in zip(group.component.topics, group.events, strict=True)
+        for place, (one, (number, index)) in enumerate(zip(events, numbers, strict=True))
+        if code.specifications[number].events[index].name == event
+    ]
+    name = f"{code.specifications[0].name}.{event}"
+    assert validation.finding(topic, name, one.function, place).answer == EQUAL
+    wrong = (
+        (number, kind, other)
+        for number in _called(validation.codes, module.feeds[topic].functions[place])
+        for kind, other in mutants(validation.codes[number])
+    )
+    for number, kind, other in islice(wrong, 0, None, every):
+        before, validation.codes[number] = validation.codes[number], other
+        yield kind, validation.finding(topic, name, one.function, place).answer.partition(":")[0]
+        validation.codes[number] = before
+
+
+def _called(codes: Sequence[Code], number: int) -> list[int]:
+    """Return the function with all functions that it calls, each once."""
+    found = [number]
+    for one in found:
+        found += {called for called in _calls(codes[one].body) if called not in found}
+    return found
+
+
+def _calls(body: Sequence[WasmInstruction]) -> Iterator[int]:
+    for one in body:
+        if one.name == "call":
+            yield int(one.operands[0])
+        yield from _calls((*one.body, *one.otherwise))

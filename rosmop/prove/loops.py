@@ -1,0 +1,225 @@
+"""Loops of the form and of the module, as one induction over their iterations.
+
+Both sides run through their loops in the same order, so the loops are paired by number. A loop is *cut* at its head.
+Each slot that an iteration changes gets a new constant there, on the module's side that of the form's variable with the
+same name. Then one iteration, and the statements after the loop, are translated once, for the state at the head of the
+last iteration. `loop_conditions` yields the conditions that must not hold; together they are the induction:
+
+- both sides reach the loop, or neither does, and paired slots are equal then;
+- if one side begins another iteration, so does the other one, and paired slots are equal again;
+- each iteration takes something from the budget, so the loop of the form ends.
+
+Names of variables are only a guess of equal slots: a wrong pair leaves a condition that may hold. A slot without a pair
+has any value. So a proof is for each number of iterations, but the answer to a condition may be a state that does not
+occur. `equality.py` then searches for a difference in `unrolled` loops, whose first iterations are translated one by
+one.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import z3
+
+from rosmop.prove.terms import (
+    MIXED,
+    NotProvedError,
+    State,
+    Term,
+    as_bits,
+    both,
+    either,
+    merged,
+    opposite,
+)
+from rosmop.runtime.action_context import BUDGET
+
+BUDGET_SLOT = "budget"
+
+Head = Callable[[int, Any, Any], Any]
+"""The value of a slot at the head of a loop, from the loop's number, the slot's name and its value before the loop."""
+
+
+@dataclass(frozen=True)
+class Cut:
+    """A loop of one side. `head` has the new constants of the slots that an iteration changes, `entry` the values of
+    these slots before the loop, and `back` those after an iteration; `frame` is the call that has the loop.
+    """
+
+    frame: int
+    reached: Term
+    again: Term
+    entry: Mapping[Any, Any]
+    head: Mapping[Any, Any]
+    back: Mapping[Any, Any]
+
+
+@dataclass
+class Loops:
+    """The loops of one side. With `unrolled`, each has at most that many iterations; `again` has the conditions under
+    which a state is not followed any further.
+    """
+
+    unrolled: int = 0
+    cuts: list[Cut] = field(default_factory=list)
+    beyond: list[Term] = field(default_factory=list)
+
+    @property
+    def again(self) -> Term:
+        return either(*(cut.again for cut in self.cuts), *self.beyond)
+
+    def run(
+        self,
+        state: State,
+        body: Callable[[State], tuple[Sequence[State], Sequence[State]]],
+        frame: int,
+        head: Head,
+        logs: Sequence[list[Any]],
+    ) -> None:
+        """Make `state` that after the loop. `body` returns the states that begin another iteration, and those that
+        leave the loop. Entries of `logs` by a translation that is repeated are removed.
+        """
+        left: list[State] = []
+        if self.unrolled:
+            for _ in range(self.unrolled):
+                again, ends = body(state.where(z3.BoolVal(True)))
+                left += ends
+                state = become(state, again)
+            self.beyond.append(state.alive)
+        else:
+            left += self._cut(state, body, frame, head, [*logs, self.cuts])
+        become(state, left)
+
+    def _cut(
+        self,
+        state: State,
+        body: Callable[[State], tuple[Sequence[State], Sequence[State]]],
+        frame: int,
+        head: Head,
+        logs: Sequence[list[Any]],
+    ) -> Sequence[State]:
+        number, constants = len(self.cuts), dict[Any, Any]()
+        nothing = z3.BoolVal(False)
+        self.cuts.append(
+            Cut(frame, nothing, nothing, {}, {}, {})
+        )  # loops within this one have greater numbers
+        while True:
+            sizes = [len(log) for log in logs]
+            again, left = body(State(state.alive, state.slots | constants))
+            back = _joined(again)
+            changed = {
+                key: head(number, key, before)
+                for key, before in state.slots.items()
+                if key not in constants
+                and not z3.is_false(back.alive)
+                and not _same(before, back.slots.get(key))
+            }
+            if not changed:
+                break
+            constants |= changed
+            for log, size in zip(logs, sizes, strict=True):
+                del log[size:]
+        entry, after = ({key: slots.get(key) for key in constants} for slots in (state.slots, back.slots))
+        self.cuts[number] = Cut(frame, state.alive, back.alive, entry, constants, after)
+        return left
+
+
+def loop_conditions(
+    form: Sequence[Cut], module: Sequence[Cut], ended: Term, left: Term
+) -> Iterator[tuple[str, Term]]:
+    """Yield the conditions that must not hold. `ended`: the form faulted, or uses something unknown. `left`: the
+    module left the message to Python. Raises `NotProvedError`.
+    """
+    if len(form) != len(module):
+        raise NotProvedError("its code has another number of loops")
+    for number, (one, other) in enumerate(zip(form, module, strict=True)):
+        name = f"loop {number + 1}"
+        for text, meant, done in (
+            ("is entered", one.reached, other.reached),
+            ("goes on", one.again, other.again),
+        ):
+            yield (
+                f"whether {name} {text}",
+                either(
+                    both(done, opposite(meant), opposite(ended)), both(meant, opposite(done), opposite(left))
+                ),
+            )
+        if BUDGET_SLOT not in one.head:
+            if not z3.is_false(one.again):
+                raise NotProvedError("not loop-free: it has a loop that costs nothing")
+            continue
+        rest = one.back[BUDGET_SLOT]
+        yield f"the budget before {name}", both(one.reached, opposite(is_budget(one.entry[BUDGET_SLOT])))
+        less = both(is_budget(rest), rest < one.head[BUDGET_SLOT])
+        yield f"the budget after an iteration of {name}", both(one.again, opposite(less))
+        for (_, begin, turned), (key, entry, back) in _pairs(one, other):
+            yield f"a variable before {name} ({key})", both(one.reached, other.reached, _differ(begin, entry))
+            yield (
+                f"a variable after an iteration of {name} ({key})",
+                both(one.again, other.again, _differ(turned, back)),
+            )
+
+
+def assumed(form: Sequence[Cut]) -> Sequence[Term]:
+    """Return what the induction knows at the head of each loop: the budget is at most that before the loop."""
+    return [
+        both(
+            is_budget(cut.head[BUDGET_SLOT]),
+            either(opposite(cut.reached), cut.head[BUDGET_SLOT] <= cut.entry[BUDGET_SLOT]),
+        )
+        for cut in form
+        if BUDGET_SLOT in cut.head
+    ]
+
+
+def is_budget(value: Term) -> Term:
+    return both(value >= 0, value <= BUDGET)
+
+
+def _pairs(one: Cut, other: Cut) -> Iterator[tuple[tuple[Any, Any, Any], tuple[Any, Any, Any]]]:
+    """Two slots are a pair if they have the same constant."""
+    known = {value.get_id(): key for key, value in one.head.items() if value is not MIXED}
+    for key, value in other.head.items():
+        match = None if value is MIXED else known.get(value.get_id())
+        if match is not None:
+            yield (match, one.entry[match], one.back[match]), (key, other.entry[key], other.back[key])
+
+
+def _differ(one: Any, other: Any) -> Term:
+    if not isinstance(one, z3.ExprRef) or not isinstance(other, z3.ExprRef):
+        return z3.BoolVal(True)
+    if z3.is_bool(one) != z3.is_bool(other):
+        one, other = (as_bits(value) if z3.is_bool(value) else value for value in (one, other))
+    return opposite(one == other)
+
+
+def constant_for(key: Any, value: Any) -> Any:
+    """Return a new constant of the value's sort. Nothing is known of a string or an address that changes."""
+    if not isinstance(value, z3.ExprRef):
+        return MIXED
+    return z3.FreshConst(value.sort(), f"{key} at the head")
+
+
+def _same(one: Any, other: Any) -> bool:
+    """Whether two values of a slot are the same term, or structures of the same terms."""
+    if isinstance(one, z3.ExprRef) and isinstance(other, z3.ExprRef):
+        return bool(one.eq(other))
+    return type(one) is type(other) and bool(one == other)
+
+
+def _joined(states: Sequence[State]) -> State:
+    """The states exclude each other."""
+    alive = [state for state in states if not z3.is_false(state.alive)]
+    if not alive:
+        return State(z3.BoolVal(False), {})
+    end = alive[-1]
+    for before in alive[-2::-1]:
+        end = State(either(before.alive, end.alive), merged(before.alive, before, end))
+    return end
+
+
+def become(state: State, states: Sequence[State]) -> State:
+    """Make `state` the point where these states meet."""
+    end = _joined(states)
+    state.alive, state.slots = end.alive, end.slots or state.slots
+    return state
