@@ -14,6 +14,7 @@ from appliance.base.shipped import SHIPPED
 from appliance.base.user_errors import UserError
 from appliance.features.guards import message_types as types
 from appliance.features.guards.message_types import TypeRow, text_for
+from appliance.features.guards.polygons import fault_of
 
 FOLDER = SHIPPED / "monitors" / "guards"
 
@@ -69,6 +70,8 @@ class Parameter:
         if form is not None:
             if not form.fullmatch(value):
                 raise GuardError(f"{self.name}={value}: write it like {self.name}='{self.default}'")
+            if self.kind == "corners" and (fault := fault_of(_corners(value))):
+                raise GuardError(f"{self.name}={value}: {fault}; give the corners in the order of the edge")
             return " ".join(value.split())
         if not (_WHOLE if self.kind == "int" else _DECIMAL).fullmatch(value):
             noun = "a whole number" if self.kind == "int" else "a number"
@@ -79,6 +82,11 @@ class Parameter:
                 f"{self.name}={value} is outside of {self.least}..{self.most}{unit}: give a number in this range"
             )
         return value
+
+
+def _corners(value: str) -> list[tuple[float, float]]:
+    numbers = [float(number) for number in re.split(r"[\s,]+", value.strip())]
+    return list(zip(numbers[::2], numbers[1::2], strict=True))
 
 
 def _network(name: str, value: str) -> str:

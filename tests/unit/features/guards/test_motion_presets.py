@@ -209,6 +209,28 @@ def test_without_a_position_only_turns_pass() -> None:
     assert guard.drive(twist(0.1), 602)[0] == 0 and guard.drive(twist(0, 0, 0, 0, 0, 1.0), 603)[5] == 1
 
 
+@pytest.mark.parametrize(
+    "polygon", ["-2,-2 -2,2 2,2 2,-2", "-2,-2 0,-2 2,-2 2,2 -2,2", "-2,-2 -2,-2 2,-2 2,2 -2,2"]
+)
+def test_a_fence_may_be_clockwise_and_have_corners_on_an_edge(polygon: str) -> None:
+    guard = Guarded("fence", polygon=polygon)
+    for at, (x, passes) in enumerate(((0, True), (1.7, False), (-1.9, True), (3, False)), 1):
+        guard.tell("by", odometry(x, 0, 0), at)
+        assert (guard.drive(twist(0.4), at)[0] == 0.4) == passes
+
+
+@pytest.mark.parametrize("orientation", [(0, 0, 0, 0), (0, 0, 0.01, 0), (0, 0, 0, math.inf)])
+def test_without_a_direction_only_turns_pass(orientation: tuple[float, ...]) -> None:
+    """A driver that knows no direction sends zeros, which are not the direction of the x axis."""
+    parts = {f"pose__pose__orientation__{axis}": part for axis, part in zip("xyzw", orientation, strict=True)}
+    pose = message("nav_msgs/Odometry", **parts)
+    guard, world = Guarded("fence"), Guarded("fence", worldFrame=True)
+    for one in (guard, world):
+        one.tell("by", pose, 1)
+    assert guard.drive(twist(0.1), 2)[0] == 0 and guard.drive(twist(0, 0, 0, 0, 0, 1.0), 3)[5] == 1
+    assert world.drive(twist(0.1), 2)[0] == 0.1
+
+
 def test_a_fence_by_satellites_is_in_metres_from_its_origin() -> None:
     def passes(metres: float, y: float, *, fixed: int = 0, world: bool = True) -> bool:
         guard = Guarded("fence", {"by": "sensor_msgs/NavSatFix"}, worldFrame=world, lat0=48, lon0=11,

@@ -57,7 +57,7 @@ def test_a_guard_is_an_ordinary_text_with_its_topics_types_and_values() -> None:
         Guard("yard", PRESETS["fence"], {"command": "/base/cmd", "by": "/pose"}, types,
               {"margin": "0.5", "polygon": "0,0 4,0  0,3.5", "worldFrame": "true"})
     )  # fmt: skip
-    assert text.startswith("// preset fence 1: command=/base/cmd geometry_msgs/TwistStamped, by=/pose")
+    assert text.startswith("// preset fence 2: command=/base/cmd geometry_msgs/TwistStamped, by=/pose")
     for part in (
         "topic command = /base/cmd;",
         "double margin = 0.5 m in 0..20;",
@@ -85,6 +85,9 @@ WRONG = [
     ("fence", "base", {}, {}, {"polygon": "0,0 1,1 nan,2"}, "write it like polygon="),
     ("fence", "base", {}, {}, {"polygon": "10,10 " * 60 + "x"}, "write it like polygon="),
     ("fence", "base", {}, {}, {"polygon": "0,0 1,1 1,\N{ARABIC-INDIC DIGIT ONE}"}, "write it like polygon="),
+    ("fence", "base", {}, {}, {"polygon": "-2,-2 2,2 2,-2 -2,2"}, "edges cross"),
+    ("fence", "base", {}, {}, {"polygon": "0,0 1,1 2,2 1,1"}, "the corners are on one line"),
+    ("fence", "base", {}, {}, {"polygon": "1,1 1,1 1,1"}, "the corners are on one line"),
     ("joints", "base", {}, {}, {"limits": 'a":1..2'}, "write it like limits="),
     ("joints", "base", {}, {}, {"limits": "a:10..20 " * 60 + "x"}, "write it like limits="),
     ("answer", "base", {}, {}, {"limit": "5"}, "write it like limit="),
