@@ -114,7 +114,9 @@ def test_a_scan_that_is_too_large_to_judge_stops_the_base(preset: str) -> None:
 
 ODOM = "nav_msgs/Odometry"
 BLIND = {
-    "fence": (message(ODOM), message(ODOM, pose__pose__position__x=math.nan)),
+    "fence": tuple(
+        message(ODOM, pose__pose__position__x=x, pose__pose__orientation__w=1.0) for x in (0.0, math.nan)
+    ),
     "arm": tuple(message("sensor_msgs/BatteryState", percentage=charge) for charge in (1.0, math.nan)),
     "sensor": tuple(message("sensor_msgs/LaserScan", ranges=[r]) for r in (4.0, math.nan)),
     "separation": tuple(
