@@ -342,6 +342,10 @@ class DataPlane:
         publisher = self._own.get(topic)
         if publisher is not None:
             publisher.publish(data)
+        if self.interceptor.is_guarded(topic):
+            for relayed in self.topics.values():
+                if relayed.topic == topic and relayed.upstream is not publisher:
+                    relayed.supersede()
 
     def _remove_topic(self, key: str, topic: str, reason: str) -> None:
         relayed = self.topics.pop((key, topic), None)

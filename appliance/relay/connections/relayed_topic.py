@@ -12,7 +12,8 @@ another type, md5sum, definition or latching flag, because they must read the ne
 
 Subscribers get only messages that monitors pass on, and the relay latches only these. Messages that monitors publish
 have no upstream and bypass monitors (`published`). The first messages of a new publisher are kept for subscribers that
-are about to connect (`startup_replay`).
+are about to connect (`startup_replay`). After a monitor has published on a topic with a safe message, earlier messages
+are repeated to nobody: a base that reconnects after a stop would get the motion before it (`supersede`).
 
 If the publisher's host has no memory left, a latched message is passed on but not kept. A later subscriber makes the
 relay reconnect to the publisher, once memory is free again, to get the message. The other subscribers then get it
@@ -390,6 +391,11 @@ class RelayedTopic:
         if self._stream is not None:
             self._stream.write(batch.view, batch.messages, first)
         self._pass_on(batch, divided=False)
+
+    def supersede(self) -> None:
+        """Repeat no earlier message to later subscribers: a guard stopped what it may have begun."""
+        self._latch.forget()
+        self._startup_replay.forget()
 
     def _pass_on(self, batch: Batch, *, divided: bool) -> None:
         for tap in self._taps:

@@ -252,6 +252,10 @@ class Interceptor:
         self.keep_all()
         return self.monitors.topics_of(held)
 
+    def is_guarded(self, topic: str) -> bool:
+        """Return whether an enabled monitor has a safe message for a topic."""
+        return self.monitors is not None and bool(self.monitors.guards(topic))
+
     def _guards(self, topic: str, *, begin: bool) -> list[str]:
         if self.monitors is None:
             return []

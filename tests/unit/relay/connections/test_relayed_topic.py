@@ -257,6 +257,19 @@ def test_a_latched_message_is_given_once_to_each() -> None:
     assert second.received == bytes(batch(b"new").view)
 
 
+@pytest.mark.parametrize("latching", ["0", "1"])
+def test_a_motion_that_a_guard_stopped_is_repeated_to_nobody(latching: str) -> None:
+    story = monitored(latching=latching)
+    story.receive(batch(b"forward"))
+    story.topic.supersede()
+    base = story.join()
+    story.topic.tidy()
+    assert base.received == b""
+    story.receive(batch(b"back"))
+    assert base.received == bytes(batch(b"back").view)
+    assert story.join().received == (base.received if latching == "1" else b"")
+
+
 def test_nothing_is_latched_for_a_publisher_that_does_not_latch() -> None:
     story = Story()
     story.join()

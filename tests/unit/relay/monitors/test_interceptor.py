@@ -558,6 +558,23 @@ def test_a_guard_sends_its_safe_message_when_it_is_ordered_and_not_when_it_is_as
     assert string("stop").endswith(world.event("publish", monitor="guard").after)
 
 
+def test_a_base_that_reconnects_after_a_stop_does_not_get_the_latched_motion(world: Monitored) -> None:
+    world.load(
+        GUARD.strip().replace("int seen", 'safe std_msgs/String {data:"stop"} on /chatter every 1s; int seen')
+    )
+    publisher = world.upstream(header := TYPED | {"latching": "1"})
+    publisher.send(string("one"))
+    late = world.connect(encode_header(WANTED))
+    assert world.gets_header(late) == header
+    world.gets(late, string("two"))
+    world.state(StopWanted(1, "/chatter", begin=True))
+    world.event("publish", monitor="guard")
+    late = world.connect(encode_header(WANTED))
+    assert world.gets_header(late) == header
+    publisher.send(string("three"))
+    world.gets(late, string("three"))
+
+
 def test_a_safe_message_is_sent_while_a_monitor_holds_its_topic(world: Monitored) -> None:
     guard = GUARD.strip().replace(
         "int seen", 'safe std_msgs/String {data:"stop"} on /chatter every 1s; int seen'
