@@ -55,7 +55,7 @@ def test_the_first_boot_makes_an_appliance(package: Path, tmp_path: Path) -> Non
     )
     try:
         machine.start()
-        machine.run("mv", package.name, "/srv/")
+        machine.run("mv", package.name, "/srv/rosrv.deb")
         write(machine, "/etc/systemd/system/network-of-the-robot.service", NETWORK)
         machine.run("systemctl", "enable", "network-of-the-robot")
         machine.run("sh", "-c", ": > /etc/apt/sources.list; rm -f /etc/apt/sources.list.d/*")

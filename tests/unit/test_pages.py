@@ -268,8 +268,13 @@ def test_the_changelog_is_short() -> None:
     assert notes.count("\n|") <= 12
 
 
-@pytest.mark.parametrize("page", WITH_LINKS[:-1], ids=lambda page: page.name)
-def test_file_names_of_pages_have_no_version(page: Path) -> None:
+_EXAMPLES = [
+    path for path in sorted((ROOT / "examples").rglob("*")) if path.suffix in {".yaml", ".yml", ".sh", ".md"}
+]
+
+
+@pytest.mark.parametrize("page", [*WITH_LINKS[:-1], *_EXAMPLES], ids=lambda page: page.name)
+def test_file_names_of_pages_and_examples_have_no_version(page: Path) -> None:
     """A command with the version of an earlier release would install nothing."""
     assert re.findall(r"rosrv[\w-]*[_-]\d+\.\d+\.\d+[\w.-]*", page.read_text()) == []
 
