@@ -13,7 +13,7 @@ another type, md5sum, definition or latching flag, because they must read the ne
 Subscribers get only messages that monitors pass on, and the relay latches only these. Messages that monitors publish
 have no upstream and bypass monitors (`published`). The first messages of a new publisher are kept for subscribers that
 are about to connect (`startup_replay`). After a monitor has published on a topic with a safe message, earlier messages
-are repeated to nobody: a base that reconnects after a stop would get the motion before it (`supersede`).
+are repeated to no later subscriber: a base that reconnects after a stop would get the motion before it (`supersede`).
 
 If the publisher's host has no memory left, a latched message is passed on but not kept. A later subscriber makes the
 relay reconnect to the publisher, once memory is free again, to get the message. The other subscribers then get it

@@ -171,6 +171,8 @@ def test_messages_beyond_a_limit_reach_no_monitor_or_subscriber() -> None:
     story.topic.tidy()
     assert (member.received, judged) == (bytes(batch(b"0", b"3").view), [1, 4])
     assert story.join().received == bytes(batch(b"3").view)
+    story.receive(batch(b"4"))  # the delayed message was the one that may pass
+    assert member.received == bytes(batch(b"0", b"3").view)
 
 
 def test_a_subscriber_whose_limit_kept_the_latched_message_from_it_gets_it_later() -> None:
@@ -257,8 +259,28 @@ def test_a_latched_message_is_given_once_to_each() -> None:
     assert second.received == bytes(batch(b"new").view)
 
 
+def test_messages_of_monitors_are_counted() -> None:
+    story = Story()
+    story.join()
+    story.topic.upstream_opened(HEADER)
+    story.topic.traffic()
+    story.topic.published(batch(b"stop"))
+    row = story.topic.traffic()
+    assert row is not None and (row.messages, row.bytes) == (1, 8)
+
+
+def test_a_topic_that_keeps_first_messages_does_not_go_past_python() -> None:
+    story = Story()
+    story.topic.monitor(None, wanted=True)
+    story.topic.upstream_opened(HEADER)
+    assert story.topic.simple() is None
+    story.now += 10
+    story.topic.tidy()
+    assert story.topic.simple() is not None
+
+
 @pytest.mark.parametrize("latching", ["0", "1"])
-def test_a_motion_that_a_guard_stopped_is_repeated_to_nobody(latching: str) -> None:
+def test_a_motion_that_a_guard_stopped_is_not_repeated(latching: str) -> None:
     story = monitored(latching=latching)
     story.receive(batch(b"forward"))
     story.topic.supersede()

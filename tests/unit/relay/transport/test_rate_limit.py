@@ -219,3 +219,13 @@ def test_the_last_message_of_a_latching_publisher_comes_later() -> None:
     flow.passing(frames(10, 11, 12), 9.0, latching=True)
     assert flow.passing(frames(9), 99.0, latching=True) is not None
     assert (flow.later(199.0), memory.used) == (None, 0)
+
+
+def test_a_leaving_holder_gives_its_amount_to_all() -> None:
+    limit = SharedRateLimit(FlowLimit(messages=8), 0.0)
+    first, second = limit.of("/a"), limit.of("/b")
+    assert sent(second, (0.0, frames(*[8] * 20))) == 3  # its own, and all in common
+    assert first.room(frames(8), 1, 0.0) == 1
+    del first
+    third = limit.of("/c")
+    assert (sent(third, (0.0, frames(*[8] * 20))), sent(second, (0.0, frames(8)))) == (1, 0)
