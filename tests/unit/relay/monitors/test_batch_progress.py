@@ -1,3 +1,4 @@
+import itertools
 import struct
 from collections.abc import Collection, Iterable
 from pathlib import Path
@@ -10,12 +11,13 @@ from hypothesis import strategies as st
 
 from appliance.channel.messages import Message, MonitorRow
 from appliance.relay.loop import EventLoop
+from appliance.relay.monitors.batch_progress import BatchProgress
 from appliance.relay.monitors.interceptor import Interceptor
 from appliance.relay.monitors.observation_points import ObservationPoint
 from appliance.relay.monitors.topic_pipeline import TopicPipeline
 from appliance.relay.relay_limits import RelayLimits
 from appliance.relay.report import Reporter
-from appliance.relay.transport.frames import FrameReceiver, Scratch
+from appliance.relay.transport.frames import Batch, FrameReceiver, Scratch
 from rosmop.check.sources import compiled_from
 from rosmop.form.findings import SpecificationError
 from rosmop.logics.interface import ClockedRun, FiniteRun
@@ -30,6 +32,7 @@ from rosmop.tests.random_specifications import (
     definitions,
 )
 from roswire.definitions import Definitions
+from roswire.tcpros import encode_frame
 from tests.support.examples import examples
 from tests.support.relay_memory import share
 from tests.support.stated import stated
@@ -381,4 +384,25 @@ def test_a_defect_of_the_walk_is_reported_once_and_the_engine_goes_on(
     told = [one for one in monitored.told() if "kind='fault'" in one]
     assert len(told) == len(shadowed) == 1
     assert "a defect of rosrv" in told[0]
+    monitored.close()
+
+
+def test_messages_that_were_cut_or_replaced_leave_the_rest_in_order() -> None:
+    frames = [encode_frame(body) for body in (b"one", b"two", b"three", b"four")]
+    progress = BatchProgress(Batch(memoryview(b"".join(frames)), 4, None), 0)
+    ends = [*itertools.accumulate(map(len, frames))]
+    progress.replace(0, ends[0], b"another")
+    progress.cut(ends[1], ends[2])
+    left = progress.result()
+    assert left is not None and left.messages == 3
+    assert bytes(left.view) == encode_frame(b"another") + frames[1] + frames[3]
+
+
+def test_only_the_named_monitor_is_resumed() -> None:
+    text = "%s() { int n = 0; event e() /%s std_msgs/Bool '{}' { n += 1; } }"
+    monitored = Monitored({f"{name}.rv": text % (name, name) for name in "ab"}, definitions(), together=False)
+    for monitor in monitored.set.monitors:
+        monitored.set.hold(monitor, "its state is lost")
+    assert monitored.interceptor.resume("a") == {"/a"}
+    assert [monitor.name for monitor in monitored.set.monitors if monitor.held] == ["b"]
     monitored.close()
