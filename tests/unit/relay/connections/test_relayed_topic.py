@@ -269,6 +269,39 @@ def test_messages_of_monitors_are_counted() -> None:
     assert row is not None and (row.messages, row.bytes) == (1, 8)
 
 
+class _Recorder:
+    """A sink with one stream."""
+
+    keeps = True
+
+    def __init__(self) -> None:
+        self.written = b""
+
+    def open(self, topic: str, host: str, header: Mapping[str, str]) -> "_Recorder":
+        return self
+
+    def write(self, frames: memoryview, messages: int, first: int, judged: int = 0) -> None:
+        self.written += bytes(frames)
+
+    def close(self) -> None: ...
+
+
+def test_a_sink_gets_messages_as_they_came_although_a_monitor_changes_them_in_place() -> None:
+    recorder = _Recorder()
+    story = Story(sink=recorder)
+
+    def censor(batch: Batch) -> Batch:
+        batch.view[4:] = b"*" * len(batch.view[4:])
+        return batch
+
+    story.topic.monitor(censor, wanted=True)
+    member = story.join()
+    story.topic.upstream_opened(HEADER)
+    story.receive(Batch(memoryview(bytearray(batch(b"secret").view)), 1, None))
+    assert member.received == bytes(batch(b"******").view)
+    assert recorder.written == bytes(batch(b"secret").view)
+
+
 def test_a_topic_that_keeps_first_messages_does_not_go_past_python() -> None:
     story = Story()
     story.topic.monitor(None, wanted=True)
