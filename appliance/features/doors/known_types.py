@@ -59,7 +59,7 @@ class Encodings:
     def __init__(self, most: int = 16 << 20) -> None:
         self.bytes = 0
         self._most = most
-        self._kept: dict[tuple[DoorMessage, Any], Any] = {}  # oldest first
+        self._kept: OrderedDict[tuple[DoorMessage, Any], Any] = OrderedDict()  # oldest first
 
     def of(self, message: DoorMessage, encode: Callable[[MessageCodec, Body], E]) -> E:
         known: E | None = self._kept.get((message, encode))
@@ -68,9 +68,8 @@ class Encodings:
         made = self._kept[message, encode] = encode(message.codec_of(message.header), message.body)
         self.bytes += _kept_bytes(message, made)
         while self.bytes > self._most:
-            oldest, encoding = next(iter(self._kept.items()))
-            del self._kept[oldest]
-            self.bytes -= _kept_bytes(oldest[0], encoding)
+            (oldest, _), encoding = self._kept.popitem(last=False)
+            self.bytes -= _kept_bytes(oldest, encoding)
         return made
 
 
