@@ -7,6 +7,7 @@ The kernel writes a large frame where it stays, so it is never copied. Invariant
    the next frame is received. Its memory is given back immediately before it is delivered: the receiver may take it.
 3. A frame is delivered only while one is wanted: bytes after it wait, and the connection is not read.
 4. After a large frame, and after `_TURN` small ones, other tasks have a turn before the next is delivered.
+5. Each frame is delivered once. An error of the receiver of a frame ends the connection.
 """
 
 import asyncio
@@ -115,7 +116,10 @@ class TcprosReceiver(asyncio.BufferedProtocol):
     def _go_on(self) -> None:
         if self._deliver is not None:
             self._transport.resume_reading()
-            self._take_frames()
+            try:
+                self._take_frames()
+            except Exception as error:  # noqa: BLE001  as an event loop does with an error of `buffer_updated`
+                self._fail(error)
 
     def _take_frames(self) -> None:
         position, end, left = 0, self._begun, _TURN
@@ -129,7 +133,7 @@ class TcprosReceiver(asyncio.BufferedProtocol):
                 break
             size = int.from_bytes(self._small[position:body], "little")
             if size > self._limit:
-                self._refuse(size)
+                self._fail(LimitExceededError(f"frame of {size} bytes; at most {self._limit} are allowed"))
                 return
             if body + size <= end:
                 position = body + size
@@ -162,9 +166,7 @@ class TcprosReceiver(asyncio.BufferedProtocol):
         if self._deliver is not None:
             self._deliver(body)
 
-    def _refuse(self, size: int) -> None:
+    def _fail(self, error: Exception) -> None:
         self._deliver = None
-        self._ended.set_exception(
-            LimitExceededError(f"frame of {size} bytes; at most {self._limit} are allowed")
-        )
+        self._ended.set_exception(error)
         self._transport.close()

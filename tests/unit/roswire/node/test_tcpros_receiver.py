@@ -108,6 +108,25 @@ async def test_other_tasks_have_a_turn_between_many_frames() -> None:
     listening.cancel()
 
 
+async def test_no_frame_is_delivered_again_after_an_error_of_its_receiver() -> None:
+    connection = Connection()
+
+    def take(body: Body) -> None:
+        connection.heard.append(body)
+        if body == b"64":
+            raise KeyError(body)
+
+    listening = asyncio.ensure_future(connection.receiver.deliver_to(take, LIMIT))
+    await asyncio.sleep(0)
+    frames = [b"%d" % number for number in range(100)]
+    connection.feed(b"".join(map(encode_frame, frames)))
+    await asyncio.sleep(1)
+    connection.feed(encode_frame(b"later"))
+    with pytest.raises(KeyError):
+        await listening
+    assert (connection.heard, connection.closed) == (frames[:65], True)
+
+
 @pytest.mark.parametrize("before", [[], [b"x"], [bytes(100_000)]])
 async def test_a_lying_length_is_refused_before_anything_is_kept(before: list[bytes]) -> None:
     connection = Connection()
