@@ -29,7 +29,7 @@ class NodeLimits:
     header_seconds: float = 10.0
     call_seconds: float = 10.0  # a call of the master or of another node
     queue_bytes: int = 64 << 20  # that wait for all subscribers, unless the node shares a memory with others
-    arriving_bytes: int = 64 << 20  # of all frames of more than some KB that have not come whole
+    arriving_bytes: int = 64 << 20  # of all frames of more than 64 KB that have not come whole
 
 
 @dataclass(frozen=True, slots=True)

@@ -46,7 +46,7 @@ class OwnMemory:
 
     def refusal(self, size: int) -> str:
         held = self.held + size
-        return f"the node's queues would hold {held} bytes; at most {self._most}" if held > self._most else ""
+        return f"the node would hold {held} bytes; at most {self._most}" if held > self._most else ""
 
 
 @dataclass(frozen=True, slots=True)

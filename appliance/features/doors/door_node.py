@@ -304,7 +304,7 @@ class DoorNode:
     ) -> None:
         """Give a message to the subscribers of its topic; a client that wants another type is refused."""
         clients, kind = self._heard.get(topic, {}), header.get("type", ANY)
-        encodings = self._encodings if len(clients) > 1 else None
+        encodings = self._encodings if receivers is None and len(clients) > 1 else None
         message = DoorMessage(topic, body, header, clock.wall_ns(), self._types.learn, encodings)
         wrong = []
         for client in clients if receivers is None else receivers:

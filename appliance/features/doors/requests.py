@@ -151,12 +151,12 @@ DoorRequest: TypeAlias = (
     | SubscribeParameter
     | UnsubscribeParameter
 )
-Frame: TypeAlias = str | bytes
-"""A WebSocket message of a client: text or binary."""
 
 
 class TextFrame(bytes):
     """A text message to a client, in UTF-8."""
+
+    __slots__ = ()
 
 
 Pieces: TypeAlias = tuple[bytes, Body]

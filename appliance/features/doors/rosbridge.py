@@ -82,10 +82,7 @@ class _Subscription:
     topic: str
     type: str | None = None  # as the first client with a type named it
     clients: dict[ClientId, tuple[float, int, Compression]] = field(default_factory=dict)
-
-    @property
-    def compression(self) -> Compression:
-        return max((one[2] for one in self.clients.values()), key=_STRENGTH.index)
+    compression: Compression = "none"  # the strongest of all clients
 
 
 @dataclass(slots=True)
@@ -206,9 +203,10 @@ class Rosbridge:
         return [SubscribeTopic(topic, kind, operation.id)]
 
     def _configure(self, spelling: str, subscription: _Subscription) -> None:
-        """Use the lowest rate and the shortest length of all subscriptions to a topic, as rosbridge does."""
+        """Use the lowest rate, shortest length and strongest compression of all subscriptions, as rosbridge does."""
         seconds = min(one[0] for one in subscription.clients.values())
         length = min(one[1] for one in subscription.clients.values())
+        subscription.compression = max((one[2] for one in subscription.clients.values()), key=_STRENGTH.index)
         self.queue.configure(spelling, depth=length or None, interval=seconds)
 
     def _unsubscribe(self, operation: UnsubscribeOp) -> list[DoorRequest]:

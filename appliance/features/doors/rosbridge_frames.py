@@ -27,8 +27,6 @@ Id = (
 Compression = Literal["none", "png", "cbor", "cbor-raw"]
 _Count = Annotated[int, Meta(ge=0, le=1_000_000)]
 _NOTHING = Raw(b"{}")
-_PUBLISH = b"\xa3\x62op\x67publish\x65topic"
-"""The CBOR of a publication up to its topic: the first of three fields."""
 
 
 class _Operation(Struct, tag_field="op", kw_only=True):

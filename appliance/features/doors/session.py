@@ -4,7 +4,7 @@ Rules:
 
 1. A frame is at most `frame_bytes` long, also after inflation. A browser's Origin must be listed.
 2. The session carries out the requests of the client in order. While it does so, it does not read; calls of services
-   do not hold up later requests.
+   and reads of parameters do not hold up later requests.
 3. Frames are sent only as fast as the client reads. In the meantime, its queue keeps the newest messages of each topic,
    and its requests are carried out: a stop does not wait for pictures. A frame is charged to the client's memory until
    the connection has room for more.

@@ -9,7 +9,6 @@ A client that reads slowly loses the oldest messages of its topics, never a repl
 4. Topics take turns, so that a large topic delays a small one by one message.
 """
 
-import sys
 from collections import OrderedDict, deque
 from collections.abc import Hashable
 from dataclasses import dataclass, field
@@ -66,7 +65,7 @@ class ViewerQueue(Generic[Key]):
         """Add a reply. Raises `ViewerStalledError`."""
         if self.memory.closed:
             return
-        size = sys.getsizeof(frame)  # one letter can make a text four times as large
+        size = len(frame)
         if reason := self.memory.refusal(size + _OVERHEAD):
             raise ViewerStalledError(reason)
         self.memory.add(size + _OVERHEAD)
@@ -110,11 +109,9 @@ class ViewerQueue(Generic[Key]):
             if now < topic.next_time:
                 return
             topic.next_time = now + topic.interval
-        if self.memory.refusal(size + _OVERHEAD - self._message_bytes):
+        if not self._make_room(size + _OVERHEAD):
             self.dropped += 1
             return
-        while self.memory.refusal(size + _OVERHEAD):
-            self._drop_from_largest()
         self.memory.add(size + _OVERHEAD)
         topic.items.append((item, size))
         self._turns.setdefault(key)
@@ -132,7 +129,7 @@ class ViewerQueue(Generic[Key]):
         """Return the next reply (with the key None) or message; None if nothing may be sent now."""
         if self._replies:
             frame = self._replies.popleft()
-            size = sys.getsizeof(frame)
+            size = len(frame)
             self._reply_bytes -= size
             self.memory.add(-size - _OVERHEAD)
             return None, frame
@@ -158,6 +155,14 @@ class ViewerQueue(Generic[Key]):
             return 0.0
         waiting = [self._topics[key] for key in self._turns]
         return min((topic.next_time if topic.queued else 0.0 for topic in waiting), default=None)
+
+    def _make_room(self, size: int) -> bool:
+        """Drop the oldest messages until there is room; drop none if that would not be enough."""
+        while self.memory.refusal(size):
+            if self.memory.refusal(size - self._message_bytes):
+                return False
+            self._drop_from_largest()
+        return True
 
     def _trim(self, topic: _Waiting) -> None:
         while len(topic.items) > topic.depth or (topic.bytes > topic.most_bytes and len(topic.items) > 1):

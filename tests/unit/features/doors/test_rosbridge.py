@@ -14,7 +14,6 @@ from appliance.features.doors.requests import (
     AnswerCall,
     CallOfService,
     DoorRequest,
-    Frame,
     OfferService,
     PublishMessage,
     SubscribeTopic,
@@ -39,13 +38,13 @@ class Client:
         self.rosbridge = Rosbridge("/door_alice", RosbridgeLimits(**limits), self.queue)
         self.now = 100.0
 
-    def sends(self, frame: Frame | dict[str, Any]) -> list[DoorRequest]:
+    def sends(self, frame: str | bytes | dict[str, Any]) -> list[DoorRequest]:
         if isinstance(frame, bytes):
             return self.rosbridge.receive(frame, is_text=False)
         text = json.dumps(frame) if isinstance(frame, dict) else frame
         return self.rosbridge.receive(text.encode(), is_text=True)
 
-    def refusal(self, frame: Frame | dict[str, Any]) -> dict[str, Any]:
+    def refusal(self, frame: str | bytes | dict[str, Any]) -> dict[str, Any]:
         assert self.sends(frame) == []
         (status,) = self.gets()
         assert status["op"] == "status" and status["level"] == "error"
@@ -362,7 +361,7 @@ def test_levels_choose_the_statuses(client: Client) -> None:
     ],
 )
 def test_a_frame_that_breaks_the_protocol_is_refused_in_words(
-    client: Client, frame: Frame, words: str, reply_to: Any
+    client: Client, frame: str | bytes, words: str, reply_to: Any
 ) -> None:
     status = client.refusal(frame)
     assert words in status["msg"] and status.get("id") == reply_to
