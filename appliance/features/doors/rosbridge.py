@@ -365,13 +365,13 @@ class Rosbridge:
             return None if taken is None else taken[1]
         spelling, message = taken
         try:
-            frame = publish_frame(spelling, message, self._subscriptions[spelling].compression)
-            if reason := self.queue.memory.refusal(_size(frame)):
+            compression = self._subscriptions[spelling].compression
+            frame = publish_frame(spelling, message, compression)
+            # A raw message had room while it waited; what is made of one can be many times as large.
+            if compression != "cbor-raw" and (reason := self.queue.memory.refusal(_size(frame))):
                 raise LimitExceededError(reason)
             return frame
-        except (
-            PeerError
-        ) as error:  # the message has no room, or does not fit its definition, which may be unusable
+        except PeerError as error:  # there is no room, or the message does not fit its definition
             return json_frame({"op": "status", "level": "error", "msg": f"{spelling}: {error}"})
 
     def next_time(self) -> float | None:

@@ -1,3 +1,5 @@
+import tracemalloc
+
 import pytest
 
 from appliance.features.doors.door_memory import ClientMemory, DoorMemory
@@ -31,6 +33,20 @@ def test_a_message_without_room_costs_the_client_no_other() -> None:
     queue.put("/image", b"too large", 60 * _MIB, 0.0)
     assert queue.dropped == 1
     assert queue.take(0.0) == ("/image", b"kept")
+
+
+def test_one_letter_makes_no_text_take_more_than_is_charged() -> None:
+    """Python takes four bytes for each character of a text that has an emoji."""
+    memory = DoorMemory().client()
+    fragments = FragmentStore(8 * _MIB, memory)
+    tracemalloc.start()
+    for number in range(3):
+        text = f"{'x' * _MIB}{number}\N{GRINNING FACE}"
+        fragments.add(FragmentOp(id=str(number), data=text, num=0, total=2))
+        del text
+    taken, _peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert 3 * _MIB < taken < memory.held
 
 
 def test_greedy_clients_leave_memory_for_the_next_one() -> None:

@@ -8,6 +8,7 @@ from typing import Any
 import cbor2
 import pytest
 
+from appliance.features.doors.door_memory import DoorMemory
 from appliance.features.doors.known_types import DoorMessage
 from appliance.features.doors.requests import (
     AdvertiseTopic,
@@ -385,3 +386,18 @@ def test_everything_that_a_client_can_make_grow_has_a_limit() -> None:
         assert refused >= 10, operation
     client.sends({"op": "unsubscribe", "topic": "/t0"})
     assert client.sends({"op": "subscribe", "topic": "/t9"}) == [SubscribeTopic("/t9")]
+
+
+def test_a_raw_message_that_waited_is_sent_although_other_clients_took_memory() -> None:
+    door = DoorMemory()
+    queue = ViewerQueue[str](message_bytes=64 << 20, memory=door.client())
+    rosbridge = Rosbridge("/door_alice", RosbridgeLimits(), queue)
+    rosbridge.receive(b'{"op":"subscribe","topic":"/t","compression":"cbor-raw"}', is_text=True)
+    body = bytes(40 << 20)
+    rosbridge.message(DoorMessage("/t", body, {}, 0, lambda _header: STRING), 0.0)
+    for size in (40 << 20, 30 << 20):
+        other = door.client()
+        assert not other.refusal(size)
+        other.add(size)
+    frame = rosbridge.next_frame(0.0)
+    assert isinstance(frame, tuple) and frame[1] is body
