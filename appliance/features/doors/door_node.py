@@ -140,7 +140,7 @@ class DoorNode:
         self._publications: dict[str, _Publication] = {}
         self._heard: dict[str, dict[_Subscriber, SubscribeTopic]] = {}
         self._offers: dict[str, _Offer] = {}
-        self._parameters = DoorParameters(node)
+        self._parameters = DoorParameters(node, calls)
         self._encodings = Encodings()
         self._locks: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()
         self._tasks = OwnedTasks()

@@ -8,6 +8,7 @@ So a connection's further requests, such as a stop, do not wait for its reads.
 """
 
 import asyncio
+import sys
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -15,6 +16,7 @@ from typing import Any, Protocol
 
 import msgspec
 
+from appliance.features.doors.door_memory import ClientMemory
 from appliance.features.doors.requests import (
     ReadParameters,
     SubscribeParameter,
@@ -45,10 +47,11 @@ class ParameterClient(Protocol):
 
 
 class DoorParameters:
-    """Carries out the requests about parameters."""
+    """Carries out the requests about parameters. The names of the reads that wait are in the memory `calls`."""
 
-    def __init__(self, node: RosNode) -> None:
+    def __init__(self, node: RosNode, calls: ClientMemory) -> None:
         self._node = node
+        self._calls = calls
         self._clients: dict[str, set[ParameterClient]] = {}
         self._lock = asyncio.Lock()  # for registrations
         self._reads: Counter[ParameterClient] = Counter()  # that wait
@@ -64,26 +67,33 @@ class DoorParameters:
             raise LimitExceededError(
                 f"{_MOST_READS} reads of parameters wait for this client; repeat it later"
             )
+        _check_number(request.names)
+        size = sum(map(sys.getsizeof, request.names))
+        if reason := self._calls.refusal(size):
+            raise LimitExceededError(
+                f"too many calls of this door wait for answers; repeat it later: {reason}"
+            )
+        self._calls.add(size)
         self._reads[client] += 1
-        self._tasks.start(self._read_for(request, client))
+        self._tasks.start(self._read_for(request, client, size))
 
-    async def _read_for(self, request: ReadParameters, client: ParameterClient) -> None:
-        async with self._reading:
-            if client not in self._reads:  # it left
-                return
-            try:
-                client.parameters(await self.read(request.names), request.reply_to)
-            except RosError as error:
-                client.failed(request, str(error))
+    async def _read_for(self, request: ReadParameters, client: ParameterClient, size: int) -> None:
+        try:
+            async with self._reading:
+                if client in self._reads:  # else it left
+                    client.parameters(await self._read(request.names), request.reply_to)
+        except RosError as error:
+            client.failed(request, str(error))
+        finally:
+            self._calls.add(-size)
             if client in self._reads:
                 self._reads[client] -= 1
 
-    async def read(self, names: Sequence[str]) -> dict[str, Any]:
+    async def _read(self, names: Sequence[str]) -> dict[str, Any]:
         if not names:
             listed = await self._node.master("getParamNames")
             names = [name for name in listed if isinstance(name, str)] if isinstance(listed, list) else []
-        if len(names) > _MOST_READ:
-            raise LimitExceededError(f"{len(names)} parameters; name at most {_MOST_READ} of them")
+            _check_number(names)
         return {
             name: await self._node.master("getParam", name)
             for name in names
@@ -148,3 +158,8 @@ class DoorParameters:
                 if name in self._clients and not self._clients[name]:
                     del self._clients[name]
                     await self._node.unsubscribe_parameter(name)
+
+
+def _check_number(names: Sequence[str]) -> None:
+    if len(names) > _MOST_READ:
+        raise LimitExceededError(f"{len(names)} parameters; name at most {_MOST_READ} of them")

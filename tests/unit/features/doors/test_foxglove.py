@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 
 from appliance.features.doors.foxglove import SUBPROTOCOLS, Foxglove, FoxgloveLimits
+from appliance.features.doors.quotas import DOOR_BYTES
 from appliance.features.doors.requests import (
     DoorRequest,
     PublishMessage,
@@ -200,6 +201,29 @@ async def test_a_stop_does_not_wait_for_reads_of_parameters() -> None:
         await asyncio.sleep(0.1)
         client.writer.close()
         await asyncio.sleep(20)
+        world.master.before_answer = None
+
+
+async def test_names_of_parameters_whose_reads_wait_are_bounded() -> None:
+    async with door_world() as world:
+        sees(world, topics={})
+        client = await world.client(subprotocols=SUBPROTOCOLS)
+        world.master.answers |= {"hasParam": True, "getParam": 1}
+        world.master.before_answer = lambda _call: asyncio.sleep(0.01)
+        for number in range(3):
+            names = [f"/{'x' * 1000}{one}" for one in range(1000)]
+            client.send({"op": "getParameters", "parameterNames": names, "id": str(number)})
+        await asyncio.sleep(1)
+        assert world.calls.held > 3_000_000
+        client.send({"op": "getParameters", "parameterNames": ["/a"] * 1001})
+        assert "1001 parameters; name at most 1000" in (await next_op(client, "status"))["message"]
+        world.calls.add(DOOR_BYTES.bounds.host)
+        client.send({"op": "getParameters", "parameterNames": ["/a"]})
+        assert "too many calls of this door wait" in (await next_op(client, "status"))["message"]
+        world.calls.add(-DOOR_BYTES.bounds.host)
+        for number in range(3):
+            assert (await next_op(client, "parameterValues"))["id"] == str(number)
+        assert world.calls.held == 0
         world.master.before_answer = None
 
 
