@@ -42,6 +42,7 @@ class Lookout:
         self._learn = learn
         self._asked: dict[_Thing, _Asked] = {}
         self._service_types: dict[str, str] = {}
+        self._policies = 0  # how many have come
         self._lock = asyncio.Lock()
         self._last: tuple[float, DoorSurroundings] | None = None
 
@@ -55,6 +56,7 @@ class Lookout:
 
     def policy_changed(self) -> None:
         """Ask again about what was denied."""
+        self._policies += 1
         self._asked = {thing: asked for thing, asked in self._asked.items() if not asked.denied}
 
     async def _look(self) -> DoorSurroundings:
@@ -92,13 +94,16 @@ class Lookout:
 
     async def _ask_one(self, thing: _Thing, nodes: tuple[str, ...]) -> None:
         kind, name = thing
+        policies = self._policies
         try:
             await (self._learn if kind == "topic" else self._probe)(name)
             self._asked[thing] = _Asked(nodes)
         except PeerUnreachableError:
             self._asked[thing] = _Asked(nodes, again=asyncio.get_running_loop().time() + _AGAIN_SECONDS)
         except RosError as error:
-            self._asked[thing] = _Asked(nodes, denied=isinstance(error, MasterDenialError))
+            denied = isinstance(error, MasterDenialError)
+            if not denied or policies == self._policies:  # else the denial may be of an earlier policy
+                self._asked[thing] = _Asked(nodes, denied=denied)
 
     async def _probe(self, service: str) -> None:
         self._service_types.pop(service, None)

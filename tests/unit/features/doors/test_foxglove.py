@@ -20,6 +20,7 @@ from roswire.definitions import Definitions
 from roswire.node import MessageType, RosNode, ServiceFailedError, ServiceType
 from roswire.standard import standard_definitions
 from roswire.tcpros import Body
+from roswire.xmlrpc import MethodCall
 from tests.support.features.doors.door_world import DoorWorld, WebSocketClient, door_world
 
 pytestmark = pytest.mark.anyio
@@ -132,6 +133,25 @@ async def test_a_topic_appears_once_the_policy_allows_it_and_its_publisher_answe
         await asyncio.sleep(30)
         assert client.frames.empty()  # no publisher answers
         await publishes(await world.robot("10.0.0.3", "/robot"), "/load", "own/Load", definitions)
+        assert [one["topic"] for one in (await next_op(client, "advertise"))["channels"]] == ["/load"]
+
+
+async def test_a_denial_of_the_policy_before_is_asked_about_again() -> None:
+    async with door_world() as world:
+        sees(world, topics={"/load": ("own/Load", "/robot")})
+        await publishes(
+            await world.robot("10.0.0.3", "/robot"), "/load", "own/Load", standard_definitions().extended(OWN)
+        )
+        world.master.denials["registerSubscriber"] = "denied by [Subscribers]"
+
+        async def change_policy(call: MethodCall) -> None:
+            if call.method == "registerSubscriber":
+                world.lookout.policy_changed()
+
+        world.master.before_answer = change_policy
+        client = await world.client(subprotocols=SUBPROTOCOLS)
+        assert (await next_op(client, "advertise"))["channels"] == []
+        del world.master.denials["registerSubscriber"]
         assert [one["topic"] for one in (await next_op(client, "advertise"))["channels"]] == ["/load"]
 
 
