@@ -97,8 +97,9 @@ class NodeSubscription:
                 self._followed[uri] = self._tasks.start(self._follow(uri))
 
     async def headers(self) -> list[Mapping[str, str]]:
-        """Return the headers of publishers, once one has connected."""
-        await self._connection.wait()
+        """Return the headers of publishers, once one is connected."""
+        while not self.connected:
+            await self._connection.wait()
         return [*self.connected.values()]
 
     def hear_own(self, body: Body, header: Mapping[str, str]) -> None:
@@ -120,6 +121,8 @@ class NodeSubscription:
                 self.problems[uri] = str(error) or f"{uri} did not answer in time"
             finally:
                 self.connected.pop(uri, None)
+                if not self.connected:
+                    self._connection.clear()
                 self._latest.pop(uri, None)
             if asyncio.get_running_loop().time() - before > _LONGEST_PAUSE:  # it was connected for a while
                 pause = _FIRST_PAUSE
