@@ -60,12 +60,16 @@ class ClientMemory:
             return f"the client would hold {held} bytes of its door and leave {max(left, 0)} for all others"
         return ""
 
+    def take(self, size: int, trouble: str = "") -> None:
+        """Charge `size` bytes. Raises `LimitExceededError` if this client should not hold them."""
+        if reason := self.refusal(size):
+            raise LimitExceededError(trouble + reason)
+        self.add(size)
+
     @contextmanager
     def holding(self, size: int) -> Iterator[None]:
-        """Charge `size` bytes during a block. Raises `LimitExceededError` if this client should not hold them."""
-        if reason := self.refusal(size):
-            raise LimitExceededError(reason)
-        self.add(size)
+        """Charge `size` bytes during a block. Raises what `take` raises."""
+        self.take(size)
         try:
             yield
         finally:

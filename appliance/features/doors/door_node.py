@@ -18,7 +18,7 @@ from msgspec import Raw
 
 from appliance.base import clock
 from appliance.features.doors.door_memory import ClientMemory
-from appliance.features.doors.door_parameters import DoorParameters, ParameterClient
+from appliance.features.doors.door_parameters import TOO_MANY_CALLS, DoorParameters, ParameterClient
 from appliance.features.doors.known_types import DoorMessage, Encodings, KnownTypes
 from appliance.features.doors.message_writer import MessageWriter, Now
 from appliance.features.doors.requests import (
@@ -334,15 +334,10 @@ class DoorNode:
     # --- services ---
 
     def _begin_call(self, request: CallOfService, client: DoorClient) -> None:
-        values = (
-            request.values.copy() if isinstance(request.values, Raw) else request.values
-        )  # not the whole frame
+        given = request.values
+        values = given.copy() if isinstance(given, Raw) else given  # not the whole frame
         size = memoryview(values).nbytes
-        if reason := self._calls.refusal(size):
-            raise LimitExceededError(
-                f"too many calls of this door wait for answers; repeat it later: {reason}"
-            )
-        self._calls.add(size)
+        self._calls.take(size, TOO_MANY_CALLS)
         self._tasks.start(self._call(replace(request, values=values), client, size))
 
     async def _call(self, request: CallOfService, client: DoorClient, size: int) -> None:

@@ -28,6 +28,7 @@ from roswire.node import RosNode
 from roswire.node.network import OwnedTasks
 from roswire.xmlrpc import Value
 
+TOO_MANY_CALLS = "too many calls of this door wait for answers; repeat it later: "
 _MOST_READ = 1000  # of one request
 _MOST_READS = 8  # of one connection that wait
 _MOST_SUBSCRIBED = 2000  # of all connections
@@ -69,11 +70,7 @@ class DoorParameters:
             )
         _check_number(request.names)
         size = sum(map(sys.getsizeof, request.names))
-        if reason := self._calls.refusal(size):
-            raise LimitExceededError(
-                f"too many calls of this door wait for answers; repeat it later: {reason}"
-            )
-        self._calls.add(size)
+        self._calls.take(size, TOO_MANY_CALLS)
         self._reads[client] += 1
         self._tasks.start(self._read_for(request, client, size))
 

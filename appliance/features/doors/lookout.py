@@ -30,7 +30,7 @@ class _Asked(NamedTuple):
 
     nodes: tuple[str, ...]
     again: float = math.inf
-    denied: bool = False
+    denied: int | None = None  # the policy that denied it
 
 
 class Lookout:
@@ -42,7 +42,7 @@ class Lookout:
         self._learn = learn
         self._asked: dict[_Thing, _Asked] = {}
         self._service_types: dict[str, str] = {}
-        self._policies = 0  # how many have come
+        self._policy = 0  # its number
         self._lock = asyncio.Lock()
         self._last: tuple[float, DoorSurroundings] | None = None
 
@@ -56,8 +56,7 @@ class Lookout:
 
     def policy_changed(self) -> None:
         """Ask again about what was denied."""
-        self._policies += 1
-        self._asked = {thing: asked for thing, asked in self._asked.items() if not asked.denied}
+        self._policy += 1
 
     async def _look(self) -> DoorSurroundings:
         try:
@@ -84,7 +83,9 @@ class Lookout:
         }
         nodes |= {("service", service): tuple(graph.services[service]) for service in sorted(graph.services)}
         self._asked = {
-            thing: asked for thing, asked in self._asked.items() if nodes.get(thing) == asked.nodes
+            thing: asked
+            for thing, asked in self._asked.items()
+            if nodes.get(thing) == asked.nodes and asked.denied in (None, self._policy)
         }
         self._service_types = {
             name: kind for name, kind in self._service_types.items() if name in graph.services
@@ -94,16 +95,16 @@ class Lookout:
 
     async def _ask_one(self, thing: _Thing, nodes: tuple[str, ...]) -> None:
         kind, name = thing
-        policies = self._policies
+        policy = self._policy
         try:
             await (self._learn if kind == "topic" else self._probe)(name)
             self._asked[thing] = _Asked(nodes)
         except PeerUnreachableError:
             self._asked[thing] = _Asked(nodes, again=asyncio.get_running_loop().time() + _AGAIN_SECONDS)
         except RosError as error:
-            denied = isinstance(error, MasterDenialError)
-            if not denied or policies == self._policies:  # else the denial may be of an earlier policy
-                self._asked[thing] = _Asked(nodes, denied=denied)
+            self._asked[thing] = _Asked(
+                nodes, denied=policy if isinstance(error, MasterDenialError) else None
+            )
 
     async def _probe(self, service: str) -> None:
         self._service_types.pop(service, None)

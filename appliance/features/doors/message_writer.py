@@ -21,9 +21,7 @@ Now = tuple[int, int]
 
 _Write = Callable[[Any, bytearray, Now], None]
 _LENGTH = struct.Struct("<I")
-_VALUE_BYTES = (
-    100  # that a value takes at most, besides its text: its place in a list, a short string, an empty list
-)
+_VALUE_BYTES = 100  # that a value takes at most besides its text: its place in a list, an empty list
 _PART_BYTES = 1 << 16
 _HEADER = "std_msgs/Header"
 
@@ -46,9 +44,7 @@ _SCALARS: dict[str, Any] = {
     "int32": _Int32,
     "uint32": _Uint32,
     "int64": Annotated[int, Meta(ge=-(1 << 63), le=(1 << 63) - 1)],
-    "uint64": Annotated[
-        int, Meta(ge=0)
-    ],  # msgspec has no larger bounds than int64; `struct` checks the other one
+    "uint64": Annotated[int, Meta(ge=0)],  # msgspec has no bound above int64: `struct` checks it
 }
 
 

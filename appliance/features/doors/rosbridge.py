@@ -150,11 +150,8 @@ class Rosbridge:
             raise OperationError(f"the will has {size} bytes; at most {self._limits.will_bytes}")
         kind = type_name(operation.type)
         self._add_advertisement(topic, kind, operation.id)
-        queue, will = (
-            operation.queue_size or 1,
-            operation.will.copy() if size else None,
-        )  # not the whole frame
-        return [AdvertiseTopic(topic, kind, operation.latch, queue, operation.id, will)]
+        will = operation.will.copy() if size else None  # not the whole frame
+        return [AdvertiseTopic(topic, kind, operation.latch, operation.queue_size or 1, operation.id, will)]
 
     def _add_advertisement(self, topic: str, kind: str | None, client: ClientId) -> None:
         _check_room(self._advertised, topic, self._limits.topics, "topics are advertised")

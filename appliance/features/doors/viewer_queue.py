@@ -109,9 +109,11 @@ class ViewerQueue(Generic[Key]):
             if now < topic.next_time:
                 return
             topic.next_time = now + topic.interval
-        if not self._make_room(size + _OVERHEAD):
-            self.dropped += 1
-            return
+        while self.memory.refusal(size + _OVERHEAD):
+            if self.memory.refusal(size + _OVERHEAD - self._message_bytes):
+                self.dropped += 1
+                return
+            self._drop_from_largest()
         self.memory.add(size + _OVERHEAD)
         topic.items.append((item, size))
         self._turns.setdefault(key)
@@ -155,14 +157,6 @@ class ViewerQueue(Generic[Key]):
             return 0.0
         waiting = [self._topics[key] for key in self._turns]
         return min((topic.next_time if topic.queued else 0.0 for topic in waiting), default=None)
-
-    def _make_room(self, size: int) -> bool:
-        """Drop the oldest messages until there is room; drop none if that would not be enough."""
-        while self.memory.refusal(size):
-            if self.memory.refusal(size - self._message_bytes):
-                return False
-            self._drop_from_largest()
-        return True
 
     def _trim(self, topic: _Waiting) -> None:
         while len(topic.items) > topic.depth or (topic.bytes > topic.most_bytes and len(topic.items) > 1):
