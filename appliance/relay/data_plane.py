@@ -36,7 +36,7 @@ from appliance.relay.relay_limits import RelayLimits
 from appliance.relay.report import Reporter
 from appliance.relay.topic_taps import TopicTaps
 from appliance.relay.transport.loop_channel import LoopLink
-from appliance.relay.transport.rate_limit import RateLimits
+from appliance.relay.transport.rate_limit import RateAllowance, RateLimits
 
 _TIDIED = 16  # number of topics between two checks of the processor time
 
@@ -270,11 +270,18 @@ class DataPlane:
         relayed.limit(own, together)
 
     def _limit_subscriber(self, message: messages.GrantInstalled) -> None:
-        flow = self._flows.of(message.limit, message.topic, message.host, message.caller_id)
+        flow = self._allowance(message)
         grant = ("topic", message.key, message.topic, message.host, message.caller_id)
         for subscriber in self._by_grant.get(grant, ()):
             if isinstance(subscriber, Subscriber):
                 subscriber.limit(flow)
+
+    def _allowance(self, grant: messages.GrantInstalled) -> RateAllowance | None:
+        """Return a subscriber's allowance; publishers' motions must not use it up for a guard's stop."""
+        node = self._table.node(grant.key)
+        if node is not None and node.monitors:
+            return None
+        return self._flows.of(grant.limit, grant.topic, grant.host, grant.caller_id)
 
     def _make_room(self, host: str, size: int) -> None:
         """Free memory for a latched message: drop latched messages of hosts that hold more than this host would."""
@@ -343,9 +350,14 @@ class DataPlane:
         if publisher is not None:
             publisher.publish(data)
         if self.interceptor.is_guarded(topic):
-            for relayed in self.topics.values():
-                if relayed.topic == topic and relayed.upstream is not publisher:
-                    relayed.supersede()
+            commands, stop = topic, data
+        elif topic.endswith("/cancel"):  # no message stops an action, but a goal must not be repeated
+            commands, stop = topic.removesuffix("cancel") + "goal", None
+        else:
+            return
+        for relayed in list(self.topics.values()):
+            if relayed.topic == commands and relayed.upstream is not publisher:
+                relayed.supersede(stop)
 
     def _remove_topic(self, key: str, topic: str, reason: str) -> None:
         relayed = self.topics.pop((key, topic), None)
@@ -522,7 +534,7 @@ class DataPlane:
         )
         stated = self._table.grant(incoming.key, relayed.topic, incoming.host, subscriber.caller_id)
         if stated is not None:
-            subscriber.limit(self._flows.of(stated.limit, relayed.topic, stated.host, stated.caller_id))
+            subscriber.limit(self._allowance(stated))
         self._by_grant.setdefault(subscriber.grant, set()).add(subscriber)
         relayed.join(subscriber)
 

@@ -12,8 +12,11 @@ another type, md5sum, definition or latching flag, because they must read the ne
 
 Subscribers get only messages that monitors pass on, and the relay latches only these. Messages that monitors publish
 have no upstream and bypass monitors (`published`). The first messages of a new publisher are kept for subscribers that
-are about to connect (`startup_replay`). After a monitor has published on a topic with a safe message, earlier messages
-are repeated to no later subscriber: a base that reconnects after a stop would get the motion before it (`supersede`).
+are about to connect (`startup_replay`).
+
+A guard's stop comes over the connection of the appliance's own publication, so it can overtake motions that wait in a
+publisher's connection, in the queue or in the kernel. Therefore each publisher's subscribers also get it behind these
+motions, and until the publisher's next message, a later subscriber gets the stop and nothing before it (`supersede`).
 
 If the publisher's host has no memory left, a latched message is passed on but not kept. A later subscriber makes the
 relay reconnect to the publisher, once memory is free again, to get the message. The other subscribers then get it
@@ -39,6 +42,7 @@ from appliance.relay.transport.frames import Batch
 from appliance.relay.transport.memory import HostMemory
 from appliance.relay.transport.pump import SUBSCRIBERS, ModuleCall, Traffic, Version
 from appliance.relay.transport.rate_limit import Part, PublicationRateLimit, RateAllowance
+from roswire.tcpros import encode_frame
 
 _SEEN_OF_A_HOST = 16  # subscribers of a host that a publisher may see by name, over one connection each
 
@@ -163,6 +167,7 @@ class RelayedTopic:
         self._stream: MessageStream | None = None
         self._startup_replay = StartupReplay(share, clock() + (APPEARED if fresh else -1))
         self._reported = True
+        self._superseded = 1  # the number of the next message at the last stop of a guard
 
     @property
     def members(self) -> tuple[TopicSubscriber, ...]:
@@ -219,6 +224,8 @@ class RelayedTopic:
         if self._served.masked:
             return None
         if self._stream is not None or self._startup_replay.keeps or self._served.undelivered:
+            return None
+        if self._latch.is_used:
             return None
         call = None
         if self._monitoring.through is not None:
@@ -392,16 +399,27 @@ class RelayedTopic:
             self._stream.write(batch.view, batch.messages, first)
         self._pass_on(batch, divided=False)
 
-    def supersede(self) -> None:
-        """Repeat no earlier message to later subscribers: a guard stopped what it may have begun."""
-        self._latch.forget()
+    def supersede(self, data: bytes | None) -> None:
+        """Send a guard's stop behind all messages of this publisher, and repeat none of these (None: send nothing)."""
         self._startup_replay.forget()
+        if data is None or self._header is None:
+            self._latch.forget()
+        elif self._superseded != self.counters.following:
+            self._superseded = self.counters.following
+            stop = Batch(memoryview(encode_frame(data)), 1, 0, owned=True)
+            self._latch.keep(stop)
+            self.differs()
+            if self._served.send(stop, divided=False):
+                self._pause_or_trim()
 
     def _pass_on(self, batch: Batch, *, divided: bool) -> None:
         for tap in self._taps:
             tap(batch)
         if self._latch.is_latching:
             self._latch.keep(batch)
+        elif self._latch.is_used:
+            self._latch.forget()
+            self.differs()
         if self._startup_replay.keeps:
             self._startup_replay.add(batch, self._clock())
         if self._served.send(batch, divided=divided and not self._served.masked):

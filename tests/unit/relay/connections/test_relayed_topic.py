@@ -313,16 +313,64 @@ def test_a_topic_that_keeps_first_messages_does_not_go_past_python() -> None:
 
 
 @pytest.mark.parametrize("latching", ["0", "1"])
-def test_a_motion_that_a_guard_stopped_is_not_repeated(latching: str) -> None:
+def test_a_guards_stop_follows_the_motions_before_it_on_their_connection(latching: str) -> None:
+    """It is sent once, and until the next message it is all that a base gets that connects again."""
     story = monitored(latching=latching)
+    early, stop, back = story.join(), bytes(batch(b"stop").view), bytes(batch(b"back").view)
+    story.topic.supersede(b"stop")
+    assert (early.received, story.join().received) == (b"", b"")
     story.receive(batch(b"forward"))
-    story.topic.supersede()
-    base = story.join()
-    story.topic.tidy()
-    assert base.received == b""
+    for _ in range(3):
+        story.topic.supersede(b"stop")
+        story.topic.tidy()
+    late = story.join()
+    assert (early.received, late.received) == (bytes(batch(b"forward").view) + stop, stop)
     story.receive(batch(b"back"))
-    assert base.received == bytes(batch(b"back").view)
-    assert story.join().received == (base.received if latching == "1" else b"")
+    assert (late.received, story.join().received) == (stop + back, back if latching == "1" else b"")
+
+
+def test_a_guards_stop_outlasts_its_publisher_for_connected_bases() -> None:
+    story = monitored()
+    base = story.join()
+    story.receive(batch(b"forward"))
+    story.topic.upstream_closed()
+    story.topic.supersede(b"stop")
+    late = story.join()
+    assert (base.received, late.received) == tuple(
+        bytes(batch(*texts).view) for texts in ((b"forward", b"stop"), (b"stop",))
+    )
+
+
+@pytest.mark.parametrize("latching", ["0", "1"])
+def test_a_cancelled_goal_is_not_repeated(latching: str) -> None:
+    story = monitored(latching=latching)
+    story.receive(batch(b"goal"))
+    story.topic.supersede(None)
+    assert story.join().received == b""
+
+
+def test_a_stop_that_a_subscribers_limit_kept_from_it_comes_later() -> None:
+    story = monitored()
+    base = story.join()
+    story.receive(batch(b"forward"))
+    story.topic.supersede(b"stop")
+    base.missed = True
+    story.topic.tidy()
+    assert base.received == bytes(batch(b"forward", b"stop", b"stop").view)
+
+
+def test_a_stop_for_which_there_is_no_memory_is_sent_and_not_repeated() -> None:
+    story = Story(memory=100)
+    base = story.join()
+    story.topic.upstream_opened(HEADER)
+    story.share.add(100)
+    story.receive(batch(b"forward"))
+    story.topic.supersede(b"stop")
+    assert (base.received, story.join().received) == (bytes(batch(b"forward", b"stop").view), b"")
+    story.receive(batch(b"back"))
+    story.share.add(-100)
+    story.join()
+    assert "give again" not in story.upstream.asked
 
 
 def test_nothing_is_latched_for_a_publisher_that_does_not_latch() -> None:
@@ -644,7 +692,7 @@ def test_the_delay_of_messages_is_counted_for_those_who_are_served() -> None:
     assert row.delay_seconds == pytest.approx(18.003)
 
 
-@given(st.lists(st.tuples(st.sampled_from(range(9)), st.booleans()), max_size=30))
+@given(st.lists(st.tuples(st.sampled_from(range(10)), st.booleans()), max_size=30))
 def test_an_answer_to_the_pump_holds_for_one_version(
     operations: list[tuple[int, bool]],
 ) -> None:
@@ -664,6 +712,7 @@ def test_an_answer_to_the_pump_holds_for_one_version(
         lambda on: topic.limit(limit if on else None, None),
         lambda _on: topic.received(batch(b"x"), story.now),
         lambda _on: topic.tidy(),
+        lambda on: topic.supersede(b"stop" if on else None),
     ]
     version, answer = topic.plain.number, topic.simple()
     for operation, on in operations:
