@@ -350,7 +350,7 @@ class DataPlane:
         if publisher is not None:
             publisher.publish(data)
         if self.interceptor.is_guarded(topic):
-            commands, stop = topic, data
+            commands, stop = topic, data if self.interceptor.is_stop(topic, data) else None
         elif topic.endswith("/cancel"):  # no message stops an action, but a goal must not be repeated
             commands, stop = topic.removesuffix("cancel") + "goal", None
         else:

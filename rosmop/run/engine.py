@@ -52,6 +52,7 @@ from rosmop.run.state import (
 from rosmop.run.state_of_runs import StateTooLargeError
 from rosmop.run.state_of_slices import BUCKETS, SliceParts
 from rosmop.run.timers import Agenda, Patience
+from rosmop.runtime import safe_messages
 from rosmop.runtime.action_context import Context
 from rosmop.runtime.wire import Buffer, WireMessage
 from roswire.definitions import Definitions
@@ -533,6 +534,11 @@ class MonitorSet:
     def guards(self, topic: str) -> list[str]:
         """Return the enabled monitors that have a safe message for a topic."""
         return [monitor.name for monitor in self._monitors if monitor.enabled and topic in monitor.safes]
+
+    def is_safe(self, topic: str, data: bytes) -> bool:
+        """Return whether a message is the safe one of an enabled monitor."""
+        senders = [one.safes[topic] for one in self._monitors if one.enabled and topic in one.safes]
+        return any(safe_messages.is_safe(sender.safe, data) for sender in senders)
 
     def stop(self, topic: str) -> None:
         """Send the safe messages until a message comes on the topic."""

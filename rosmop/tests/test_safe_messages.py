@@ -58,6 +58,14 @@ def test_a_stop_replaces_the_message_and_keeps_its_stamp() -> None:
     assert monitors.process("/cmd_vel", SAFE_BYTES, 3).result == "passed"
 
 
+def test_a_safe_message_is_known_by_its_topic_and_bytes_while_its_monitor_is_enabled() -> None:
+    monitors = load(guard())
+    messages = [("/cmd_vel", SAFE_BYTES), ("/cmd_vel", command()), ("/scan", SAFE_BYTES)]
+    assert [monitors.is_safe(*one) for one in messages] == [True, False, False]
+    monitors.switch({"guard": False}, 1)
+    assert not monitors.is_safe("/cmd_vel", SAFE_BYTES)
+
+
 def test_a_stop_without_a_message_of_its_topic_is_published() -> None:
     text = guard(SAFE, SCAN.replace("near = r[0];", "STOP;"), DRIVE, "event e() every 1s { STOP; }")
     monitors = load(text)

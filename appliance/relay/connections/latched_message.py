@@ -30,11 +30,6 @@ class LatchedMessage:
         return 0 if self.batch is None else len(self.batch.view)
 
     @property
-    def is_used(self) -> bool:
-        """Whether there is a message, or one that was not kept: a guard's stop, for a publisher that does not latch."""
-        return self.batch is not None or self.is_refused
-
-    @property
     def is_lacking(self) -> bool:
         return self.is_latching and self.withheld and self.batch is None
 

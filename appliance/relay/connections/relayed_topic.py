@@ -167,7 +167,7 @@ class RelayedTopic:
         self._stream: MessageStream | None = None
         self._startup_replay = StartupReplay(share, clock() + (APPEARED if fresh else -1))
         self._reported = True
-        self._superseded = 1  # the number of the next message at the last stop of a guard
+        self._superseded = False  # whether a guard's stop is the last message
 
     @property
     def members(self) -> tuple[TopicSubscriber, ...]:
@@ -221,11 +221,9 @@ class RelayedTopic:
         """
         if self._latch.is_latching or self._taps or self.flow.limits or len(self._served) > SUBSCRIBERS:
             return None
-        if self._served.masked:
+        if self._served.masked or self._superseded:
             return None
         if self._stream is not None or self._startup_replay.keeps or self._served.undelivered:
-            return None
-        if self._latch.is_used:
             return None
         call = None
         if self._monitoring.through is not None:
@@ -292,6 +290,7 @@ class RelayedTopic:
         alone = self._monitoring.wanted and not (self._latch.is_latching or self._waiting or self._served)
         self._startup_replay.opened(self._clock(), alone=alone)
         if before is not None and _identity(before) != _identity(header):
+            self._forget_stop()
             for member in self._served.row:
                 member.cut("the publisher returned with a different type")
         waiting, self._waiting = self._waiting, {}
@@ -309,7 +308,8 @@ class RelayedTopic:
         """Forget the upstream's state, but keep the subscribers (see the module docstring)."""
         self._end_stream()
         self.hand_out(divided=False)
-        self._latch.forget()
+        if not self._superseded:
+            self._latch.forget()
         self.flow.forget()
         self._state = TopicState.LOST
         self._startup_replay.forget()
@@ -400,26 +400,33 @@ class RelayedTopic:
         self._pass_on(batch, divided=False)
 
     def supersede(self, data: bytes | None) -> None:
-        """Send a guard's stop behind all messages of this publisher, and repeat none of these (None: send nothing)."""
+        """Send a guard's stop behind all messages of this publisher, and repeat none of these.
+
+        Without a stop, only repeat none of them: a monitor has published another command.
+        """
         self._startup_replay.forget()
         if data is None or self._header is None:
-            self._latch.forget()
-        elif self._superseded != self.counters.following:
-            self._superseded = self.counters.following
+            self._forget_stop()
+        elif not self._superseded:
+            self._superseded = True
             stop = Batch(memoryview(encode_frame(data)), 1, 0, owned=True)
             self._latch.keep(stop)
             self.differs()
             if self._served.send(stop, divided=False):
                 self._pause_or_trim()
 
+    def _forget_stop(self) -> None:
+        self._superseded = False
+        self._latch.forget()
+        self.differs()
+
     def _pass_on(self, batch: Batch, *, divided: bool) -> None:
         for tap in self._taps:
             tap(batch)
+        if self._superseded:
+            self._forget_stop()
         if self._latch.is_latching:
             self._latch.keep(batch)
-        elif self._latch.is_used:
-            self._latch.forget()
-            self.differs()
         if self._startup_replay.keeps:
             self._startup_replay.add(batch, self._clock())
         if self._served.send(batch, divided=divided and not self._served.masked):
@@ -508,7 +515,7 @@ class RelayedTopic:
         self.relieve()
 
     def _forget_header(self) -> None:
-        if self._state is TopicState.LOST and not self._served:
+        if self._state is TopicState.LOST and not self._served and not self._superseded:
             self._state, self._header = TopicState.UNKNOWN, None
 
     def announce(self) -> None:

@@ -256,6 +256,9 @@ class Interceptor:
         """Return whether an enabled monitor has a safe message for a topic."""
         return self.monitors is not None and bool(self.monitors.guards(topic))
 
+    def is_stop(self, topic: str, data: bytes) -> bool:
+        return self.monitors is not None and self.monitors.is_safe(topic, data)
+
     def _guards(self, topic: str, *, begin: bool) -> list[str]:
         if self.monitors is None:
             return []

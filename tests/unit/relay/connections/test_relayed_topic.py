@@ -312,33 +312,53 @@ def test_a_topic_that_keeps_first_messages_does_not_go_past_python() -> None:
     assert story.topic.simple() is not None
 
 
+STOP, FORWARD, BACK = (bytes(batch(text).view) for text in (b"stop", b"forward", b"back"))
+
+
 @pytest.mark.parametrize("latching", ["0", "1"])
 def test_a_guards_stop_follows_the_motions_before_it_on_their_connection(latching: str) -> None:
     """It is sent once, and until the next message it is all that a base gets that connects again."""
     story = monitored(latching=latching)
-    early, stop, back = story.join(), bytes(batch(b"stop").view), bytes(batch(b"back").view)
-    story.topic.supersede(b"stop")
-    assert (early.received, story.join().received) == (b"", b"")
+    early = story.join()
     story.receive(batch(b"forward"))
     for _ in range(3):
         story.topic.supersede(b"stop")
         story.topic.tidy()
     late = story.join()
-    assert (early.received, late.received) == (bytes(batch(b"forward").view) + stop, stop)
+    assert (early.received, late.received) == (FORWARD + STOP, STOP)
     story.receive(batch(b"back"))
-    assert (late.received, story.join().received) == (stop + back, back if latching == "1" else b"")
+    assert (late.received, story.join().received) == (STOP + BACK, BACK if latching == "1" else b"")
+    story.topic.supersede(b"stop")
+    assert late.received == STOP + BACK + STOP
 
 
-def test_a_guards_stop_outlasts_its_publisher_for_connected_bases() -> None:
+def test_a_command_of_a_monitor_is_not_repeated_as_a_stop() -> None:
+    """The next stop is sent again, also for those who connect later."""
     story = monitored()
+    base = story.join()
+    story.topic.supersede(b"stop")
+    story.topic.supersede(None)
+    assert story.join().received == b""
+    story.topic.supersede(b"stop")
+    assert (base.received, story.join().received) == (STOP + STOP, STOP)
+
+
+@pytest.mark.parametrize("latching", ["0", "1"])
+def test_a_guards_stop_outlasts_the_connection_of_its_publisher(latching: str) -> None:
+    """A base gets it that connects again after a cut, unless the publisher returns with another type."""
+    story = monitored(latching=latching)
     base = story.join()
     story.receive(batch(b"forward"))
     story.topic.upstream_closed()
     story.topic.supersede(b"stop")
-    late = story.join()
-    assert (base.received, late.received) == tuple(
-        bytes(batch(*texts).view) for texts in ((b"forward", b"stop"), (b"stop",))
-    )
+    assert base.received == FORWARD + STOP
+    story.topic.leave(base)
+    assert story.join().received == STOP
+    story.topic.upstream_opened(HEADER | {"latching": latching})
+    assert story.join().received == STOP
+    story.topic.upstream_closed()
+    story.topic.upstream_opened(HEADER | {"latching": latching, "md5sum": "other"})
+    assert story.join().received == b""
 
 
 @pytest.mark.parametrize("latching", ["0", "1"])

@@ -561,6 +561,11 @@ def test_a_guard_sends_its_safe_message_when_it_is_ordered_and_not_when_it_is_as
     world.state(StopWanted(3, "/chatter", begin=True))
     assert string("stop").endswith(world.event("publish", monitor="guard").after)
     world.gets(subscriber, string("stop"))
+    publisher.send(string("a"))
+    world.gets(subscriber, string("a"))
+    world.state(OwnPublished("/chatter", string("no stop")[4:]))
+    publisher.send(string("b"))
+    world.gets(subscriber, string("b"))
 
 
 def test_a_base_that_reconnects_after_a_stop_does_not_get_the_latched_motion(world: Monitored) -> None:
