@@ -52,10 +52,6 @@ def test_all_mistakes_are_reported_with_their_positions(file: Path) -> None:
 def test_a_key_in_the_wrong_section_names_the_right_one(file: Path) -> None:
     file.write_text("queue_messages: 10\n")
     assert mistakes(file) == [f"{file}:1: unknown key queue_messages: did you mean relay.queue_messages?"]
-    file.write_text("syslog: {}\n")  # `sso` is similar
-    assert mistakes(file) == [f"{file}:1: unknown key syslog: did you mean audit.syslog?"]
-    file.write_text("recorder: {enable: true}\n")  # `enable` is a key of its own, but `enabled` is nearer
-    assert mistakes(file) == [f"{file}:1: unknown key recorder.enable: did you mean enabled?"]
 
 
 def test_a_wrong_entry_of_a_list_has_its_line(file: Path) -> None:

@@ -1,5 +1,10 @@
 import pkgutil
+import re
+from pathlib import Path
 
+import pytest
+
+from appliance.configuration.config_sources import ConfigError, resolve
 from appliance.configuration.sections import Sections
 from appliance.features.recorder.feature import RECORDER
 from appliance.features.recorder.rings import USED_BY
@@ -21,3 +26,10 @@ def test_the_recorder_runs_only_if_configured() -> None:
 def test_each_function_that_is_named_exists() -> None:
     named = [RECORDER.routes, RECORDER.recorded, USED_BY]
     assert all(callable(pkgutil.resolve_name(str(place))) for place in named)
+
+
+def test_a_similar_key_of_the_section_is_proposed(tmp_path: Path) -> None:
+    file = tmp_path / "appliance.yaml"
+    file.write_text("recorder: {enable: true}\n")  # `enable` is a key of its own, but `enabled` is nearer
+    with pytest.raises(ConfigError, match=re.escape("unknown key recorder.enable: did you mean enabled?")):
+        resolve(file, {}, {})

@@ -1,7 +1,10 @@
+import re
+from pathlib import Path
+
 import pytest
 from pydantic import ValidationError
 
-from appliance.configuration.config_sources import read
+from appliance.configuration.config_sources import ConfigError, read, resolve
 from appliance.configuration.sections import Sections
 from appliance.features.syslog.feature import SYSLOG
 from appliance.features.syslog.settings import Syslog
@@ -50,3 +53,10 @@ def test_the_forwarder_runs_only_if_configured() -> None:
     assert forwarder.dispensable
     assert not forwarder.capabilities
     assert forwarder.receiver(wanted) == ("audit log's forwarder", "tls", "10.0.0.9", 6514)
+
+
+def test_a_section_in_the_wrong_place_names_the_right_one(tmp_path: Path) -> None:
+    file = tmp_path / "appliance.yaml"
+    file.write_text("syslog: {}\n")  # `sso` is similar
+    with pytest.raises(ConfigError, match=re.escape("unknown key syslog: did you mean audit.syslog?")):
+        resolve(file, {}, {})
