@@ -171,6 +171,7 @@ def faulty_event(
     wrong = (
         (number, kind, other)
         for number in _called(validation.codes, module.feeds[topic].functions[place])
+        if number not in module.routines.values()  # the proof takes these as given
         for kind, other in mutants(validation.codes[number])
     )
     for number, kind, other in islice(wrong, 0, None, every):
