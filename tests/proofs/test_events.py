@@ -24,6 +24,7 @@ UNDECIDED = {
 """The number of mutants that are rejected without z3, by the kind of the fault and the answer. None passes as equal."""
 
 
+@pytest.mark.timeout(1200)  # beside other work, the slowest takes more than the usual five minutes
 @pytest.mark.parametrize("text", FAULTY)
 def test_every_fault_is_found_or_none(text: str) -> None:
     """z3 decides all except those of `UNDECIDED`: a mutant differs for some message, or is proved equivalent.
