@@ -266,7 +266,7 @@ class Tunnels:
         return _AGAIN_SECONDS[min(self._failures, len(_AGAIN_SECONDS)) - 1]
 
     async def _own_certificate(self, needed: messages.CertificateNeeded) -> bytes:
-        """Return the appliance's certificate; without the authority's key, the one that the other appliance issued."""
+        """Return this appliance's certificate. Without the authority's key, the other appliance issued it."""
         obstacle = await self._authority.obstacle()
         kept = self._appliances.certificate(needed.key) if obstacle else b""
         if kept:

@@ -57,7 +57,7 @@ def request_of(call: str, host: Address, caller_id: str, resource: str) -> Reque
 def rights_of_call(
     request: Request, call: str, key: str | None = None, *, value: Value = None, tree: Tree | None = None
 ) -> list[Right]:
-    """Return the rights of a call; `request` is the one that decides it (`request_of`).
+    """Return the rights of a call. `request` decides the call (`request_of`).
 
     `key` and `value` are those of its parameter, and `tree` is the present parameter tree.
     """

@@ -88,16 +88,7 @@ class SpecificationCompiler:
             return CheckedSpecifications()
         require_bounded(sources)
         ask = self._asked_once if at_start else self._ordered
-        answer = await ask(
-            lambda number: messages.ContentsWanted(
-                number,
-                sources.files,
-                sources.definitions,
-                at_start=at_start,
-                topics=sources.topics,
-                broken=[*broken],
-            )
-        )
+        answer = await ask(_wanted(sources, broken, at_start=at_start))
         return checked(answer.contents, sources, site_keys)
 
     async def try_out(
@@ -112,14 +103,7 @@ class SpecificationCompiler:
             self._dry_run = True
             try:
                 answer = await self._asked(
-                    lambda number: messages.ContentsWanted(
-                        number,
-                        sources.files,
-                        sources.definitions,
-                        dry_run=True,
-                        topics=sources.topics,
-                        broken=[*broken],
-                    ),
+                    _wanted(sources, broken, dry_run=True),
                     goes_on=lambda: not self._orders,
                 )
             finally:
@@ -205,3 +189,17 @@ class SpecificationCompiler:
 
     def _heard(self, message: Any) -> None:
         self._link.answered(message.number, message)
+
+
+def _wanted(
+    sources: Sources, broken: Sequence[str], *, at_start: bool = False, dry_run: bool = False
+) -> Callable[[int], messages.ContentsWanted]:
+    return lambda number: messages.ContentsWanted(
+        number,
+        sources.files,
+        sources.definitions,
+        at_start=at_start,
+        dry_run=dry_run,
+        topics=sources.topics,
+        broken=[*broken],
+    )

@@ -826,7 +826,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
     ) -> CheckedSpecifications:
         """Let files that have done nothing since the start, because of an error, do nothing still.
 
-        Raises `SpecificationsRefusedError` if another file has an error, or one that is `loaded`, or needs one of them.
+        Raises `SpecificationsRefusedError` if a `loaded` or any other file has an error, or needs one of these files.
         """
         present, following = self.sources.named(), sources.named()
         errors = {

@@ -130,7 +130,7 @@ def unknown_monitors(names: Sequence[str], checked: CheckedSpecifications) -> st
 async def _check_kept(
     check: Check, row: MonitorRevisionRow, site_keys: Sequence[str]
 ) -> CheckedSpecifications:
-    """Check a stored revision; the error of one that this version refuses has the command that discards it."""
+    """Check a stored revision. If this version refuses it, the error names the command that discards it."""
     try:
         return await check(sources_of(row), site_keys)
     except SpecificationsRefusedError as error:

@@ -153,7 +153,7 @@ def _handling(one: PropertyStep) -> tuple[int, int] | None:
 
 
 def _answers(one: PropertyStep, bits: int) -> dict[int, int]:
-    """Return the results of handlers; one that may not drop gets no drop."""
+    """Return the results of handlers. Handlers that may not drop get no drop."""
     bits |= HAPPENED | CHANGED
     return {
         each.function: bits if each.drops else bits & ~DROPPED

@@ -69,7 +69,7 @@ def tokenize(source: Source, signs: Sequence[str]) -> list[FormulaToken]:
 
 
 def _sign_pattern(sign: str) -> str:
-    """Return a pattern for a sign; one that ends with a letter (``~o``) must end where the word ends."""
+    """Return a pattern for a sign. A sign that ends with a letter (``~o``) must end where the word ends."""
     return re.escape(sign) + (r"(?![A-Za-z_0-9])" if sign[-1].isalnum() else "")
 
 

@@ -151,7 +151,7 @@ class State:
 
 
 def merged(test: Term, yes: State, no: State) -> dict[Any, Any]:
-    """Return the values of two branches together; one that has ended has no values."""
+    """Return the values of two branches together. A branch that has ended has no values."""
     if z3.is_false(no.alive):
         return yes.slots
     if z3.is_false(yes.alive):

@@ -93,7 +93,7 @@ class NextDue(Protocol):
     """A function that returns the time of the next tick or deadline (ns), or None."""
 
     def __call__(self, *, anew: bool) -> int | None:
-        """Return the time. With `anew`, compute it again, because there may be an earlier deadline."""
+        """Return the time. `anew`: do not use the last result, because there may be an earlier deadline."""
 
 
 class FastLane(Protocol):

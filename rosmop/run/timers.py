@@ -70,7 +70,7 @@ class Agenda:
         self.due = min(times, default=None)
 
     def when_due(self, *, anew: bool) -> int | None:
-        """Return the next time. With `anew`, compute it again, because lanes may have moved deadlines."""
+        """Return the next time. `anew`: do not use the last result, because lanes may have moved deadlines."""
         if anew:
             self.schedule()
         return self.due

@@ -35,7 +35,7 @@ class TcprosReceiver(asyncio.BufferedProtocol):
         self._small = bytearray(_SMALL_BYTES)
         self._begun = 0  # bytes of `_small` that are not delivered
         self._large: bytearray | None = None
-        self._missing = 0  # bytes of the large frame, or of one that is dropped
+        self._missing = 0  # bytes of the large frame, even if it is dropped
         self._ended: asyncio.Future[None] = asyncio.get_running_loop().create_future()
 
     async def next(self, limit: int) -> Body:

@@ -3,8 +3,8 @@
 1. A signature is stored only if it is valid for the checkpoint's text and made with the pinned key.
 2. The key of the first valid signature is pinned in `<log>.pub` (PEM); the program never replaces it.
 3. While the signer is not in service, checkpoints stay unsigned. Their signatures are requested later (`ask`), oldest
-   first, a limited number at a time. The signer never signs a checkpoint that precedes one that it signed, so each
-   request says whether it is the oldest: the first one of a new signer must be.
+   first, a limited number at a time. Once the signer has signed a checkpoint, it refuses
+   all earlier ones. So each request says whether it is the oldest, and a new signer gets the oldest first.
 """
 
 from collections.abc import Callable

@@ -19,11 +19,10 @@ _ANY = 1 << 63
 
 
 class ReceiptFloor:
-    """The last record that retention by age may remove: any, or if `holding`, the last one that another
+    """The last record that retention by age may remove: any record, or if `holding`, only records that another
     machine has.
 
-    While only the reserve of the log's disk is free, any record may be removed. One thread writes, another
-    reads.
+    While only the reserve of the log's disk is free, it may remove any record. One thread writes, another reads.
     """
 
     def __init__(self, state: Path, reserve: int, *, holding: bool) -> None:

@@ -9,7 +9,7 @@ Corner = tuple[float, float]
 def fault_of(corners: Sequence[Corner]) -> str:
     """Return why the corners, in either direction, enclose no area; empty if they do."""
     edges = [edge for edge in pairwise([*corners, corners[0]]) if edge[0] != edge[1]]
-    if all(_turn(*edges[0], corner) == 0 for corner in corners) if edges else True:
+    if not edges or all(_turn(*edges[0], corner) == 0 for corner in corners):
         return "the corners are on one line"
     if any(_cross(*one, *other) for one, other in combinations(edges, 2)):
         return "edges cross"

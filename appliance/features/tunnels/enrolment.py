@@ -316,7 +316,7 @@ _ENDPOINT_SECONDS = 20.0
 
 
 async def find_endpoint(settings: Settings, look: Callable[[], Awaitable[EndpointFound]]) -> Endpoint:
-    """Return the configured address, or the one that the supervisor finds.
+    """Return the configured address, or the address that the supervisor finds.
 
     Raises `HostRefusedError`; if no address is found, its text lists the options that set the address.
     """

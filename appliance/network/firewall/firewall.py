@@ -101,7 +101,7 @@ class Firewall:
         )
 
     def _clear(self, backend: Backend) -> None:
-        """Remove the rules of a back end; one that this machine lacks has none."""
+        """Remove the rules of a back end. If this machine lacks the back end, do nothing."""
         try:
             backend.remove()
         except FirewallError as error:

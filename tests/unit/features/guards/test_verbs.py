@@ -140,7 +140,7 @@ def test_json_changes_no_less(tmp_path: Path, capsys: pytest.CaptureFixture[str]
 
 @pytest.mark.parametrize("new", [True, False])
 def test_json_refuses_no_less(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, new: bool) -> None:
-    """A plan that would be refused ends with status 1, and is not replayed; one that would not is replayed."""
+    """A plan that would be refused ends with status 1, and is not replayed. Other plans are replayed."""
     robot, replayed = Robot(tmp_path, FENCE), list[str]()
     robot.as_json = True
     monkeypatch.setattr(verbs, "_replay", lambda _robot, row, _text, _since: replayed.append(row.name))

@@ -171,7 +171,7 @@ def test_messages_beyond_a_limit_reach_no_monitor_or_subscriber() -> None:
     story.topic.tidy()
     assert (member.received, judged) == (bytes(batch(b"0", b"3").view), [1, 4])
     assert story.join().received == bytes(batch(b"3").view)
-    story.receive(batch(b"4"))  # the delayed message was the one that may pass
+    story.receive(batch(b"4"))  # the delayed message used up the limit
     assert member.received == bytes(batch(b"0", b"3").view)
 
 
