@@ -258,9 +258,8 @@ class Channel:
             self._discard_outgoing()
             if self._socket.fileno() >= 0:
                 self._watch_writable()
-                with contextlib.suppress(
-                    OSError
-                ):  # end the stream also after an error that does not mean its end
+                # End the stream also after an error that does not mean its end.
+                with contextlib.suppress(OSError):
                     self._socket.shutdown(socket.SHUT_RDWR)
 
     def _discard_outgoing(self) -> None:

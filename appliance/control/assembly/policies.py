@@ -114,6 +114,8 @@ class Policies(Revisions[RevisionRow]):
         self._carried_out = carried_out
         self._site_keys = site_keys
         self.policy = policy
+        self._labelled: Policy | None = None  # whose labels are kept
+        self._labels: list[tuple[Network, str]] = []
         self.file_refused = store.settings().get(_REFUSED, "")
         """Why the file was refused at the last start or reload, in a line; empty: it was not."""
 
@@ -124,7 +126,10 @@ class Policies(Revisions[RevisionRow]):
     def in_words(self, host: str) -> str:
         """Return `tablet (10.0.0.7)` for a host that the policy in force names."""
         policy = self.current
-        return in_words(host, HostNames.of(policy.text, policy.enrolled, policy.robot).labels())
+        if self._labelled is not policy:
+            self._labels = HostNames.of(policy.text, policy.enrolled, policy.robot).labels()
+            self._labelled = policy
+        return in_words(host, self._labels)
 
     @property
     def differs_from_file(self) -> bool:
