@@ -78,6 +78,14 @@ class Setting:
     known: bool = False
 
 
+@dataclass(eq=False)
+class Read:
+    """A read under way, with the values that it may get."""
+
+    key: str
+    values: set[int | None]
+
+
 POLICIES = {
     "open": Policy(),
     "/a is published by 1": Policy({"/a": HOSTS[0]}),
@@ -110,11 +118,10 @@ class World:
         self.nodes: list[Node] = []
         self.possible = {"open"}  # policies that may be in force
         self.ordering = 0  # orders under way
+        self.unread: str | None = None  # the policy in the file, if no order since has been acknowledged
         self.parameters: dict[str, set[int | None]] = {key: {None} for key in KEYS}
         self._setting = {key: Setting() for key in KEYS}
-        self._reads: list[
-            tuple[str, set[int | None]]
-        ] = []  # the reads under way, with the values that each may get
+        self._reads: list[Read] = []
         self.strict = self.random.random() < 0.5
         self.appliances = self._make_appliances(folder)
         self.appliance = self.appliances[0]
@@ -254,10 +261,10 @@ class World:
     @contextlib.contextmanager
     def reading(self, key: str) -> Iterator[set[int | None]]:
         """Yield the values that a read may get: all that the parameter may have had since it began."""
-        read = key, set(self.parameters[key])
+        read = Read(key, set(self.parameters[key]))
         self._reads.append(read)
         try:
-            yield read[1]
+            yield read.values
         finally:
             self._reads.remove(read)
 
@@ -352,13 +359,14 @@ class World:
         self.ordering += 1
         if self.random.random() < 0.5:
             self.appliance.policy.write_text(POLICIES[name].text, encoding="utf-8")
+            self.unread = name
             answer = await self.order(admin.PolicyReload())
         else:
             answer = await self.order(admin.PolicyLoad(POLICIES[name].text))
         self.ordering -= 1
         if answer is not None:
             self.say(f"policy: {name} is in force, {answer.revoked} revoked")
-            self.possible = {name}
+            self.possible, self.unread = {name}, None
             self.check()
         else:
             await self.find_out()
@@ -431,9 +439,9 @@ class World:
             setting.under_way += 1
             setting.values.add(value)
             self.parameters[key] = self.parameters[key] | {value}
-            for read, values in self._reads:
-                if read == key:
-                    values.add(value)
+            for read in self._reads:
+                if read.key == key:
+                    read.values.add(value)
             node.process.start(node.set_parameter(key, value))
 
     def reads_parameter(self) -> None:
@@ -487,6 +495,8 @@ class World:
     def crashes(self) -> None:
         """All processes end at once, as when a container is killed."""
         self.say("the appliance crashes")
+        if self.unread is not None:  # a start reads the file
+            self.possible = self.possible | {self.unread}
         self.appliance.crash()
 
     # --- the history ---
