@@ -20,13 +20,16 @@ import socket
 import struct
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
+from typing import TYPE_CHECKING
 
 import structlog
 
 from appliance.policy.model import Address, address_of
-from appliance.policy.policy import Policy
 from appliance.rpc.front import plain_address
 from appliance.rpc.processor_time import ProcessorTime
+
+if TYPE_CHECKING:  # the API's process accepts connections too, and does not load the policy's modules
+    from appliance.policy.policy import Policy
 
 Network = ipaddress.IPv4Network | ipaddress.IPv6Network
 Program = Callable[[], bytes]
@@ -58,7 +61,7 @@ _log = structlog.get_logger()
 class NamedFirst:
     """This machine and hosts that the policy names are first, blocked hosts second."""
 
-    def __init__(self, policy: Callable[[], Policy]) -> None:
+    def __init__(self, policy: "Callable[[], Policy]") -> None:
         self._policy = policy
         self._of: Policy | None = None
         self._program = b""
