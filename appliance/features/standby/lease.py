@@ -217,7 +217,7 @@ class ApplianceLease:
             self._switching_until = None  # the other appliance did not claim
         if self._is_cut_off(now):
             self._give_up(now, released=True)  # the lease has expired at the witness
-            return (self._take_over(),)
+            return ()
         due: list[WitnessRequest | PeerMessage] = [self._to_witness("renew", now)]
         if self.is_active(now):
             due.append(self._ask(now))
@@ -261,7 +261,6 @@ class ApplianceLease:
             self._valid_until = max(self._valid_until, request.sent + CONFIDENCE)
         if request.operation == "release" and self._switching_until is not None:
             self._released = True
-            return (self._take_over(),)
         return ()
 
     def received(self, now: float, message: PeerMessage) -> Outgoing:
@@ -308,12 +307,15 @@ class ApplianceLease:
         if obstacle:
             raise LeaseError(obstacle)
         self._give_up(now, released=False)
-        self._next_round = now
-        return self.tick(now, waiting_since=None, caught_up=False)
+        return (self._to_witness("release", now),)
 
     def _give_up(self, now: float, *, released: bool) -> None:
-        """Become passive until the other appliance has claimed; `released`: the witness need not be asked first."""
+        """Become passive until the other appliance has claimed; `released`: the witness need not be asked first.
+
+        The other one is told a round later, so that the processes of this appliance hear of it first.
+        """
         self._valid_until = now
+        self._next_round = now + CLAIM_SECONDS
         self._void_sequence, self._void_number = self._sequence, self._number
         self._switching_until, self._released = now + 2 * EXPIRY, released
 

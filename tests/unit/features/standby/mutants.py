@@ -30,7 +30,7 @@ class Mutant(NamedTuple):
 _STALE = ("bad link", "link of the appliances", "pause of the active")
 MUTANTS = {
     "R1: a claim does not wait for the expiry": Mutant(witness, "if self._clock() < self._expires:", "if False:", 0),
-    "R1: an appliance out of sync gets the lease": Mutant(witness, "if name not in before.in_sync:", "if False:", 18),
+    "R1: an appliance out of sync gets the lease": Mutant(witness, "if name not in before.in_sync:", "if False:", 29),
     "R1: a grant keeps the epoch": Mutant(witness, "epoch=before.epoch + 1, holder=name", "holder=name", 0),
     "R1: a grant is not saved": Mutant(witness, "        self._save(record)\n", "", 0),
     "R1: a grant leaves the firewall": Mutant(witness, "            self._enforce(name)\n", "            pass\n", 0),
@@ -51,7 +51,7 @@ MUTANTS = {
     ),
     "R3: a promise is forgotten at a restart": Mutant(
         lease, "self._promised_until = now + EXPIRY\n        self._promised_to:",
-        "self._promised_until = now\n        self._promised_to:", 47, ("witness link", "crash"),
+        "self._promised_until = now\n        self._promised_to:", 280, ("witness link", "crash"),
     ),
     "R3: an older epoch gets promises, and its data is stored": Mutant(
         lease, "if epoch < self.epoch or epoch == self.held:", "if epoch == self.held:", 671,
@@ -62,13 +62,13 @@ MUTANTS = {
         "self._witnessed_at = self._started\n                if not self.follow(message.epoch):", 3,
     ),
     "R4: the first grant comes at once": Mutant(
-        witness, "self._expires = clock() + EXPIRY", "self._expires = clock()", 62
+        witness, "self._expires = clock() + EXPIRY", "self._expires = clock()", 215
     ),
     "a holder of an older epoch stays active": Mutant(
-        lease, "            self.epoch = epoch\n            self.held = None", "            self.epoch = epoch", 18
+        lease, "            self.epoch = epoch\n            self.held = None", "            self.epoch = epoch", 7
     ),
     "a switchover: an older renewal makes active": Mutant(
-        lease, " and request.sequence > self._void_sequence", "", 0, ("switchover",)
+        lease, " and request.sequence > self._void_sequence", "", 1, ("switchover",)
     ),
 }  # fmt: skip
 
