@@ -1,10 +1,7 @@
-"""The two appliances at which hosts open their tunnels: addresses, and the certificates for their own tunnel
-keys.
+"""The two appliances at which hosts open their tunnels, with the certificates for their own tunnel keys.
 
-The standby introduces itself over the replication (`replication_frames.Introduction`). The active appliance
-has the standby's key certified and stores the certificate in the replicated state, for a takeover. Each key
-stays on its appliance. There are at most two rows; the certificate of an appliance that was replaced is
-revoked.
+Each key stays on its appliance. The standby's certificate is in the replicated state, for a takeover; the
+certificate of a replaced appliance is revoked.
 """
 
 import asyncio
@@ -51,19 +48,16 @@ class ApplianceTable(Appliances):
         return next((row for row in self._rows.values() if not self._is_own(row)), None)
 
     async def until_introduced(self) -> None:
-        """Wait a moment for the other appliance, which begins to prepare its tunnels with the first host."""
         if self.other is None:
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(_INTRODUCTION_SECONDS):
                     await self._introduced.wait()
 
     def certificate(self, key: str) -> bytes:
-        """Return the valid certificate for an appliance's tunnel key, in PEM; empty if there is none."""
         row = self._rows.get(key)
         return row.certificate.encode() if row is not None and row.expires > clock.wall() else b""
 
     def is_served(self, pin: str) -> None:
-        """Note the pin of this appliance's REST server, for the kits that the other appliance makes."""
         self._pin = pin
         row = self._rows.get(self._own)
         if row is not None and pin not in ("", row.pin):
@@ -78,10 +72,7 @@ class ApplianceTable(Appliances):
         self._save(_row(key, self._endpoint, self._pin, made))
 
     async def introduce(self, other: Introduction, authority: StoredAuthority) -> None:
-        """Store the other appliance, with a certificate for its key that is valid for long; log a failure.
-
-        While an introduction is in progress, further ones are ignored; the standby repeats its own every hour.
-        """
+        """Further introductions are ignored in the meantime: the standby repeats its own."""
         if self._introducing.locked():
             return
         async with self._introducing:

@@ -1,4 +1,4 @@
-"""The feature standby: two appliances, of which one stands by to take over (docs/standby.md)."""
+"""Define the feature standby (docs/standby.md)."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any

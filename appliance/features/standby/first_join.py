@@ -52,7 +52,7 @@ class JoinOptions:
 
 
 def join_first(options: JoinOptions, *, as_json: bool) -> None:
-    """Write the kits, then the membership. A failure before that leaves this appliance as it was."""
+    """Write the kits, then the membership: a failure before that leaves this appliance as it was."""
     path = path_of(options.state)
     _require_state(options.state)
     earlier = existing_membership(path)
@@ -94,7 +94,7 @@ def _with_authority(other: Membership, state: Path) -> Membership:
 
 @contextlib.contextmanager
 def as_owner(folder: Path) -> Iterator[None]:
-    """Act as the owner of a folder: in a container, root may not use the folders of other users. Raises `OSError`."""
+    """Act as the owner of a folder: in a container, root may not use the folders of other users."""
     owner, own = folder.stat().st_uid, os.geteuid()
     if owner == own or own != 0:
         yield
@@ -107,10 +107,6 @@ def as_owner(folder: Path) -> Iterator[None]:
 
 
 def existing_membership(path: Path) -> Membership | None:
-    """Return the membership in a file; None if the file is missing or damaged.
-
-    Exits with status 1 if it cannot be read.
-    """
     try:
         return load_membership(path)
     except MembershipError as error:
@@ -130,7 +126,6 @@ def _require_state(state: Path) -> None:
 
 
 def _settings(options: JoinOptions) -> Settings:
-    """Return the settings of the running appliance; without one, those of the configuration file."""
     running = options.state / "run" / "config.json"
     try:
         if running.exists():

@@ -1,16 +1,11 @@
 """Pass the state of monitors from one appliance to the other.
 
-The replicated setting `active appliance` has the name and epoch of the appliance whose relays passed the last
-messages. It is stored only after all relays have taken the inherited state, so a control that dies before
-repeats the inheritance. In a planned switchover, the relays first drop all messages and leave their state,
-which is stored before the lease is given up.
+The replicated setting `active appliance` names the appliance and epoch whose relays passed the last messages. It
+is stored only after all relays have taken the inherited state, so a control that dies before repeats the
+inheritance.
 
-For any other takeover, the state is copied while it changes: at most every `_COPY_SECONDS`, and less often if
-it is large. The replicated setting `_COPIES` has the time of the last copy; a standby notes when it gets a
-later one (`CopyAge`). A copy is used only if it was made in the last epoch, and if the standby got its time
-in the last `_FRESH_SECONDS`. Otherwise the state is lost, and monitors that act by their state hold their
-topics. So do monitors without a copy, and those with the modifier `hold`, because a copy lacks the last
-moment.
+At an unplanned takeover, a copy is used only if it is of the last epoch and fresh. Otherwise monitors that act by
+their state hold their topics. So do those with the modifier `hold`, because a copy lacks the last moment.
 """
 
 import asyncio
@@ -41,10 +36,7 @@ class _Active(msgspec.Struct, frozen=True):
 
 
 class _Copies(msgspec.Struct, frozen=True):
-    """The epoch of the stored states; `at` is the time of its monitors (ns).
-
-    0: the relays left these states, and passed no message since.
-    """
+    """The stored copies of states; `at` is the time of the states (ns), 0 if the relays passed no message since."""
 
     epoch: int
     at: int
@@ -84,7 +76,7 @@ def inherited_state(pair: Pair, store: StateStore) -> tuple[InheritedState, Call
 
 
 async def leave_state(pair: Pair, store: StateStore, rollout: Rollout) -> None:
-    """Stop the relays, and store the state of their monitors. Raises `HandOverError` if a relay does not answer."""
+    """Store the state of all monitors after their last message, before the lease is given up."""
     try:
         contents = await rollout.leave(_LEAVE_SECONDS)
     except (TimeoutError, ConnectionError) as error:
@@ -93,16 +85,13 @@ async def leave_state(pair: Pair, store: StateStore, rollout: Rollout) -> None:
 
 
 def keep_state(store: StateStore, rollout: Rollout) -> None:
-    """Continue after `leave_state`; the states that the relays left become void."""
+    """The states that the relays left become void."""
     store.save_setting(_COPIES, "")
     rollout.pass_again()
 
 
 class StateCopies:
-    """Copies the states of the active appliance's monitors for an unplanned takeover.
-
-    `followed()`: the standby gets changes now.
-    """
+    """Copies the states of monitors for an unplanned takeover; `followed()`: the standby gets changes now."""
 
     def __init__(self, pair: Pair, store: StateStore, rollout: Rollout, followed: Callable[[], bool]) -> None:
         self._epoch = pair.epoch
@@ -117,7 +106,7 @@ class StateCopies:
             await asyncio.sleep(await self.copy_once())
 
     async def copy_once(self) -> float:
-        """Copy the states that have changed; return the seconds until the next time."""
+        """Return the seconds until the next time."""
         if not self._rollout.has_state() or not self._followed():
             self._void()
             return _COPY_SECONDS
@@ -140,7 +129,6 @@ class StateCopies:
         return max(_COPY_SECONDS, size / _BYTES_A_SECOND)
 
     def _void(self) -> None:
-        """Make the stored copies void, because they are not continued."""
         if self._complete:
             self._complete = False
             if self._rollout.has_state():
@@ -148,10 +136,7 @@ class StateCopies:
 
 
 class CopyAge:
-    """The time since a standby got the last note that the copies are up to date.
-
-    `setting(name)` returns a replicated setting.
-    """
+    """The time since the last note that the copies are up to date."""
 
     def __init__(self, setting: Callable[[str], str]) -> None:
         self._setting = setting
@@ -168,5 +153,4 @@ class CopyAge:
             self._note, self._changed = note, clock.now()
 
     def at(self, moment: float) -> float | None:
-        """Return the age at a time (monotonic), or None if there was no new note."""
         return None if self._changed is None else max(0.0, moment - self._changed)

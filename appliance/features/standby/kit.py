@@ -1,8 +1,7 @@
 """Make the memberships of two appliances, and the kits for the robot's computers. No I/O.
 
-Each call makes new keys and a new lease file. So a new kit never changes the lease of an earlier kit. After a new kit,
-the standby is in sync only when it has all data. An old kit that is installed again grants nothing to an appliance with
-new keys.
+All keys and the lease file are new each time: a new kit never changes the lease of an earlier kit, and an old kit
+that is installed again grants nothing.
 """
 
 import json
@@ -23,11 +22,9 @@ _SHUT = "rosrv-witness-shut.service"
 
 @dataclass(frozen=True, kw_only=True)
 class PairPlan:
-    """The decisions of an operator.
+    """The decisions of an operator; `address` and `name` are those of the appliance that has all data.
 
-    `address` and `name` are those of the appliance that has all data. `ports` are translated at the fixed address,
-    such as `11311` and `19001-26000`; `master_port` is one of them. `epoch` exceeds that of any earlier lease.
-    `followers` maps names of further computers to their addresses.
+    `ports` are such as `11311` and `19001-26000`. `epoch` exceeds that of any earlier lease.
     """
 
     name: str
@@ -52,7 +49,7 @@ class KitFile(NamedTuple):
 
 
 class Kits(NamedTuple):
-    """The memberships of both appliances, and the files of each folder: `witness`, `follower-NAME`."""
+    """The memberships, and the files of each folder: `witness`, `follower-NAME`."""
 
     own: Membership
     other: Membership
@@ -60,7 +57,6 @@ class Kits(NamedTuple):
 
 
 def make_kits(plan: PairPlan) -> Kits:
-    """Make all keys and files. Raises `ValueError` with the reason if the addresses or names are not possible."""
     peer_key = secrets.token_hex(32)
     keys = {name: secrets.token_hex(32) for name in (plan.name, plan.other)}
     links = {name: make_link_certificate() for name in keys}

@@ -1,24 +1,22 @@
-"""The lease as an appliance sees it: active or passive, by times and messages alone.
+"""The lease as an appliance sees it: active or passive, by times and messages alone, without clock and socket.
 
-This module reads no clock and no socket. Its owner passes the time with each message, sends the results, and
-calls `tick` when `next_event` is due. All times are from the appliance's own clock, which must run while the
-machine sleeps (CLOCK_BOOTTIME); clocks are never compared.
+All times are from the appliance's own clock, which must run while the machine sleeps (CLOCK_BOOTTIME); clocks are
+never compared.
 
-1. The active appliance stays active for 0.8 of an expiry after it *sent* a renewal that was granted, or a request for a
-   promise that was given. The witness and the other appliance count a whole expiry from a later time.
-2. A passive appliance becomes active only by a grant of the witness. A grant that arrives while it has promised not to
-   claim waits until the promise ends.
-3. A passive appliance gives no promise while the witness says that the lease has expired: the active appliance is cut
-   off from the robot, which then needs this one. It asks the witness also while it has promised not to claim.
+1. The active appliance stays active for 0.8 of an expiry after it *sent* a renewal that was granted, or a request
+   for a promise that was given. The witness and the other appliance count a whole expiry from a later time.
+2. A passive appliance becomes active only by a grant of the witness, and after the end of its promise not to
+   claim.
+3. A passive appliance gives no promise while the witness says that the lease has expired: the active appliance is
+   cut off from the robot, which then needs this one. So it asks the witness also during a promise.
 4. An appliance that starts may have given a promise before, so it claims one expiry later.
-5. Only the witness makes epochs. An active appliance believes no other one that claims a later epoch: by 1 and 2 there
-   is none. A passive appliance believes it until the witness answers, unless the epoch is beyond `FARTHEST`.
-6. The active appliance answers without the standby only after the witness has removed the standby from the in-sync set.
-   It waits for the standby again before it asks the witness to add it.
-7. The active appliance also gives up if the witness answers only the other one for an expiry: the robot needs that one,
-   whose promise would otherwise keep it from a claim for another expiry.
-8. The active appliance gives its lease up only if the other one could claim it at once: that one has all data and could
-   serve, the witness answers it, and can save the grant. Each promise has what the other one knows of this.
+5. Only the witness makes epochs. An active appliance believes no later epoch: by 1 and 2 there is none. A passive
+   one believes it until the witness answers, unless the epoch is beyond `FARTHEST`.
+6. The active appliance answers without the standby only after the witness has removed the standby from the
+   in-sync set. It waits for the standby again before it asks the witness to add it.
+7. The active appliance also gives up if the witness answers only the other one for an expiry: otherwise a promise
+   of that one would delay its claim.
+8. The active appliance gives its lease up only if the other one, by its promises, could claim it at once.
 """
 
 from collections.abc import Sequence
@@ -44,7 +42,7 @@ class LeaseError(Exception):
 
 @dataclass(frozen=True)
 class WitnessRequest:
-    """A request to the witness. `sequence` orders the requests of this process; `sent` is its time."""
+    """A request to the witness; `sequence` orders the requests of this process."""
 
     operation: Operation
     epoch: int
@@ -54,10 +52,7 @@ class WitnessRequest:
 
 @dataclass(frozen=True)
 class WitnessAnswer:
-    """An answer of the witness, with the lease after the request.
-
-    `expired`: no appliance has renewed it in time. `trouble`: why the witness could not save the next grant.
-    """
+    """The lease after a request. `expired`: no appliance has renewed it in time."""
 
     ok: bool
     reason: str
@@ -70,7 +65,7 @@ class WitnessAnswer:
 
 @dataclass(frozen=True)
 class PromiseRequest:
-    """A request of the active appliance: do not claim for one expiry."""
+    """A request not to claim for one expiry."""
 
     epoch: int
     session: str
@@ -79,10 +74,10 @@ class PromiseRequest:
 
 @dataclass(frozen=True)
 class ClaimPromise:
-    """The promise not to claim for one expiry; it repeats the request.
+    """The answer to a `PromiseRequest`, which it repeats.
 
-    `able`: the sender could serve after a takeover. `unheard`: the seconds since it sent the last request that the
-    witness answered. An appliance of an earlier version leaves both out.
+    `unheard`: the seconds since the sender's last request that the witness answered. An earlier version leaves
+    the last two fields out.
     """
 
     epoch: int
@@ -94,7 +89,7 @@ class ClaimPromise:
 
 @dataclass(frozen=True)
 class TakeOver:
-    """The order to claim now. It ends the promises up to this number, which the sender no longer relies on."""
+    """The order to claim now. It ends the promises up to this number."""
 
     epoch: int
     session: str
@@ -106,7 +101,10 @@ Outgoing = Sequence[WitnessRequest | PeerMessage]
 
 
 class ApplianceLease:
-    """The state of one appliance. `epoch` is the highest that it has stored; `session` is new at each start."""
+    """The state of one appliance, whose owner calls `tick` when `next_event` is due.
+
+    `epoch` is the highest that it has stored.
+    """
 
     def __init__(self, name: str, other: str, session: str, epoch: int, now: float) -> None:
         self.epoch = epoch
@@ -147,16 +145,13 @@ class ApplianceLease:
 
     @property
     def heard(self) -> float | None:
-        """Return the time of this appliance's last request that the other one answered, or None."""
         return self._heard if self._heard > self._started else None
 
     @property
     def other_witnessed(self) -> float | None:
-        """Return the time of the witness's last answer to the other appliance, by its promises; None if unknown."""
         return self._other_witnessed
 
     def handover_obstacle(self, now: float) -> str:
-        """Return why the other appliance could not claim at once if this one gave the lease up, or an empty text."""
         other = self._other
         if self.answers_alone or now - self._heard > SILENCE:
             return f"{other} is not ready to take over; wait until it answers and has all data"
@@ -170,7 +165,7 @@ class ApplianceLease:
         return self.held is not None and self._promised_until <= now < self._valid_until
 
     def may_be_renewed(self, now: float) -> bool:
-        """Whether a lapsed lease may soon be renewed in its epoch, so no other appliance was active since."""
+        """Whether a lapsed lease may be renewed in its epoch, so no other appliance was active since."""
         if self.held is None or self._switching_until is not None:
             return False
         return self.answers_alone or now < self._valid_until + _RENEWABLE
@@ -179,12 +174,10 @@ class ApplianceLease:
         return self.is_active(now) and (acknowledged or self.answers_alone)
 
     def next_event(self, now: float) -> float:
-        """Return the time of the next `tick`, or of the next change of `is_active`."""
         changes = (self._valid_until, self._promised_until)
         return min([self._next_round, *(time for time in changes if time > now)])
 
     def follow(self, epoch: int) -> bool:
-        """Return whether data of an active appliance with this epoch is accepted; a smaller epoch never is."""
         if epoch < self.epoch or epoch == self.held:
             return False
         if epoch - self.epoch > FARTHEST:
@@ -195,11 +188,7 @@ class ApplianceLease:
         return True
 
     def tick(self, now: float, *, waiting_since: float | None, caught_up: bool) -> Outgoing:
-        """Return what is due.
-
-        `waiting_since`: the time of the oldest change that waits for the standby. `caught_up`: the standby has
-        acknowledged all changes.
-        """
+        """`waiting_since`: the time of the oldest change that waits for the standby."""
         if now < self._next_round:
             return self._remove(now, waiting_since)
         self._next_round = now + RENEW_SECONDS
@@ -300,7 +289,6 @@ class ApplianceLease:
         return ()
 
     def switch_over(self, now: float) -> Outgoing:
-        """Become passive, and let the other appliance claim at once. Raises `LeaseError`."""
         if not self.is_active(now):
             raise LeaseError("this appliance is not active; give the order to the other one")
         obstacle = self.handover_obstacle(now)
@@ -310,9 +298,9 @@ class ApplianceLease:
         return (self._to_witness("release", now),)
 
     def _give_up(self, now: float, *, released: bool) -> None:
-        """Become passive until the other appliance has claimed; `released`: the witness need not be asked first.
+        """Tell the other appliance a round later, when the processes of this one have heard of it.
 
-        The other one is told a round later, so that the processes of this appliance hear of it first.
+        `released`: the witness need not be asked first.
         """
         self._valid_until = now
         self._next_round = now + CLAIM_SECONDS
@@ -336,7 +324,6 @@ class ApplianceLease:
             self.held = None
 
     def _remove(self, now: float, waiting_since: float | None) -> Sequence[WitnessRequest]:
-        """Return the request to remove the standby if a change has waited for it too long; at most one in a round."""
         waits = waiting_since is not None and now - waiting_since > SILENCE
         if not waits or self.answers_alone or now < self._next_removal or not self.is_active(now):
             return ()

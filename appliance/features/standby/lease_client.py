@@ -47,35 +47,31 @@ class LeaseClient:
             self.send(lease_link.ControlUnready())
 
     async def report_service(self, report: Callable[[], lease_link.ControlServes]) -> None:
-        """Report until cancelled that this process serves, or why it cannot: if reports stop, it does not."""
+        """Report until cancelled: if reports stop, this process does not serve."""
         while True:
             self.send(report())
             await asyncio.sleep(_SERVES_SECONDS)
 
     def listen(self, changed: Callable[[lease_link.LeaseState], None]) -> None:
-        """Call `changed` with the last report, if there is one, and with each later report."""
         self._listeners.append(changed)
         if self.state is not None:
             changed(self.state)
 
     def see(self, epoch: int) -> None:
-        """Report that this process accepts data of an active appliance with this epoch."""
         self.send(lease_link.EpochSeen(epoch))
 
     def send(self, message: messages.Message) -> None:
-        """Send a message; without a link it is lost, and the next link begins with a new report."""
+        """Without a link the message is lost; the next link begins with a new report."""
         self._link.send(message)
 
     def active(self) -> bool:
         return self.state is not None and clock.since_boot() < self.state.until
 
     def hears_witness(self) -> bool:
-        """Return whether the witness on the robot has just answered this appliance."""
         answered = None if self.state is None else self.state.answered
         return answered is not None and clock.since_boot() - answered <= EXPIRY
 
     async def standby_hears_witness(self) -> bool:
-        """Whether the witness answers a request that the standby sends after this call; wait at most an expiry."""
         asked = clock.since_boot()
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(EXPIRY):
@@ -92,7 +88,6 @@ class LeaseClient:
             await self._news.wait()
 
     async def hand_over(self) -> None:
-        """Become passive and let the other appliance take over. Raises `HandOverError` if that is not possible now."""
         if self._handing_over is not None:
             raise HandOverError("a switchover has already begun")
         self._handing_over = asyncio.get_running_loop().create_future()

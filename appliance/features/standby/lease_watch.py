@@ -1,11 +1,7 @@
 """Decide by the reports of the lease whether this appliance may serve.
 
-A report has the time to which the lease is valid. From that time on, the appliance does not serve, unless a later time
-follows.
-
-A lease that has lapsed may be renewed in the same epoch. Then no other appliance was active in between, and the state
-in memory is still the newest. So a lapse only suspends the processes that serve the robot. They go on after a renewal
-in the same epoch; in all other cases they end.
+If a lapsed lease is renewed in the same epoch, no other appliance was active in between, and the state in memory
+is still the newest. So a lapse only suspends the processes that serve the robot; without such a renewal they end.
 """
 
 import asyncio
@@ -57,7 +53,6 @@ class LeaseWatch(ServiceGate):
             self.ended()
 
     def held(self, until: float, epoch: int) -> None:
-        """Note that the lease is valid until `until` (seconds of CLOCK_BOOTTIME), in this epoch."""
         if self.epoch not in (None, epoch):
             self.ended()
         self._until, self._renewable = until, True
@@ -88,7 +83,7 @@ class LeaseWatch(ServiceGate):
             self._changes.passivate()
 
     def not_renewable(self) -> None:
-        """Note that the process of the lease has ended: the next process gets the lease only in a new epoch."""
+        """The next process gets the lease only in a new epoch."""
         self._renewable = False
         if self.suspended:
             self.ended()

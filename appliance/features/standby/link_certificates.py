@@ -1,7 +1,7 @@
-"""Make and check the certificates of the link between two appliances: TLS 1.3, each side knows the other's exactly.
+"""Make and check the certificates of the link between two appliances: TLS 1.3, each side knows the other's
+exactly.
 
-No authority signs them, so neither the key of the tunnels' authority nor the time of day matters here. A certificate is
-valid until the operators replace it.
+No authority signs them, and they do not expire, so neither the authority's key nor the time of day matters.
 """
 
 import datetime
@@ -52,11 +52,6 @@ def make_link_certificate() -> LinkCertificate:
 
 
 def link_context(own: LinkCertificate, peer: str, folder: Path, *, server: bool) -> ssl.SSLContext:
-    """Return the TLS context of one side, which accepts only the certificate `peer` (PEM).
-
-    Key and certificate are written to `folder`, from which OpenSSL reads them. Raises `OSError`, and `ssl.SSLError` if
-    a certificate or key is damaged.
-    """
     write_whole(folder / KEY, own.key.encode("ascii"), 0o600)
     write_whole(folder / CERTIFICATE, own.certificate.encode("ascii"), 0o600)
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER if server else ssl.PROTOCOL_TLS_CLIENT)
@@ -69,7 +64,6 @@ def link_context(own: LinkCertificate, peer: str, folder: Path, *, server: bool)
 
 
 def replication_context(membership: Membership, folder: Path, *, server: bool) -> ssl.SSLContext:
-    """Return the TLS context of the replication. Raises `OSError` with the remedy."""
     own = LinkCertificate(membership.certificate, membership.key)
     try:
         return link_context(own, membership.other_certificate, folder, server=server)

@@ -1,4 +1,4 @@
-"""`rosrv standby status|promote`: the running appliance and the other one."""
+"""The commands `rosrv standby status|promote`, for a running appliance."""
 
 import threading
 from functools import partial
@@ -95,10 +95,6 @@ def promote(appliance: Appliance) -> None:
 
 
 def _look(appliance: Appliance) -> StatusView:
-    """Return the present state. Raises `NotRunningError` also for an appliance that cannot give it now.
-
-    Exits with status 1 on an appliance without a pair.
-    """
     answer = appliance.ask(StandbyWanted())
     if not answer.ok and answer.trouble != "unknown":
         raise NotRunningError(answer.error)
@@ -110,10 +106,6 @@ def _holder(state: StandbyState) -> str:
 
 
 def _held_by(name: str, appliance: Appliance) -> StandbyState | None:
-    """Return the state once the appliance with this name holds the lease; None if it does not in time.
-
-    Every few seconds, a line on standard error says that the command waits.
-    """
     pause, began = threading.Event(), clock.now()
     shown, until = began, began + _SWITCH_SECONDS
     while (now := clock.now()) < until:

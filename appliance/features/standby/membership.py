@@ -83,7 +83,6 @@ def path_of(state: Path) -> Path:
 
 
 def load_membership(path: Path) -> Membership | None:
-    """Return the membership in a file; None if the file is missing. Raises `MembershipError` and `OSError`."""
     try:
         return msgspec.json.decode(path.read_bytes(), type=Membership)
     except FileNotFoundError:
@@ -95,7 +94,6 @@ def load_membership(path: Path) -> Membership | None:
 
 
 def save_membership(path: Path, membership: Membership, owner: tuple[int, int] | None = None) -> None:
-    """Write the membership, readable by its owner (user id, group id) only. Raises `OSError`."""
     path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     write_whole(path, encoded(membership), 0o600, owner)
 

@@ -1,4 +1,4 @@
-"""`rosrv standby join|leave|repair`: make an appliance one of two, or a single one, without a running appliance."""
+"""The commands `rosrv standby join|leave|repair`, which work without a running appliance."""
 
 from pathlib import Path
 from typing import Annotated

@@ -38,7 +38,6 @@ class StandbyPairView(PairView):
         state: Path,
         verify: "Callable[[], Verification]",
     ) -> tuple[Any, Callable[[Any], None]]:
-        """Verify two logs and the takeovers between them; the other appliance may have no log yet."""
         from appliance.features.standby import takeover_table  # noqa: PLC0415  only one command needs it
         from appliance.features.standby.takeover_verification import (  # noqa: PLC0415  as above
             VerifiedLog,

@@ -57,7 +57,6 @@ class PairedRole(ActiveRole):
     def host_authority(
         self, signer: Link, store: StateStore, trail: AuditTrail, table: HostTable
     ) -> HostAuthority:
-        """Return the authority that both appliances share. The standby can introduce itself."""
         del trail
         authority = SharedAuthority(Authority(signer), store.hosts)
         endpoint = host_endpoint(self._settings, self.pair.membership)
@@ -66,7 +65,6 @@ class PairedRole(ActiveRole):
         return HostAuthority(authority, appliances)
 
     def hand_tunnels_to(self, tunnels: Tunnels) -> None:
-        """Give the link that this process opened while it stood by to the tunnels."""
         self.pair.tunnels.hand_to(tunnels)
 
     def in_doubt(self) -> bool:

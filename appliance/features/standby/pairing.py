@@ -22,7 +22,6 @@ _FIXED_AUTHORITY = (
 
 
 def pairing_in(state: Path) -> Pairing | None:
-    """Return the pairing in a state directory; None on a single appliance. Raises `StartError` if it is unusable."""
     try:
         membership = load_membership(path_of(state))
     except (MembershipError, OSError) as error:

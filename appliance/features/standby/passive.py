@@ -1,7 +1,6 @@
 """Stand by: follow the changes of the active appliance until this one is activated.
 
-The only state that changes is the file of the replica. The admin socket answers requests about the standby; an operator
-gives all other orders to the active appliance.
+Only the replica's file changes.
 """
 
 import asyncio
@@ -46,7 +45,7 @@ _log = structlog.get_logger()
 
 
 class PassiveControl:
-    """Control of a standby. `folder` is closed to other users: it gets the certificate and the key of the link."""
+    """Control of a standby; `folder` is closed to other users: it gets the key of the link."""
 
     def __init__(
         self,
@@ -56,7 +55,6 @@ class PassiveControl:
         lease: LeaseClient,
         compiler: SpecificationCompiler,
     ) -> None:
-        """Open the replica. Raises `StoreError`."""
         self._settings = settings
         self._membership = membership
         self._lifeline = lifeline
@@ -91,7 +89,6 @@ class PassiveControl:
         self.api: Channel | None = None  # the link to the api, after `run`
 
     async def run(self, until: asyncio.Event) -> None:
-        """Stand by until the event is set; the state file is then closed and consistent."""
         loop = asyncio.get_running_loop()
 
         def begin(what: str, work: Callable[[], Awaitable[None]]) -> asyncio.Task[None]:
@@ -143,18 +140,15 @@ class PassiveControl:
 
     @property
     def away_seconds(self) -> float | None:
-        """Return the seconds since this appliance last followed the active one; None if it never did."""
         if not self._receiver.followed:
             return None
         return 0.0 if self._connected else clock.now() - self._away_since
 
     @property
     def copy_age(self) -> float | None:
-        """Return the age of the copies of monitors' state when this appliance last followed the active one."""
         return self.copies.at(clock.now() if self._connected else self._away_since)
 
     def _state_presence(self) -> None:
-        """Let the lease claim only while this appliance has all data and could serve."""
         if self._complete and self._check.obstacle == "":
             self._lease.present()
         else:
@@ -184,7 +178,6 @@ class PassiveControl:
         )
 
     async def hand_over(self) -> None:
-        """Ask the active appliance to hand over. Raises `HandOverError` if that is not possible now."""
         if self._check.obstacle:
             raise HandOverError(f"this appliance cannot take over: {self._check.obstacle}")
         if not self._lease.hears_witness():
@@ -203,7 +196,7 @@ class PassiveControl:
             raise HandOverError(refusal)
 
     def _heard(self, message: Any, descriptors: tuple[int, ...]) -> None:
-        """Serve the api and the process for charon; leave the supervisor's other messages to the active control."""
+        """Leave the supervisor's other messages to the active control."""
         if isinstance(message, messages.LinkOpened) and message.role == "api":
             self._rest.attach(self._lifeline.api_channel(descriptors[0]))
         elif isinstance(message, messages.LinkOpened) and message.role == "charon":
@@ -235,7 +228,6 @@ class PassiveControl:
         self._lifeline.say(messages.TunnelsWanted(str(pool), str(pool.network_address + 1)))
 
     def _accepts(self, epoch: int) -> bool:
-        """Return whether data of an active appliance with this epoch is accepted: it must be the greatest known."""
         lease = self._lease.state
         if lease is None or epoch < max(self._epoch, lease.epoch):
             return False
@@ -255,7 +247,6 @@ async def until_activated(
     *,
     stopping: asyncio.Event,
 ) -> Pair | None:
-    """Stand by until this appliance is activated, or return None if it is stopped. Raises `StoreError`, `OSError`."""
     taken_over, api, tunnels = not lifeline.activated.is_set(), None, StandbyTunnels()
     away: float | None = None
     copy_age: float | None = None

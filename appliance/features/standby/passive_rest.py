@@ -36,7 +36,7 @@ _log = structlog.get_logger()
 
 
 class ReplicatedTokens:
-    """The tokens in the state file of a standby, read again from time to time."""
+    """The tokens in the replica, read again from time to time."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -69,7 +69,7 @@ class ReplicatedTokens:
 
 
 class PassiveRest:
-    """The link to the api of a standby; `pin` is the pin of its key, empty if it is not known."""
+    """The link to the api of a standby, and the pin of its key."""
 
     def __init__(self, administration: RequestHandler, tokens: ReplicatedTokens) -> None:
         self._administration = administration
@@ -80,21 +80,19 @@ class PassiveRest:
         self._serving: dict[int, asyncio.Task[None]] = {}
 
     def attach(self, channel: Channel) -> None:
-        """Serve a new api process. Until the tokens can be read, it answers 503: the appliance is starting."""
+        """Until the tokens can be read, the api answers 503: the appliance is starting."""
         self._link.attach(channel)
         self._tokens.read()
         if self._tokens.known:  # with an empty list, the api would tell users that their tokens are revoked
             self._state_tokens()
 
     def release(self) -> Channel | None:
-        """Stop serving; return the channel to the api for the active control, which gets all further requests."""
         for number, task in self._serving.items():
             task.cancel()
             self._answer(number, AdminAnswer(False, error=_TAKING_OVER, trouble="busy"))
         return self._link.release()
 
     async def run(self) -> None:
-        """Send the api the tokens whenever they change, until cancelled."""
         while True:
             if await asyncio.to_thread(self._tokens.read):
                 self._state_tokens()

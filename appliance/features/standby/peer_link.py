@@ -1,8 +1,7 @@
-"""The datagrams between two appliances: requests for a promise, promises, and the order to take over.
+"""The datagrams between two appliances, each authenticated with a shared key.
 
-Each datagram is authenticated with a key that both appliances share. A promise repeats the nonce and the number of its
-request. An active appliance uses one nonce in an epoch. So a request is new only if its epoch is greater, or if its
-nonce is the same and its number is greater.
+A promise repeats the nonce and the number of its request. An active appliance uses one nonce in an epoch, so a
+request is new only if its epoch is greater, or its number at the same nonce.
 """
 
 import msgspec
@@ -18,7 +17,7 @@ PURPOSES: dict[type[PeerMessage], bytes] = {
 
 
 class PeerChannel:
-    """Writes messages to the other appliance, and reads its messages."""
+    """One end of these datagrams."""
 
     def __init__(self, name: str, other: str, key: bytes) -> None:
         self._name = name
@@ -30,7 +29,6 @@ class PeerChannel:
         return seal(PURPOSES[type(message)], self._name, self._key, msgspec.to_builtins(message))
 
     def read(self, datagram: bytes) -> PeerMessage | None:
-        """Return the message of a datagram; None if it is not authentic, malformed, or was recorded earlier."""
         if name_in(datagram) != self._other:
             return None
         for kind, purpose in PURPOSES.items():

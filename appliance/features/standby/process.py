@@ -1,12 +1,10 @@
 """Run the lease as a process of the appliance: the witness, the other appliance, the supervisor and control.
 
-The process does nothing else, so neither a busy nor a restarted control loses the lease. It reports each extension to
-the supervisor. If no further extension arrives, the supervisor stops the processes that serve the robot. The epoch is
-on the disk before it is used.
+It does nothing else, so neither a busy nor a restarted control loses the lease. The epoch is on the disk before
+it is used.
 
-This appliance claims only while its control is present. The control of a standby also withdraws its presence while it
-could not serve (`features/standby/takeover_check.py`). If the control of an active appliance does not serve
-(`service_watch.py`), the lease is given to the other appliance, provided that that one could claim and serve.
+This appliance claims only while its control is present, which a standby withdraws while it could not serve
+(`takeover_check.py`). `service_watch.py` decides when an active appliance gives the lease away.
 """
 
 import asyncio
@@ -91,7 +89,7 @@ class LeaseProcess:
         self._wake = asyncio.Event()
 
     async def run(self) -> None:
-        """Keep the lease. Raises `OSError` if the epoch cannot be stored: the appliance is then passive."""
+        """Raise `OSError` if the epoch cannot be stored: the appliance is then passive."""
         self.peers.bind(("0.0.0.0", self._membership.port))  # noqa: S104  the firewall admits the other appliance
         loop = asyncio.get_running_loop()
         for one, received in ((self.peers, self.peer_sent), (self.asking, self.witness_sent)):
@@ -253,7 +251,7 @@ class LeaseProcess:
 
 
 def stored_epoch(path: Path) -> int:
-    """Return the stored epoch; 0 without a file. Raises `ValueError` if it is damaged, because then nothing is safe."""
+    """Raise `ValueError` if the file is damaged, because then nothing is safe."""
     try:
         text = path.read_text("ascii").strip()
     except FileNotFoundError:
@@ -264,7 +262,7 @@ def stored_epoch(path: Path) -> int:
 
 
 def store_epoch(path: Path, epoch: int) -> None:
-    """Save the epoch; a file that exists is overwritten, which needs no free space. Raises `OSError`."""
+    """Overwrite the file if it exists, which needs no free space."""
     content = f"{epoch:<{_EPOCH_BYTES - 1}}\n".encode()
     if path.exists() and path.stat().st_size == _EPOCH_BYTES:
         write_synced(str(path), content)

@@ -1,21 +1,15 @@
 """The state file of a standby: it takes changes and snapshots from the active appliance, each in one transaction.
 
-The active appliance is authenticated, but not trusted. It can put and delete rows of the known tables, with values of
-the right types; it cannot send SQL, a database file, a trigger, or rows of another table. The file cannot grow beyond
-`LARGEST_STATE`. Changes must follow each other without a gap, and none is accepted from a smaller epoch.
+The active appliance is authenticated, but not trusted. It can put and delete rows of the known tables, with
+values of the right types; it cannot send SQL, a database file, a trigger, or rows of another table. The file
+cannot grow beyond `LARGEST_STATE`. Changes must follow each other without a gap, and none is accepted from a
+smaller epoch.
 
-A stored change survives the death of all processes. It is on the disk after the next `sync`: a sync for each answer
-would take longer than the call itself. So after a power cut, a standby must catch up before it takes over.
+A stored change survives the death of all processes, but not a power cut before the next `sync`. So after a power
+cut, a standby must catch up before it takes over.
 
-All tables are copied. None has a secret that must stay on one appliance:
-
-- `token` has salted scrypt hashes, `token_keys` the hash of a reading key and a public key, `enrolment_token` the hash
-  of a one-time token. A standby needs them to accept the operators and hosts of the active appliance, and nothing that
-  proves possession can be derived from them.
-- `host_certificate` has certificates, `policy_signature` signatures; both are public.
-- `parameters` may have secrets of the robot. The robot's nodes expect them from either appliance.
-
-Private keys (audit log, certificate authority, REST, this link) are in other files, and never in this database.
+All tables are copied: tokens are there only as hashes, and the robot's nodes expect `parameters` from either
+appliance. Private keys are never in this database.
 """
 
 import contextlib
@@ -42,9 +36,9 @@ LARGEST_STATE = 1 << 30
 
 
 class Replica:
-    """The state file at `path`. Raises `StoreError` if it cannot be opened or written.
+    """The state file of a standby. Methods raise `StoreError` and wait for the disk: call them in a thread.
 
-    `failed` is called if changes of an earlier run cannot be written. Methods wait for the disk: call them in a thread.
+    `failed` is called if changes of an earlier run cannot be written.
     """
 
     def __init__(
@@ -67,11 +61,7 @@ class Replica:
         self.position = Stored(*kept) if kept else Stored(0, "", 0)
 
     def take(self, message: FromActive) -> None:
-        """Store a message, so that `position` survives the death of this process.
-
-        Raises `ReplicationError` if it is not allowed, and `StoreError` if it cannot be written. The state is
-        then as it was before the message, or before the snapshot.
-        """
+        """Store a message, or leave the state as it was."""
         with self._lock:
             try:
                 with self._explained():
@@ -81,19 +71,16 @@ class Replica:
                 raise
 
     def has_hosts(self) -> bool:
-        """Return whether a host is enrolled that may open a tunnel. Raises `StoreError`."""
         with self._lock, self._explained():
             query = "SELECT EXISTS (SELECT 1 FROM host WHERE revoked IS NULL)"
             return bool(self._connection.execute(query).fetchone()[0])
 
     def setting(self, name: str) -> str:
-        """Return a replicated setting, or an empty string. Raises `StoreError`."""
         with self._lock, self._explained():
             found = self._connection.execute("SELECT value FROM setting WHERE name = ?", (name,)).fetchone()
             return str(found[0]) if found else ""
 
     def sync(self) -> None:
-        """Wait until everything stored is on the disk. Raises `StoreError`."""
         try:
             with self._path.with_name(f"{self._path.name}-wal").open("rb") as log:
                 os.fsync(log.fileno())

@@ -1,8 +1,7 @@
 """Keep the replica of a standby on the disk, and notice that a power cut may have taken its last changes.
 
-A change is acknowledged before it is on the disk. After a reboot the last changes may be missing, so this appliance
-takes over only once it has followed the active one again. If no active appliance appears within `WAIT_SECONDS`, both
-lost their power together, and each has all but the last changes.
+After a reboot, this appliance takes over only once it has followed the active one again, or after `WAIT_SECONDS`
+without one: then both lost their power together.
 """
 
 import asyncio
@@ -22,16 +21,12 @@ class ReplicaSync:
     """Syncs a replica. The file `replica-boot` in `folder` has the boot in which the replica was last complete."""
 
     def __init__(self, replica: Replica, folder: Path, boot: str | None = None) -> None:
-        """`boot` identifies the present boot; None: the kernel's id."""
         self._replica = replica
         self._mark = folder / _MARK
         self._boot = boot if boot is not None else Path(BOOT_ID).read_text("ascii").strip()
 
     async def run(self, followed: Callable[[], bool], complete: Callable[[], None]) -> None:
-        """Sync after changes, until cancelled; call `complete` once this appliance may take over.
-
-        `followed()` is true once the active appliance has sent what was missing. Raises `StoreError` and `OSError`.
-        """
+        """`followed()`: the active appliance has sent what was missing."""
         loop = asyncio.get_running_loop()
         end, marked, synced = loop.time() + WAIT_SECONDS, False, None
         while True:
@@ -46,7 +41,7 @@ class ReplicaSync:
             await asyncio.sleep(_SYNC_SECONDS)
 
     def _is_complete(self) -> bool:
-        """Whether the machine has not restarted since the replica was complete; a new replica is complete."""
+        """Whether the machine has not restarted since; a new replica is complete."""
         try:
             return self._mark.read_text("ascii") == self._boot
         except FileNotFoundError:

@@ -1,10 +1,9 @@
 """Replicate the state of the active one of two appliances, and hold answers back until the standby has stored it.
 
-1. An answer waits until the standby has stored all changes made before it, or until
-   the witness has removed the standby from the in-sync set.
+1. An answer waits until the standby has stored all changes made before it, or until the witness has removed the
+   standby from the in-sync set.
 2. Without a valid lease nothing is answered.
-3. A planned switchover begins only while the standby is in sync, and the lease is given up only after the standby has
-   stored every change.
+3. The lease is given up only after the standby, which is in sync, has stored every change.
 """
 
 import asyncio
@@ -54,7 +53,6 @@ class RobotAdmission:
             self._gap_ended()
 
     def in_doubt(self) -> bool:
-        """Return whether a computer of the robot may shut out this appliance."""
         now = clock.since_boot()
         return now - self._answered > _GAP_SECONDS or now - self._admitted < _ADMITTED_SECONDS
 
@@ -71,12 +69,11 @@ _log = structlog.get_logger()
 
 
 class Pair(NamedTuple):
-    """On one of two appliances: the other one, the lease, and the epoch in which this one is active.
+    """The lease and the replication of an active appliance in its epoch.
 
-    `api` is the link to the api, and `tunnels` has the link to the process for charon, if they were opened while this
-    appliance stood by. `taken_over`: this process stood by before, so the epoch is new.
-    `away_seconds`: the time since this process last followed the other appliance; None: it did not. `copy_age`: the age
-    of the copies of monitors' state when it last followed (`inheritance.py`); None: it got none.
+    `taken_over`: this process stood by before, and opened the links `api` and `tunnels` then. `away_seconds` is
+    the time since it last followed the other appliance (None: never), `copy_age` the age of the copies of
+    monitors' state then.
     """
 
     membership: Membership
@@ -126,10 +123,7 @@ def host_endpoint(settings: Settings, membership: Membership) -> str:
 
 
 class Replication:
-    """The replication of an active appliance. Create it before the first change that the standby needs.
-
-    `switchover_wanted` is set when an operator of the standby orders a switchover.
-    """
+    """The replication of an active appliance. Create it before the first change that the standby needs."""
 
     def __init__(
         self,
@@ -141,11 +135,8 @@ class Replication:
         taken_over: bool,
         folder: Path,
     ) -> None:
-        """`folder` is closed to other users: it gets the certificate and the key of the link.
-
-        After a takeover (`taken_over`) the earlier active appliance is away or still restarting, and the first answers
-        would wait for it in vain. So its removal is requested as soon as this appliance serves; until then, it may
-        take the lease back.
+        """After a takeover the first answers would wait for the earlier active appliance in vain. So its removal
+        is requested as soon as this appliance serves; until then, it may take the lease back.
         """
         self._membership = membership
         self._lease = lease
@@ -176,7 +167,6 @@ class Replication:
         self.sender.on_introduction(start)
 
     async def run(self) -> None:
-        """Serve the standby until cancelled. While the port is in use, try again."""
         self.begin()
         loop = asyncio.get_running_loop()
         tasks = [
@@ -196,7 +186,7 @@ class Replication:
         self.report()
 
     def close(self) -> None:
-        """Keep no further changes for the standby; a change that is not answered yet gets no answer."""
+        """A change that is not answered yet gets no answer."""
         self.sender.close()
 
     async def _listening(self) -> socket.socket:
@@ -215,7 +205,6 @@ class Replication:
                 return made
 
     async def stored(self) -> None:
-        """Wait until all changes made so far may be answered. Raises `StoreError` if they cannot be written."""
         try:
             await self.sender.acknowledged(self._database.number)
         except ReplicationError as error:
@@ -259,9 +248,8 @@ class Replication:
         )
 
     async def require_ready(self) -> None:
-        """Raise `HandOverError`, with the reason, unless the standby could take over now.
-
-        An answer of the witness from before the order proves nothing: the standby's cable may just have been unplugged.
+        """An answer of the witness from before the order proves nothing: the standby's cable may just have been
+        unplugged.
         """
         if not self._in_sync() or not self._connected():
             raise HandOverError(
@@ -281,7 +269,6 @@ class Replication:
             )
 
     async def hand_over(self) -> None:
-        """Give the lease up once the standby has all changes. Raises `HandOverError`; this appliance stays active."""
         try:
             async with asyncio.timeout(_SETTLE_SECONDS):
                 await self.sender.acknowledged(self._database.number)
@@ -323,7 +310,6 @@ class Replication:
             await asyncio.sleep(_SYNC_SECONDS)
 
     def report(self) -> None:
-        """Report the replication to the lease, if it has changed."""
         lag = self.sender.lag()
         self._absent = self._absent and not (lag.connected or self.sender.alone)
         waiting = lag.waiting_since

@@ -1,10 +1,7 @@
 """The messages between an active appliance and its standby, and the frames that carry them.
 
-A frame is a length (4 bytes) and one message as MessagePack. The standby sends `Stored`: first its position, then one
-for each message that it received; between them, it sends an `Introduction` every hour, and an
-`ObstacleFound` when its obstacle to a takeover changes; at first it has none. The active appliance sends `Changes`
-after that position, at least one a second, or a snapshot: `SnapshotBegin`, `SnapshotRows` and `SnapshotEnd`. It
-answers the order `SwitchoverWanted` only if it refuses it.
+A frame is a length (4 bytes) and one message as MessagePack. The standby sends its position as `Stored`, then one
+for each message. The active appliance sends the later `Changes`, at least one a second, or a snapshot.
 """
 
 import asyncio
@@ -45,7 +42,7 @@ class SwitchoverWanted(msgspec.Struct, frozen=True, array_like=True, tag="switch
 
 
 class SwitchoverRefused(msgspec.Struct, frozen=True, array_like=True, tag="switchover refused"):
-    """The active appliance does not hand over, for this reason. An earlier version ends the link at this message."""
+    """The active appliance does not hand over. An earlier version ends the link at this message."""
 
     reason: Annotated[str, msgspec.Meta(max_length=_LONGEST_REASON)]
 
@@ -53,8 +50,8 @@ class SwitchoverRefused(msgspec.Struct, frozen=True, array_like=True, tag="switc
 class Introduction(msgspec.Struct, frozen=True, array_like=True, tag="introduction"):
     """The standby asks for a certificate for its own tunnel key, with a signing request (PEM).
 
-    `key` is the fingerprint of the key, `endpoint` the address or name at which hosts reach the standby, and `pin` the
-    pin of its REST server (empty: REST is off). Hosts' files contain the last two.
+    `endpoint` is the address or name at which hosts reach the standby, and `pin` that of its REST server (empty:
+    REST is off).
     """
 
     request: Annotated[bytes, msgspec.Meta(max_length=16 << 10)]
@@ -70,7 +67,7 @@ class ObstacleFound(msgspec.Struct, frozen=True, array_like=True, tag="obstacle"
 
 
 class Refused(msgspec.Struct, frozen=True, array_like=True, tag="refused"):
-    """The sender of this message ends the link, for this reason."""
+    """The sender of this message ends the link."""
 
     reason: Annotated[str, msgspec.Meta(max_length=_LONGEST_REASON)]
 
@@ -140,7 +137,6 @@ class ReplicationLink(Generic[M]):
         self._decoder: msgspec.msgpack.Decoder[M] = msgspec.msgpack.Decoder(received)
 
     async def send(self, message: Any) -> None:
-        """Send a message, and wait until the connection can take more. Raises `ReplicationError`."""
         body = self._encoder.encode(message)
         if len(body) > LARGEST_FRAME:
             raise ReplicationError(
@@ -164,7 +160,6 @@ class ReplicationLink(Generic[M]):
             raise ReplicationError(f"the link was lost: {error}") from error
 
     async def receive(self, seconds: float) -> M:
-        """Return the next message. Raises `ReplicationError` for a bad frame, a lost link, or silence for `seconds`."""
         try:
             async with asyncio.timeout(seconds):
                 (length,) = _LENGTH.unpack(await self._reader.readexactly(_LENGTH.size))

@@ -34,9 +34,8 @@ _SILENCE_SECONDS = 10.0  # the active appliance sends something every second
 class ReplicationReceiver:
     """The standby's end; `accepts` decides whether an appliance of this epoch may be the active one.
 
-    `introduction()` returns this appliance's introduction, or None while it has none. `obstacle()` returns why this
-    appliance could not serve after a takeover; empty: it could. `revised()` is called after a change of the policy or
-    the specifications.
+    `revised()` is called after a change of the policy or the specifications.
+
     """
 
     def __init__(
@@ -61,10 +60,6 @@ class ReplicationReceiver:
         self._messages = 0
 
     async def want_switchover(self) -> str:
-        """Ask the active appliance to hand over; return why it refuses, or an empty text.
-
-        Raises `ReplicationError` if it is not connected, or does not answer.
-        """
         if self._link is None:
             raise ReplicationError("the active appliance is not connected")
         refusal: asyncio.Future[str] = asyncio.get_running_loop().create_future()
@@ -83,7 +78,6 @@ class ReplicationReceiver:
             self._refusal.set_result(reason)
 
     async def follow(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """Take changes until the link ends. Raises `ReplicationError`, and `StoreError` if the disk is full."""
         link: ReplicationLink[FromActive] = ReplicationLink(reader, writer, FromActive)
         self._introduced, self._reported = -_INTRODUCED_SECONDS, ""
         try:
@@ -122,14 +116,14 @@ class ReplicationReceiver:
             await link.send(introduction)
 
     async def _report_obstacle(self, link: ReplicationLink[FromActive]) -> None:
-        """Report an obstacle that has changed. An earlier version does not know this message, and ends the link."""
+        """An earlier version does not know this message, and ends the link."""
         obstacle = self._obstacle()
         if obstacle != self._reported:
             self._reported = obstacle
             await link.send(obstacle_of(obstacle))
 
     async def _take(self, message: FromActive) -> None:
-        """Store a message. A few small changes take less time than a thread, and an answer waits for them."""
+        """A few small changes take less time than a thread, and an answer waits for them."""
         if isinstance(message, Changes) and _is_small(message):
             self._replica.take(message)
         else:

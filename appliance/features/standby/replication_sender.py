@@ -1,16 +1,12 @@
 """Send the changes of the active appliance's state to its standby, and wait until the standby has them.
 
-The standby connects, and reports its last change. It gets the later changes if this process still has them in
-memory. Otherwise it gets a snapshot: all rows of a copy of the database, then the changes after the copy.
-Rows are sent rather than the database file, which the standby would have to trust.
+A standby whose next change is no longer in memory gets a snapshot: rows, because it would have to trust a file.
 
 1. A change counts as acknowledged only if it was sent on this link, and the standby has reported it stored.
-2. While the standby is away, at most `room` bytes of changes are kept; while it is connected, four times as many, so
-   that it need not take a snapshot for the large values of a few hosts. Changes never wait for the standby; the caller
-   decides whether an answer waits (`acknowledged`).
-3. While the appliance answers alone (`answer_alone`), `acknowledged` does not wait. This ends once the standby has all
-   changes.
-4. A standby that comes back with less than it acknowledged is logged, and no longer counts as having those changes.
+2. While the standby is away, at most `room` bytes of changes are kept; while it is connected, four times as many,
+   so that the large values of a few hosts cost no snapshot. Changes never wait for the standby.
+3. While the appliance answers alone, `acknowledged` does not wait. This ends once the standby has all changes.
+4. A standby that comes back with less than it acknowledged no longer counts as having those changes.
 """
 
 import asyncio
@@ -59,10 +55,10 @@ _log = structlog.get_logger()
 
 
 class ReplicationLag(NamedTuple):
-    """How far the standby is behind, and why its last link ended.
+    """How far the standby is behind; `waiting_since` (time of the loop) is set while an answer waits.
 
-    `waiting_since` (time of the loop) is set while `acknowledged` has waiters. `obstacle` is why the connected standby
-    could not serve after a takeover; empty: it could, or it is not connected.
+    `obstacle` is why the connected standby could not serve after a takeover.
+
     """
 
     connected: bool
@@ -78,7 +74,7 @@ class ReplicationLag(NamedTuple):
 
 
 class ReplicationSender:
-    """The changes of `database` for the standby; `epoch` returns the epoch in which this appliance is active.
+    """The changes of `database` for the standby.
 
     Create it in the event loop, before the first change that the standby needs.
     """
@@ -91,7 +87,6 @@ class ReplicationSender:
         room: int = _ROOM,
         switchover_wanted: Callable[[], None] = lambda: None,
     ) -> None:
-        """`room`: bytes of changes that are kept. `switchover_wanted()` is called for an order of the standby."""
         self._database = database
         self._epoch = epoch
         self._switchover_wanted = switchover_wanted
@@ -111,11 +106,6 @@ class ReplicationSender:
         self._introduced: Callable[[Introduction], None] = lambda _introduction: None
 
     async def acknowledged(self, number: int) -> None:
-        """Wait until the standby has stored all changes up to this number.
-
-        While the standby is away, this waits until it is back, or until this appliance answers alone. Raises
-        `ReplicationError` when the sender is closed.
-        """
         if self.alone:
             return
         if number > self._acknowledged and not self.alone:
@@ -130,13 +120,11 @@ class ReplicationSender:
         self._introduced = introduced
 
     async def refuse_switchover(self, reason: str) -> None:
-        """Tell the standby why its order to hand over is not carried out, if it is still connected."""
         if self._open is not None:
             with contextlib.suppress(ReplicationError):
                 await self._open.send(refusal_of(reason))
 
     def answer_alone(self) -> None:
-        """Answer without the standby until it has all changes: the witness has removed it from the in-sync set."""
         self.alone = True
         for waiter in self._waiting:
             if not waiter.done():
@@ -153,7 +141,6 @@ class ReplicationSender:
         )
 
     async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """Send to the standby until the link ends; a new link ends the earlier one. Raises `ReplicationError`."""
         link: ReplicationLink[FromStandby] = ReplicationLink(reader, writer, FromStandby)
         try:
             while (earlier := self.link) is not None:
@@ -183,7 +170,6 @@ class ReplicationSender:
             await link.close()
 
     def close(self) -> None:
-        """End the link, and keep no further changes; callers of `acknowledged` get an error."""
         self._database.unfollow(self._feed)
         for waiter in self._waiting:
             if not waiter.done():
@@ -255,7 +241,6 @@ class ReplicationSender:
                 self.take(message)
 
     def take(self, stored: Stored) -> None:
-        """Take an acknowledgement of the standby. Raises `ReplicationError` if it is not possible."""
         if stored.number > self._sent:
             raise ReplicationError(
                 f"the standby acknowledged change {stored.number}, and was sent only {self._sent} changes"
@@ -327,7 +312,7 @@ class ReplicationSender:
 
 
 async def _in_thread(function: Callable[..., T], *arguments: Any) -> T:
-    """Call a function in a thread, and wait for its end even if cancelled, because its connection is closed then."""
+    """Wait for the end even if cancelled, because its connection is closed then."""
     task = asyncio.ensure_future(asyncio.to_thread(function, *arguments))
     try:
         return await asyncio.shield(task)

@@ -18,7 +18,7 @@ _log = structlog.get_logger()
 
 
 class ReplicationListener:
-    """Accepts the standby's connections on a listening socket, and sends to the last one."""
+    """Accepts the standby's connections, and sends to the last one."""
 
     def __init__(self, sender: ReplicationSender, context: ssl.SSLContext) -> None:
         self._sender = sender
@@ -26,7 +26,6 @@ class ReplicationListener:
         self._connections: set[asyncio.Task[None]] = set()
 
     async def run(self, listening: socket.socket) -> None:
-        """Accept connections until cancelled."""
         loop = asyncio.get_running_loop()
         listening.setblocking(False)
         try:
@@ -69,10 +68,6 @@ class ReplicationListener:
 
 
 async def follow_at(address: str, port: int, context: ssl.SSLContext, receiver: ReplicationReceiver) -> None:
-    """Connect to the active appliance and follow it until the link ends.
-
-    Raises `ReplicationError`, and `StoreError` if this appliance's disk is full.
-    """
     try:
         async with asyncio.timeout(2 * _HANDSHAKE_SECONDS):
             reader, writer = await asyncio.open_connection(

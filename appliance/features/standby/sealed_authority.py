@@ -1,7 +1,7 @@
 """Bring the encrypted key of an authority to the other appliance.
 
-Only a key that the passphrase encrypts is brought. The other appliance keeps it beside its own authority, and
-its signer uses it (`ipsec/brought_authority.py`).
+Only a key that the passphrase encrypts is brought. The other appliance keeps it beside its own authority
+(`ipsec/brought_authority.py`).
 """
 
 import contextlib
@@ -24,7 +24,6 @@ class SealedAuthority(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def sealed_authority(signer: Path) -> SealedAuthority | None:
-    """Return the authority in the signer's directory; None without an encrypted key. Raises `OSError`."""
     path = signer / KEY_FILE
     key = path.read_bytes() if path.exists() else b""
     if not is_encrypted(key):
@@ -33,11 +32,6 @@ def sealed_authority(signer: Path) -> SealedAuthority | None:
 
 
 def keep_sealed(signer: Path, sealed: SealedAuthority, owner: tuple[int, int] | None) -> None:
-    """Store the other appliance's authority in the signer's directory, which is created if missing.
-
-    `owner` is the user and group of the signer; None: the caller's. Raises `ValueError` if the key is not encrypted,
-    and `OSError`.
-    """
     if not is_encrypted(sealed.key.encode()):
         raise ValueError("the key of the authority is not encrypted: set ipsec.ca_passphrase_file there")
     folder = signer / FOLDER

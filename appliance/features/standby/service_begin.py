@@ -61,7 +61,6 @@ _log = structlog.get_logger()
 
 
 async def begin(base: Foundation, parts: Parts) -> FeaturePart:
-    """Return the part of the standby in control. One of two appliances first begins its epoch (`_begin_epoch`)."""
     role = base.role
     if not isinstance(role, PairedRole):
         return _part(StandbyOrders(SingleAppliance(), base.trail))
@@ -108,7 +107,6 @@ def _part(orders: StandbyOrders) -> FeaturePart:
 
 
 async def _begin_epoch(base: Foundation, parts: Parts, pair: Pair) -> TakeoverRecorder:
-    """Record that this appliance is active, and give its relays the state of the other appliance's monitors."""
     name, other = pair.membership.name, pair.membership.other
     recorder = TakeoverRecorder(
         base.trail, base.audit, base.store, base.signing.signed, name=name, other=other

@@ -1,16 +1,13 @@
-"""Judge whether the control of an active appliance serves the robot, by its reports and by times alone.
+"""Judge whether the control of an active appliance serves the robot, by its reports.
 
-An appliance that holds the lease without serving is worse than none, because the other one sees a healthy
-holder. So the lease is given away when control reports an obstacle (a full disk), is silent, or does not get
-ready after a start.
+An appliance that holds the lease without serving is worse than none, because the other one sees a healthy holder.
+So the lease is given away when control reports an obstacle (a full disk), is silent, or does not get ready.
 
-A control that stood by is ready soon after the activation, in less than `START_SECONDS`. A control that died and
-starts again has `RESTART_SECONDS`, because topics and the state of monitors need no control. After a lapse, control
-has just begun to start, without relays. The other appliance takes over sooner, unless a monitor would lose its state
-and hold its topics.
+A control that died has `RESTART_SECONDS`, because topics and monitors need no control. After a lapse there are no
+relays, so the other appliance takes over sooner, unless a monitor would lose its state and hold its topics.
 
-If the lease is given away after less than `STEADY_SECONDS` of service, all limits are doubled the next time:
-two appliances that both cannot serve must not pass it back and forth.
+If the lease is given away soon, all limits are doubled the next time: two appliances that both cannot serve must
+not pass it back and forth.
 """
 
 from appliance.features.standby.witness import EXPIRY
@@ -41,7 +38,6 @@ class ServiceWatch:
         self._serves, self._obstacle = False, ""
 
     def reported(self, now: float, obstacle: str, *, keeps_state: bool) -> None:
-        """Note a report of control; it serves if the obstacle is empty."""
         self._keeps_state = keeps_state
         if not obstacle:
             self._served, self._serves, self._cold = now, True, False
@@ -51,7 +47,7 @@ class ServiceWatch:
         self._obstacle = obstacle
 
     def fault(self, now: float, *, active: bool, present: bool = True) -> str:
-        """Return why the lease should be given away, or an empty text. `present`: control stands by or serves."""
+        """`present`: control stands by or serves."""
         if active and not self._active:
             self._served, self._cold = now, not present
             self._ready = None

@@ -1,8 +1,7 @@
 """Use the hosts' certificate authority on an appliance that may lack its key, because the other one has it.
 
-The authority's certificate and its last signed list of revoked certificates are in the replicated state. So
-after a takeover the tunnels of enrolled hosts open without the key. New certificates wait for it. A revoked
-host is shut out anyway, because charon loads no connection for it.
+Its certificate and its last signed list of revoked certificates are replicated, so tunnels open without the key.
+A revoked host is shut out anyway, because charon loads no connection for it.
 """
 
 import datetime

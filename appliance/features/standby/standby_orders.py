@@ -24,13 +24,10 @@ class StandbySource(Protocol):
     """The state of the two appliances, and the switchover."""
 
     def state(self) -> StandbyState | None:
-        """Return the state of both appliances, or None on a single appliance."""
+        """Return None on a single appliance."""
 
     async def hand_over(self) -> None:
-        """Make the standby the active appliance. The active appliance may end before this returns.
-
-        On the standby: ask the active appliance to hand over. Raises `HandOverError`.
-        """
+        """Raise `HandOverError`. The active appliance may end before this returns."""
 
 
 class SingleAppliance:
@@ -43,10 +40,8 @@ class SingleAppliance:
 
 
 class ActiveAppliance:
-    """The `StandbySource` of the active appliance.
-
-    `leaving()` stops the relays and makes the last changes before the switchover. If it fails, `staying()` is
-    called.
+    """The `StandbySource` of the active appliance; `leaving()` makes the last changes before the switchover; if
+    it fails, `staying()` is called.
     """
 
     def __init__(
@@ -73,7 +68,7 @@ class ActiveAppliance:
 
 
 class StandbyOrders:
-    """The answers of an appliance in service. Its methods raise `UnknownThingError` on a single appliance."""
+    """The answers of an appliance in service, which raise `UnknownThingError` without a pair."""
 
     def __init__(self, source: StandbySource, trail: AuditTrail) -> None:
         self._source = source
@@ -83,10 +78,7 @@ class StandbyOrders:
         return _state_of(self._source)
 
     async def promote(self, _request: standby_requests.StandbyPromote, who: str) -> StandbyState:
-        """Make the standby the active appliance. Raises `HandOverError`.
-
-        The order is on disk before the hand-over begins, because the hand-over ends this process.
-        """
+        """The order is on disk before the hand-over begins, which ends this process."""
         other = _state_of(self._source).other
         self._trail.happened(
             "switchover ordered", f"{other.name} ({other.address}) is to become the active appliance", who=who
@@ -101,7 +93,6 @@ class StandbyOrders:
         return _state_of(self._source)
 
     async def obey(self, wanted: asyncio.Event, refuse: Callable[[str], Awaitable[None]]) -> None:
-        """Carry out the orders that operators give on the standby, until cancelled; `refuse(reason)` answers it."""
         while True:
             await wanted.wait()
             wanted.clear()
@@ -112,9 +103,9 @@ class StandbyOrders:
 
 
 class StandbyAdministration:
-    """The answers of a standby: its state and, if `orders`, the switchover. All other requests are rejected.
+    """The answers of a standby: its state and, if `orders`, the switchover.
 
-    `orders` is for the admin socket only: over REST, the order is given to the active appliance, which records it.
+    Over REST, the active appliance gets the order, and records it.
     """
 
     def __init__(self, source: StandbySource, *, orders: bool) -> None:
@@ -126,7 +117,6 @@ class StandbyAdministration:
             self._answers[standby_requests.StandbyPromote] = self._promoted
 
     async def carry_out(self, request: admin.AdminRequest[A], *, who: str) -> admin.AdminAnswer[A]:
-        """Answer a request, whose sender does not matter."""
         del who
         answer: Callable[[], Awaitable[Any]] | None = self._answers.get(type(request))
         if answer is None:

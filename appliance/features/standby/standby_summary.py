@@ -17,7 +17,6 @@ UNCHECKED = "it has just started, and still checks whether it could serve"
 
 
 def standby_troubles(state: StandbyState, patience: float = 0.0) -> Iterator[Trouble]:
-    """Yield the troubles, the most urgent first; `patience`: seconds that the other appliance may be away or start."""
     other = state.other
     if both_active(state):
         holder = state.witness.holder
@@ -40,7 +39,6 @@ def standby_troubles(state: StandbyState, patience: float = 0.0) -> Iterator[Tro
 
 
 def both_active(state: StandbyState) -> bool:
-    """Whether this appliance is active, and the witness names another holder of the lease."""
     witness = state.witness
     return state.role == "active" and not is_silent(witness) and witness.holder not in ("", state.name)
 

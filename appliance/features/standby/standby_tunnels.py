@@ -1,7 +1,7 @@
 """Prepare the tunnels on a standby: the firewall of the pool, and the process that runs charon, without charon.
 
-The process makes its own key. Its signing request goes to the active appliance, which stores a certificate for it in
-the replicated state. So a takeover needs neither the authority's key nor the start of this process.
+That process makes its own key, for which the active appliance stores a certificate, so a takeover needs neither
+the authority's key nor the start of this process.
 """
 
 import structlog
@@ -16,7 +16,7 @@ _log = structlog.get_logger()
 
 
 class StandbyTunnels:
-    """The link to the process that runs charon, until the appliance is activated; `pin` is then the pin of the api."""
+    """The link to the process that runs charon, until the appliance is activated."""
 
     def __init__(self) -> None:
         self._link = Link(self._heard)
@@ -32,12 +32,10 @@ class StandbyTunnels:
             _log.warning("this appliance cannot take over the tunnels of hosts", reason=message.reason)
 
     def introduction(self, endpoint: str, pin: str) -> Introduction | None:
-        """Return the request for this appliance's certificate, or None while the process has not made it."""
         needed = self._needed
         return None if needed is None else Introduction(needed.request, needed.key, endpoint, pin)
 
     def hand_to(self, tunnels: Tunnels) -> None:
-        """Give the link and the request to the tunnels of the active appliance."""
         channel = self._link.release()
         if channel is not None:
             tunnels.attach(channel, self._needed)

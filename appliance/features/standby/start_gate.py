@@ -34,7 +34,6 @@ class StandbyGate(StartGate):
         compiler: SpecificationCompiler,
         stopping: asyncio.Event,
     ) -> ActiveRole | None:
-        """Return the role once this appliance may serve; None if it is stopped first. Raises `STATE_ERRORS`."""
         try:
             membership = load_membership(config.with_name(LINK_FILE))
         except MembershipError as error:

@@ -1,13 +1,8 @@
 """Move the times in the state to this appliance's clocks when it takes over from the other one.
 
-The state has the ends of blocks, commit-confirm, timed disables, tokens and their grace time, tickets of
-doors, and one-time tokens of hosts, by the clocks of the appliance that wrote them. The active appliance
-replicates a reading of its clocks every `READ_SECONDS`. At a takeover, all ends move by the difference
-between both appliances' clocks, in one write, so that each duration has the same time left.
-
-If this appliance did not follow the other one before the takeover, the difference is not known, because it
-may include time off. Durations then continue from the last reading, so no block ends early. The ends of
-tokens stay as they are, because they are dates.
+All ends move by the difference between both clocks, in one write, so that each duration has the same time left.
+If this appliance did not follow the other one before, the difference may include time off. Durations then
+continue from the last reading, so no block ends early. The ends of tokens stay, because they are dates.
 """
 
 import asyncio
@@ -35,7 +30,7 @@ class _Reading(msgspec.Struct, frozen=True):
 
 
 def adopt_times(store: StateStore, pair: Pair, age: Callable[[], int]) -> None:
-    """Move the times in the state, if the other appliance wrote them. Call this before any part reads them."""
+    """Call this before any part reads the times."""
     text = store.settings().get(_SETTING)
     if text is None:
         return
@@ -63,7 +58,6 @@ def adopt_times(store: StateStore, pair: Pair, age: Callable[[], int]) -> None:
 
 
 async def note_times(store: StateStore, pair: Pair, age_now: Callable[[], int]) -> None:
-    """Replicate readings of this appliance's clocks until cancelled."""
     while True:
         _save(store, _Reading(pair.membership.name, clock.wall(), age_now()))
         await asyncio.sleep(READ_SECONDS)

@@ -1,13 +1,8 @@
 """Check on a standby that control could start if this appliance took over now.
 
-The check calls the functions by which the start of control reads the stored policy, specifications, hosts and
-nodes, makes the certificate of the link and opens the port of the ROS master. It also writes to the disk of
-the state, and compiles the specifications for the relays, so that a takeover need not
-(`SpecificationCompiler`). It runs at the start, after a change of the policy or the specifications, and every
-`_AGAIN_SECONDS`, because the appliance's own files, disk and ports may change.
-
-While the check fails, this appliance does not claim the lease, but still follows the active appliance and stays in the
-in-sync set.
+The check also writes to the disk of the state, and compiles the specifications, so that a takeover need not. It
+is repeated, because the appliance's own files, disk and ports may change. While it fails, this appliance does not
+claim the lease, but still follows the active one and stays in the in-sync set.
 """
 
 import asyncio
@@ -43,15 +38,13 @@ from appliance.store.writer_thread import Database, StoreError
 
 
 class ReadOnlyDatabase(Database):
-    """The state file at `path`. It has no thread and no file of queued changes, and takes no changes."""
+    """The state file without a thread or queued changes."""
 
     def __init__(self, path: Path, schema: str, *, failed: Callable[[str], None]) -> None:
-        """Take the arguments of `Database`; only the path matters."""
         del schema, failed
         self._path = path
 
     def query(self, sql: str, parameters: Sequence[Value] = ()) -> list[tuple[Any, ...]]:
-        """Read the rows as they are now. Raises `StoreError`."""
         try:
             with contextlib.closing(sqlite3.connect(f"{self._path.as_uri()}?mode=ro", uri=True)) as reader:
                 return reader.execute(sql, parameters).fetchall()
@@ -70,10 +63,7 @@ _log = structlog.get_logger()
 
 
 class TakeoverCheck:
-    """The check; set `news` when the policy or the specifications of the active appliance have changed.
-
-    `obstacle` is why this appliance could not serve after a takeover, or empty.
-    """
+    """The check; set `news` when the policy or the specifications of the active appliance have changed."""
 
     def __init__(
         self,
@@ -84,7 +74,6 @@ class TakeoverCheck:
         *,
         again: float = _AGAIN_SECONDS,
     ) -> None:
-        """`again`: seconds between two checks without news."""
         self._settings = settings
         self._membership = membership
         self._compile = compile_specifications
@@ -95,7 +84,6 @@ class TakeoverCheck:
         self.news = asyncio.Event()
 
     async def run(self, changed: Callable[[], None]) -> None:
-        """Check until cancelled; call `changed` when the result has changed."""
         while True:
             self.news.clear()
             obstacle = await self._find_obstacle()
@@ -123,7 +111,6 @@ class TakeoverCheck:
         return reason
 
     async def _load(self) -> None:
-        """Read what a takeover reads. Raises any error that would end it."""
         settings = self._settings
         await asyncio.to_thread(_require_room, self._folder)
         last, said = await asyncio.to_thread(self._load_state)
@@ -145,7 +132,6 @@ class TakeoverCheck:
         open_listener(*settings.listen_address).close()
 
     def _load_state(self) -> tuple[MonitorRevisionRow | None, str]:
-        """Read the state and the policy; return the stored specifications, if there are any, and their switches."""
         settings = self._settings
         store = StateStore(self._folder, failed=_log.error, kind=ReadOnlyDatabase)
         known = PolicyContext(
@@ -161,7 +147,6 @@ class TakeoverCheck:
 
 
 def lacking_room(folder: Path) -> str:
-    """Return why the state's disk has no room for the records and changes of an active appliance, or an empty text."""
     disk = os.statvfs(folder)
     free = disk.f_bavail * disk.f_frsize
     if free >= _ROOM:

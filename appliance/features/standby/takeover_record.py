@@ -1,8 +1,7 @@
 """Record takeovers of a pair of appliances, and replicate the newest signed checkpoint of this appliance's log.
 
-Each appliance has its own hash chain and key. The replicated state has a row for each appliance of the pair with its
-newest signed checkpoint, and a row with the last takeover. The record of a takeover names both, as the other appliance
-left them. A checkpoint that is not valid, or of this appliance's chain, is not named; the record has the reason.
+The record of a takeover names the newest replicated checkpoint of the other chain and the last takeover. A
+checkpoint that is not valid, or of this appliance's chain, is not named.
 """
 
 import asyncio
@@ -28,10 +27,10 @@ _log = structlog.get_logger()
 
 
 class TakeoverRecorder:
-    """The recorder of the appliance `name`, whose partner is `other`.
+    """The recorder of the active appliance `name`, whose partner is `other`.
 
-    `signed` is set with each signature of a checkpoint. Only the active appliance uses this class, because
-    only it changes the state: call `took_over`, then run `follow` as a task.
+    `signed` is set with each signature of a checkpoint. Call `took_over`, then run `follow` as a task.
+
     """
 
     def __init__(
@@ -53,11 +52,8 @@ class TakeoverRecorder:
         self._replicated = 0  # the number of the newest replicated checkpoint
 
     async def took_over(self, epoch: int) -> None:
-        """Record that this appliance became the active one in this epoch, before it decides anything.
-
-        When control restarts within the epoch, the record is not repeated. The state gets the takeover once the record
-        is on the disk. If the log cannot be written, the record waits in memory, as all records do. Raises `StoreError`
-        if the state cannot be read.
+        """A restart within the epoch does not repeat the record. The state gets the takeover once the record is
+        on the disk.
         """
         own = await asyncio.to_thread(self._last_recorded)
         if own is None or own.epoch != epoch:
@@ -79,10 +75,11 @@ class TakeoverRecorder:
             self._store.save_setting(_LAST_TAKEOVER, msgspec.json.encode(last).decode())
 
     async def handed_over(self, epoch: int) -> None:
-        """Record that this appliance hands over, after its last answer; return when the state has the sealed log.
+        """Return when the state has the sealed log.
 
-        If the hand-over fails afterwards, the event `switchover failed` revokes this record. The signer may be slow or
-        away: the caller bounds the wait. Raises `StoreError` after the state was closed.
+        If the hand-over fails, the event `switchover failed` revokes this record. The signer may be slow or away:
+        the caller bounds the wait.
+
         """
         self._trail.happened(
             "handed over",
@@ -95,10 +92,6 @@ class TakeoverRecorder:
         await self._replicate()
 
     async def follow(self) -> None:
-        """Replicate the newest signed checkpoint now, soon a new one that seals the takeover, and later each one.
-
-        Raises `StoreError` after the state was closed.
-        """
         await self._replicate()
         await self._audit.wait_signed()
         while True:
@@ -129,7 +122,6 @@ class TakeoverRecorder:
         return None if detail is None else EpochOf(detail.epoch, detail.appliance)
 
     def _others_checkpoint(self, state: dict[str, str]) -> tuple[SignedCheckpoint | None, str]:
-        """Return the other appliance's last replicated checkpoint and a sentence about it, or None and the reason."""
         stored = state.get(_CHECKPOINT + self._other)
         if not stored:
             return None, f"no checkpoint of {self._other} was replicated"
@@ -157,7 +149,6 @@ def _epoch(takeover: EpochOf) -> int:
 
 
 def _decoded(text: str, kind: type[_T]) -> _T | None:
-    """Return a value that the other appliance may have written; None if it is not of this kind."""
     try:
         return msgspec.json.decode(text, type=kind)
     except (ValueError, RecursionError):

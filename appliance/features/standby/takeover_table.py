@@ -11,7 +11,6 @@ from appliance.features.standby.takeover_verification import PairVerification, T
 
 
 def absent(log: Path, state: Path) -> str:
-    """Return the name of the other appliance of a pair if it has no log, or an empty text."""
     if log.exists():
         return ""
     try:
@@ -22,7 +21,6 @@ def absent(log: Path, state: Path) -> str:
 
 
 def print_pair(pair: PairVerification) -> None:
-    """Print both verifications, then the findings between the logs, and each takeover with its proof."""
     names = {takeover.log: takeover.appliance for takeover in pair.takeovers}
     for result in pair.logs:
         if result.log in names:

@@ -1,13 +1,12 @@
 """Verify the takeovers between the verified logs of two appliances.
 
-1. The checkpoint that a takeover names is in the other log, with this hash and a signature by the other log's key.
+1. The checkpoint that a takeover names is in the other log, with this hash and a signature by the other log's
+   key.
 2. Epochs increase in each log and over both. No record up to a named checkpoint is of a later epoch.
-3. The takeover that a takeover names as the one before it is in its log.
+3. The earlier takeover that a takeover names is in its log.
 4. An appliance decides nothing between its hand-over and its next takeover, except what was under way.
-5. While one appliance decided, the other was silent for at least as long. Each duration is measured with one clock, so
-   the two clocks need not agree. `_TOLERANCE` allows for a clock that was set while its machine was off.
-
-Records of the other log after the named checkpoint are its tail, which its later checkpoints cover, if there are any.
+5. While one appliance decided, the other was silent for at least as long. Each duration is measured with one
+   clock. `_TOLERANCE` allows for a clock that was set while its machine was off.
 """
 
 import enum
@@ -53,7 +52,7 @@ class TakeoverFindingKind(enum.StrEnum):
 
 
 class TakeoverFinding(msgspec.Struct, frozen=True):
-    """A fault between two logs; `epoch` is that of the takeover, 0 if the finding is not about one takeover."""
+    """A fault between two logs; `epoch` is 0 if the finding is not about one takeover."""
 
     kind: TakeoverFindingKind
     epoch: int
@@ -63,11 +62,10 @@ class TakeoverFinding(msgspec.Struct, frozen=True):
 class TakeoverProof(msgspec.Struct, frozen=True, kw_only=True):
     """A takeover with its proof; `sequence` is its record in the log of `appliance`.
 
-    `link`: "proven" (the named checkpoint is in the other log), "removed" (retention removed its records
-    since), "none" (no checkpoint was replicated), or "wrong" (see the findings). The checkpoint sealed the
-    other log `through` that record; the `tail` are the other log's records after it until its next takeover,
-    of which `tail_signed` are sealed by its later checkpoints. `overlap`: "excluded", "found", or "unknown"
-    (the other appliance did not take over again, decided nothing, or a clock was set).
+    `link`: "proven" (the named checkpoint is in the other log), "removed" (retention removed its records since),
+    "none" (no checkpoint was replicated), or "wrong". The checkpoint sealed the other log `through` that record;
+    the `tail` are its later records, of which `tail_signed` are sealed by later checkpoints. `overlap`:
+    "excluded", "found", or "unknown".
     """
 
     epoch: int
@@ -84,10 +82,7 @@ class TakeoverProof(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class PairVerification(msgspec.Struct, frozen=True, kw_only=True):
-    """The verification of two logs and of the takeovers between them; `ok` if nothing is wrong in any.
-
-    `absent` is the name of an appliance that has no log, because it was never active.
-    """
+    """The verification of two logs; `absent` is an appliance without a log: it was never active."""
 
     ok: bool
     logs: tuple[Verification, ...]
@@ -104,7 +99,6 @@ class VerifiedLog(NamedTuple):
 
 
 def verify_takeovers(first: VerifiedLog, second: VerifiedLog) -> PairVerification:
-    """Verify the takeovers between two logs. Raises `LogUnreadableError` if a file is no longer a log."""
     findings: list[TakeoverFinding] = []
     proofs: list[TakeoverProof] = []
     with ExitStack() as stack:
@@ -122,10 +116,7 @@ def verify_takeovers(first: VerifiedLog, second: VerifiedLog) -> PairVerificatio
 
 
 def verify_alone(log: VerifiedLog, absent: str) -> PairVerification:
-    """Verify the log of an appliance whose other one, `absent`, has no log: then its own records name none.
-
-    Raises `LogUnreadableError` if the file is no longer a log.
-    """
+    """Verify a log whose other one does not exist: then its own records name none."""
     kind = TakeoverFindingKind.LOG_MISSING
     findings: list[TakeoverFinding] = []
     with reading(log.path, advice="") as connection:
@@ -158,8 +149,6 @@ def _opened(connection: sqlite3.Connection, log: VerifiedLog) -> TakeoverLog:
 
 
 class _Placed(NamedTuple):
-    """A takeover, its log, and the log of the other appliance."""
-
     takeover: Takeover
     own: TakeoverLog
     other: TakeoverLog
@@ -170,8 +159,6 @@ class _Placed(NamedTuple):
 
 
 class _Pair:
-    """The verification of one pair."""
-
     def __init__(self, first: TakeoverLog, second: TakeoverLog) -> None:
         self._sides = ((first, second), (second, first))
         placed = [_Placed(one, own, other) for own, other in self._sides for one in own.takeovers]
@@ -329,7 +316,7 @@ _WRONG = {
 
 
 def _wrong_checkpoint(named: SignedCheckpoint, log: TakeoverLog) -> tuple[TakeoverFindingKind, str] | None:
-    """Return why a named checkpoint is not in a log; None if it is, or if its records were removed."""
+    """Return None also if the records were removed."""
     first, last, key = log.result.removed + 1, log.result.last, log.result.key or "no key"
     known = KnownLog(log.result.log, key, first, last, log.hash_at, log.checkpoint_text)
     fault = named.fault_in(known)
@@ -368,10 +355,11 @@ def _proof(
 
 
 def _overlap(before: _Placed, active: list[_Placed], back: _Placed) -> int | None:
-    """Return the nanoseconds by which one appliance's silence is too short for the other's epochs; None if unknown.
+    """Return the nanoseconds by which one appliance's silence is too short for the other's epochs.
 
-    `before` and `back` are takeovers of the one, `active` those of the other between them. `active` ends with the last
-    decision of each epoch; the silence is the time from the last decision before to `back`.
+    `before` and `back` are takeovers of the one, `active` those of the other between them. `active` ends with the
+    last decision of each epoch; the silence is the time from the last decision before to `back`.
+
     """
     silent, busy = before.own, active[0].own
     last = silent.last_decision(before.takeover.sequence, back.takeover.sequence)

@@ -1,8 +1,7 @@
 """Define the records of takeovers between two appliances, and read them from a log.
 
-Each appliance has a chain and a key of its own. The record of a takeover links the two chains: it names the other
-chain's last checkpoint that was replicated, with its signature. It also names the takeover before it, so that a removed
-record leaves a gap, although the epochs of a lease may have gaps.
+A record names the other chain's last replicated checkpoint, and the takeover before it, so that a removed record
+leaves a gap, although the epochs of a lease may have gaps.
 """
 
 import sqlite3
@@ -30,11 +29,7 @@ class EpochOf(msgspec.Struct, frozen=True):
 
 
 class TookOver(msgspec.Struct, frozen=True, kw_only=True):
-    """The detail of a `took over` record.
-
-    `checkpoint` is the last replicated checkpoint of the `other` appliance's log, and `previous` the last takeover
-    before this one; None if this appliance had none.
-    """
+    """The detail of a `took over` record; `checkpoint` is the last replicated one of the `other` appliance's log."""
 
     epoch: _Epoch
     appliance: _Name
@@ -52,7 +47,7 @@ class HandedOver(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Takeover(NamedTuple):
-    """A takeover with its place and time (nanoseconds since the epoch, by its own machine's clock)."""
+    """A takeover; times are nanoseconds since the epoch, by the appliance's own clock."""
 
     sequence: int
     time: int
@@ -113,7 +108,6 @@ class TakeoverLog:
         return self.takeovers[place - 1] if place else None
 
     def end_of(self, sequence: int, epoch: int = -1) -> int:
-        """Return the place before the first takeover after a record and an epoch, or the last place of the log."""
         later = islice(self.takeovers, bisect_right(self._places, sequence), None)
         return next((one.sequence - 1 for one in later if one.detail.epoch > epoch), self.result.last)
 

@@ -1,4 +1,4 @@
-"""The state of two appliances, with its alarms, metrics and line of `rosrv status`."""
+"""Show two appliances in the status, the alarms and the metrics."""
 
 from typing import Any
 

@@ -12,22 +12,17 @@ This file runs alone, with the standard library of Python 3.5 to 3.12 and the pr
 1. A claim is granted only after the lease has expired, to an appliance in the in-sync set. A grant increments the
    epoch, saves it, and changes the firewall before it is answered. If one of these fails, nothing is granted.
 2. Only the holder changes the in-sync set. Each change is on the disk before it is answered.
-3. Every start waits one expiry before the first grant. After a reboot both appliances are shut out; a renewal of the
-   holder admits it again, since no other appliance has had a grant.
+3. Every start waits one expiry before the first grant. After a reboot both appliances are shut out; a renewal of
+   the holder admits it again, since no other appliance has had a grant.
 4. A damaged or missing lease shuts out both appliances, until an operator runs `begin`.
-5. A full disk prevents no change: the file of the lease keeps its size. Twice a minute another file beside it is
-   written, and each answer says why that failed: a disk that cannot be written would prevent the next takeover.
+5. A full disk prevents no change: the file of the lease keeps its size. Each answer says why a regular write
+   failed: a disk that cannot be written would prevent the next takeover.
 
-The firewall translates one fixed address to the holder, and rejects all other traffic of the appliance that is not the
-holder with TCP resets, also in established connections. An idle connection sends nothing that could be rejected.
-Therefore the witness sends each such local socket one segment outside its window. The socket answers with an
-acknowledgement, and the firewall rejects that with the reset that the socket accepts. A socket that still waits for the
-answer to its first packet repeats that after 1, 3 and 7 seconds only. It gets such a packet itself, and answers that.
-Tunnels, ping, resets and requests to the witness pass. With nft, a request without the tag of its sender's key is
-dropped in the kernel. The rules are for IPv4: give the appliances no IPv6 address that the robot reaches.
-
-A robot has one witness. Its other computers, and other machines that use the fixed address, are followers: they ask the
-witness (`look`, which changes nothing) and write the same firewall rules.
+The firewall translates one fixed address to the holder, and rejects all other traffic of the other appliance with
+TCP resets. For an idle connection, the witness sends its local socket a segment outside its window; the firewall
+rejects the acknowledgement with a reset. A socket that still waits for the answer to its first packet repeats
+that only after 1, 3 and 7 seconds, so it gets such a packet itself. Tunnels, ping, resets and requests to the
+witness pass. The rules are for IPv4: give the appliances no IPv6 address that the robot reaches.
 """
 
 import argparse
@@ -122,8 +117,8 @@ WitnessSettings = NamedTuple(
 )
 """`fixed` is the address that the robot's nodes use; `ports` are translated to the holder.
 
-`listen` is the address and port of the witness. `followers` are the other computers that ask it. In the settings of a
-follower, `follows_as` is its name, `followers` has only itself, and the appliances have no keys.
+`followers` are the other computers that ask the witness. In the settings of a follower, `follows_as` is its name,
+`followers` has only itself, and the appliances have no keys.
 """
 
 
@@ -132,12 +127,12 @@ follower, `follows_as` is its name, `followers` has only itself, and the applian
 
 @functools.lru_cache(maxsize=64)
 def tag_of(key: bytes) -> bytes:
-    """Return the first bytes of all datagrams with this key, so that most forged ones cost no authentication."""
+    """Return the first bytes of all datagrams with this key: most forged ones cost no authentication."""
     return hmac.new(key, b"rosrv lease tag 1\0", hashlib.sha256).digest()[:_TAG]
 
 
 def seal(purpose: bytes, name: str, key: bytes, body: Dict[str, Any]) -> bytes:
-    """Return a datagram to or from the appliance `name`: tag, name, authentication code, and the body as JSON."""
+    """Return a datagram: tag, name, authentication code, and the body as JSON."""
     label = name.encode("ascii")
     text = json.dumps(body, sort_keys=True, separators=(",", ":")).encode("ascii")
     head = tag_of(key) + bytes([len(label)]) + label
@@ -145,7 +140,7 @@ def seal(purpose: bytes, name: str, key: bytes, body: Dict[str, Any]) -> bytes:
 
 
 def name_in(datagram: bytes) -> str:
-    """Return the name of the appliance in a datagram, which is not authenticated yet; empty if it has none."""
+    """The name is not authenticated yet."""
     if not _TAG + 1 + _MAC < len(datagram) <= LONGEST:
         return ""
     name = datagram[_TAG + 1 : _TAG + 1 + datagram[_TAG]].decode("ascii", "replace")
@@ -153,7 +148,6 @@ def name_in(datagram: bytes) -> str:
 
 
 def unseal(purpose: bytes, key: bytes, datagram: bytes) -> Optional[Dict[str, Any]]:
-    """Return the body of a datagram with a name, or None if its tag or its authentication code is wrong."""
     if datagram[:_TAG] != tag_of(key):
         return None
     end = _TAG + 1 + datagram[_TAG]
@@ -169,7 +163,6 @@ def unseal(purpose: bytes, key: bytes, datagram: bytes) -> Optional[Dict[str, An
 
 
 def is_count(value: object) -> bool:
-    """Return whether this is a number that an appliance may send: 0 to `HIGHEST`."""
     return type(value) is int and 0 <= value <= HIGHEST
 
 
@@ -179,9 +172,9 @@ def is_count(value: object) -> bool:
 class LeaseFile:
     """The lease on the disk: two copies in a file that keeps its size, so that no change needs free space.
 
-    A change overwrites the first copy, then the second one. A crash leaves at most one of them incomplete, and the
-    other one is right: the change was not answered before both were written. The file of an earlier version has one
-    copy; the first change replaces it.
+    A crash leaves at most one copy incomplete, and the other one is right: the change was not answered before
+    both were written. The file of an earlier version has one copy.
+
     """
 
     def __init__(self, path: str, names: Tuple[str, ...]) -> None:
@@ -190,7 +183,6 @@ class LeaseFile:
         self._lock = -1
 
     def __enter__(self) -> "LeaseFile":
-        """Keep other processes from this lease. Raises `WitnessError` if one uses it."""
         os.makedirs(os.path.dirname(os.path.abspath(self.path)), mode=0o700, exist_ok=True)
         self._lock = os.open(self.path + ".lock", os.O_RDWR | os.O_CREAT, 0o600)
         try:
@@ -207,7 +199,6 @@ class LeaseFile:
         self._lock = -1
 
     def read(self) -> LeaseRecord:
-        """Return the lease. Raises `WitnessError` if it is missing or damaged."""
         try:
             with open(self.path, "rb") as file:
                 content = file.read(2 * _COPY + 1)
@@ -225,7 +216,6 @@ class LeaseFile:
             ) from error
 
     def _record(self, copy: bytes) -> LeaseRecord:
-        """Return the lease in a copy. Raises `ValueError`, `KeyError`, `TypeError`."""
         code, _, text = copy.rstrip(b" ").partition(b"\n")
         if code.decode("ascii") != hashlib.sha256(text).hexdigest():
             raise ValueError("its checksum is wrong")
@@ -244,7 +234,7 @@ class LeaseFile:
             return False
 
     def write(self, record: LeaseRecord) -> None:
-        """Save the lease. Raises `WitnessError` if the old one stays; any other error leaves it uncertain."""
+        """After a `WitnessError` the old lease stays; any other error leaves it uncertain."""
         body = {
             "epoch": record.epoch,
             "holder": record.holder,
@@ -293,7 +283,6 @@ class LeaseFile:
 
 
 def write_synced(path: str, content: bytes) -> None:
-    """Write a file, in place if it exists, and sync it to the disk. Raises `OSError`."""
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT, 0o600)
     try:
         if os.write(descriptor, content) != len(content):
@@ -304,10 +293,7 @@ def write_synced(path: str, content: bytes) -> None:
 
 
 class DiskCheck:
-    """The regular check that the disk of the lease can be written, in a thread: a slow disk delays no answer.
-
-    The check overwrites a file beside the lease, which keeps its size.
-    """
+    """The regular check that the disk of the lease can be written, in a thread: a slow disk delays no answer."""
 
     def __init__(self, lease: LeaseFile, clock: Callable[[], float]) -> None:
         self._lease = lease
@@ -336,7 +322,6 @@ class DiskCheck:
         self._began = None
 
     def trouble(self) -> str:
-        """Return why a change of the lease would fail; an empty text: it would not."""
         began = self._began
         if began is not None and self._clock() - began > _SLOW_SECONDS:
             return "the disk of the lease %s takes more than %d s for a write" % (
@@ -351,8 +336,9 @@ class DiskCheck:
 class Witness:
     """The rules of the lease.
 
-    `save` writes the lease; `admit` changes the firewall to admit one appliance, or none (""). Both raise
-    `WitnessError` if nothing has changed. `boot` is the present boot. Without a `record`, every request is refused.
+    `admit` changes the firewall to admit one appliance, or none (""). Like `save`, it raises `WitnessError` if
+    nothing has changed. Without a `record`, every request is refused.
+
     """
 
     def __init__(
@@ -376,7 +362,6 @@ class Witness:
         admit(self.admitted)
 
     def enforce_again(self) -> None:
-        """Write the firewall rules again, because another program changed them. Raises `WitnessError`."""
         holder = self.record.holder if self.record is not None else ""
         self._enforce(holder if self.admitted == holder else "")
 
@@ -384,7 +369,6 @@ class Witness:
         return max(0.0, self._expires - self._clock())
 
     def handle(self, name: str, operation: str, epoch: int, other: str) -> str:
-        """Carry out a request of the appliance `name`. Return an empty text, or the reason of the refusal."""
         if self.record is None:
             return "the lease is damaged: run witness.py begin on the robot"
         if epoch > self.record.epoch:
@@ -447,10 +431,11 @@ class Witness:
 
 
 class WitnessGate:
-    """Check datagrams: each request is authenticated, and newer than all earlier ones of its appliance.
+    """Checks datagrams: each request is authenticated, and newer than all earlier ones of its appliance.
 
-    A request has the witness's nonce of this start, which no earlier recording can have, and a rising number. The
-    answer repeats both and the appliance's own nonce. An old nonce or number is answered with the present ones.
+    A request has the witness's nonce of this start, which no earlier recording can have, and a rising number. An
+    old nonce or number is answered with the present ones.
+
     """
 
     def __init__(
@@ -470,7 +455,6 @@ class WitnessGate:
         self.fresh = ""  # the name in the last datagram, if it was authentic and new
 
     def answer(self, datagram: bytes, address: str) -> Optional[bytes]:
-        """Return the answer to a datagram from `address`, or None if the datagram is not authenticated."""
         name, self.fresh = name_in(datagram), ""
         peer = self._peers.get(name)
         body = None
@@ -482,7 +466,7 @@ class WitnessGate:
         return seal(ANSWER, name, peer.key, self._answer(name, body))
 
     def _allowed(self, name: str, body: Dict[str, Any]) -> bool:
-        """Return whether this operation is allowed: a follower cannot change the lease, so no rule depends on it."""
+        """A follower cannot change the lease, so no rule depends on it."""
         return name in self._appliances or body["do"] == "look"
 
     def _well_formed(self, body: Dict[str, Any]) -> bool:
@@ -525,15 +509,13 @@ class WitnessGate:
 class WitnessFollower:
     """The rules of a follower.
 
-    It admits an appliance only while the appliance's lease runs at the witness: for 0.9 of the time that the
-    answer has left, counted from the time the request was *sent*. The rest allows for clocks of different
-    speeds. The witness grants the lease only after it expired or was released. So whenever the robot admits
-    one appliance, no follower admits the other one, unless that one has given the lease up. Without answers,
-    both are shut out after at most one expiry. Old and repeated answers are ignored.
+    It admits an appliance only for 0.9 of the time that its lease has left, counted from the time the request was
+    *sent*; the rest allows for clocks of different speeds. So while the robot admits one appliance, no follower
+    admits the other one, unless that one has given the lease up. Without answers, both are shut out after at most
+    one expiry.
 
-    `epoch` is the greatest that was saved; a smaller one, of a witness that was restored from an old disk, is
-    not accepted. `clock` also runs while the computer sleeps; `answered` is its time at the last authentic
-    answer.
+    `epoch` is the greatest that was saved; a smaller one, of a witness that was restored from an old disk, is not
+    accepted. `clock` also runs while the computer sleeps.
     """
 
     def __init__(
@@ -585,7 +567,6 @@ class WitnessFollower:
         )
 
     def receive(self, datagram: bytes) -> None:
-        """Use an answer of the witness. Raises `WitnessError` if the epoch or the rules cannot be written."""
         body = unseal(ANSWER, self._key, datagram) if name_in(datagram) == self._name else None
         if body is None or body.get("session") != self._session or not is_count(body.get("number")):
             return
@@ -616,7 +597,6 @@ class WitnessFollower:
         self.tick()
 
     def tick(self) -> None:
-        """Admit the holder, or shut out both when its time has passed. Raises `WitnessError`."""
         wanted = self._holder if self._clock() < self._until else ""
         if wanted != self._admitted:
             self.enforce(wanted)
@@ -625,7 +605,7 @@ class WitnessFollower:
         self.enforce(self._holder if self._clock() < self._until else "")
 
     def enforce(self, name: str) -> None:
-        """Write the rules. Raises `WitnessError`; then the next `tick` tries again."""
+        """Write the rules; after a `WitnessError`, the next `tick` tries again."""
         self._admitted = "?"
         self._admit(name)
         self._admitted = name
@@ -635,7 +615,7 @@ class WitnessFollower:
 
 
 def nft_rules(settings: WitnessSettings, admitted: str) -> str:
-    """Return the nftables file that admits one appliance, or none, as one transaction."""
+    """With these rules, the kernel drops a request without the tag of its sender's key."""
     names = sorted(settings.appliances)
     control = "{ %s }" % ", ".join(map(str, (*_TUNNEL_PORTS, settings.listen[1])))
     local = 'iif "lo" ip daddr %s udp dport %d drop' % settings.listen  # no appliance is on this computer
@@ -690,11 +670,8 @@ def nft_rules(settings: WitnessSettings, admitted: str) -> str:
 
 
 def iptables_rules(settings: WitnessSettings, admitted: str, present: Dict[str, List[str]]) -> str:
-    """Return the input of `iptables-restore --noflush` that admits one appliance, or none.
-
-    Tables change one after the other. The filter comes first: until the translation follows, connections to the fixed
-    address are rejected or go to the new holder. `present` has the rules of each built-in chain, such as `nat OUTPUT`.
-    Our jump becomes the first rule, before any that accepts established connections.
+    """The filter comes first: until the translation follows, connections to the fixed address are rejected or go
+    to the new holder. Our jump becomes the first rule, before any that accepts established connections.
     """
     names = sorted(settings.appliances)
     control = ",".join(map(str, (*_TUNNEL_PORTS, settings.listen[1])))
@@ -751,7 +728,6 @@ def _passing(control: str) -> List[str]:
 
 
 def without_iptables_rules(saved: str) -> str:
-    """Return the input of `iptables-restore --noflush` that removes our rules from the output of `iptables-save`."""
     lines, own = [], []  # type: List[str], List[str]
     for line in saved.splitlines():
         if line.startswith("*"):
@@ -771,7 +747,6 @@ def without_iptables_rules(saved: str) -> str:
 
 
 def run_program(command: List[str], text: str) -> str:
-    """Run a program with `text` as its input, and return its output. Raises `WitnessError`."""
     try:
         done = subprocess.run(
             command,
@@ -800,7 +775,6 @@ def chosen_backend(release: str, find: Callable[[str], Optional[str]]) -> str:
 
 
 def remove_rules(backend: str, run: Program = run_program) -> None:
-    """Remove all rules of this program. Raises `WitnessError`."""
     if backend == "nft":
         run(["nft", "-f", "-"], "table ip %s\ndelete table ip %s\n" % (TABLE, TABLE))
     else:
@@ -818,7 +792,6 @@ class LeaseFirewall:
         self._rules = 0
 
     def admit(self, name: str) -> None:
-        """Admit one appliance, or none (""). Raises `WitnessError`."""
         self._written = []
         if self._backend == "nft":
             self._run(["nft", "-f", "-"], nft_rules(self._settings, name))
@@ -829,10 +802,8 @@ class LeaseFirewall:
         self._written = self._present()
 
     def intact(self) -> bool:
-        """Return whether the written rules are unchanged; a removed table cannot be listed.
-
-        Another program may have changed them before they were read for the first time. So the jumps, which
-        must be first, and the number of rules are compared with what was written.
+        """Another program may have changed the rules before they were read for the first time. So the jumps,
+        which must be first, and the number of rules are compared with what was written.
         """
         try:
             present = self._present()
@@ -864,10 +835,6 @@ class LeaseFirewall:
 def sockets_with(
     addresses: Set[str], tables: List[str], states: Tuple[str, ...] = _ESTABLISHED
 ) -> List[Ends]:
-    """Return the ends of each connection with one of these addresses.
-
-    `tables` are the contents of /proc/net/tcp and /proc/net/tcp6; only connections in these `states` are returned.
-    """
     found = []
     for line in [line for table in tables for line in table.splitlines()[1:]]:
         fields = line.split()
@@ -888,7 +855,6 @@ def _end(text: str) -> Tuple[str, int]:
 
 
 def segment(connection: Ends, flags: int, number: int) -> bytes:
-    """Return an IPv4 packet from the peer to the own socket, with some sequence number."""
     own, own_port, peer, peer_port = connection
     ends = socket.inet_aton(peer) + socket.inet_aton(own)
     tcp = struct.pack("!HHIIBBHHH", peer_port, own_port, number, number, 5 << 4, flags, 0, 0, 0)
@@ -901,7 +867,7 @@ def segment(connection: Ends, flags: int, number: int) -> bytes:
 
 
 class IdleConnections:
-    """Reset local connections with an appliance that is no longer admitted, even idle ones."""
+    """Reset local connections, even idle ones, with an appliance that is no longer admitted."""
 
     def __init__(self, settings: WitnessSettings) -> None:
         self._settings = settings
@@ -915,10 +881,8 @@ class IdleConnections:
         return sockets_with(self._addresses(""), _socket_tables(), _CONNECTING)
 
     def reset(self, admitted: str, connecting: Iterable[Ends] = ()) -> None:
-        """Begin to reset all present connections with other appliances, and with the fixed address.
-
-        `connecting` wait for a first answer since before the rules changed, so the connection tracker leads their first
-        packet to the earlier appliance for good.
+        """`connecting` wait for a first answer since before the rules changed, so the connection tracker leads
+        their first packet to the earlier appliance for good.
         """
         addresses = self._addresses(admitted)
         self._left = sockets_with(addresses, _socket_tables())
@@ -927,7 +891,6 @@ class IdleConnections:
         self.go_on()
 
     def go_on(self) -> bool:
-        """Send a segment to each connection that remains; return whether another round is needed."""
         if not self._left:
             return False
         peers, tables = {peer for _, _, peer, _ in self._left}, _socket_tables()
@@ -963,7 +926,7 @@ def _socket_tables() -> List[str]:
 
 
 def read_settings(path: str) -> WitnessSettings:
-    """Return the settings of a file that only root can read, since it has the keys. Raises `WitnessError`."""
+    """Raise `WitnessError` unless only root can read the file, since it has the keys."""
     try:
         with open(path, encoding="utf-8") as file:
             if stat.S_IMODE(os.fstat(file.fileno()).st_mode) & 0o077:
@@ -975,7 +938,6 @@ def read_settings(path: str) -> WitnessSettings:
 
 
 def settings_of(body: Dict[str, Any]) -> WitnessSettings:
-    """Return the settings in this object. Raises `ValueError`, and errors of Python for wrong types."""
     host, _, port = body["listen"].rpartition(":")
     follows_as = body.get("follows_as", "")
     appliances = _peers(body["appliances"], keys=not follows_as)
@@ -1067,14 +1029,12 @@ class LeaseEnforcement:
         self._checked = self._reset = time.monotonic()
 
     def admit(self, name: str) -> None:
-        """Admit one appliance, or none (""), and reset the connections with the other one. Raises `WitnessError`."""
         connecting = self._idle.connecting()
         self._firewall.admit(name)
         self._idle.reset(name, connecting)
         self._log.add("the robot admits %s" % (name or "no appliance"))
 
     def go_on(self, enforce_again: Callable[[], None]) -> bool:
-        """Continue the resets, and check the rules once a second; return whether they were checked."""
         now = time.monotonic()
         if now - self._reset >= _RESET_SECONDS:
             self._reset = now
@@ -1103,7 +1063,6 @@ def _shut(settings: WitnessSettings, backend: str) -> None:
 
 
 def serve(settings: WitnessSettings, backend: str, lease: LeaseFile) -> None:
-    """Answer the appliances until the process ends."""
     log = BoundedLog(_write_error, time.monotonic)
     enforcement = LeaseEnforcement(settings, backend, log)
     try:
@@ -1136,7 +1095,7 @@ def serve(settings: WitnessSettings, backend: str, lease: LeaseFile) -> None:
 
 
 def _note_trouble(witness: Witness, lease: LeaseFile, disk: DiskCheck, log: BoundedLog) -> None:
-    """Store why the next change of the lease would not be saved, for the answers. If the file has no room, make it."""
+    """Give the answers the reason why the next change would not be saved. If the file has no room, make it."""
     if witness.record is not None and not lease.has_room():
         with contextlib.suppress(WitnessError):  # reported as the trouble
             lease.write(witness.record)
@@ -1147,11 +1106,11 @@ def _note_trouble(witness: Witness, lease: LeaseFile, disk: DiskCheck, log: Boun
 
 
 class RequestSockets:
-    """The sockets for requests: one for all hosts, and one for each appliance and follower since its last new request.
+    """The sockets for requests: one for all hosts, and one for each appliance and follower since its last new
+    request.
 
-    The kernel gives datagrams from the address *and port* of that request to the connected socket. Another host cannot
-    guess this port, so datagrams with a forged address fill only the buffer of the common socket. A connected socket is
-    read first.
+    The kernel gives datagrams from the address *and port* of that request to the connected socket. Another host
+    cannot guess this port, so datagrams with a forged address fill only the buffer of the common socket.
     """
 
     def __init__(self, listen: Tuple[str, int]) -> None:
@@ -1167,7 +1126,6 @@ class RequestSockets:
             one.close()
 
     def ready(self) -> List[Tuple[socket.socket, int]]:
-        """Wait for requests; return each socket that has some, and the number to read from it at once."""
         connected = [one for one, _ in self._connected.values()]
         found, _, _ = select.select([*connected, self._common], [], [], 0.2)
         return [(one, _BATCH if one is self._common else _EACH) for one in found]
@@ -1216,7 +1174,6 @@ def _answer_one(one: socket.socket, gate: WitnessGate, requests: RequestSockets)
 
 
 def follow(settings: WitnessSettings, backend: str, lease: LeaseFile) -> None:
-    """Follow the witness until the process ends. First, both appliances are shut out."""
     log = BoundedLog(_write_error, time.monotonic)
     enforcement = LeaseEnforcement(settings, backend, log)
     names = tuple(sorted(settings.appliances))
@@ -1298,7 +1255,6 @@ def _receive_one(asking: socket.socket, witness: Tuple[str, int], follower: Witn
 
 
 def begin(settings: WitnessSettings, lease: LeaseFile, in_sync: List[str], epoch: int) -> None:
-    """Write the lease again, without a holder. Raises `WitnessError`."""
     wrong = [name for name in in_sync if name not in settings.appliances]
     if wrong or not in_sync:
         raise WitnessError("--in-sync: %r is not an appliance of the settings" % ",".join(wrong))

@@ -55,10 +55,7 @@ class WitnessChannel:
         return seal(REQUEST, self._name, self._key, body)
 
     def read(self, datagram: bytes) -> tuple[WitnessRequest, WitnessAnswer] | None:
-        """Return an answer with its request, or None if it answers no pending request.
-
-        An answer to a request with an old nonce or number has the present ones: the next request uses them.
-        """
+        """An answer to a request with an old nonce or number has the present ones: the next request uses them."""
         if name_in(datagram) != self._name:
             return None
         try:
@@ -78,7 +75,7 @@ class WitnessChannel:
 
 
 class WitnessLink(asyncio.DatagramProtocol):
-    """The socket to the witness; each answer goes to `answered`."""
+    """The socket to the witness."""
 
     def __init__(
         self, channel: WitnessChannel, answered: Callable[[WitnessRequest, WitnessAnswer], None]
@@ -99,6 +96,6 @@ class WitnessLink(asyncio.DatagramProtocol):
         """Ignore an unreachable witness, because the lease counts only on answers."""
 
     def send(self, request: WitnessRequest) -> None:
-        """Send a request. Without a socket or a route it is lost; the lease asks again."""
+        """Without a socket or a route the request is lost; the lease asks again."""
         if self._transport is not None:
             self._transport.sendto(self._channel.write(request))
