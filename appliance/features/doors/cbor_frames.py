@@ -1,9 +1,8 @@
 """Convert CBOR frames of clients to JSON, within bounds.
 
-cbor2 knows many tags that a door does not need, such as big numbers, dates, regular expressions and
-references to earlier values. So a scan of the heads comes first, and accepts only the kinds that JSON also
-has, byte strings, and the typed arrays of RFC 8746. It bounds depth and number of values, which a frame of
-few bytes could make large.
+cbor2 knows many tags that a door does not need. So a scan of the heads comes first: it accepts only the kinds
+that JSON also has, byte strings, and the typed arrays of RFC 8746, and bounds depth and number of values, which a
+short frame could make large.
 """
 
 import struct
@@ -15,7 +14,7 @@ import msgspec
 from appliance.features.doors.message_reader import MessageValueError
 
 MOST_DEPTH = 70
-"""The deepest nesting of arrays and objects; messages nest at most 64 levels deep."""
+"""The deepest nesting; messages nest at most 64 levels deep."""
 
 MOST_ITEMS = 50_000
 """The most values of one frame; a typed array is one value."""
@@ -33,11 +32,7 @@ _OTHERS = frozenset({20, 21, 22, 25, 26, 27})  # false, true, null, floats of 16
 
 
 def json_of_cbor(frame: bytes) -> bytes:
-    """Return a frame as JSON; raises `MessageValueError`.
-
-    Byte strings become base64, and typed arrays lists, or base64 if their elements are `uint8`. NaN becomes null, which
-    no field accepts.
-    """
+    """Byte strings and arrays of `uint8` become base64. NaN becomes null, which no field accepts."""
     try:
         _scan(frame)
         return msgspec.json.encode(cbor2.loads(frame, tag_hook=_typed_array))
@@ -98,7 +93,6 @@ def _head(frame: bytes, position: int) -> tuple[int, int, int]:
 
 
 def _scan_typed_array(frame: bytes, position: int, tag: int) -> tuple[int, int]:
-    """Return the position after a typed array, and the number of values that it becomes."""
     if tag not in _CODES:
         raise MessageValueError(f"the CBOR tag {tag}; only typed arrays (RFC 8746) may have tags")
     major, size, position = _head(frame, position)

@@ -20,7 +20,7 @@ class _Counts(NamedTuple):
 
 
 class CountedClient:
-    """A connection with its counts; `queues` are the queues of its protocol, once it has one."""
+    """A connection with its counts, and the queues of its protocol, once it has one."""
 
     def __init__(self, session: DoorSession, peer: str, ticket: str, queues: list[ViewerQueue[Any]]) -> None:
         self.session = session
@@ -38,16 +38,13 @@ class CountedClient:
         return _Counts(self.session.received, self.session.sent, self.session.refusals)
 
     def sample(self) -> None:
-        """Note the present counts; call it every `SAMPLE_SECONDS`."""
         self._samples.append(self._counts())
 
     def shown(self) -> ClientShown:
-        """Return the connection, with its counts of the last minute."""
         lately = (now - before for now, before in zip(self._counts(), self._samples[0], strict=True))
         return ClientShown(self._peer, self.ticket, self.session.protocol_name, self._since, *lately)
 
 
 def shown(clients: Iterable[CountedClient]) -> Iterator[ClientShown]:
-    """Yield the connections, the oldest first, at most `MOST_SHOWN`."""
     oldest_first = sorted((one.shown() for one in clients), key=lambda one: one.since)
     yield from oldest_first[:MOST_SHOWN]

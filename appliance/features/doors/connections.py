@@ -25,10 +25,7 @@ class ConnectionLimits:
 
 
 class DoorConnections:
-    """Serves connections, each in a task of its own; `refused` counts those that came in excess.
-
-    The callback `refused(reason)` is called for such a connection.
-    """
+    """Serves connections; `refused` counts those that came in excess."""
 
     def __init__(self, limits: ConnectionLimits) -> None:
         self.refused = 0
@@ -56,7 +53,6 @@ class DoorConnections:
         *,
         refused: Callable[[str], None],
     ) -> None:
-        """Serve a connection, or refuse it with HTTP 503 and the reason."""
         reason = self._excess()
         if reason:
             refused(reason)

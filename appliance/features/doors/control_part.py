@@ -34,7 +34,7 @@ _log = structlog.get_logger()
 
 
 async def keep(sections: Sections, store: StateStore, lifeline: ControlLifeline) -> KeptDoors:
-    """Return the table of doors, with addresses that no other program can use, before the policy names them."""
+    """Read the doors before the policy names them, with addresses that no other program can use."""
     settings = sections.of(Doors)
     table = DoorTable(store, settings)
     if table.live():
@@ -96,7 +96,6 @@ class DoorOrders:
         return door_requests.DoorList([self._shown(row) for row in self._table.live()])
 
     async def add(self, request: door_requests.DoorAdd, who: str) -> door_requests.DoorState:
-        """Add a door. Raises `SenselessError`, `UnavailableError` and `StoreError`."""
         async with self._one:
             if self._table.stray:
                 raise UnavailableError(self._table.stray)
@@ -124,7 +123,6 @@ class DoorOrders:
             return self._shown(row)
 
     async def remove(self, request: door_requests.DoorRemove, who: str) -> door_requests.DoorState:
-        """Remove a door. Raises `UnknownThingError` and `StoreError`."""
         async with self._one:
             shown = self._shown(self._table.of(request.name))
             take_effect()
@@ -151,7 +149,6 @@ class DoorOrders:
             return shown
 
     async def ticket(self, request: door_requests.DoorTicket, who: str) -> door_requests.NewTicket:
-        """Make a ticket. Raises `UnknownThingError`, `SenselessError` and `StoreError`."""
         door = self._table.of(request.name)
         take_effect()
         row, text = self._tickets.make(door.name, request.seconds, who)
@@ -168,7 +165,6 @@ class DoorOrders:
         return door_requests.OwnDoor(name=name, door=None if row is None else self._shown(row), reason=reason)
 
     async def visit(self, _request: door_requests.DoorVisit, who: str) -> door_requests.NewTicket:
-        """Make a ticket for one connection to the caller's door. Raises `UnknownThingError`."""
         _name, door, reason = self._own.of(who)
         if door is None:
             raise UnknownThingError(reason)
@@ -200,7 +196,6 @@ class DoorOrders:
         return problem
 
     def enter(self, door: str, ticket: str, peer: str, descriptor: int) -> tuple[int, str]:
-        """Pass a person's connection to a door; return an HTTP status and why it is refused, or an empty text."""
         row = next((one for one in self._table.live() if one.name == door), None)
         visit = self._visits.find(door, ticket)
         found = visit or self._tickets.find(door, ticket)
@@ -223,7 +218,6 @@ class DoorOrders:
         return 101, ""
 
     async def watch(self) -> None:
-        """Start and define the processes of doors, end connections whose tickets are over, and retry what failed."""
         self._processes.start()
         for number in range(1 << 62):
             await asyncio.sleep(_LOOK_SECONDS)

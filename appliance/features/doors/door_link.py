@@ -12,7 +12,7 @@ from appliance.channel.messages.message import Message
 
 
 class DoorStarted(Message, frozen=True):
-    """The first message of a process on each link: its door (empty if unknown), and when the door was added."""
+    """The first message: the process's door (empty if unknown), and when it was added."""
 
     name: str
     added: float
@@ -20,10 +20,9 @@ class DoorStarted(Message, frozen=True):
 
 
 class DoorGiven(Message, frozen=True):
-    """Control names the door that the process serves, or changes the pages that may connect.
+    """The door that the process serves, and the pages that may connect.
 
-    `tickets` are the ids of the valid tickets. Connections of other tickets end, because those may have
-    expired without control.
+    Connections without a ticket of `tickets` end, because theirs may have expired without control.
     """
 
     name: str
@@ -37,7 +36,7 @@ class DoorGiven(Message, frozen=True):
 
 
 class TypesGiven(Message, frozen=True):
-    """The operator's definitions by `package/Type.msg` or `.srv`, before `DoorGiven` and at each change."""
+    """The operator's definitions by `package/Type.msg` or `.srv`, at each change."""
 
     definitions: dict[str, str]
 
@@ -51,14 +50,14 @@ class DoorEnded(Message, frozen=True):
 
 
 class AgentListener(Message, frozen=True):
-    """Control gives the listening socket of the agent's port; only this address or network may connect (empty: any)."""
+    """The listening socket of the agent's port; only this address or network may connect."""
 
     descriptors: ClassVar[int] = 1
     source: str
 
 
 class ViewerGiven(Message, frozen=True):
-    """Control gives a person's connection, from the address `peer`, which showed this ticket."""
+    """A person's connection, from the address `peer`, which showed this ticket."""
 
     descriptors: ClassVar[int] = 1
     peer: str
@@ -72,7 +71,7 @@ class TicketEnded(Message, frozen=True):
 
 
 class SocketWanted(Message, frozen=True):
-    """The door asks for a connection to a port of the appliance, or for a listening socket (port 0)."""
+    """The door asks for a connection, or for a listening socket (port 0)."""
 
     number: int
     port: int
@@ -93,7 +92,7 @@ class SocketRefused(Message, frozen=True):
 
 
 class ConnectionsChanged(Message, frozen=True):
-    """Connections of one peer began or ended in the last second; `reason` is the reason of the last end."""
+    """Connections of one peer began or ended in the last second."""
 
     peer: str
     ticket: str
@@ -103,9 +102,10 @@ class ConnectionsChanged(Message, frozen=True):
 
 
 class DoorCounted(Message, frozen=True):
-    """The counts of the process since its start, at most once a second; `connections` is the present number.
+    """The counts since the start of the process, except the present `connections`.
 
     `refused` counts connections, and `refusals` requests of clients.
+
     """
 
     connections: int = 0
@@ -119,7 +119,6 @@ class DoorCounted(Message, frozen=True):
 
 
 MOST_SHOWN = 50
-"""The most connections of a door that operators see one by one."""
 
 
 class ClientShown(msgspec.Struct, frozen=True):
@@ -135,7 +134,7 @@ class ClientShown(msgspec.Struct, frozen=True):
 
 
 class ClientsShown(Message, frozen=True):
-    """The present connections, the oldest first, at most `MOST_SHOWN`."""
+    """The present connections, the oldest first."""
 
     clients: list[ClientShown]
 

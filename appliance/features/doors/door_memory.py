@@ -1,13 +1,11 @@
 """Divide the memory of one door among its clients and its node.
 
-A client holds frames that have not come whole or are being carried out, with the values and messages that are made of
-them, fragments, and replies and messages that wait for it or are being sent. Two more count as clients: the messages
-that wait for other nodes, and the arguments of calls that wait for answers. Large messages that come from other nodes
-have a memory of their own until they are whole (`NodeLimits.arriving_bytes`), so that slow clients keep none from the
-others. Invariants:
+The messages that wait for other nodes, and the arguments of calls that wait for answers, count as a client each.
+Large messages from other nodes have a memory of their own until they are whole, so that slow clients keep none
+from the others.
 
 1. Each client may hold `least` bytes, whatever the others hold: half of the whole, divided by the most clients.
-2. Beyond `least`, clients share the other half. A client gets no more of it than it leaves for all others.
+2. Beyond `least`, a client gets no more of the other half than it leaves for all others.
 """
 
 from collections.abc import Iterator
@@ -18,7 +16,7 @@ from roswire.errors import LimitExceededError
 
 
 class DoorMemory:
-    """The memory of one door with at most this many connections; `shared` bytes of the shared half are in use."""
+    """The memory of one door with at most this many connections."""
 
     def __init__(self, connections: int = DOOR_CONNECTIONS.bounds.host) -> None:
         self.most_shared = DOOR_BYTES.bounds.whole // 2
@@ -30,7 +28,7 @@ class DoorMemory:
 
 
 class ClientMemory:
-    """The memory of one client, of which it holds `held` bytes. After `close`, the client holds nothing."""
+    """The memory of one client, of which it holds `held` bytes."""
 
     def __init__(self, door: DoorMemory) -> None:
         self.held = 0
@@ -39,7 +37,6 @@ class ClientMemory:
         self._shared = 0  # of the bytes that it holds, those of the shared half
 
     def add(self, size: int) -> None:
-        """Charge `size` bytes; give bytes back if `size` is negative."""
         if self.closed:
             return
         self.held += size
@@ -48,7 +45,6 @@ class ClientMemory:
         self._shared = shared
 
     def refusal(self, size: int) -> str:
-        """Return why this client should not hold `size` more bytes; empty if it may."""
         held = self.held + size
         if held <= self._door.least:
             return ""
@@ -61,14 +57,12 @@ class ClientMemory:
         return ""
 
     def take(self, size: int, trouble: str = "") -> None:
-        """Charge `size` bytes. Raises `LimitExceededError` if this client should not hold them."""
         if reason := self.refusal(size):
             raise LimitExceededError(trouble + reason)
         self.add(size)
 
     @contextmanager
     def holding(self, size: int) -> Iterator[None]:
-        """Charge `size` bytes during a block. Raises what `take` raises."""
         self.take(size)
         try:
             yield

@@ -1,9 +1,7 @@
 """The node of a door, which all connections of its identity share.
 
-Agents make a new connection for each call. So a topic stays registered for some seconds after its last client left,
-and a client that comes back finds it. Each new client of a topic gets the last messages of latched publishers. The
-master sees one publication and one subscription for each topic, however many connections use it. The door decides
-nothing: the master and the relay do, as for any host.
+Agents make a new connection for each call. So a topic stays registered for some seconds after its last client
+left. The master and the relay decide, as for any host.
 """
 
 import asyncio
@@ -86,7 +84,7 @@ class DoorClient(_Subscriber, ParameterClient, Protocol):
     def answered(self, call: int, values: Raw | bytes) -> None: ...
 
     def ask(self, service: str, values: Raw) -> str:
-        """Forward a call of an offered service, and return its id. Raises `PeerError`."""
+        """Forward a call of an offered service, and return its id."""
 
     def give_up(self, call: str) -> None: ...
 
@@ -104,7 +102,6 @@ class _Publication:
     wills: dict[DoorClient, Raw] = field(default_factory=dict)
 
     def publish(self, values: Raw | bytes, memory: ClientMemory) -> None:
-        """Publish a message. Raises `PeerError` if the values do not fit."""
         raw = isinstance(values, Raw)
         self.publication.publish(_written(self.codec.writer, values, memory) if raw else values)
 
@@ -117,10 +114,9 @@ class _Offer:
 
 
 class DoorNode:
-    """Carries out the requests of all connections of one door.
+    """The requests of all connections of one door.
 
-    The connections use at most `most_topics` publications, and as many subscriptions. The arguments of their calls that
-    wait for answers are in the memory `calls`, because they may outlive their connection.
+    Arguments of calls are in the memory `calls`, because they may outlive their connection.
     """
 
     def __init__(
@@ -151,7 +147,6 @@ class DoorNode:
         await self.node.close()
 
     async def carry_out(self, request: DoorRequest, client: DoorClient) -> None:
-        """Carry out a request. Raises `RosError`, whose text is the refusal."""
         match request:
             case AdvertiseTopic():
                 await self._advertise(request, client)
@@ -259,6 +254,7 @@ class DoorNode:
         """Raise the master's refusal if the publication is no longer granted, such as after an approval's end.
 
         The master does not notify publishers, so it is asked again soon after the last subscriber left.
+
         """
         if known.publication.subscribers:
             known.doubtful, known.refusal = True, None
@@ -302,7 +298,6 @@ class DoorNode:
         header: Mapping[str, str],
         receivers: Iterable[_Subscriber] | None = None,
     ) -> None:
-        """Give a message to the subscribers of its topic; a client that wants another type is refused."""
         clients, kind = self._heard.get(topic, {}), header.get("type", ANY)
         encodings = self._encodings if receivers is None and len(clients) > 1 else None
         message = DoorMessage(topic, body, header, clock.wall_ns(), self._types.learn, encodings)
@@ -413,7 +408,6 @@ class DoorNode:
                 raise
 
     async def learn(self, topic: str) -> None:
-        """Subscribe to a topic for a moment, to learn its definition. Raises `RosError`."""
         learner = _Learner()
         await self._subscribe(SubscribeTopic(topic), learner)
         try:
@@ -439,14 +433,13 @@ class DoorNode:
 
 
 def _written(writer: MessageWriter, values: Raw | bytes, memory: ClientMemory) -> bytes:
-    """Return a message of JSON values, whose bytes are charged unless it is small. Raises `PeerError`."""
     cost = writer.cost(values)
     with memory.holding(cost) if cost > _SMALL_BYTES else contextlib.nullcontext():
         return writer.from_json(values, present_time())
 
 
 def _named(values: Raw, names: list[str]) -> bytes:
-    """Return the arguments of a call as an object; a list gives them in the order of the fields."""
+    """A list gives the arguments in the order of the fields."""
     text = bytes(values)
     if not text.lstrip().startswith(b"["):
         return text

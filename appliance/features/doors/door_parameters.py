@@ -1,10 +1,7 @@
-"""The parameters of a door: reads, writes, and subscriptions, which all connections of its identity share.
+"""The parameters of a door, with one subscription at the master for each, whatever connections use it.
 
-The master sees one subscription for each parameter, however many connections use it, and decides each call. A
-subscription ends with its last connection. Connections get the values in the order in which the master set them.
-
-A read takes two calls for each parameter, of which a robot has hundreds, and viewers read all of them again and again.
-So a connection's further requests, such as a stop, do not wait for its reads.
+A read takes two calls for each parameter, of which a robot has hundreds. So a connection's further requests, such
+as a stop, do not wait for its reads.
 """
 
 import asyncio
@@ -44,11 +41,11 @@ class ParameterClient(Protocol):
         """Take the refusal of a read."""
 
     def parameter_changed(self, subscribed: str, name: str, value: Value) -> None:
-        """Pass on the new value of a parameter, which is the subscribed one or below it; `{}` if it was deleted."""
+        """`name` is the subscribed parameter or one below it; `{}` if it was deleted."""
 
 
 class DoorParameters:
-    """Carries out the requests about parameters. The names of the reads that wait are in the memory `calls`."""
+    """The requests about parameters. The names of the reads that wait are in the memory `calls`."""
 
     def __init__(self, node: RosNode, calls: ClientMemory) -> None:
         self._node = node
@@ -63,7 +60,6 @@ class DoorParameters:
         await self._tasks.close()
 
     def begin_read(self, request: ReadParameters, client: ParameterClient) -> None:
-        """Read parameters, one request after another. Raises `LimitExceededError`."""
         if self._reads[client] >= _MOST_READS:
             raise LimitExceededError(
                 f"{_MOST_READS} reads of parameters wait for this client; repeat it later"
@@ -98,7 +94,6 @@ class DoorParameters:
         }
 
     async def write(self, request: WriteParameter) -> None:
-        """Set or delete a parameter. Raises `RosError`."""
         if request.value is None:
             await self._node.master("deleteParam", request.name)
             return
@@ -111,7 +106,6 @@ class DoorParameters:
     async def carry_out(
         self, request: SubscribeParameter | UnsubscribeParameter, client: ParameterClient
     ) -> None:
-        """Begin or end the subscription of a connection. Raises `RosError`."""
         if isinstance(request, SubscribeParameter):
             await self._subscribe(request.name, client)
         else:

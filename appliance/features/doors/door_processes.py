@@ -1,15 +1,10 @@
 """Control's side of the processes of doors: which door each serves, its sockets, and its reports.
 
-Invariants:
-
-1. A process gets only sockets with the address of its door. It connects to RVMaster's port and to ports of proxy
-   endpoints and relays, and to no other port.
-2. A process of a door that was removed, or that another door replaced, gets `DoorEnded`, and nothing after it: the next
-   door of the slot has a process of its own. A door that was added again is another door, because its tickets and its
-   agent's address are others.
+1. A process gets only sockets with the address of its door, and connects only to RVMaster's port and to ports of
+   proxy endpoints and relays. At most `_MOST_PENDING` requests for sockets wait at once.
+2. A process of a door that was removed or replaced gets `DoorEnded`, and nothing after it. A door that was added
+   again is another door, because its tickets and its agent's address are others.
 3. A process outlives control. It gets the valid tickets on each link, and ends the connections of all others.
-4. A process knows the operator's definitions that are in force.
-5. A process has at most `_MOST_PENDING` requests for sockets at once; further ones are refused.
 """
 
 import asyncio
@@ -61,11 +56,7 @@ class _Slot:
 
 
 class DoorProcesses:
-    """The processes of all doors.
-
-    `tickets(door)` returns the ids of the valid tickets. `left(door, ticket)` is called when a connection ended.
-    `definitions()` returns those beside the specifications in force.
-    """
+    """The processes of all doors. `left(door, ticket)` is called when a connection ended."""
 
     def __init__(
         self,
@@ -147,7 +138,6 @@ class DoorProcesses:
         self._send(self._slots[row.slot or 0], door_link.TicketEnded(ticket))
 
     def pass_on(self, row: DoorRow, descriptor: int, peer: str, ticket: str) -> bool:
-        """Give a person's connection to the process of a door; return whether the process runs."""
         slot = self._slots[row.slot or 0]
         return slot.started and self._send(slot, door_link.ViewerGiven(peer, ticket), descriptor)
 
@@ -215,7 +205,6 @@ class DoorProcesses:
             self._listen(slot, row, row.port)
 
     def define(self) -> None:
-        """Give the definitions in force to the processes that have others, and tell them of another policy."""
         changed, self._revision = self._revision != self._base.policies.revision, self._base.policies.revision
         for slot in self._slots:
             if slot.started:
@@ -253,7 +242,6 @@ class DoorProcesses:
         self._base.trail.happened("door failed", reason, host=row.address, resource=row.name)
 
     def retry(self) -> None:
-        """Listen again on ports that were in use, and start processes that do not run."""
         for row in self._table.live():
             slot = self._slots[row.slot or 0]
             if slot.started and slot.trouble and row.port is not None:

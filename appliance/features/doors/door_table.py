@@ -1,8 +1,8 @@
-"""The table of doors: identities, their addresses and processes. It only keeps state.
+"""The table of doors: identities, their addresses and processes.
 
 1. A name keeps its address for good, also after the removal of its door: records name hosts by address.
-2. The policy gets no address of a door unless the firewall reserves it (`problem` is empty): otherwise another host or
-   program could use the address. An address outside of `doors.network` is never reserved.
+2. The policy gets no address of a door unless the firewall reserves it: otherwise another host or program could
+   use the address. An address outside of `doors.network` is never reserved.
 """
 
 import ipaddress
@@ -23,7 +23,7 @@ _MOST_NAMES = 2000  # including removed ones
 
 
 class DoorTable:
-    """All doors that were ever added; `closed` is why the firewall does not reserve their network, or empty."""
+    """All doors that were ever added; `closed` is why the firewall does not reserve them."""
 
     def __init__(self, store: StateStore, settings: Doors) -> None:
         self._store = store
@@ -34,12 +34,10 @@ class DoorTable:
 
     @property
     def problem(self) -> str:
-        """Return why no door can be used now, or an empty text."""
         return self.stray or self.closed
 
     @property
     def stray(self) -> str:
-        """Return which door has an address outside of the network, and the remedy; empty if none has."""
         stray = next((row for row in self.live() if not self._has(row.address)), None)
         if stray is None:
             return ""
@@ -61,7 +59,6 @@ class DoorTable:
         return {} if self.problem else {f"{DOOR}{row.name}": address_of(row.address) for row in self.live()}
 
     def of(self, name: str) -> DoorRow:
-        """Return a door. Raises `UnknownThingError`."""
         row = self._rows.get(name)
         if row is None or row.removed is not None:
             known = ", ".join(row.name for row in self.live()[:20]) or "none"
@@ -72,7 +69,6 @@ class DoorTable:
         return next((row for row in self.live() if row.slot == slot), None)
 
     def planned(self, name: str, port: int | None, source: str) -> DoorRow:
-        """Return the row of a new door, which is not stored yet. Raises `SenselessError`."""
         self._require_name(name)
         if source and port is None:
             raise SenselessError("--from needs --port: only agents are known by their address")

@@ -1,8 +1,7 @@
-"""The tickets with which people's viewers open a door. A viewer can carry nothing but a URL.
+"""The tickets with which people's viewers open a door, because a viewer can carry nothing but a URL.
 
-A ticket is `ID.SECRET`: 48 bits that name it in records, and 256 random bits. The secret is stored as its hash only:
-256 bits cannot be guessed, so a fast hash is enough. A ticket ends by `StoredDeadlines`, as tokens do: neither a step
-of the clock nor a restart gives it more time.
+A ticket is `ID.SECRET`: 48 bits that name it in records, and 256 random bits, which cannot be guessed, so a fast
+hash is stored. Neither a step of the clock nor a restart gives it more time (`StoredDeadlines`).
 """
 
 import hashlib
@@ -23,7 +22,7 @@ LONGEST_SECONDS = 30 * 86_400.0
 
 
 class DoorTickets:
-    """All tickets that are not over; `ends` has their ends, limited by the time since they were made or loaded."""
+    """All tickets that are not over."""
 
     def __init__(self, store: StateStore, ends: Deadlines) -> None:
         self._store = store
@@ -32,14 +31,13 @@ class DoorTickets:
         self.valid()  # from now on, no step of the clock postpones an end
 
     def valid(self, door: str | None = None) -> list[TicketRow]:
-        """Return the tickets (of one door) that can be used now, and forget those that are over."""
         for row in [*self._rows.values()]:
             if self._ends.passed(row.id, row.expires):
                 self._forget(row.id)
         return [row for row in self._rows.values() if door in (None, row.door)]
 
     def make(self, door: str, seconds: float, who: str) -> tuple[TicketRow, str]:
-        """Make a ticket; return its row and its text, which is stored nowhere. Raises `SenselessError`."""
+        """The returned text is stored nowhere."""
         if not 1 <= seconds <= LONGEST_SECONDS:
             raise SenselessError("a ticket is valid for one second to 30 days: write 8h or 7d")
         if len(self.valid()) >= _MOST:

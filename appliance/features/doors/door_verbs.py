@@ -1,4 +1,4 @@
-"""`rosrv door add|list|ticket|remove`: doors for browsers, viewers and agents."""
+"""The commands `rosrv door add|list|ticket|remove`."""
 
 from typing import Annotated
 

@@ -1,11 +1,7 @@
 """The visits of signed-in people: the console opens the caller's own door, with a ticket for one connection.
 
-Invariants:
-
-1. Nothing is stored. A visit ends with control's process, as the sessions of people do.
-2. A ticket opens one connection, within `_OPEN_SECONDS`.
-3. A visit ends when the last token and session of its person's name ends.
-4. A person has at most `_MOST_OF_PERSON` visits; a further one ends the oldest.
+Nothing is stored. A visit ends with control's process, and with the last token and session of its person's name.
+A person has at most `_MOST_OF_PERSON` visits; a further one ends the oldest.
 """
 
 from collections.abc import Callable
@@ -42,7 +38,6 @@ class DoorVisits:
         return row, text
 
     def find(self, door: str, text: str) -> TicketRow | None:
-        """Return the ticket for this door with this text, or None if it was used or is over."""
         row = shown(text, {one.row.id: one.row for one in self._visits.values()})
         return None if row is None or row.door != door or not self._may_open(self._visits[row.id]) else row
 
@@ -55,14 +50,13 @@ class DoorVisits:
             del self._visits[ticket]
 
     def forget(self, door: str) -> None:
-        """Forget all visits of a door that was removed; its process ends with their connections."""
         self._visits = {ticket: one for ticket, one in self._visits.items() if one.row.door != door}
 
     def present(self, door: str) -> list[TicketRow]:
         return [one.row for one in self._visits.values() if one.row.door == door and not one.over]
 
     def ended(self) -> list[TicketRow]:
-        """Return the visits that are over since the last call, and forget them."""
+        """Return each visit once."""
         if not self._visits:
             return []
         bearers = self._bearers()

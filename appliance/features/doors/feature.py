@@ -1,4 +1,4 @@
-"""The feature doors: a ROS node for each browser, viewer or agent, with rights of its own. Off until one is added."""
+"""Define the feature doors, which is off until a door is added."""
 
 from typing import TYPE_CHECKING, Any
 

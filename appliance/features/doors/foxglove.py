@@ -1,8 +1,7 @@
-"""Foxglove's WebSocket protocol of one connection, without I/O: `foxglove.websocket.v1`, also named `foxglove.sdk.v1`.
+"""Foxglove's WebSocket protocol of one connection, without I/O: `foxglove.websocket.v1` and `foxglove.sdk.v1`.
 
-Channels carry the bytes of ROS messages unchanged, in the encoding `ros1`. The door announces what its
-identity may see, and refuses in words: a status with the level error, or `serviceCallFailure`. An asset is a file of
-the robot. The door has none, does not announce this capability, and answers each `fetchAsset` with an error.
+Channels carry the bytes of ROS messages unchanged. The door announces what its identity may see, and refuses in
+words: a status with the level error, or `serviceCallFailure`.
 """
 
 import struct
@@ -78,7 +77,7 @@ class _FoxgloveError(PeerError):
 
 
 class Foxglove:
-    """The protocol of one connection; `node` is the name of the door's node."""
+    """The protocol of one connection."""
 
     wants_surroundings = True
 
@@ -298,7 +297,6 @@ class Foxglove:
         self._tell("serviceCallFailure", serviceId=service, callId=call, message=text)
 
     def failed(self, request: DoorRequest, reason: str) -> None:
-        """Refuse a request with its reason, and forget what it began."""
         match request:
             case CallOfService():
                 service, call = self._calls.pop(request.call, (0, 0))
@@ -324,7 +322,6 @@ class Foxglove:
         self._tell("parameterValues", parameters=rows, **({} if reply_to is None else {"id": reply_to}))
 
     def parameter_changed(self, subscribed: str, name: str, value: Value, now: float) -> None:
-        """Queue a new value, for which the client may wait as for a message; a deleted parameter has none."""
         row = {"name": name} if value == {} else {"name": name, "value": value}
         frame = TextFrame(msgspec.json.encode({"op": "parameterValues", "parameters": [row]}))
         self.queue.put(subscribed, frame, len(frame), now)
@@ -337,11 +334,7 @@ class Foxglove:
     # --- what the door sees ---
 
     def surroundings(self, seen: DoorSurroundings) -> list[DoorRequest]:
-        """Announce new channels and services, and withdraw old ones; return the ends of subscriptions to old
-        ones.
-
-        Clients end these subscriptions without a frame. Raises `ViewerStalledError`.
-        """
+        """Return the ends of subscriptions to old channels, which clients end without a frame."""
         if seen.denial and (self._seen is None or self._seen.denial != seen.denial):
             self._refuse(seen.denial)
         first, self._seen = self._seen is None, seen

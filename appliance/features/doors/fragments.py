@@ -18,7 +18,7 @@ class _Incomplete:
 
 
 class FragmentStore:
-    """The frames of one client that are not complete, of at most `most_bytes` together, charged to `memory`."""
+    """The incomplete frames of one client, of at most `most_bytes` together."""
 
     def __init__(self, most_bytes: int, memory: ClientMemory) -> None:
         self._memory = memory
@@ -27,7 +27,6 @@ class FragmentStore:
         self._frames: dict[ClientId, _Incomplete] = {}
 
     def add(self, fragment: FragmentOp) -> bytes | None:
-        """Add a fragment; return the frame once it is complete. Raises `OperationError`, and drops the frame."""
         frame = self._frames.get(fragment.id)
         if frame is None:
             frame = self._frames[fragment.id] = _Incomplete(fragment.total)

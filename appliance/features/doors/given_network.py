@@ -21,13 +21,12 @@ class GivenNetwork:
         self._number = 0
 
     async def connect(self, host: str, port: int) -> tuple[asyncio.StreamReader, ByteWriter]:
-        """Return a new connection to a port of the appliance, whatever `host` is. Raises `OSError`."""
+        """Return a connection to a port of the appliance, whatever `host` is."""
         del host
         connection = await self._socket(port)
         return await asyncio.open_connection(sock=connection, limit=BUFFER_BYTES)
 
     async def receive(self, host: str, port: int, receiver: asyncio.BufferedProtocol) -> None:
-        """Raises what `connect` raises."""
         del host
         connection = await self._socket(port)
         await asyncio.get_running_loop().create_connection(lambda: receiver, sock=connection)
@@ -64,7 +63,6 @@ class GivenNetwork:
             future.set_exception(ConnectionRefusedError(reason))
 
     def lost(self) -> None:
-        """Refuse the requests that wait for a control process that has ended."""
         for number in [*self._waiting]:
             self.refused(number, "the appliance is being restarted")
 

@@ -1,4 +1,4 @@
-"""The doors in the state, which control reads before the policy comes into force, and the requests about them."""
+"""The doors in the state, which control reads before the policy comes into force."""
 
 from collections.abc import Callable, Mapping
 from typing import Protocol
@@ -27,10 +27,7 @@ class Orders(Protocol):
 
 
 class KeptDoors:
-    """The doors in the state, and the orders about them once control has its other parts.
-
-    `usable` is `OperatorContext.bearers`.
-    """
+    """The doors in the state, and later the orders about them."""
 
     def __init__(self, table: DoorTable) -> None:
         self.table = table

@@ -1,8 +1,7 @@
 """The message and service types that a door knows.
 
-A message type is known if ROS's own packages define it, or if a publisher sent its definition in a connection header.
-Headers carry no definitions of services: a service type is known if ROS's own packages define it, or if the operator
-gave its file, beside the specifications.
+A type is known if ROS's own packages define it, if a publisher sent its definition in a connection header, or if
+the operator gave the file of a service.
 """
 
 from collections import OrderedDict
@@ -28,8 +27,8 @@ _MOST_CHARACTERS = 500_000
 class DoorMessage:
     """A message that came on a topic, with its publisher's header.
 
-    `received` is the system time in nanoseconds. If several clients get the message, `encodings` keeps what is made of
-    it for a while. Encoding raises `MessageValueError`, or `DefinitionError` if the definition cannot be used.
+    `received` is nanoseconds since the epoch. Encoding raises `MessageValueError`, or `DefinitionError` if the
+    definition cannot be used.
     """
 
     topic: str
@@ -54,7 +53,7 @@ class DoorMessage:
 
 
 class Encodings:
-    """The encodings that were made last, for the other clients of a door: at most `most` bytes with their messages."""
+    """The last encodings: at most `most` bytes with their messages."""
 
     def __init__(self, most: int = 16 << 20) -> None:
         self.bytes = 0
@@ -78,7 +77,7 @@ def _kept_bytes(message: DoorMessage, encoding: Raw | bytes) -> int:
 
 
 class KnownTypes:
-    """The types of one door. Beyond the limit, the least recently used types are forgotten."""
+    """The types of one door, the most recently used. Methods raise `DefinitionError`."""
 
     def __init__(self, standard: Definitions, limits: ValueLimits) -> None:
         self._standard = self._defined = standard
@@ -95,7 +94,6 @@ class KnownTypes:
             self._latest.pop(name, None)
 
     def learn(self, header: Mapping[str, str]) -> MessageCodec:
-        """Return the codec for a publisher's messages; raises `DefinitionError`."""
         name, md5sum = header.get("type", ""), header.get("md5sum", "")
         known = self._codecs.get((name, md5sum))
         if known is not None:
@@ -109,7 +107,6 @@ class KnownTypes:
         return self._keep(name, md5sum, definitions)
 
     def message(self, name: str) -> tuple[MessageCodec, Definitions]:
-        """Return the codec and the definitions of a type; raises `DefinitionError`."""
         md5sum = self._latest.get(name, "")
         known = self._codecs.get((name, md5sum))
         if known is None:
@@ -126,7 +123,6 @@ class KnownTypes:
         return known
 
     def service(self, name: str) -> tuple[MessageCodec, MessageCodec, Definitions]:
-        """Return the codecs of the request and the response of a service type; raises `DefinitionError`."""
         if name not in self._defined.service_types:
             raise DefinitionError(
                 "the door does not know this service type, which is not one of ROS's own packages: put its .srv file "

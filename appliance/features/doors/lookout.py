@@ -1,9 +1,7 @@
 """Find the topics and services that a door's identity may see, with definitions and types.
 
-Viewers list topics before they subscribe, and need the definitions first. A definition that the door does not know
-comes with the header of a publisher, so the door subscribes to the topic for a moment. A topic that the policy denies
-stays without a definition. The result is kept until the publishers or the providers change. A denial is kept also until
-the policy changes, and a node that did not answer is asked again.
+Viewers need definitions before they subscribe, so the door subscribes to a topic with an unknown one for a
+moment. The result is kept until the graph changes, and a denial at most until the policy changes.
 """
 
 import asyncio
@@ -26,7 +24,7 @@ _Thing = tuple[Literal["topic", "service"], str]
 
 
 class _Asked(NamedTuple):
-    """The publishers or providers that were asked; at the time `again`, they are asked again."""
+    """At the time `again`, the publishers or providers are asked again."""
 
     nodes: tuple[str, ...]
     again: float = math.inf
@@ -47,7 +45,6 @@ class Lookout:
         self._last: tuple[float, DoorSurroundings] | None = None
 
     async def look(self) -> DoorSurroundings:
-        """Return the surroundings, at most a second old."""
         async with self._lock:
             now = asyncio.get_running_loop().time()
             if self._last is None or now - self._last[0] > _FRESH_SECONDS:
@@ -55,7 +52,6 @@ class Lookout:
             return self._last[1]
 
     def policy_changed(self) -> None:
-        """Ask again about what was denied."""
         self._policy += 1
 
     async def _look(self) -> DoorSurroundings:

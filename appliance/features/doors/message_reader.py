@@ -1,9 +1,7 @@
 """Read serialised messages as plain values, which JSON and CBOR can write.
 
-Bytes (`uint8[]`, `char[]`) become `bytes`, times objects with `secs` and `nsecs`. For CBOR, numeric arrays become the
-typed arrays of RFC 8746, which are the bytes of the message itself.
-
-A small message can have very many values, such as an array of empty strings. So each read has a budget of values.
+For CBOR, numeric arrays become typed arrays (RFC 8746), which are the bytes of the message itself. Each read has
+a budget of values, because a small message can have very many, such as empty strings.
 """
 
 import struct
@@ -36,7 +34,7 @@ class MessageValueError(PeerError):
 
 
 class _Cursor:
-    """The position in a message, and the number of values that may still be read."""
+    """The position, and the number of values that may still be read."""
 
     __slots__ = ("data", "left", "position")
 
@@ -76,7 +74,6 @@ class MessageReader:
         self._read = _Readers(definitions, typed_arrays=typed_arrays).message(name)
 
     def read(self, data: Body) -> dict[str, Any]:
-        """Return the values of a message; raises `MessageValueError`."""
         cursor = _Cursor(data, self._most_values)
         try:
             values: dict[str, Any] = self._read(cursor)
@@ -92,8 +89,6 @@ class MessageReader:
 
 
 class _Readers:
-    """The readers of message types, each of which is made once."""
-
     def __init__(self, definitions: Definitions, *, typed_arrays: bool) -> None:
         self._definitions = definitions
         self._typed_arrays = typed_arrays

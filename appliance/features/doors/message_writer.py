@@ -1,8 +1,7 @@
 """Write plain values as serialised messages.
 
-For each message type, a schema of msgspec is made once. It checks types, ranges and names of fields before anything is
-written, and names the path of the first error. Missing fields are zero. As in rosbridge, a header without a stamp gets
-the present time, and the text `now` stands for the present time.
+A schema of msgspec checks a whole message before anything is written, and names the path of the first error. As
+in rosbridge, missing fields are zero, a header without a stamp gets the present time, and so does the text `now`.
 """
 
 import struct
@@ -78,7 +77,7 @@ class MessageWriter:
         self.fields = [field.name for field in definitions.message(name).fields]
 
     def cost(self, text: bytes | msgspec.Raw) -> int:
-        """Return an upper bound of the bytes that `from_json` takes at once, for the values and twice the message."""
+        """Return an upper bound of the bytes that `from_json` takes at once."""
         view = memoryview(text)
         parts = (bytes(view[start : start + _PART_BYTES]) for start in range(0, len(view), _PART_BYTES))
         objects = others = 0
@@ -89,7 +88,6 @@ class MessageWriter:
         return len(view) * 17 // 4 + objects * self._object_bytes + others * _VALUE_BYTES + 2 * zeros
 
     def from_json(self, text: bytes | msgspec.Raw, now: Now) -> bytes:
-        """Return the message of a JSON object; raises `MessageValueError` with the path."""
         out = bytearray()
         try:
             self._write(self._decoder.decode(text), out, now)
@@ -101,7 +99,7 @@ class MessageWriter:
 
 
 class _FieldError(Exception):
-    """A value that its schema accepts but that cannot be written; `path` leads to it, as in msgspec's errors."""
+    """A value that its schema accepts but that cannot be written; `path` leads to it."""
 
     def __init__(self, text: str) -> None:
         super().__init__(text)
@@ -114,8 +112,6 @@ class _FieldError(Exception):
 
 
 class _Writers:
-    """The schema and the writer of each message type, made once."""
-
     def __init__(self, definitions: Definitions, most_bytes: int) -> None:
         self._definitions = definitions
         self._most_bytes = most_bytes

@@ -1,8 +1,7 @@
 """Decide which pages may open a WebSocket, by the Origin that a browser sends.
 
-Programs send no Origin, or the address they connect to. A browser sends the origin of its page. A page may
-have the name of any address (DNS rebinding), so an origin that equals the Host is accepted only if the Host
-is an address or `localhost`, which have only the door's own page.
+Programs send no Origin, or the address they connect to. A page may have the name of any address (DNS rebinding),
+so an Origin that equals the Host is accepted only for an address or `localhost`.
 """
 
 import ipaddress
@@ -13,7 +12,6 @@ from websockets.datastructures import Headers
 
 
 def rejection(headers: Headers, listed: Collection[str]) -> str:
-    """Return why a connection with these headers is rejected; an empty text if its origin is accepted."""
     origins, hosts = headers.get_all("Origin"), headers.get_all("Host")
     if not origins or (len(origins) == 1 and origins[0] in listed) or _is_own(origins, hosts):
         return ""

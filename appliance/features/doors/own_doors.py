@@ -1,8 +1,7 @@
 """Find the door of a signed-in caller: the door with the token's name, or with the name of a person's group.
 
-The rights of a door are those of `door:NAME` in the policy, so the names decide who gets them. An
-administrator chooses the names of tokens and doors, and `sso.doors`. A name that the provider gives a person
-opens no door, because people can choose it at some providers.
+An administrator chooses these names. A name that the provider gives a person opens no door, because people can
+choose it at some providers.
 """
 
 from collections.abc import Callable
@@ -14,10 +13,7 @@ from appliance.store.door_tables import DoorRow
 
 
 class CallerDoor(NamedTuple):
-    """The door of a caller; without a `row`, `reason` has the cause and the remedy.
-
-    `name` is the door's name, even if the door does not exist. It is empty if the caller can have none.
-    """
+    """The door of a caller; without a `row`, `reason` has the cause and the remedy."""
 
     name: str
     row: DoorRow | None

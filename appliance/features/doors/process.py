@@ -1,8 +1,6 @@
 """Run the process of a door: its lifeline, its link to control, its node, and its clients' connections.
 
-The process has no network: control gives it every socket (`door_link.py`). It outlives control. While control
-is away, present connections continue, and the node can make no new ones. The process ends when its door is
-removed.
+It outlives control. Without control, the node can make no new connections, because control gives it every socket.
 """
 
 import asyncio
@@ -61,8 +59,6 @@ class _Change:
 
 @dataclass(slots=True)
 class _Totals:
-    """The counts of connections that ended."""
-
     received: int = 0
     sent: int = 0
     dropped: int = 0
@@ -82,8 +78,6 @@ class _Totals:
 
 @dataclass(slots=True)
 class _Door:
-    """The parts that exist once the door's node listens."""
-
     node: DoorNode
     lookout: Lookout
     connections: DoorConnections
@@ -91,8 +85,6 @@ class _Door:
 
 
 class _Process:
-    """Connects the supervisor, control, the node and the clients."""
-
     def __init__(self, lifeline_fd: int) -> None:
         self._child = Child(
             Channel(socket.socket(fileno=lifeline_fd), messages.Lifeline),
@@ -119,7 +111,7 @@ class _Process:
         self._tasks = OwnedTasks()
 
     async def run(self) -> None:
-        """Serve; raises `SystemExit` if the door must start again."""
+        """Raise `SystemExit` if the door must start again."""
         self._child.attach(messages.Ready())
         self._tasks.start(self._report())
         ended = asyncio.ensure_future(self._child.ended.wait())
@@ -292,7 +284,7 @@ class _Process:
     # --- reports ---
 
     def _ended(self, peer: str, ticket: str, reason: str) -> None:
-        """Report the end or the refusal of a connection; control forgets a visit then."""
+        """Control forgets a visit then."""
         self._changed(peer, ticket, ended=1, reason=reason)
         self._tickets[ticket] -= 1
         self._tickets = +self._tickets

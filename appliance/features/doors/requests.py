@@ -1,7 +1,6 @@
 """Define the requests of a client to the node of its door, in the client's order.
 
-The protocols of doors make the requests, without I/O, and the session carries them out. `reply_to` is the id
-that the client gave, which the answer or the refusal repeats. Names are canonical.
+`reply_to` is the id that the client gave, which the answer or the refusal repeats. Names are canonical.
 """
 
 from dataclasses import dataclass
@@ -17,9 +16,10 @@ ClientId: TypeAlias = str | int | float | None
 
 @dataclass(frozen=True, slots=True)
 class AdvertiseTopic:
-    """Advertise a topic. Without a type, the topic has the type that its other publishers and subscribers use.
+    """Advertise a topic. Without a type, the topic has the type that its other nodes use.
 
     `will` is published if the connection ends while the topic is advertised.
+
     """
 
     topic: str
@@ -40,7 +40,7 @@ class UnadvertiseTopic:
 
 @dataclass(frozen=True, slots=True)
 class PublishMessage:
-    """Publish a message on an advertised topic, as JSON values or as the bytes of the message."""
+    """Publish JSON values or the bytes of the message."""
 
     topic: str
     values: msgspec.Raw | bytes
@@ -49,7 +49,7 @@ class PublishMessage:
 
 @dataclass(frozen=True, slots=True)
 class SubscribeTopic:
-    """Subscribe to a topic; if there is a type, the topic must have this type."""
+    """Subscribe to a topic, which must have the type if there is one."""
 
     topic: str
     type: str | None = None
@@ -66,7 +66,7 @@ class UnsubscribeTopic:
 
 @dataclass(frozen=True, slots=True)
 class CallOfService:
-    """Call a service. `call` identifies the call; `values` are an object, or a list of values in order."""
+    """Call a service; `values` are an object, or a list of values in order."""
 
     service: str
     call: int
@@ -94,7 +94,7 @@ class WithdrawService:
 
 @dataclass(frozen=True, slots=True)
 class AnswerCall:
-    """Answer a call of an offered service: with values, or with the reason of the failure."""
+    """Answer a call: with values, or with the reason of the failure."""
 
     service: str
     call: str
@@ -160,4 +160,4 @@ class TextFrame(bytes):
 
 
 Pieces: TypeAlias = tuple[bytes, Body]
-"""The head and the body of a binary WebSocket message to a client: a body is large, and not copied."""
+"""The head and the body of a binary WebSocket message: a body is large, and not copied."""

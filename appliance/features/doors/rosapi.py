@@ -1,7 +1,7 @@
-"""The services of rosapi, answered from the graph, if the policy lets the door call getSystemState and getTopicTypes.
+"""The services of rosapi, with its own service types, answered from the graph that the policy lets the door see.
 
-The answers have the fields of rosapi's own service types. `get_ros_version` belongs to ROS 2: clients call it to find
-out which ROS this is, and it fails at once. A call that the policy denies fails with the master's words.
+`get_ros_version` fails: it belongs to ROS 2, and clients call it to find out which ROS this is. A call that the
+policy denies fails with the master's words.
 """
 
 from collections.abc import Awaitable, Callable, Mapping, Sequence
@@ -28,7 +28,7 @@ _EXAMPLES = {"bool": "False", "string": "", "float32": "0.0", "float64": "0.0"}
 
 
 class Sight(Protocol):
-    """The part of the system that an identity may see. The methods raise `RosError` with the reason of a denial."""
+    """The part of the system that an identity may see. Methods raise `RosError` for a denial."""
 
     async def graph(self) -> VisibleGraph: ...
 
@@ -45,7 +45,7 @@ class Sight(Protocol):
 
 
 class MasterSight:
-    """The sight of a node: the answers of the master to its calls, each of which the policy decides."""
+    """The answers of the master, which the policy decides."""
 
     def __init__(self, node: RosNode, now: Callable[[], Now]) -> None:
         self._node = node
@@ -91,8 +91,6 @@ def _rows(value: Value) -> dict[str, list[str]]:
 
 
 class _Arguments(Struct):
-    """The fields of all requests of rosapi."""
-
     topic: str = ""
     type: str = ""
     service: str = ""
@@ -287,7 +285,7 @@ async def _fail(reason: str) -> Raw:
 
 
 def _as_value(text: str) -> Value:
-    """Return the value of a JSON text; a text that is not JSON is a string, as in rosapi."""
+    """A text that is not JSON is a string, as in rosapi."""
     try:
         value: Value = msgspec.json.decode(text)
     except (ValueError, RecursionError):
@@ -300,7 +298,6 @@ def _as_text(value: Value) -> str:
 
 
 def typedefs(definitions: Definitions, name: str) -> list[dict[str, Any]]:
-    """Return rosapi's descriptions of a message type and the types inside it, each once, outer types first."""
     found: dict[str, dict[str, Any]] = {}
 
     def add(kind: str) -> None:

@@ -1,12 +1,10 @@
 """The rosbridge protocol, version 2, of one connection, without I/O.
 
-Rules:
-
 1. The requests of one frame are carried out in order. After a refused advertisement, its message is dropped.
-2. Every refusal is words: a `status` of the level error with the id of the operation, or a `service_response` with
-   `result` false and an object with `message`. Nothing else is sent without a request.
+2. Every refusal is words: a `status` of the level error with the id of the operation, or a failed
+   `service_response`. Nothing else is sent without a request.
 3. Frames repeat the client's own spelling of a name; requests have the canonical name.
-4. Everything that a client can make grow has a limit: names, ids, topics, services, calls, fragments.
+4. Everything that a client can make grow has a limit.
 5. No fragments are sent: no client library reads them.
 """
 
@@ -98,7 +96,7 @@ class _Call:
 
 
 class Rosbridge:
-    """The protocol of one connection; `node` is the name of the door's node, against which names are resolved."""
+    """The protocol of one connection; `node` is the name of the door's node."""
 
     wants_surroundings = False
 
@@ -326,11 +324,6 @@ class Rosbridge:
         return []
 
     def ask(self, service: str, values: Raw) -> str:
-        """Send the client a call of its service, and return the id of the call.
-
-        Raises `OperationError` if the client does not offer the service or has many calls, and
-        `ViewerStalledError`.
-        """
         spelling = self._services.get(service)
         if spelling is None:
             raise OperationError(f"the client does not offer {service} any longer")
@@ -346,7 +339,6 @@ class Rosbridge:
         self._asked.pop(call, None)
 
     def status(self, level: str, text: str, reply_to: ClientId = None) -> None:
-        """Send a status, if the client wants its level. Raises `ViewerStalledError`."""
         if _LEVELS.index(level) <= self._level:
             self.queue.reply(json_frame({"op": "status", "level": level, "msg": text}, reply_to))
 
@@ -380,7 +372,6 @@ def _size(frame: bytes | Pieces) -> int:
 
 
 def _one_type(topic: str, use: str, known: str | None, given: str | None) -> str | None:
-    """Return the type of a topic of this client. Raises `OperationError` if the client names a second type."""
     if None not in (known, given) and known != given:
         raise OperationError(f"{topic} is {use} as {known}, not {given}")
     return known or given

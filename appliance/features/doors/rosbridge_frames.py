@@ -34,7 +34,7 @@ class _Operation(Struct, tag_field="op", kw_only=True):
 
 
 class AdvertiseOp(_Operation, tag="advertise"):
-    """Advertise a topic. `will` is a message that the door publishes if the connection ends before `unadvertise`."""
+    """Advertise a topic. `will` is published if the connection ends before `unadvertise`."""
 
     topic: Name
     type: Name
@@ -142,7 +142,7 @@ OPERATIONS = (
 
 
 class Envelope(Struct):
-    """The common fields of an operation; they name an operation that cannot be decoded."""
+    """The common fields, for an operation that cannot be decoded."""
 
     op: Any = None
     id: Any = None
@@ -150,7 +150,6 @@ class Envelope(Struct):
 
 
 def publish_frame(topic: str, message: DoorMessage, compression: Compression) -> TextFrame | Pieces:
-    """Return a message for a client; raises `MessageValueError`."""
     if compression == "cbor-raw":
         return _raw_head(topic, message), message.body
     if compression == "cbor":
@@ -162,12 +161,10 @@ def publish_frame(topic: str, message: DoorMessage, compression: Compression) ->
 
 
 def _publish_head(topic: str) -> bytes:
-    """Return the CBOR of a publication up to its last field."""
     return b"\xa3\x62op\x67publish\x65topic" + cbor(topic)
 
 
 def _raw_head(topic: str, message: DoorMessage) -> bytes:
-    """Return the CBOR of a raw message without its bytes, which follow: two maps of three fields."""
     secs, nsecs = divmod(message.received, 1_000_000_000)
     return b"".join(
         (
@@ -202,7 +199,7 @@ def as_png(data: bytes) -> bytes:
 
 
 def type_name(text: str) -> str:
-    """Return the name of a type without further slashes, which rosbridge accepts. Raises `OperationError`."""
+    """Remove further slashes, which rosbridge accepts."""
     parts = [part for part in text.split("/") if part]
     if len(parts) != 2:
         raise OperationError(f"{quoted(text)} is not a type; write PACKAGE/NAME")
@@ -218,15 +215,11 @@ _ENVELOPE = msgspec.json.Decoder(Envelope)
 
 
 def json_of_binary(frame: bytes) -> bytes:
-    """Return a binary frame of a client as JSON. It is CBOR, unless it begins like a JSON object.
-
-    Raises `MessageValueError`.
-    """
+    """A binary frame is CBOR, unless it begins like a JSON object."""
     return frame if frame.lstrip()[:1] == b"{" else json_of_cbor(frame)
 
 
 def decode_operation(text: bytes) -> Operation:
-    """Return the operation of a frame; raises `OperationError`."""
     try:
         return _OPERATION.decode(text)
     except (ValueError, RecursionError) as error:
@@ -246,7 +239,6 @@ def _complaint(text: bytes, error: Exception) -> str:
 
 
 def id_of(text: bytes) -> ClientId:
-    """Return the id of an operation that cannot be carried out, if it has a short one."""
     try:
         envelope = _envelope(text)
         return None if envelope is None else msgspec.convert(envelope.id, Id)

@@ -1,15 +1,13 @@
 """The WebSocket of one client: handshake, frames in both directions, and the end.
 
-Rules:
-
 1. A frame is at most `frame_bytes` long, also after inflation. A browser's Origin must be listed.
-2. The session carries out the requests of the client in order. While it does so, it does not read; calls of services
-   and reads of parameters do not hold up later requests.
-3. Frames are sent only as fast as the client reads. In the meantime, its queue keeps the newest messages of each topic,
-   and its requests are carried out: a stop does not wait for pictures. A frame is charged to the client's memory until
-   the connection has room for more.
+2. The client's requests are carried out in order; calls of services and reads of parameters do not hold up later
+   ones.
+3. Frames are sent only as fast as the client reads. In the meantime, its queue keeps the newest messages of each
+   topic, and its requests are carried out: a stop does not wait for pictures.
 4. A client that sends nothing, and does not answer pings, is disconnected: within seconds if it has a will.
-5. Once the session disconnects a client, it carries out no further request, and ends even if the client does not read.
+5. Once the session disconnects a client, it carries out no further request, and ends even if the client does not
+   read.
 """
 
 import asyncio
@@ -63,7 +61,7 @@ _WINDOW_BITS = 12  # with this and the level, a connection takes about 40 KB for
 
 @dataclass(frozen=True, slots=True)
 class SessionOptions:
-    """The limits of a connection, and the origins whose pages may open connections; times are in seconds."""
+    """The limits of a connection in bytes and seconds."""
 
     origins: tuple[str, ...] = ()
     frame_bytes: int = 8 << 20
@@ -75,7 +73,7 @@ class SessionOptions:
 
 
 class ClientProtocol(Protocol):
-    """The protocol that a client speaks, without I/O. Its methods may raise `ViewerStalledError`."""
+    """The protocol that a client speaks, without I/O. Methods may raise `ViewerStalledError`."""
 
     @property
     def wants_surroundings(self) -> bool:
@@ -93,7 +91,7 @@ class ClientProtocol(Protocol):
     def parameter_changed(self, subscribed: str, name: str, value: Value, now: float) -> None: ...
 
     def surroundings(self, seen: DoorSurroundings) -> Sequence[DoorRequest]:
-        """Announce the surroundings, and return the requests that follow; only if `wants_surroundings`."""
+        """Announce the surroundings, and return the requests that follow."""
 
     def ask(self, service: str, values: Raw) -> str: ...
 
@@ -105,15 +103,15 @@ class ClientProtocol(Protocol):
         """Return the next frame to send now, or None."""
 
     def next_time(self) -> float | None:
-        """Return the time at which the next waiting frame may be sent, or None."""
+        """Return the time at which the next waiting frame may be sent."""
 
 
 Protocols = Callable[[str | None], ClientProtocol]
-"""Makes the protocol for the subprotocol of the WebSocket, or for None."""
+"""Makes the protocol for the subprotocol of the WebSocket."""
 
 
 class DoorSession:
-    """One connection, from the handshake on; `end` has the reason of its end."""
+    """One connection, from the handshake on."""
 
     def __init__(
         self,
@@ -266,7 +264,6 @@ class DoorSession:
             await self._drop_rest()
 
     def _charge_unfinished(self) -> None:
-        """Charge the bytes of an unfinished frame; disconnect the client if its door has no memory for more."""
         size = len(self._frame) + len(self._socket.reader.buffer)
         self.memory.add(size - self._unfinished)
         self._unfinished = size
@@ -310,7 +307,7 @@ class DoorSession:
                 self._disconnect(CloseCode.POLICY_VIOLATION, str(error))
 
     async def _carry_out(self, frame: bytes) -> None:
-        """Carry out the requests of a frame; after a refused advertisement, drop the messages of its topic."""
+        """After a refused advertisement, drop the messages of its topic."""
         self.received += 1
         requests = self._protocol.receive(frame, is_text=self._is_text)
         self._wake.set()
@@ -359,11 +356,10 @@ class DoorSession:
         await asyncio.sleep(_CLOSING_SECONDS)  # for the client's answer to the closing frame
 
     def _take_frames(self, now: float) -> int:
-        """Pass frames that may be sent now to the WebSocket; return their number of bytes, about
-        `_BATCH_BYTES`.
+        """Return the number of bytes.
 
-        Without deflate, the session writes their heads itself, and their bodies are not copied. `_flush`
-        sends them before anything else can be added, so nothing follows a closing frame.
+        Without deflate, the session writes the heads itself, and the bodies are not copied. `_flush` sends them
+        before anything else can be added, so nothing follows a closing frame.
         """
         size = 0
         while size < _BATCH_BYTES and (frame := self._protocol.next_frame(now)) is not None:
@@ -432,7 +428,6 @@ class DoorSession:
         self._tell(lambda: self._protocol.failed(request, reason))
 
     def ask(self, service: str, values: Raw) -> str:
-        """Queue a call for the client, and return its id. Raises `PeerError`."""
         try:
             return self._protocol.ask(service, values)
         except ViewerStalledError as error:

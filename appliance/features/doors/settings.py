@@ -9,7 +9,7 @@ from appliance.configuration.quantities import Count
 from appliance.configuration.sections import FeatureSection, key, section
 
 MOST_DOORS = 32
-"""The most doors at the same time; each has a process while it exists."""
+"""The most doors at the same time; each has a process."""
 
 
 @section

@@ -1,4 +1,4 @@
-"""The surroundings of a door, as its identity may see them: the graph, and the types of topics and services."""
+"""The surroundings of a door, as its identity may see them."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -39,7 +39,7 @@ class SeenService:
 
 @dataclass(frozen=True, slots=True)
 class DoorSurroundings:
-    """The surroundings that the door sees; `denial` has the reason if the policy permits no look."""
+    """The surroundings of a door; `denial` has the reason if the policy permits no look."""
 
     graph: VisibleGraph
     topics: Sequence[SeenTopic]

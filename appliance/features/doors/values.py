@@ -32,12 +32,11 @@ class MessageCodec:
         self.writer = MessageWriter(definitions, name, most_bytes=limits.message_bytes)
 
     def json(self, data: Body) -> msgspec.Raw:
-        """Return a message as JSON: bytes as base64, NaN and infinity as null. Raises `MessageValueError`."""
+        """Write bytes as base64, NaN and infinity as null."""
         self._check(data)
         return msgspec.Raw(msgspec.json.encode(self._json.read(data)))
 
     def cbor(self, data: Body) -> bytes:
-        """Return a message as CBOR, with typed arrays. Raises `MessageValueError`."""
         self._check(data)
         return cbor(self._cbor.read(data))
 

@@ -1,4 +1,4 @@
-"""The state of doors, with its alarms, metrics and line of `rosrv status`."""
+"""Show doors in the status, the alarms and the metrics."""
 
 from collections.abc import Iterator, Mapping
 from typing import Annotated
@@ -56,7 +56,7 @@ _METRICS: Mapping[str, Metric] = {
     ),
     "restarts": counter("rosrv_door_restarts_total", "unexpected ends of the process of the door", "door"),
 }  # fmt: skip
-"""The metrics by the fields of `DoorHealth`. All except the restarts begin at zero when the door's process starts."""
+"""All except the restarts begin at zero when the door's process starts."""
 
 
 def _alarms(state: DoorsState) -> Iterator[Trouble]:

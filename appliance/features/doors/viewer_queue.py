@@ -1,11 +1,9 @@
 """Queue the frames that wait for one client: replies in order, and the newest messages of each topic.
 
-A client that reads slowly loses the oldest messages of its topics, never a reply. Invariants:
-
-1. At most `message_bytes` of messages wait. If more come, the topic with the most bytes loses its oldest message.
-2. At most `reply_bytes` of replies wait. A client that requests more without reading gets `ViewerStalledError`.
-3. All frames that wait are charged to the client's part of the memory of its door. Without room, the client's oldest
-   messages are dropped, or the new one if that is not enough, and a reply ends the connection.
+1. Beyond `message_bytes`, the topic with the most bytes loses its oldest message.
+2. A client that requests more than `reply_bytes` of replies without reading gets `ViewerStalledError`.
+3. All frames are charged to the client's memory. Without room, its oldest messages are dropped, or the new one if
+   that is not enough, and a reply ends the connection.
 4. Topics take turns, so that a large topic delays a small one by one message.
 """
 
@@ -42,7 +40,7 @@ class _Waiting:
 
 
 class ViewerQueue(Generic[Key]):
-    """The queue of one client; times are monotonic seconds. `memory` defaults to that of a door with one client."""
+    """The queue of one client; times are monotonic seconds."""
 
     def __init__(
         self,
@@ -62,7 +60,6 @@ class ViewerQueue(Generic[Key]):
         self._turns: OrderedDict[Key, None] = OrderedDict()  # the topics with messages, the next one first
 
     def reply(self, frame: bytes) -> None:
-        """Add a reply. Raises `ViewerStalledError`."""
         if self.memory.closed:
             return
         size = len(frame)
@@ -77,9 +74,7 @@ class ViewerQueue(Generic[Key]):
         self._replies.append(frame)
 
     def configure(self, key: Key, *, depth: int | None, interval: float) -> None:
-        """Set the number of messages that wait, and the seconds between two of them.
-
-        With a depth, a message that comes too early waits; without, it is dropped. Then only a few messages
+        """With a depth, a message that comes too early waits; without, it is dropped. Then only a few messages
         wait, and a large message only until the next one comes.
         """
         most, most_bytes = (_BURST, _BURST_BYTES) if depth is None else (depth, self._most_message_bytes)
@@ -101,7 +96,6 @@ class ViewerQueue(Generic[Key]):
             self.memory.add(-topic.bytes - _OVERHEAD * len(topic.items))
 
     def put(self, key: Key, item: object, size: int, now: float) -> None:
-        """Add a message of a configured topic; drop it if the topic is not configured."""
         topic = self._topics.get(key)
         if topic is None or self.memory.closed:
             return
@@ -128,7 +122,7 @@ class ViewerQueue(Generic[Key]):
             self._drop_from_largest()
 
     def take(self, now: float) -> "tuple[None, bytes] | tuple[Key, Any] | None":
-        """Return the next reply (with the key None) or message; None if nothing may be sent now."""
+        """Replies have the key None."""
         if self._replies:
             frame = self._replies.popleft()
             size = len(frame)
@@ -152,7 +146,6 @@ class ViewerQueue(Generic[Key]):
         return None
 
     def next_time(self) -> float | None:
-        """Return the time at which the next message may be sent; None if none waits."""
         if self._replies:
             return 0.0
         waiting = [self._topics[key] for key in self._turns]
