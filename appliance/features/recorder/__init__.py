@@ -1,1 +1,1 @@
-"""The flight recorder: keeps the latest messages in memory that outlives the relays, and makes recordings of them."""
+"""Keep the latest messages in memory that outlives the relays, and make recordings of them."""

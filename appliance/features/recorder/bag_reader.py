@@ -1,7 +1,6 @@
 """Read the recorder's bags by their index, so that only the needed parts of a large bag are read.
 
-Times are nanoseconds since the epoch. Messages are ordered by time, then by their position in the file. A file that is
-not a complete bag of the recorder raises `ValueError`.
+Times are nanoseconds since the epoch. A file that is not a complete bag of the recorder raises `ValueError`.
 """
 
 import heapq
@@ -30,7 +29,7 @@ _U32, _U64, _STAMP = struct.Struct("<I"), struct.Struct("<Q"), struct.Struct("<I
 
 
 class MessagePosition(NamedTuple):
-    """A position; `chunk` and `offset` are offsets in the file and in the chunk."""
+    """A position; `chunk` is an offset in the file, `offset` one in the chunk."""
 
     time: int
     chunk: int
@@ -45,7 +44,7 @@ class MessagePosition(NamedTuple):
 
 
 class Chunk(NamedTuple):
-    """A chunk: times of the first and last message, and its offset in the file."""
+    """The times of the first and last message, and the chunk's offset in the file."""
 
     first: int
     last: int
@@ -80,7 +79,7 @@ class BagReader:
     @classmethod
     @contextmanager
     def of(cls, path: Path) -> Iterator[Self]:
-        """Yield the bag at a path. Raises `OSError` and `ValueError`, even while the bag is read in the block."""
+        """Raise `OSError` and `ValueError`, even while the bag is read in the block."""
         with path.open("rb") as file:
             try:
                 yield cls(file)
@@ -88,7 +87,6 @@ class BagReader:
                 raise ValueError(f"not a bag that the recorder wrote: {error!r}") from None
 
     def index(self, chunk: Chunk) -> Iterator[tuple[int, bytes]]:
-        """Yield the index entries of a chunk (`INDEX_ENTRY`): seconds, nanoseconds, offset."""
         self._file.seek(chunk.place)
         if read_fields(self._file)["op"] != CHUNK:
             raise ValueError("a chunk is not at the offset in the index")
@@ -122,7 +120,6 @@ class BagReader:
     def before(
         self, place: MessagePosition, connections: Collection[int], most: int
     ) -> list[tuple[MessagePosition, int]]:
-        """Return at most `most` positions before a position, in order."""
         found: list[tuple[MessagePosition, int]] = []
         for chunk in sorted(self.chunks, key=lambda chunk: -chunk.last):
             if len(found) == most and chunk.last < found[-1][0].time:
@@ -133,7 +130,6 @@ class BagReader:
         return found[::-1]
 
     def body(self, place: MessagePosition, most: int) -> tuple[int, bytes]:
-        """Return the size of a message, and at most `most` of its first bytes."""
         self._file.seek(place.chunk)
         read_fields(self._file)
         self._file.seek(4 + place.offset, 1)

@@ -1,8 +1,7 @@
 """Write ROS 1 bags (format 2.0) in pieces; after a crash, another writer can finish the bag.
 
-`rosbags` can neither write an extra field (the host) into a connection's header nor continue a bag. Chunks are not
-compressed, and each is followed by its indexes. `close` reads the data for the final index from the file, so a writer
-keeps only the file's length and its connections. Format: http://wiki.ros.org/Bags/Format/2.0.
+`rosbags` can neither write an extra field (the host) into a connection's header nor continue a bag. Format:
+http://wiki.ros.org/Bags/Format/2.0.
 """
 
 import os
@@ -34,7 +33,6 @@ class BagWriter:
     """Writes a bag after the first `size` bytes of the file."""
 
     def __init__(self, path: Path, connections: Mapping[int, Mapping[str, str]], size: int = 0) -> None:
-        """Cut the bag after `size` bytes and continue it; `connections` are the headers so far."""
         self._connections = dict(connections)
         self._file: BinaryIO = path.open("r+b" if size and path.exists() else "w+b")
         whole = self._whole(size)
@@ -46,13 +44,11 @@ class BagWriter:
             self._file.write(MAGIC + _bag_header(0, 0, 0))
 
     def connect(self, header: Mapping[str, str]) -> int:
-        """Add a connection with a header (topic, type, md5sum and others); return its number."""
         number = len(self._connections)
         self._connections[number] = dict(header)
         return number
 
     def write(self, messages: Iterable[BagMessage]) -> int:
-        """Write messages as one chunk; return the length of the file."""
         chunk, index = bytearray(), dict[int, list[bytes]]()
         first, last = 1 << 63, 0
         for message in messages:
@@ -99,7 +95,6 @@ class BagWriter:
         )
 
     def _whole(self, size: int) -> int:
-        """Return how many of the first `size` bytes hold complete chunks with their indexes."""
         whole, at, there = 0, _FIRST, self._file.seek(0, os.SEEK_END)
         try:
             for place, fields, length in self._records(min(size, there)):
@@ -111,7 +106,6 @@ class BagWriter:
         return size if at == size <= there else whole
 
     def _records(self, end: int) -> Iterator[tuple[int, dict[str, bytes], int]]:
-        """Yield each record's position, fields and length of data; the file is then at the data."""
         at = _FIRST
         while at < end:
             self._file.seek(at)
@@ -122,7 +116,6 @@ class BagWriter:
             at = following
 
     def _chunk_infos(self, end: int) -> list[bytes]:
-        """Return the records of chunks: position, times, and number of messages by connection."""
         chunks: list[tuple[int, list[tuple[int, int]], list[tuple[int, int]]]] = []
         for at, fields, size in self._records(end):
             if fields["op"] == CHUNK:
@@ -151,7 +144,7 @@ class BagWriter:
 
 
 def read_fields(file: BinaryIO) -> dict[str, bytes]:
-    """Return the fields of a record; the file is then at the length of the record's data."""
+    """Return the fields of a record; the file is then at the length of its data."""
     data = file.read(_U32.unpack(file.read(4))[0])
     return fields_of(data)
 

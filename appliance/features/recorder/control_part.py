@@ -1,4 +1,4 @@
-"""Make the recorder's part of control: the plan of recordings, the orders, and the link to the process."""
+"""Make the recorder's part of control: plan, orders, and the link to the process."""
 
 from typing import Any
 
@@ -13,7 +13,7 @@ from appliance.features.recorder.settings import RecorderRules
 
 
 def make(core: FeatureContext) -> FeaturePart:
-    """Return control's part. The recorder checks its own disk space, so its orders need no room in the store."""
+    """The recorder checks its own disk space, so its orders need no room in the store."""
     rules = core.sections.of(RecorderRules)
     plan = RecordingPlan(rules, core.charged_to, IdSource().next)
     orders = RecordingOrders(rules, core.trail, core.in_force, plan)

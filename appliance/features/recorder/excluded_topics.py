@@ -1,8 +1,8 @@
 """Exclude topics from recordings: `recorder.never` has globs for names of topics and types.
 
-The policy checks a topic's name, but its type is only a claim of the publisher. A topic whose md5sum differs from the
-known definition of the type is recorded anyway. A claim with the right md5sum may still be false, so each recording
-lists the topics that it left out because of a publisher's claim.
+A type is only a claim of the publisher. A topic whose md5sum differs from the known definition is recorded
+anyway. A claim with the right md5sum may still be false, so each recording lists the topics that it left out
+because of one.
 """
 
 from collections.abc import Collection, Iterable, Mapping
@@ -33,7 +33,6 @@ def known_sums(never: Collection[str]) -> dict[str, str]:
 def left_out_because(
     never: Collection[str], sums: Mapping[str, str], topic: str, header: Mapping[str, str]
 ) -> str:
-    """Return why a publisher's messages are not recorded, or an empty text."""
     if fits(never, topic):
         return NAMED
     name = header.get("type", "")

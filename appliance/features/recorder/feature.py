@@ -1,4 +1,4 @@
-"""The feature recorder: relays keep the last messages in memory, and a process stores those around an event."""
+"""Define the feature recorder."""
 
 from typing import TYPE_CHECKING, Any
 

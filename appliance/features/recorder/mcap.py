@@ -1,7 +1,4 @@
-"""Convert a bag to MCAP, for tools that cannot read bags.
-
-Messages are copied unchanged (profile `ros1`), in order of time, to uncompressed chunks with indexes.
-"""
+"""Convert a bag to MCAP (profile `ros1`), for tools that cannot read bags."""
 
 from collections import Counter
 from collections.abc import Iterator, Mapping
@@ -18,16 +15,13 @@ _OF_SENDER = ("md5sum", "callerid", "host", "latching")
 
 
 def as_mcap(bag: Path) -> Iterator[bytes]:
-    """Yield the MCAP of a bag, which may be removed during the iteration.
-
-    Raises `OSError`, and `ValueError` for an invalid bag; either may also come during the iteration.
-    """
+    """The bag may be removed during the iteration. Raises `OSError`, and `ValueError` for an invalid bag."""
     opened = ExitStack()
     return _pieces(opened, opened.enter_context(BagReader.of(bag)))
 
 
 class _Pieces(BytesIO):
-    """A buffer for the bytes since the last `take`; `tell` counts all bytes of the file."""
+    """The bytes since the last `take`; `tell` counts all bytes of the file."""
 
     _taken = 0
 

@@ -1,7 +1,6 @@
 """Run the recorder process: its lifeline, its link to control, and a thread that does the work.
 
-The process has no network. It reads the relays' memory and the audit log, and writes recordings. It outlives control;
-until a new control runs, its reports wait in the recording store.
+The process has no network. It outlives control; its reports wait in the recording store.
 """
 
 import asyncio

@@ -1,4 +1,4 @@
-"""`rosrv record now|list|show|timeline|messages|fetch|remove`: the flight recorder."""
+"""The commands `rosrv record now|list|show|timeline|messages|fetch|remove`."""
 
 import hashlib
 import os
@@ -252,7 +252,7 @@ def remove(appliance: Appliance, recording: _Id) -> None:
 
 
 def bag_of(appliance: Appliance, recording: str, part: Path) -> Path:
-    """Return the path of a bag, and record the request. Over REST, write the bag to `part`. Raises `OSError`."""
+    """Record the request. Over REST, write the bag to `part`."""
     way = appliance.way
     if isinstance(way, AdminSocket):
         return _bag(way, appliance.ask_or_exit(recording_requests.RecordingFetch(recording)))
@@ -272,7 +272,6 @@ def _bag(way: AdminSocket, recording: Recording) -> Path:
 
 
 def _asked(way: "RestWay", path: str, query: dict[str, Any], kind: type[_T]) -> _T:
-    """Return an answer of REST. Exits with status 1 for a rejected request, and 2 for bad input or no answer."""
     from appliance.cli.connection.rest_session import RestProblemError  # noqa: PLC0415  httpx is not imported for the socket
 
     given = {name: value for name, value in query.items() if value is not None}
@@ -287,7 +286,6 @@ def _asked(way: "RestWay", path: str, query: dict[str, Any], kind: type[_T]) -> 
 
 
 def _read(what: Callable[[], _T]) -> _T:
-    """Read a bag. Exits with status 2 if it cannot be read."""
     try:
         return what()
     except OSError as error:
@@ -297,7 +295,6 @@ def _read(what: Callable[[], _T]) -> _T:
 
 
 def _moment_given(option: str, text: str | None) -> int | None:
-    """Return nanoseconds since the epoch. Exits with status 2 if `text` is not a time."""
     try:
         return None if text is None else parse_timestamp(text, clock.wall_ns())
     except ValueError as error:
@@ -332,12 +329,11 @@ def _drawn(found: Timeline, host_in_words: HostInWords) -> Iterator[str]:
 
 
 def _private(path: Path) -> int:
-    """Open a new file that only its owner may read, because messages are private. Raises `OSError`."""
+    """Let only the owner read the file, because messages are private."""
     return os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
 
 
 def _convert(bag: Path, target: Path) -> None:
-    """Convert a bag to MCAP. Raises `OSError`; exits with status 1 if a message type is invalid."""
     made = name_to_make(target)
     with os.fdopen(_private(made), "wb") as file:
         try:

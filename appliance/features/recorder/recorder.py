@@ -1,15 +1,9 @@
 """Make a recording of the relays' memory when an audit record is a trigger.
 
-`step` does all work that is due, without waiting, and returns the messages for control.
-
-Invariants:
-
-1. Each host has one recording at a time (`recording_plan`). A trigger during the recording extends it, up to
-   `longest`; a later one begins another recording. Control plans the recording, and the trigger's audit record names
-   it.
-2. Recordings never exceed their part of the disk, and never use space that is reserved for the audit log.
-3. After a crash, the next recorder finishes each recording: completely if the memory still exists, otherwise as far
-   as it was written. The recording's description reports what is missing.
+1. Control plans the recordings (`recording_plan`), so that the trigger's audit record names its recording.
+2. Recordings never use space that is reserved for the audit log.
+3. After a crash, the next recorder finishes each recording: completely if the memory still exists, otherwise as
+   far as it was written.
 """
 
 import shutil
@@ -47,10 +41,7 @@ _log = structlog.get_logger()
 
 
 class Recorder:
-    """Records `rings`, which were created at the time `memory`.
-
-    Times are nanoseconds since the epoch; `reserve` bytes of the disk stay free.
-    """
+    """Records `rings`, which were created at the time `memory`. Times are nanoseconds since the epoch."""
 
     def __init__(
         self,
@@ -192,7 +183,6 @@ class Recorder:
     # --- triggers -----------------------------------------------------------------------------------------
 
     def _new_triggers(self) -> list[tuple[Trigger, str]]:
-        """Return the new triggers, each with the id of the recording that control has planned, if any."""
         follower = self._follower or self._begin_to_follow()
         found: list[tuple[Trigger, str]] = []
         for _page in range(_PAGES):
@@ -210,7 +200,7 @@ class Recorder:
         return found
 
     def _begin_to_follow(self) -> Follower:
-        """Follow the log from the start of the memory, because an earlier recorder may not have read it so far."""
+        """Begin at the start of the memory, because an earlier recorder may not have read the log so far."""
         since = max(self._memory, self._clock() - int(self._rules.before * _SECOND))
         first = search(self._log, Filter(since=since), "0", 1, newest_first=False).entries
         self._follower = Follower(self._log, Filter(), first[0].sequence - 1 if first else None)
@@ -235,7 +225,7 @@ class Recorder:
             self._missed(trigger, why_not, planned)
 
     def _missed(self, trigger: Trigger, why: str, planned: str = "") -> None:
-        """Report that a trigger made no recording. Unless one was planned, repeat this only every ten minutes."""
+        """Unless a recording was planned, repeat the report only every ten minutes."""
         now, kind = self._clock(), (trigger.charged_to, trigger.what)
         if (
             planned or abs(now - self._told.get(kind, -_TELL_AGAIN)) >= _TELL_AGAIN
@@ -248,7 +238,6 @@ class Recorder:
     def _record(
         self, trigger: Trigger, before: float | None = None, after: float | None = None, planned: str = ""
     ) -> tuple[RecordingInProgress | None, str]:
-        """Extend or begin a recording; return None and the reason if neither is possible."""
         charged_to, now = trigger.charged_to, trigger.time
         for making in tuple(self._making):
             progress = making.progress
@@ -350,7 +339,6 @@ class Recorder:
         self._asked_for.discard(making.progress.id)
 
     def _take_up(self) -> None:
-        """Continue the recordings of an earlier recorder, and discard those without readable progress."""
         for folder in self._store.parts():
             try:
                 progress = load_progress(folder)
@@ -377,7 +365,6 @@ class Recorder:
             _log.error("a recording cannot be removed", reason=str(error))
 
     def _make_room(self, charged_to: str) -> str:
-        """Remove recordings until a new one of this host fits; return the reason if it cannot."""
         while True:
             try:
                 found, why = self._store.in_the_way(

@@ -36,17 +36,15 @@ class Span(NamedTuple):
 
 
 class Piece(NamedTuple):
-    """A bag, and the period to read from it. Periods of pieces do not overlap."""
+    """A bag, and the period to read from it, which overlaps no other."""
 
     name: str
     bag: Path
     span: Span
     why_not: str
-    """The reason why the bag is incomplete, or empty."""
 
 
 def span_of(since: str | None, until: str | None) -> Span:
-    """Return the period of --since and --until. Exits with status 2 for an invalid one."""
     now = clock.wall_ns()
     try:
         span = Span(
@@ -61,7 +59,6 @@ def span_of(since: str | None, until: str | None) -> Span:
 
 
 def require_recorded(known: Recordings, topics: Mapping[str, str]) -> None:
-    """Exit with status 2 if one of these topics (name to type) is never recorded."""
     for topic, kind in topics.items():
         if not any(fnmatchcase(topic, glob) for glob in known.topics):
             raise MONITOR.usage_error(
@@ -74,11 +71,7 @@ def require_recorded(known: Recordings, topics: Mapping[str, str]) -> None:
 
 @contextmanager
 def pieces_of(appliance: Appliance, known: Recordings, span: Span) -> Iterator[list[Piece]]:
-    """Fetch the recordings of a period and the recorder's memory, oldest first, with an audit record.
-
-    The files stay open in the block, so that a recording that is removed remains readable. Exits with status 1 if
-    nothing was recorded or the appliance rejects the request.
-    """
+    """The files stay open in the block, so that a recording that is removed remains readable."""
     found: list[tuple[Span, Recording]] = []
     for row in sorted(known.recordings, key=lambda row: row.began):
         since = max(row.began, found[-1][0].until + 1 if found else span.since)
@@ -113,10 +106,6 @@ def pieces_of(appliance: Appliance, known: Recordings, span: Span) -> Iterator[l
 def recorded_messages(
     appliance: Appliance, since: str | None, until: str | None, topics: Mapping[str, str]
 ) -> Iterator[list[tuple[str, Path, tuple[int, int]]]]:
-    """Yield bags with these topics (name to type), each with a name and the period to read; print what is missing.
-
-    Exits with status 2 for a mistake, 1 if nothing was recorded.
-    """
     span = span_of(since, until)
     recorded = appliance.ask_or_exit(RecordingsWanted())
     require_recorded(recorded, topics)
@@ -128,7 +117,6 @@ def recorded_messages(
 def _cover(
     pieces: Sequence[Piece], span: Span, in_progress: Sequence[OpenRecording], *, as_json: bool
 ) -> None:
-    """Print the gaps in the pieces; messages of a recording that is still being made are not readable yet."""
     # Without --since, the time before the first piece is not a gap.
     began = span.since or pieces[0].span.since
     for gap in gaps([piece.span for piece in pieces], Span(began, span.until)):
@@ -150,7 +138,7 @@ def _cover(
 
 
 def gaps(parts: Sequence[Span], span: Span) -> Iterator[Span]:
-    """Yield the parts of the span that no part covers; the parts must be in order."""
+    """The parts must be in order."""
     at = span.since
     for part in parts:
         if part.since > at:
@@ -161,7 +149,6 @@ def gaps(parts: Sequence[Span], span: Span) -> Iterator[Span]:
 
 
 def _lent(appliance: Appliance, span: Span) -> Recording | None:
-    """Return the recorder's memory of a period as a recording. Exits with status 1 for a rejected request."""
     try:
         answer = appliance.ask(recording_requests.RecordingOfMemory(*span))
     except NotRunningError as error:

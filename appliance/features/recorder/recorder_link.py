@@ -1,4 +1,4 @@
-"""The link control <-> recorder, and the terms of the shared memory that the supervisor gives relays and recorder."""
+"""The link control <-> recorder, and the terms of the shared memory of relays and recorder."""
 
 import msgspec
 
@@ -9,9 +9,8 @@ from appliance.features.recorder.recording_answers import OpenRecording, Recordi
 class RingTerms(msgspec.Struct, frozen=True):
     """The terms of the memory of relay `index`, made at `since` (nanoseconds since the epoch).
 
-    The relay keeps the last `seconds` of each topic whose name matches a glob of `topics`, unless its name or type
-    matches a glob of `never`. `sums` lists the known md5sums of types that match a glob of `never`; a topic that
-    claims such a type must have its md5sum.
+    `never` has globs for topics and types. `sums` lists the known md5sums of such types; a topic that claims one
+    must have its md5sum.
     """
 
     index: int
@@ -23,7 +22,7 @@ class RingTerms(msgspec.Struct, frozen=True):
 
 
 class RecordingsAsked(Message, frozen=True):
-    """Control asks for the list, and for a new report of each recording that it has not noted."""
+    """Control asks for the list, and for a new report of what it has not noted."""
 
 
 class RecordingsStated(Message, frozen=True):
@@ -51,13 +50,13 @@ class RevisionsStated(Message, frozen=True):
 
 
 class RecordingClosed(Message, frozen=True):
-    """A recording is complete. The recorder repeats this report until control has noted it."""
+    """A recording is complete; this report is repeated until control has noted it."""
 
     recording: Recording
 
 
 class RecordingNoted(Message, frozen=True):
-    """Control has made an audit record of a recording, or of its removal."""
+    """Control has recorded a recording, or its removal."""
 
     id: str
 
@@ -72,7 +71,7 @@ class RecordingRequested(Message, frozen=True):
 
 
 class RecordingStarted(Message, frozen=True):
-    """The recording `id` of request `number` began, and lasts from `began` to `ends` (ns) or later."""
+    """The recording `id` of request `number` lasts from `began` to `ends` (ns) or later."""
 
     number: int
     id: str
@@ -89,10 +88,7 @@ class RecordingRemovalWanted(Message, frozen=True):
 
 
 class RecordingRemoved(Message, frozen=True):
-    """A recording was removed, by order `number` of `who` or because of `reason`.
-
-    The recorder repeats this report until control has noted it.
-    """
+    """A recording was removed; this report is repeated until control has noted it."""
 
     number: int
     recording: Recording
@@ -101,7 +97,7 @@ class RecordingRemoved(Message, frozen=True):
 
 
 class MemoryWanted(Message, frozen=True):
-    """Control asks for a temporary recording of the memory from `since` to `until` (ns)."""
+    """Control asks for the memory from `since` to `until` (ns), as a temporary recording."""
 
     number: int
     trigger: Trigger
@@ -110,7 +106,7 @@ class MemoryWanted(Message, frozen=True):
 
 
 class MemoryLent(Message, frozen=True):
-    """A temporary `recording` can be read. It expires, or is removed for later ones."""
+    """A temporary `recording` can be read, until it expires or later ones replace it."""
 
     number: int
     recording: Recording
@@ -125,9 +121,9 @@ class RecordingRefused(Message, frozen=True):
 
 
 class RecordingMissed(Message, frozen=True):
-    """A trigger made no recording. The recorder sends only some of these reports.
+    """A trigger made no recording; only some are reported.
 
-    `planned` is the recording that the trigger's audit record promised, if any.
+    `planned` is the recording that the trigger's audit record promised.
     """
 
     trigger: Trigger

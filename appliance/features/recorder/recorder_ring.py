@@ -19,10 +19,9 @@ _NOTHING = memoryview(b"")
 
 
 class RecorderRing:
-    """Writes after the data of the previous process, and takes over the descriptor.
+    """Writes after the data of the previous process.
 
-    A recorded message has the time at which monitors judged it, by their clock `now`, so that a replay judges
-    it at the same time. If the machine's clock is set, later messages have times by the new setting.
+    A message has the time at which monitors judged it, so that a replay judges it at the same time.
     """
 
     def __init__(self, given: RingTerms, descriptor: int, now: Callable[[], int]) -> None:
@@ -48,7 +47,6 @@ class RecorderRing:
         return (judged or now) + self._set
 
     def open(self, topic: str, host: str, header: Mapping[str, str]) -> "RingStream | ExcludedStream | None":
-        """Open the stream of a connection; None if the topic is not recorded or the memory is full."""
         if not fits(self._topics, topic):
             return None
         why = left_out_because(self._never, self._sums, topic, header)

@@ -1,11 +1,9 @@
 """Write a recording from the memory of the relays to a bag.
 
-1. After each step, the file `progress` stores the bag's length and all data needed to continue; the file is replaced
-   atomically. A new recorder cuts the bag at that length and continues: the memory still holds the unwritten
-   messages.
-2. Missing messages are reported: as a count by topic if the numbers of messages have a gap, otherwise in words.
-3. A bag has at most `largest` bytes, not counting the audit records.
-4. The headers of its connections have at most `_MOST_HEADERS` bytes, because publishers choose their content.
+1. After each step, the file `progress` is replaced atomically. A new recorder cuts the bag at the length in it
+   and continues: the memory still holds the unwritten messages.
+2. Missing messages are reported, as a count by topic if possible.
+3. The headers of connections have at most `_MOST_HEADERS` bytes, because publishers choose their content.
 """
 
 import hashlib
@@ -60,10 +58,8 @@ class TopicCount(msgspec.Struct):
 class Progress(msgspec.Struct):
     """The progress of a recording; times are nanoseconds since the epoch.
 
-    `memory` is when the rings were created. `size` is the length of the bag, `connections` are the headers in
-    it. For each ring, `places` has the position in each stream, and `following` the number of each stream's
-    next message. `not_there` has the counts of messages and streams that the ring had lost when the recording
-    began.
+    `memory` is when the rings were created. For each ring, `places` has the position in each stream, `following`
+    the number of each stream's next message, and `not_there` the losses before the recording.
     """
 
     id: str
@@ -81,19 +77,16 @@ class Progress(msgspec.Struct):
     unconnected: int = 0
     """The number of messages left out because headers exceed `_MOST_HEADERS`."""
     why_not: str = ""
-    """Why the recording ended early, or is incomplete."""
     charged_to: str = OPERATORS
     hold: int = 0
     """The time that an act extends the recording, in nanoseconds."""
     latest: int = 0
-    """The recording ends at this time at the latest."""
     left_out: list[LeftOutTopic] = []
     claims: int = 0
     """The number of topics left out because of their publishers' claims."""
 
 
 def load_progress(folder: Path) -> Progress:
-    """Return the progress of an unfinished recording. Raises `OSError` and `ValueError`."""
     return msgspec.msgpack.decode((folder / PROGRESS).read_bytes(), type=Progress)
 
 
@@ -195,7 +188,6 @@ class RecordingInProgress:
         self._bag.leave()
 
     def finish(self, records: Iterable[LogEntry], revisions: RevisionsStated) -> Recording:
-        """Write the description to disk and return it. Raises `OSError`."""
         progress = self.progress
         self._write_records(records)
         self._bag.close()

@@ -1,4 +1,4 @@
-"""Answers about recordings of the flight recorder: the messages sent before and after an event."""
+"""Answers about recordings of the flight recorder."""
 
 from typing import Annotated, Any, Literal
 

@@ -38,11 +38,7 @@ _M = TypeVar("_M", recorder_link.RecordingStarted, recorder_link.RecordingRemove
 
 
 class RecordingOrders:
-    """Operators' orders; the methods raise `UnavailableError`, `UnknownThingError` and `SenselessError`.
-
-    `in_force()` returns the revisions of policy and specifications in force. `plan` finds the recording that
-    covers an event.
-    """
+    """Operators' orders; they raise `UnavailableError`, `UnknownThingError` and `SenselessError`."""
 
     def __init__(
         self,
@@ -62,7 +58,6 @@ class RecordingOrders:
         self._notes: set[asyncio.Future[None]] = set()
 
     def state(self) -> RecorderState | None:
-        """Return the recorder's state, or None if it is off."""
         if not self._rules.enabled:
             return None
         sizes = [recording.size for recording in self._kept.values()]
@@ -101,7 +96,6 @@ class RecordingOrders:
         return RecordingBegun(begun.id, begun.ends)
 
     async def called(self, call: messages.OwnServiceCalled) -> messages.OwnServiceAnswered:
-        """Answer a node's service call with the id of a new recording, or with the reason."""
         try:
             self._require()
             text = f"{call.caller_id} of {call.host} called {call.service}"
@@ -121,7 +115,7 @@ class RecordingOrders:
     async def _begin(
         self, what: TriggerKind, reason: str, text: str, who: str, span: tuple[float, float], **caller: Any
     ) -> recorder_link.RecordingStarted:
-        """Record the order, then begin a recording; `span` is seconds before and after now."""
+        """`span` is seconds before and after now."""
         before, after = span
         record = self._trail.happened(
             "recording ordered", reason, who=who, before=before, after=after, **caller
@@ -139,7 +133,7 @@ class RecordingOrders:
         return await self._given_out(request.id, "recording fetched", f"by {who}", who)
 
     async def read(self, request: recording_requests.RecordingRead, who: str) -> Recording:
-        """Record who reads messages; repetitions within a few seconds are only counted."""
+        """Repetitions within a few seconds are only counted."""
         topics = request.topics
         if len(topics) > _MOST_TOPICS or any(len(topic) > _LONGEST_NAME for topic in topics):
             raise SenselessError(f"at most {_MOST_TOPICS} topics at once, of {_LONGEST_NAME} characters each")
@@ -212,7 +206,6 @@ class RecordingOrders:
         return known[recording_id]
 
     async def _ask(self, order: Callable[[int], messages.Message], kind: type[_M]) -> _M:
-        """Send an order with a new number, and return the answer, which must be of this kind."""
         try:
             answer: _M | recorder_link.RecordingRefused = await self.link.ask(order, _PATIENCE_SECONDS)
         except ChannelClosedError:

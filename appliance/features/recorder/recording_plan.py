@@ -1,21 +1,13 @@
-"""Plan which recording an *act* (an audited event that triggers recordings) begins or extends, and which host is
-charged. No I/O.
+"""Plan which recording an *act* (an audited event that triggers recordings) begins or extends. No I/O.
 
-Times are nanoseconds since the epoch.
+Control makes the plan together with the act's audit record, which names the recording, or the reason why there is
+none. A recording is charged to the cause of its first trigger: `ROBOT`, a host or network as the policy names it,
+`UNKNOWN` for all other hosts together, `OPERATORS`, or `APPLIANCE`. Times are nanoseconds since the epoch.
 
-The control process makes the plan together with the audit record of the act. So the record names the recording, or
-the reason why there is none. The recorder reads the log and carries out the plan. A recording is charged to the cause
-of its first trigger: `ROBOT`, a host or network as the policy names it, `UNKNOWN` for all other hosts together,
-`OPERATORS` for orders, or `APPLIANCE` for an act without a host (such as a monitor's timer).
-
-Invariants:
-
-1. Each host has at most one open recording; the robot, operators and the appliance share one (`recording_owner`). An
-   act during a recording extends it, up to `longest`.
+1. Each host has at most one open recording, and all hosts except the robot together `_MOST_AT_ONCE`. An act
+   during a recording extends it, up to `longest`.
 2. Each host may begin `per_hour` recordings an hour for each kind of trigger.
-3. Recordings of one host do not overlap, unless an order requests one. A recording that would overlap begins at the
-   end of the previous one, and lasts for the length of the memory after an act.
-4. All other hosts together have at most `_MOST_AT_ONCE` open recordings.
+3. Recordings of one host do not overlap, unless an order requests one.
 """
 
 from collections import deque
@@ -39,13 +31,12 @@ _MOST_HOSTS = 4096  # hosts whose last recording's end is remembered
 
 
 def recording_owner(charged_to: str) -> str:
-    """Return the owner of recordings; the robot, operators and the appliance are one owner."""
     return ROBOT if charged_to in _OURS else charged_to
 
 
 @dataclass(frozen=True, slots=True)
 class RecordingSpan:
-    """The period of a recording, which an act extends to `hold` nanoseconds after it, but never beyond `latest`."""
+    """An act extends the recording to `hold` nanoseconds after it, but never beyond `latest`."""
 
     began: int
     ends: int
@@ -59,9 +50,10 @@ class RecordingSpan:
 def span(
     rules: RecorderRules, now: int, ended: int, before: float | None = None, after: float | None = None
 ) -> RecordingSpan:
-    """Return the period for an act at `now`; the host's last recording ended at `ended`.
+    """The host's last recording ended at `ended`.
 
-    `before` and `after` are the seconds of an order; an order's period may overlap the last recording.
+    `before` and `after` are the seconds of an order, whose period may overlap the last recording.
+
     """
     began = now - int((rules.before if before is None else before) * _SECOND)
     hold = int((rules.after if after is None else after) * _SECOND)
@@ -101,10 +93,7 @@ class HourlyLimit:
 
 
 class RecordingPlan:
-    """Name the recording of each audit record that is a trigger, or the reason why none is made.
-
-    `charged_to(host)` returns the name that is charged for a host's acts; `new_id` returns an id for a recording.
-    """
+    """The recording of each audit record that is a trigger, or the reason why none is made."""
 
     def __init__(
         self, rules: RecorderRules, charged_to: Callable[[str], str], new_id: Callable[[], str]
@@ -120,7 +109,6 @@ class RecordingPlan:
     def detail(
         self, event: str, decision: str | None, severity: Severity, host: str | None, now: int
     ) -> dict[str, str]:
-        """Return the detail of an event's audit record, empty if the event is not a trigger."""
         wanted = [kind for kind in kinds_of(event, decision, severity) if kind in self._rules.triggers]
         if not wanted:
             return {}
@@ -156,7 +144,6 @@ class RecordingPlan:
     # --- messages of the recorder ---
 
     def stated(self, recordings: Iterable[Recording], in_progress: Iterable[OpenRecording]) -> None:
-        """Plan with the recorder's recordings, even after a restart of control."""
         kept = list(recordings)
         self._limit = HourlyLimit(self._rules.per_hour, kept)
         for recording in kept:
@@ -169,7 +156,6 @@ class RecordingPlan:
         return next((open_span.ends for name, open_span in self._open.values() if name == recording_id), None)
 
     def opened(self, charged_to: str, recording_id: str, began: int, ends: int) -> None:
-        """Note a recording that began by an order or a call."""
         latest = began + int(self._rules.longest * _SECOND)
         self._open[recording_owner(charged_to)] = (
             recording_id,
@@ -184,7 +170,7 @@ class RecordingPlan:
             del self._ended[next(iter(self._ended))]
 
     def missed(self, charged_to: str, recording_id: str, why: str, now: int) -> None:
-        """Note why a recording is missing; acts in the next minute get the same reason."""
+        """Acts in the next minute get the same reason."""
         self._close(recording_owner(charged_to), recording_id)
         self._obstacle = why, now + 60 * _SECOND
 

@@ -1,4 +1,4 @@
-"""Routes of `/v1/recordings`: the flight recorder's messages, for investigators. The audit log records each fetch.
+"""Routes of `/v1/recordings`. The audit log records each fetch.
 
 Removal needs no `If-Match`, because a recording never changes.
 """
@@ -91,7 +91,6 @@ def _add_reading(router: Routes, services: Services) -> None:
         bearer: Bearer,
         what: _Reading[_T],
     ) -> _T:
-        """Read a bag, one at a time."""
         recording = answered(await services.control.ask(asked, bearer))
         async with reading.turn(bearer):
             try:
@@ -155,7 +154,6 @@ def _add_reading(router: Routes, services: Services) -> None:
 
 
 async def bag_response(services: Services, recording_id: str, bearer: Bearer, *, mcap: bool) -> Response:
-    """Return the file of a recording, after the audit log has recorded the bearer."""
     found = answered(await services.control.ask(recording_requests.RecordingFetch(recording_id), bearer))
     try:  # open it before the answer begins: a recording that is then removed is still sent completely
         pieces = await asyncio.to_thread(as_mcap if mcap else _pieces_of, _bag_of(services, found.id))

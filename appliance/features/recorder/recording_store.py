@@ -1,22 +1,16 @@
-"""Store recordings (`ID/recording.bag` and `ID/recording.json`) and unfinished recordings (`.ID.part/`).
+"""Store recordings (`ID/`) and unfinished recordings (`.ID.part/`).
 
 A removed recording stays as `.ID.gone/`, without its bag, until its removal is in the audit log. `.ID.rest/` is
 garbage.
 
-Invariants:
-
-1. A folder is renamed to its recording's id only when its whole content is on disk, so it is complete.
-2. All recordings together never exceed `disk` bytes: before a recording begins, room for the largest possible one is
-   made. Each host other than the robot has at most a quarter of `disk`, and all of them together three quarters. Their
-   recordings never replace recordings of the robot or of operators, for whom half of `disk` is always available. The
-   first to be removed is the oldest recording of the kind of trigger that uses the most bytes. The number of
-   recordings, and the bytes of their descriptions (`_MOST_DESCRIBED`), are also limited, because the control process
-   gets all descriptions in one message.
-3. The file `noted` in a folder marks a recording that is in the audit log. Other recordings are reported again.
-4. The file `lent` in a folder marks a temporary recording, which does not count in `disk`. At most `MOST_TEMPORARY` of
-   them exist, each for up to `TEMPORARY_SECONDS`. A further temporary recording replaces the oldest, unless the oldest
-   is so new that its reader may not have opened it yet (`_OPENING_SECONDS`). A new recorder removes all temporary
-   recordings.
+1. A folder is renamed to its recording's id only when its whole content is on disk.
+2. Recordings never exceed `disk` bytes: room for the largest possible one is made before one begins. Hosts other
+   than the robot have at most three quarters, each a quarter, and never replace recordings of the robot or of
+   operators. The first to be removed is the oldest of the kind of trigger that uses the most bytes. Descriptions
+   are limited, because control gets all of them in one message.
+3. The file `noted` marks a recording that is in the audit log. Other recordings are reported again.
+4. The file `lent` marks a temporary recording, which does not count in `disk`. A further one replaces the oldest,
+   unless its reader may not have opened it yet.
 5. Whenever the recorder dies, a recording either still exists, or its removal is reported: the folder is renamed
    atomically before anything in it is removed.
 """
@@ -49,7 +43,7 @@ _log = structlog.get_logger()
 
 
 class RecordingStore:
-    """The recordings in a folder, each of which is removed after `seconds` of `clock`."""
+    """The recordings in a folder, each kept for `seconds` of `clock`."""
 
     def __init__(self, folder: Path, *, disk: int, seconds: float | None, clock: Callable[[], int]) -> None:
         self._folder = folder
@@ -76,7 +70,7 @@ class RecordingStore:
                     _log.error("a recording cannot be read", recording=path.name, error=str(error))
 
     def _kept_since(self, recording: Recording) -> int:
-        """Return when the recording was stored, by the age clock, or else its end."""
+        """Return the time by the age clock, or else the end of the recording."""
         with suppress(OSError, ValueError):
             return int((self._folder / recording.id / _SINCE).read_bytes())
         return recording.ended
@@ -102,7 +96,7 @@ class RecordingStore:
         return sorted(path for path in self._folder.iterdir() if kind.fullmatch(path.name))
 
     def _discard(self, folder: Path) -> None:
-        """Remove a folder without an audit record. Raises `OSError`."""
+        """Remove a folder without an audit record."""
         rest = self._folder / f".{folder.name.strip('.')[:20]}.rest"
         folder.rename(rest)
         shutil.rmtree(rest)
@@ -112,7 +106,6 @@ class RecordingStore:
             self._discard(self.part(recording_id))
 
     def keep(self, recording: Recording) -> None:
-        """Add a recording that is completely on disk."""
         kept = self._folder / recording.id
         with suppress(OSError):  # the disk is full: the recording's age then counts from its end
             (self.part(recording.id) / _SINCE).write_bytes(b"%d" % self._clock())
@@ -123,17 +116,15 @@ class RecordingStore:
         self._described[recording.id] = self._length(recording)
 
     def mark_temporary(self, recording_id: str) -> None:
-        """Mark a recording as temporary before it is made. Raises `OSError`."""
         self.part(recording_id).mkdir(mode=0o750, exist_ok=True)
         (self.part(recording_id) / _TEMPORARY).touch()
 
     def has_temporary_room(self, now: int) -> bool:
-        """Make room; return False if all temporary recordings are too new to remove. Raises `OSError`."""
+        """Return False if all temporary recordings are too new to remove."""
         self._expire(now, MOST_TEMPORARY - 1, _OPENING_SECONDS)
         return len(self._temporary) < MOST_TEMPORARY
 
     def publish_temporary(self, recording: Recording) -> None:
-        """Add a temporary recording for `TEMPORARY_SECONDS`, or until another replaces it. Raises `OSError`."""
         self.part(recording.id).rename(self._folder / recording.id)
         self._temporary.append(recording)
 
@@ -151,7 +142,6 @@ class RecordingStore:
         return self.find(recording_id) is not None or self._gone(recording_id).exists()
 
     def remove(self, recording: Recording, who: str, reason: str) -> None:
-        """Remove a recording; the audit log gets `who` and `reason`. Raises `OSError`."""
         kept, gone = self._folder / recording.id, self._gone(recording.id)
         with suppress(OSError):  # the disk may be full, since recordings are then removed
             (kept / _REMOVED).write_bytes(msgspec.json.encode((who, reason)))
@@ -175,7 +165,6 @@ class RecordingStore:
             yield recording, who, reason
 
     def note(self, recording_id: str) -> None:
-        """Note that the audit log has the recording or its removal. Raises `OSError`."""
         if self.find(recording_id) is not None:
             (self._folder / recording_id / _NOTED).touch()
         elif self._gone(recording_id).exists():
@@ -185,12 +174,7 @@ class RecordingStore:
         return [found for found in self.recordings if not (self._folder / found.id / _NOTED).exists()]
 
     def outdated(self, now: int) -> Iterator[tuple[Recording, str]]:
-        """Remove old temporary recordings; yield others that are too old, with the reason.
-
-        The caller must remove each before continuing.
-
-        `now` is nanoseconds since the epoch. Raises `OSError`.
-        """
+        """Yield recordings that are too old, with the reason; the caller must remove each before continuing."""
         self._expire(now, 0, TEMPORARY_SECONDS)
         while self._seconds is not None and self.recordings:
             oldest = self.recordings[0]
@@ -201,8 +185,8 @@ class RecordingStore:
     def in_the_way(self, charged_to: str, making: Sequence[str] = ()) -> tuple[Recording | None, str]:
         """Return the next recording to remove in favour of a new one of this host, and the reason.
 
-        None with a reason means that none may be removed; None without one means that there is room. `making` has the
-        hosts of the recordings in progress.
+        None with a reason: none may be removed; None without one: there is room. `making` has the hosts of the
+        recordings in progress.
         """
         held = self._sizes(lambda found: found.charged_to)
         held.update({name: number * self.largest for name, number in Counter((*making, charged_to)).items()})

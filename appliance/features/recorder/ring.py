@@ -1,31 +1,23 @@
 """Keep the latest messages of a relay in shared memory, which survives the relay and is read by the recorder.
 
-The supervisor holds the memory, one relay writes it (`RingWriter`), and one recorder reads it (`RingReader`). The
-memory consists of blocks of one size. Each connection to a publisher is a *stream*: a chain of header blocks (the
-connection's TCPROS header, with the definition of the type) and a chain of data blocks. The blocks of each chain are
-numbered from 0. The data chain is a sequence of records, which may span blocks. A record contains the number of
-frames, their size in bytes, the time, the number of the first frame, and the frames.
+One relay writes the memory, and one recorder reads it. Each connection to a publisher is a *stream*: a chain of
+header blocks (the connection's TCPROS header) and a chain of data blocks, numbered from 0. The data are records,
+which may span blocks: number of frames, size in bytes, time, number of the first frame, frames.
 
-Invariants:
+1. A block is valid up to `used`, which is stored after the data, and its row while the word `birth` is not 0,
+   which is stored last. So a writer that is killed at any instruction leaves at most one torn record at the end
+   of a chain, which the reader ignores.
+2. Before a block is reused, its `birth` is set to 0. The reader discards a copy if `birth` has changed.
+3. Without a free block, the first of these is reused: the oldest block, if it is too old; the oldest of the
+   writing topic or host, if that has used its quota; the oldest of a topic or host above its quota; the oldest of
+   all. A block that an active stream is filling counts as new.
+4. The reader trusts no content: it bounds every number by the memory's own size.
+5. Header blocks take at most a quarter of the memory, and of the quota of a host. A new header replaces closed
+   streams, the oldest first. Streams without room are counted (`REFUSED`), and so are messages in a record larger
+   than its topic's quota (`MISSED`).
 
-1. A block is valid up to `used`, a word in the block's row of the table that is stored after the data. A row is valid
-   while its word `birth` is not 0; this word is stored last. So a writer that is killed at any instruction leaves
-   complete records, and at most one torn record at the end of a chain. The reader ignores a torn record.
-2. Before a block is reused, its `birth` is set to 0. The reader copies a block and then reads `birth` again. If
-   `birth` has changed, the reader discards the copy.
-3. While blocks are free, every stream may take them. When none is free, the first of these is reused: the oldest
-   block, if it is too old; the oldest of the writing topic or host, if that topic or host has used its quota; the
-   oldest of a topic or host above its quota; the oldest of all. A block that an active stream is filling counts as
-   new.
-4. The reader trusts no content: it derives all sizes from the memory's own size, and bounds every number by that
-   size.
-5. Header blocks stay while their stream is open or has data. They take at most a quarter of the memory, and the
-   header blocks of one host at most a quarter of its quota. If a new header has no room, closed streams are removed,
-   the oldest first. A stream whose header still has no room is counted (`REFUSED`) and not recorded. Messages in a
-   record larger than its topic's quota are counted (`MISSED`) and not recorded.
-
-`used` and `birth` are aligned words of 64 bits. If the processor reorders stores (ARM), the reader may see a record's
-data only at its next check, which is harmless.
+`used` and `birth` are aligned words of 64 bits. If the processor reorders stores (ARM), the reader may see a
+record's data only at its next check.
 """
 
 import struct
@@ -69,7 +61,6 @@ class Geometry(NamedTuple):
 
 
 def geometry(size: int) -> Geometry:
-    """Return the layout. Raises `ValueError` if the size is too small."""
     if size < SMALLEST:
         raise ValueError(f"a ring of {size} bytes is too small: use at least {SMALLEST}")
     block = _SMALLEST_BLOCK
@@ -91,7 +82,7 @@ class BlockRow(NamedTuple):
 
     @property
     def sound(self) -> bool:
-        """Whether the row is in use and plausible; numbers of a compromised writer must not overflow a word."""
+        """The numbers of a compromised writer must not overflow a word."""
         return (
             0 < self.birth < _MOST_NUMBER
             and 0 < self.stream < _MOST_NUMBER
@@ -102,7 +93,7 @@ class BlockRow(NamedTuple):
 
 @dataclass(eq=False, slots=True)
 class _Share:
-    """The use of a quota: `blocks` are the data blocks of a topic or host, oldest first."""
+    """The use of a quota; `blocks` are data blocks, oldest first."""
 
     most: int
     blocks: OrderedDict[int, None] = field(default_factory=OrderedDict)
@@ -112,8 +103,6 @@ class _Share:
 
 @dataclass(eq=False, slots=True)
 class _Chain:
-    """The blocks of one stream, and the quotas that they use."""
-
     shares: tuple[_Share, ...] = ()
     names: tuple[str, str] = ("", "")
     headers: list[int] = field(default_factory=list)
@@ -122,7 +111,6 @@ class _Chain:
 
 
 def words_of(memory: memoryview) -> memoryview:
-    """Return the memory as 64-bit words, which are loaded and stored atomically."""
     return memory[: len(memory) // 8 * 8].cast("Q")
 
 
@@ -158,7 +146,7 @@ class RingStream:
         self._used = 0  # the index of the block's word
 
     def write(self, frames: memoryview, messages: int, first: int, judged: int = 0) -> None:
-        """Write frames; `first` is the first frame's number, `judged` the time when monitors got the frames, or 0."""
+        """`first` is the first frame's number, `judged` the time when monitors got the frames, or 0."""
         ring = self._ring
         size = len(frames)
         now = self.written = ring.clock(judged)
@@ -178,7 +166,6 @@ class RingStream:
         self._ring.close_chain(self._stream, self._chain)
 
     def lose_block(self) -> None:
-        """Note that another stream reuses the current block."""
         self.block, self._place, self._end = -1, 0, 0
 
     def _append(self, head: memoryview, frames: memoryview) -> None:
@@ -216,8 +203,8 @@ class RingStream:
 class RingWriter:
     """Writes shared memory, and keeps the data of earlier writers.
 
-    `topic_share` and `host_share` are the parts of the memory that one topic and one host may keep when others need
-    it. Blocks older than `seconds` are reused first.
+    `topic_share` and `host_share` are what one topic and one host may keep when others need it. Blocks older than
+    `seconds` are reused first.
     """
 
     def __init__(
@@ -250,7 +237,6 @@ class RingWriter:
         self._inherit()
 
     def open(self, topic: str, host: str, header: Mapping[str, str]) -> RingStream | None:
-        """Open a stream; None if its header has no room."""
         text = memoryview(encode_header({**header, "topic": topic, "host": host}))
         needed = -(-len(text) // self.block)
         shares = tuple(
@@ -282,7 +268,6 @@ class RingWriter:
         self.words[counter] = (self.words[counter] + by) % (1 << 64)
 
     def take(self, stream: int, number: int, kind: int, begins: int, chain: _Chain, *, now: int) -> int:
-        """Return a free block for a chain; if none is free, reuse one (invariant 3)."""
         if not self._free:
             self._give_up(chain, now - self._keep)
         block = self._free.pop()
@@ -308,7 +293,7 @@ class RingWriter:
             self._forget(stream, chain)
 
     def _give_up(self, chain: _Chain, old: int) -> None:
-        """Free a block for a chain; blocks written before the time `old` are too old (invariant 3)."""
+        """Blocks written before the time `old` are too old (invariant 3)."""
         oldest = self._oldest(old)
         if self._order[oldest][1] >= old or self._in_use(oldest, old):
             full = (share for share in chain.shares if len(share.blocks) >= share.most)
@@ -317,12 +302,11 @@ class RingWriter:
         self._push_out(oldest)
 
     def _in_use(self, block: int, old: int) -> bool:
-        """Whether a stream is filling the block and has written lately; a slow stream may have all its data in it."""
+        """A slow stream may have all its data in the block."""
         writer = self._chains[self._order[block][0]].writer
         return writer is not None and writer.block == block and writer.written >= old
 
     def _oldest(self, old: int) -> int:
-        """Return the oldest block; blocks that are being filled count as new."""
         for _ in range(len(self._order)):
             block = next(iter(self._order))
             if not self._in_use(block, old):
@@ -345,7 +329,6 @@ class RingWriter:
             loser.writer.lose_block()
 
     def _room_for_header(self, needed: int, host: _Share) -> bool:
-        """Make room for a header, and remove closed streams if needed; return whether there is room."""
 
         def crowded(*, of_host: bool) -> bool:
             has, whole = (

@@ -28,13 +28,12 @@ _LONGEST_HEADER = 256 << 10
 _NEEDED = frozenset({"topic", "type", "md5sum", "message_definition", "callerid", "host"})
 _LONGEST_TYPE = 256
 MOST_MESSAGES = 1 << 53
-"""The most messages of one stream."""
 
 _Blocks = dict[int, tuple[int, BlockRow]]
 
 
 class ReadPosition(NamedTuple):
-    """A position: a block of the chain, and a byte in it."""
+    """A block of the chain, and a byte in it."""
 
     number: int
     offset: int
@@ -59,8 +58,6 @@ class StreamFrames(NamedTuple):
 
 @dataclass(slots=True)
 class _Run:
-    """Consecutive blocks of a chain."""
-
     number: int
     begins: int
     data: bytearray
@@ -78,14 +75,11 @@ class RingReader:
 
     @property
     def not_there(self) -> tuple[int, int]:
-        """Return the numbers of too long messages, and of streams without room, since the ring was created."""
         return self._words[MISSED], self._words[REFUSED]
 
     def read(self, since: int, until: int) -> Iterator[StreamFrames]:
-        """Yield messages since the last call that were received from `since` to `until` (ns since the epoch).
-
-        Later messages are left for a later call. Such a message is skipped if the stream continues with an earlier
-        one, because then the clock was set back.
+        """A message after `until` (ns since the epoch) is left for a later call, but skipped if the stream
+        continues with an earlier one, because then the clock was set back.
         """
         headers: dict[int, _Blocks] = {}
         data: dict[int, _Blocks] = {}
@@ -115,11 +109,7 @@ class RingReader:
         return _readable(header) if header.keys() >= _NEEDED else None
 
     def _copy(self, block: int, row: BlockRow) -> bytes | None:
-        """Return the data of a block, or None if the block was reused.
-
-        The current `used` applies: while the table was copied, the block may have been filled and the next
-        one begun.
-        """
+        """The current `used` applies: while the table was copied, the block may have been filled."""
         start = self._geometry.data + block * self._geometry.block
         part = bytes(self._memory[start : start + min(self._words[used_at(block)], self._geometry.block)])
         return part if self._words[birth_at(block)] == row.birth else None

@@ -1,8 +1,7 @@
 """Keep the memory (rings) in which relays store the last messages; the memory survives a relay.
 
-Each relay writes to its own ring. The recorder gets read-only descriptors, and no process can shrink a ring, so
-reading never fails. All memory is allocated at the start, so a lack of memory shows then and not during an incident,
-and a relay never waits for pages.
+The recorder gets read-only descriptors, and no process can shrink a ring, so reading never fails. All memory is
+allocated at the start, so a lack shows then and not during an incident, and a relay never waits for pages.
 """
 
 import fcntl
@@ -26,7 +25,7 @@ USED_BY = "appliance.features.recorder.recorder_ring:open_ring"
 
 
 class RecorderRings:
-    """The rings of all relays; `rules` has their total size. Raises `StartError` (not enough memory), `OSError`."""
+    """The rings of all relays, of one total size. Raises `StartError` without enough memory."""
 
     def __init__(self, rules: RecorderRules, relays: int) -> None:
         if rules.memory > (left := _left()):

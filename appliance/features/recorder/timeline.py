@@ -1,10 +1,7 @@
 """Compute a recording's timeline, and find its messages around a time.
 
-The numbers of columns, topics, events and messages are limited, however large the recording is. Omissions are
-reported.
-
-Events come from the audit records in the bag, because retention may have removed them from the log since. In the bag,
-a publisher's header has a host, and the recorder's own header has none.
+Events come from the audit records in the bag, because retention may have removed them from the log. In the bag, a
+publisher's header has a host, and the recorder's own header has none.
 """
 
 import re
@@ -67,8 +64,6 @@ class _Said(msgspec.Struct):
 
 
 class _Columns:
-    """Columns that divide the time from `since` to `until` (both inclusive)."""
-
     def __init__(self, since: int, until: int, number: int) -> None:
         self.since, self.until, self.number = since, until, number
         self._width = (until - since) // number + 1
@@ -79,7 +74,6 @@ class _Columns:
                 counts[(time - self.since) // self._width] += 1
 
     def spread(self, first: int, last: int, number: int, counts: list[int]) -> None:
-        """Count `number` events at equal distances between two times."""
         first, last = min(first, last), max(first, last)
         for column in range(self._column(first), self._column(last) + 1):
             begin = self.since + column * self._width
@@ -90,7 +84,6 @@ class _Columns:
         return (min(max(time, self.since), self.until) - self.since) // self._width
 
     def only(self, first: int, last: int) -> int | None:
-        """Return the column that contains both times, or None."""
         if first < self.since or last > self.until:
             return None
         column = (first - self.since) // self._width
@@ -111,11 +104,11 @@ def timeline(
     record: str = "",
     log: Path | None = None,
 ) -> Timeline:
-    """Return the time line; `since` and `until` are ns since the epoch (None: the recording's start or end).
+    """Return the timeline; `since` and `until` are ns since the epoch.
 
-    It lists the first events, or those around the event of the audit record with the id `record`. `log` is
-    the audit log, for repetitions that it counted only after the recording's end. Raises `OSError`,
-    `LogUnreadableError`, and `ValueError` if the recording has no such time or the bag is invalid.
+    It lists the first events, or those around the event of the audit record with the id `record`. `log` is the
+    audit log, for repetitions that it counted only after the recording's end. Raises `OSError`,
+    `LogUnreadableError`, and `ValueError`.
     """
     start = recording.began if since is None else max(since, recording.began)
     end = recording.ended if until is None else min(until, recording.ended)
@@ -145,7 +138,7 @@ def timeline(
 
 
 class _Listed:
-    """The listed events: the first `MOST_EVENTS`, or those around the event of `record` if it comes later."""
+    """The first `MOST_EVENTS`, or those around the event of `record` if it comes later."""
 
     def __init__(self, record: str) -> None:
         self._record = record
@@ -193,7 +186,6 @@ def _flows(reader: BagReader, wanted: _Columns) -> list[RecordedFlow]:
 
 
 def _counted_later(log: Path, recording: Recording) -> list[tuple[_Said | AuditRecord, int]]:
-    """Return records after a recording's end, which may count repetitions during it. Raises `LogUnreadableError`."""
     ended = recording.ended
     written = Filter(since=ended + 1, until=ended + int((FoldSettings().seconds + 1) * _SECOND))
     found = (entry.record for entry in islice(export(log, written), _MOST_LATER))
@@ -207,7 +199,7 @@ def _is_before(time: object, end: int) -> bool:
 def _events(
     records: Iterable[tuple[_Said | AuditRecord, int]],
 ) -> Iterator[tuple[RecordedEvent, int, int]]:
-    """Yield the events of records, each of which may count several events between a first and a last time."""
+    """Yield the events of records, each of which may count several between a first and a last time."""
     for said, time in records:
         kind = _kind(said)
         if kind is None:
@@ -264,12 +256,10 @@ def messages_around(
     topics: Collection[str] = (),
     neighbours: int = NEIGHBOURS,
 ) -> RecordedMessages:
-    """Return the messages around `at`, a time, a position or the id of an audit record, at most `neighbours`
-    on each side.
+    """Return at most `neighbours` messages on each side of `at`: a time, a position or the id of an audit record.
 
     The message of a time is the last one at or before it; that of a record is the message that the record is
-    about, or else the message of its time. `topics` limits the result to these topics (empty: all). Raises
-    `OSError`, and `ValueError` if the recording has no such record or the bag is invalid.
+    about, or else the message of its time.
     """
     with BagReader.of(bag) as reader:
         wanted = {
@@ -314,10 +304,11 @@ def _last_until(reader: BagReader, time: int, wanted: Collection[int]) -> Messag
 def _place_of_record(
     reader: BagReader, recording: Recording, record: str, wanted: Collection[int]
 ) -> MessagePosition | int:
-    """Return the position of a record's message, or the record's time if the bag lacks the message.
+    """Return the record's time if the bag lacks the message.
 
-    A record of a monitor has the time at which the monitor judged the message, and so has the message.
-    Messages that were received together have the same time, so their first bytes are compared as well.
+    A record of a monitor and its message have the same time. So have messages that were received together, so
+    their first bytes are compared as well.
+
     """
     said, time = next((found for found in _records(reader) if found[0].id == record), (None, 0))
     if said is None:

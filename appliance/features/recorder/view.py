@@ -1,4 +1,4 @@
-"""The state of the flight recorder, with its alarm, metrics and line of `rosrv status`."""
+"""Show the flight recorder in the status, the alarms and the metrics."""
 
 from collections.abc import Iterator
 
