@@ -1,4 +1,4 @@
-"""`rosrv host authority rotate`: replace the key of the authority of hosts."""
+"""The command `rosrv host authority rotate`."""
 
 from appliance.backup.contents import BackupError
 from appliance.cli.connection.target import DEFAULT_STATE, State

@@ -1,9 +1,7 @@
 """Request hosts' certificates from the signer, store them, pass them to charon, and return the parts of kits.
 
-Invariants:
-
-1. An enrolment or renewal fails if its name is revoked before it ends, whether an operator or the host started it.
-2. Every certificate that is issued or revoked is recorded.
+An enrolment or renewal fails if its name is revoked before it ends. Every certificate that is issued or revoked
+is recorded.
 """
 
 import asyncio
@@ -33,10 +31,7 @@ _SERVED_SECONDS = 10.0
 
 
 class Certification:
-    """The common steps of enrolment by operators and by hosts.
-
-    `changed()` is called after a change of the hosts; it returns the number of rights that this revoked.
-    """
+    """The common steps of enrolment by operators and by hosts. Methods raise `HostRefusedError`."""
 
     def __init__(
         self,
@@ -78,14 +73,13 @@ class Certification:
 
     @contextlib.contextmanager
     def unless_revoked(self, name: str) -> Iterator[None]:
-        """Raise `HostForbiddenError` at the end of the block if the name was revoked in it."""
+        """Raise `HostForbiddenError` at the end if the name was revoked in the block."""
         before = self._revocations[name]
         yield
         if self._revocations[name] != before:
             raise HostForbiddenError(f"{name} was revoked in the meantime")
 
     async def require_authority(self) -> None:
-        """Raise `HostRefusedError`, with the remedy, without the authority's key."""
         try:
             await self._authority.require_key()
         except AuthorityError as error:
@@ -94,7 +88,6 @@ class Certification:
     async def issue(
         self, name: str, request: str, days: float, *, proof: bytes = b"", former: bytes = b""
     ) -> CertificateMade:
-        """Return a new certificate. Raises `HostRefusedError`."""
         self.table.require_room(name)
         try:
             return await self._authority.issue(request.encode(), name, days, proof=proof, former=former)
@@ -132,10 +125,8 @@ class Certification:
         self.changed()
 
     async def finish(self, name: str, kept: dict[str, str] | None = None) -> KitParts:
-        """Wait until an enrolment is on disk and charon has confirmed it.
-
-        If charon does not confirm in time, the kit has a warning. `kept` are the options stored with the host's
-        token. Raises `HostRefusedError`, `StoreError`.
+        """If charon does not confirm in time, the kit has a warning. `kept` are the options stored with the
+        host's token.
         """
         taken = (
             await self.tunnels.until_taken()
@@ -149,7 +140,6 @@ class Certification:
         return await self.kit(name, warning, kept)
 
     async def kit(self, name: str, warning: str | None, kept: dict[str, str] | None = None) -> KitParts:
-        """Return the parts of a host's kit. Raises `HostRefusedError`."""
         if self.rest.inner_port is not None and not await self.until_served():
             warning = warning or "REST is not running: the kit cannot renew its certificate automatically"
         authority = await self.authority_certificate()
@@ -182,7 +172,6 @@ class Certification:
         )
 
     async def revocations(self, _request: host_requests.RevocationsWanted) -> RevocationList:
-        """Return the revocation list in PEM. Raises `HostRefusedError`."""
         try:
             listed = await self.tunnels.revocations.signed()
         except AuthorityError as error:
@@ -190,7 +179,6 @@ class Certification:
         return RevocationList(listed.decode())
 
     async def authority(self, _request: host_requests.AuthorityWanted) -> AuthorityCertificate:
-        """Return the authority's certificate in PEM. Raises `HostRefusedError`."""
         return AuthorityCertificate((await self.authority_certificate()).decode())
 
     async def authority_certificate(self) -> bytes:
@@ -200,7 +188,6 @@ class Certification:
             raise HostRefusedError(str(error), ours=True) from error
 
     async def until_served(self) -> bool:
-        """Wait for the api, which starts after control; return False if it does not connect in time."""
         try:
             async with asyncio.timeout(_SERVED_SECONDS):
                 await self._served.wait()
@@ -209,7 +196,7 @@ class Certification:
         return True
 
     def each_hour(self) -> None:
-        """Replace ended certificates by their stored successors; record once each certificate that ends soon."""
+        """Record once each certificate that ends soon."""
         now = clock.wall()
         self.table.revoked.forget_ended()
         for row in self.table.enrolled():

@@ -1,8 +1,7 @@
 """Provision and watch charon over vici, with blocking calls.
 
-Only differences are applied: new hosts are loaded, removed hosts are unloaded and their tunnels closed. When a host's
-certificate is replaced, its tunnel is also closed, and opens again with the new certificate. charon's confirmation is
-not trusted: each check closes again whatever remains of a closed tunnel.
+Only differences are applied. When a host's certificate is replaced, its tunnel is also closed. charon's
+confirmation is not trusted: each check closes again whatever remains of a closed tunnel.
 """
 
 import base64
@@ -50,7 +49,7 @@ class ViciClient:
             self._session.load_key({"type": "any", "data": key})
 
     def provision(self, stated: TunnelsStated) -> None:
-        """Bring the wanted state into charon; revoked tunnels are closed before new ones are loaded."""
+        """Close revoked tunnels before new ones are loaded."""
         before = self._stated
         if before is None or before.authority != stated.authority:
             with self._said("the authority's certificate"):
@@ -78,10 +77,8 @@ class ViciClient:
         self._stated = stated
 
     def seen(self) -> list[TunnelSeen]:
-        """Return the tunnels that are up.
-
-        Tunnels of removed hosts, or with a replaced certificate, are closed again: a rekeying during the first close
-        can keep such a tunnel open.
+        """Tunnels of removed hosts, or with a replaced certificate, are closed again: a rekeying during the first
+        close can keep such a tunnel open.
         """
         for _ in range(_LISTS):
             found = self._standing()
@@ -112,7 +109,7 @@ class ViciClient:
         return [str(name) for group in ("ke", "dh") for name in found.get(group, {})]
 
     def listen(self) -> Iterator[tuple[str, bool, str]]:
-        """Yield changes of tunnels (host, up, real address) until charon ends, over a separate connection."""
+        """Yield changes of tunnels (host, up, real address), over a separate connection."""
         session = self._connect(timeout=None)
         try:
             for _kind, event in session.listen(["child-updown"]):
@@ -168,7 +165,7 @@ class ViciClient:
 
 
 def _der_of(pem: bytes) -> bytes:
-    """Return the certificate in DER, which is a quarter shorter than PEM: vici's limit is 65,535 bytes."""
+    """Return DER, which is a quarter shorter than PEM: vici's limit is 65,535 bytes."""
     return base64.b64decode(b"".join(pem.split(b"-----")[2:3]))
 
 

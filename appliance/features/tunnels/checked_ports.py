@@ -36,7 +36,6 @@ class PortChecks:
         self._in_words = in_words
 
     async def tell(self, request: host_requests.HostPorts, who: str) -> PortsReport:
-        """Store a result. Raises `HostRefusedError`, `HostsChangedError`."""
         self._table.require(request.expected)
         key, state = self._known_machine(request.name), request.state
         now = clock.wall()
@@ -59,7 +58,6 @@ class PortChecks:
         return PortsReport(self._view.ports(key), self._table.revision, key)
 
     def in_clear_text(self) -> dict[str, int]:
-        """Return the number of nodes by address."""
         pool = self._table.pool
         return {
             address: nodes

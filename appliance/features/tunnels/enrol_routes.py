@@ -1,10 +1,7 @@
 """Answer a host's own requests, without a bearer token: enrolment, renewal, authority, revocations.
 
-Invariants:
-
-1. Enrolment needs only a one-time token. A host that sends wrong tokens must wait, and all such hosts also share one
-   limit. A host that sent no wrong token never waits, so an attacker with many addresses cannot keep out a valid
-   token.
+1. A host that sends wrong tokens must wait, and all such hosts share one limit. A host that sent no wrong token
+   never waits, so an attacker with many addresses cannot keep out a valid token.
 2. Only a host in its tunnel can renew. Control compares the peer's address with the virtual address of the name,
    which the firewall accepts only through IPsec. The signer checks the signature by the host's present key.
 3. This module does not parse signing requests.
@@ -163,15 +160,12 @@ def _add_renewal(router: Routes, services: Services) -> None:
 
 
 class _Patience:
-    """Limits wrong tokens of each host, and of all hosts together."""
-
     def __init__(self, per_minute: int) -> None:
         self._one = Buckets(per_minute / 60, per_minute)
         # An attacker may have many addresses.
         self._all = Buckets(max(per_minute, _ALL_PER_MINUTE) / 60, max(per_minute, _ALL_PER_MINUTE), peers=1)
 
     def require(self, peer: str) -> None:
-        """Raise `ProblemError` (429) if this peer must wait."""
         now = clock.now()
         seconds = self._one.wait(peer, now)
         if self._one.touched(peer, now):

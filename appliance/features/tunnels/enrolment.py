@@ -1,9 +1,7 @@
 """Carry out operators' requests about hosts with a tunnel: enrol, issue kits and one-time tokens, revoke.
 
-Invariants:
-
-1. Before its first `await`, a revocation removes the host from the policy, and removes its registrations.
-2. Only the answer to `token` contains a token, and no answer contains a private key.
+Before its first `await`, a revocation removes the host from the policy, and its registrations. No answer contains
+a private key, and only the answer to `token` contains a token.
 """
 
 import asyncio
@@ -37,12 +35,10 @@ from appliance.store.host_tables import EnrolmentTokenRow
 
 
 class HostEnrolment(TunnelHosts):
-    """The operators' requests; `itself` serves the requests of hosts.
+    """The operators' requests, which raise `HostRefusedError`, `HostsChangedError` and `StoreError`.
 
-    `expel(address, reason)` removes a host's registrations and grants and returns their number.
-    `find_endpoint()` returns the address at which hosts reach the appliance; `machines()` returns the number
-    of nodes by address. `carried_out()` waits for the relays: the operator's answer comes after the
-    connections of an expelled host close.
+    `expel(address, reason)` returns the number of removed registrations and grants. `carried_out()` waits for the
+    relays: the answer comes after the connections of an expelled host close.
     """
 
     def __init__(
@@ -101,14 +97,12 @@ class HostEnrolment(TunnelHosts):
         return await self._find_endpoint()
 
     async def kit(self, request: host_requests.HostKit) -> answers.KitParts:
-        """Return the parts of a host's kit. Raises `HostRefusedError`."""
         self._table.enrolled_row(request.name)
         return await self._certification.kit(request.name, None)
 
     # --- changes by operators ---
 
     async def add(self, request: host_requests.HostAdd, who: str) -> answers.KitParts:
-        """Enrol a host. Raises `HostRefusedError`, `HostsChangedError`, `StoreError`."""
         name = request.name
         async with self._certification.changing:
             self._table.require(request.expected)
@@ -123,7 +117,6 @@ class HostEnrolment(TunnelHosts):
             return await self._certification.finish(name)
 
     async def renew(self, request: host_requests.HostRenew, who: str) -> answers.KitParts:
-        """Replace the certificate of a host. Raises as `add`."""
         name = request.name
         async with self._certification.changing:
             self._table.require(request.expected)
@@ -137,7 +130,6 @@ class HostEnrolment(TunnelHosts):
             return await self._certification.finish(name)
 
     async def token(self, request: host_requests.HostToken, who: str) -> answers.EnrolmentToken:
-        """Make a one-time token. Raises as `add`."""
         name = request.name
         found = answers.Endpoint(request.endpoint, "") if request.endpoint else await self._find_endpoint()
         async with self._certification.changing:
@@ -198,7 +190,6 @@ class HostEnrolment(TunnelHosts):
             )
 
     async def revoke(self, request: host_requests.HostRevoke, who: str) -> answers.Revoked:
-        """Close the connections of an enrolled host, or revoke an awaited host's token. Raises as `add`."""
         name = request.name
         self._table.require(request.expected)
         self._certification.revoked(name)
@@ -226,7 +217,7 @@ class HostEnrolment(TunnelHosts):
         return answers.Revoked(self._table.revision, name, row.address, row.serial, taken)
 
     async def reload(self, request: host_requests.HostsReload, who: str) -> answers.Reloaded:
-        """Read hosts.yaml again. Raises as `add`; an invalid file changes nothing."""
+        """An invalid file changes nothing."""
         self._table.require(request.expected)
         return await self._declare(self._table.declared.reload, who)
 
@@ -234,7 +225,7 @@ class HostEnrolment(TunnelHosts):
         await self.reload(host_requests.HostsReload(), who)
 
     async def take_bundle(self, text: str, who: str) -> answers.Reloaded:
-        """Replace the declared hosts by a bundle's text; an empty one stands for hosts.yaml. Raises as `reload`."""
+        """An empty text stands for hosts.yaml."""
         declared = self._table.declared
         return await self._declare(partial(declared.take, text) if text else declared.reload, who)
 
@@ -316,10 +307,6 @@ _ENDPOINT_SECONDS = 20.0
 
 
 async def find_endpoint(settings: Settings, look: Callable[[], Awaitable[EndpointFound]]) -> Endpoint:
-    """Return the configured address, or the address that the supervisor finds.
-
-    Raises `HostRefusedError`; if no address is found, its text lists the options that set the address.
-    """
     if settings.isolation == "none":
         raise HostRefusedError(NO_TUNNELS)
     configured = settings.ipsec.endpoint

@@ -1,7 +1,7 @@
 """Make the kit of an enrolled host: an archive with its certificate and all files for its tunnel. No I/O.
 
-The kit uses the host's own strongSwan with its own paths (`/etc/swanctl`), so AppArmor and other tunnels of the host
-still work. The tunnel carries only traffic between the host's virtual address and the appliance's.
+The kit uses the host's own strongSwan with its own paths (`/etc/swanctl`), so AppArmor and other tunnels of the
+host still work.
 """
 
 import io
@@ -21,10 +21,11 @@ _SCRIPTS = ("join.sh", "leave.sh", "keep.sh", "renew.sh", "README")
 
 @dataclass(frozen=True)
 class Kit:
-    """The data of a kit. `endpoint` is the address or name by which the host reaches the appliance; `protect`
-    is an nftables file.
+    """The data of a kit; `key` is None if the host made its own key.
 
-    `key` is None if the host made its own key. `host.second` is the address of the other appliance of two.
+    `endpoint` is the address or name of the appliance, `host.second` that of the other one of two; `protect` is
+    an nftables file.
+
     """
 
     host: KitParts
@@ -63,7 +64,7 @@ def members(kit: Kit) -> list[tuple[str, str, int]]:
 
 
 def filled(script: str, values: Mapping[str, str]) -> str:
-    """Return a script with its values; `@stop@` stands for the file `stop.inc`."""
+    """`@stop@` stands for the file `stop.inc`."""
     folder = files("appliance.features.tunnels").joinpath("kit_files")
     text, stop = (folder.joinpath(name).read_text(encoding="utf-8") for name in (script, "stop.inc"))
     return _Template(text.replace("@stop@\n", stop)).substitute(values)
@@ -81,7 +82,6 @@ def archive(kit: Kit) -> bytes:
 
 
 def swanctl_conf(kit: Kit) -> str:
-    """Return the configuration of swanctl, with a tunnel to each of two appliances."""
     # charon opens no tunnel: keep.sh notices a lost one in seconds (charon with its own settings in minutes), and opens
     # only one if there are two appliances.
     connections = "".join(_connection(kit, name, remote) for name, remote in kit.remotes.items())

@@ -1,11 +1,8 @@
 """Keep the one-time tokens with which hosts enrol themselves. A host with an unused token is *awaited*.
 
-Invariants:
-
-1. Only one answer contains a token's text, and only the hash of its secret is stored. The secret has
-   256 random bits, so a fast hash is enough.
-2. A token is valid once, for one name, until it expires or a newer token for the name replaces it. It is used up before
-   the certificate is requested, so if two hosts send the same token, only one gets a certificate.
+1. Only the hash of a token's secret is stored. The secret has 256 random bits, so a fast hash is enough.
+2. A token is valid once, for one name, until it expires or a newer token for the name replaces it. It is used up
+   before the certificate is requested, so if two hosts send the same token, only one gets a certificate.
 """
 
 import hashlib
@@ -47,7 +44,6 @@ class EnrolmentTokens:
     def add(
         self, name: str, *, seconds: float, address: str, days: float, kit: dict[str, str], who: str
     ) -> tuple[EnrolmentTokenRow, str]:
-        """Make a token; return its row and its text, which cannot be read again."""
         token_id, now = secrets.token_hex(6), clock.wall()
         secret = secrets.token_urlsafe(32)
         row = EnrolmentTokenRow(name, token_id, _hash(secret), now, now + seconds, address, days, kit, who)
@@ -57,7 +53,6 @@ class EnrolmentTokens:
         return row, f"rosrv-enrol_{token_id}_{secret}"
 
     def take(self, text: str) -> EnrolmentTokenRow:
-        """Use up the token. Raises `BadEnrolmentTokenError`."""
         found = _FORM.fullmatch(text)
         rows = {row.id: row for row in self.rows().values()}
         row = rows.get(found[1]) if found is not None else None

@@ -1,4 +1,4 @@
-"""The feature tunnels: charon, the enrolment of hosts that connect through IPsec, and the ports that nodes close."""
+"""Define the feature tunnels."""
 
 from typing import TYPE_CHECKING, Any
 

@@ -36,10 +36,9 @@ class Hosts(msgspec.Struct, frozen=True):
 class KitParts(msgspec.Struct, frozen=True, kw_only=True):
     """The contents of an enrolled host's kit, without its private key.
 
-    `rest_url` is the URL of REST in the tunnel, and `pin` the pin of its server's key. If either is empty,
-    the host cannot renew its certificate through REST. `rest_trouble` is why other machines cannot reach
-    REST, or empty. `kept` has the data that were stored with the one-time token. `second` is the address of
-    the other appliance of two, or empty; `pin` then names the keys of both.
+    Without `rest_url` and `pin`, the host cannot renew its certificate through REST. `rest_trouble` is why other
+    machines cannot reach REST. `kept` has the data that were stored with the one-time token. `second` is the
+    address of the other appliance of two; `pin` then names the keys of both.
     """
 
     revision: int

@@ -1,7 +1,7 @@
 """Routes of `/v1/hosts` that are not derived: one host, its kit, and changes whose answer is not control's.
 
-Every change needs `If-Match` with the ETag of `GET /v1/hosts`. This ETag changes with the table of hosts, but not when
-a tunnel goes up or down.
+Every change needs `If-Match` with the ETag of `GET /v1/hosts`, which does not change when a tunnel goes up or
+down.
 """
 
 import asyncio
@@ -82,7 +82,6 @@ async def _enrol(call: OperationCall[Any]) -> Response:
 
 
 async def _kit(call: OperationCall[Any]) -> Response:
-    """Return a kit; its key is made here unless the host has its own."""
     wishes, key, order = _wishes(call.body), None, call.order
     if not order.request:
         made = await asyncio.to_thread(make_key)

@@ -1,4 +1,4 @@
-"""`rosrv host add|list|kit|reload|revoke`: hosts with an IPsec tunnel."""
+"""The commands `rosrv host add|list|kit|reload|revoke`."""
 
 from pathlib import Path
 from typing import Annotated

@@ -1,4 +1,4 @@
-"""Show operators the hosts: a row for each, its difference from hosts.yaml, and what needs attention."""
+"""Show operators the hosts, their differences from hosts.yaml, and what needs attention."""
 
 import math
 from collections.abc import Mapping
@@ -72,7 +72,6 @@ class HostView:
         )
 
     def divergence(self, name: str) -> str | None:
-        """Return the difference from hosts.yaml, or None if there is none or hosts.yaml declares no hosts."""
         if not self._table.declared.there:
             return None
         declared, row = self._table.declared.hosts.get(name), self._table.rows.get(name)
@@ -110,7 +109,6 @@ class HostView:
         )
 
     def machines(self, machines: Mapping[str, int]) -> list[Machine]:
-        """Return machines with nodes in clear text, and others whose ports were checked."""
         told = self._table.ports.keys() - self._table.rows.keys() - self._table.declared.hosts.keys()
         return [
             Machine(address, machines.get(address, 0), self.ports(address))

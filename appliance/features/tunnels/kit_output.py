@@ -21,9 +21,7 @@ _LONGEST_REQUEST = 16 << 10
 
 
 def wishes_of(appliance: str | None, ports: str, opened: list[str] | None) -> KitOptions:
-    """Return the options of a kit; the endpoint is empty if the appliance must choose it. Exits with status 2
-    for invalid ones.
-    """
+    """The endpoint is empty if the appliance must choose it."""
     if appliance is not None and not _ENDPOINT.fullmatch(appliance):
         raise usage_error(f"--appliance {appliance!r} is neither an address nor a name")
     try:
@@ -33,7 +31,6 @@ def wishes_of(appliance: str | None, ports: str, opened: list[str] | None) -> Ki
 
 
 def placed(running: Appliance, wishes: KitOptions) -> tuple[KitOptions, str]:
-    """Return the options with an endpoint, and why the appliance chose it. Exits with status 1 if it cannot."""
     if wishes.endpoint:
         return wishes, ""
     found = running.ask_or_exit(HostEndpoint())
@@ -41,7 +38,6 @@ def placed(running: Appliance, wishes: KitOptions) -> tuple[KitOptions, str]:
 
 
 def key_and_request(csr: Path | None) -> tuple[str | None, str]:
-    """Return a new key and its request in PEM. With `csr`, return None and the request in that file."""
     if csr is not None:
         return None, _read_request(csr)
     key = make_key()

@@ -1,7 +1,7 @@
 """Write a kit or a script to standard output, or to a new file that only its owner can read.
 
-Enrolment cannot be undone: a new kit revokes the old certificate, and a token is shown only once. So the file is
-created, and disk space reserved, before the request is sent. If the request fails, the file is removed.
+Enrolment cannot be undone, and a token is shown only once. So the file is created, and disk space reserved,
+before the request is sent.
 """
 
 import contextlib
@@ -36,7 +36,7 @@ class Output:
         return self.path == STANDARD_OUTPUT
 
     def write(self, data: bytes, lost: str) -> None:
-        """Write the data; if that fails, print `lost`, which has the remedy, and exit with status 1."""
+        """If the data cannot be written, print `lost`, which has the remedy."""
         try:
             self._file.write(data)
             if not self.is_standard:
@@ -55,11 +55,7 @@ class Output:
 
 @contextlib.contextmanager
 def new_output(out: Path | None, default: str, *, as_json: bool) -> Iterator[Output]:
-    """Yield the output. Existing files are never replaced, and a file that the block did not write is
-    removed.
-
-    Exits with status 2 if the file cannot be created.
-    """
+    """Existing files are never replaced, and a file that the block did not write is removed."""
     name = default.replace("/", "_")
     if out == STANDARD_OUTPUT:
         if as_json:

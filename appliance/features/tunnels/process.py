@@ -1,14 +1,9 @@
 """Run charon, the IPsec daemon of the tunnels, which only this process talks to.
 
-This process makes the appliance's key for the tunnels once, and requests a certificate from the control process. The
-control process sends the complete wanted state (`TunnelsStated`) after each change; charon is started when the first
-state arrives. If charon dies, this process also ends, and the supervisor starts both again.
-
 1. The private key stays in this process's own directory (mode 0600) and in charon.
-2. charon has the privileges of this process: its own user, and the capabilities to change the network and to bind the
-   ports 500 and 4500. It dies with this process.
-3. The only untrusted input parsed here is charon's log, as lines of text; at most `REFUSALS_PER_SECOND` are passed
-   on.
+2. charon has the privileges of this process: its own user, and the capabilities to change the network and to bind
+   the ports 500 and 4500. Each dies with the other, and the supervisor starts both again.
+3. The only untrusted input parsed here is charon's log; at most `REFUSALS_PER_SECOND` are passed on.
 4. Calls to charon are made one at a time: two calls on one session would read each other's answers.
 """
 
@@ -77,7 +72,6 @@ class TunnelProcess:
         self.failed = False
 
     async def run(self) -> None:
-        """Serve until stopped or charon dies; set `failed` unless the end was orderly."""
         self._loop = asyncio.get_running_loop()
         self._child.attach(messages.Ready())
         self._spawn(self._provision())
@@ -207,7 +201,7 @@ class TunnelProcess:
                 await self._say_how_it_stands(self._vici)
 
     async def _say_how_it_stands(self, vici: ViciClient) -> None:
-        """Report the tunnels; list them again if a tunnel changed in the meantime, because the list may be older."""
+        """List again if a tunnel changed in the meantime, because the list may be older."""
         for _ in range(_LISTINGS):
             changes = self._changes
             seen = await self._in_turn(vici.seen)
@@ -253,7 +247,6 @@ def main(lifeline_fd: int, directory: Path) -> None:
 
 
 def tun_obstacle() -> str:
-    """Return why the TUN device cannot be opened, and the remedy, or an empty text."""
     try:
         os.close(os.open(TUN, os.O_RDWR | os.O_CLOEXEC))
     except OSError as error:

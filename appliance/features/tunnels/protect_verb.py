@@ -1,7 +1,6 @@
-"""`rosrv protect`: close the ROS ports of a machine with nodes, and check from outside that they are closed.
+"""The command `rosrv protect`.
 
-The verb works without a state directory, on any machine with this program. A running appliance supplies its address and
-receives the result of a check. Exit status: 0 done, or closed; 1 a port is open; 2 failed, or no answer.
+Exit status: 0 done, or closed; 1 a port is open; 2 failed, or no answer.
 """
 
 import json
@@ -196,7 +195,6 @@ def _check(checked: _CheckTarget, running: Appliance) -> None:
 
 
 def _own(running: Appliance) -> str:
-    """Return this machine's address. Raises `ValueError`."""
     hint = "give its address as this machine sees it: --appliance 192.168.1.20"
     if running.place is not None:
         raise ValueError(f"REST does not know the appliance's address on this machine's network; {hint}")

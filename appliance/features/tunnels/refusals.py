@@ -1,8 +1,7 @@
 """Parse refusals in charon's log, which reports refused tunnels only there. No I/O.
 
 One worker thread handles a packet from arrival to answer, so the lines of that thread in between belong to the
-packet. If ESP runs in charon, the log also has packets that a tunnel dropped: replays, and packets with an address
-that the tunnel does not permit.
+packet. If ESP runs in charon, the log also has packets that a tunnel dropped.
 """
 
 import re
@@ -43,7 +42,7 @@ _LONGEST = 400
 
 @dataclass(frozen=True)
 class Refusal:
-    """A refusal: an address and charon's reasons. `packet`: a tunnel's packet was dropped, not a request."""
+    """A refusal in charon's log; `packet`: a tunnel's packet was dropped, not a request."""
 
     remote: str
     reason: str
@@ -63,7 +62,6 @@ class RefusalParser:
         self._packets: dict[str, _Packet] = {}  # by worker thread; charon has 16 threads
 
     def read(self, line: str) -> Refusal | None:
-        """Return the refusal that this line completes."""
         found = _LINE.match(line)
         if found is None:
             return None

@@ -13,11 +13,9 @@ NO_TUNNELS = (
 
 @dataclass(frozen=True)
 class RestAddress:
-    """The ports of REST. `port` is for other machines; if it is None, `trouble` gives the reason and the
-    remedy.
+    """The ports of REST; `port` is for other machines; without it, `trouble` gives the reason and the remedy.
 
-    `inner_port` is for hosts in tunnels, at the appliance's tunnel address; None if these hosts cannot reach
-    REST.
+    `inner_port` is for hosts in tunnels, at the appliance's tunnel address.
     """
 
     port: int | None

@@ -1,7 +1,7 @@
 """Remove the key of the hosts' authority of a stopped appliance; its next start makes another one.
 
-This is for a stolen key, with which anyone can make certificates of trusted hosts. The key file is
-overwritten first, as by `purge`.
+This is for a stolen key, with which anyone can make certificates of trusted hosts. The key file is overwritten
+first.
 """
 
 import os
@@ -18,7 +18,6 @@ from appliance.supervisor.state_directory import StateDirectory, foreign
 
 
 def rotate_authority(state: Path) -> None:
-    """Remove the key. Raises `BackupError` if an appliance runs, is one of two, or has no authority."""
     state = state.absolute()
     folder = state / "signer"
     try:

@@ -1,11 +1,11 @@
 """Serve a host's own requests: enrol with a one-time token, renew its certificate through its tunnel.
 
-1. A token is used up before the authority is asked. If no certificate is issued, the token becomes valid again, so that
-   its bearer can correct the request. It stays used if its name was revoked in between.
-2. A host that renews must send from the virtual address of its name and prove that it has the name's present key. The
-   firewall accepts that address through IPsec only.
-3. The present certificate stays valid until the host reports that it has installed the next one. If the host loses its
-   connection in between, it can use either certificate.
+1. A token is used up before the authority is asked. If no certificate is issued, the token becomes valid again,
+   unless its name was revoked in between.
+2. A host that renews must send from the virtual address of its name, which the firewall accepts through IPsec
+   only, and prove that it has the name's present key.
+3. The present certificate stays valid until the host reports that it has installed the next one. If the host
+   loses its connection in between, it can use either certificate.
 4. A host can renew once in a twentieth of its certificate's life, because each renewal makes the list of revoked
    certificates longer.
 """
@@ -44,7 +44,6 @@ class HostSelfService:
         }
 
     async def enrol(self, request: host_requests.HostEnrol) -> KitParts:
-        """Enrol a host by its token. Raises `HostRefusedError`."""
         async with self._certification.changing:
             try:
                 awaited = self._certification.awaited.take(request.token)
@@ -68,7 +67,6 @@ class HostSelfService:
             return await self._certification.finish(name, awaited.kit)
 
     async def renew(self, request: host_requests.HostRenewItself) -> NewCertificate:
-        """Return a certificate for a host's new key. Raises `HostRefusedError`."""
         name = request.name
         async with self._certification.changing:
             row = self._in_its_tunnel(name, request.peer)
@@ -95,7 +93,6 @@ class HostSelfService:
             )
 
     async def renewed(self, request: host_requests.HostRenewed) -> Renewed:
-        """End a host's earlier certificate. Raises `HostRefusedError`."""
         name = request.name
         before = self._in_its_tunnel(name, request.peer).serial
         # Without the authority's key the previous certificate could not be put on the list of revoked certificates.
