@@ -1,1 +1,1 @@
-"""Fleet: push sealed segments of the audit log to a collector, and take its signed bundles."""
+"""Push sealed segments of the audit log to a collector, and take its signed bundles."""

@@ -1,16 +1,12 @@
-"""Bring bundles of the fleet into force through the same gate as local loads, all parts or none.
+"""Bring bundles of the fleet, which TUF has verified, into force through the same gate as local loads.
 
-The gate decides on bundles that TUF has verified: hosts.yaml is parsed, the policy is compiled and passes the bundle's
-own test cases, the specifications compile and every relay takes them; with `site_keys`, all texts are signed. Then a
-trial of `confirm_seconds` begins: the bundle stays only if the robot stays healthy.
-
-Invariants:
 1. Before the first change, a journal (`BundleRecord.trial`) with the way back is on the disk. If control or the
    appliance ends during a trial, the next start goes back.
-2. The bundle in force changes in one write, at the end of a healthy trial.
+2. The bundle in force changes in one write, at the end of a trial in which the robot stayed healthy.
 3. Going back never undoes a change that an operator made during the trial.
 4. A refused bundle changes nothing; the last good one stays in force.
-5. A bundle whose monitors would hold topics that carry messages waits: the robot would get no command, not even a stop.
+5. A bundle whose monitors would hold topics that carry messages waits: the robot would get no command, not even a
+   stop.
 """
 
 import asyncio
@@ -66,7 +62,7 @@ _UNCONFIRMED_CHANGE = "a local change waits for its confirmation; the bundle wai
 
 
 class Trial(msgspec.Struct, frozen=True):
-    """The journal of a trial: the bundle, and what was in force before (`hosts_back` is empty for hosts.yaml)."""
+    """The bundle, and the state before (`hosts_back` is empty for hosts.yaml)."""
 
     path: str
     sha256: str
@@ -81,12 +77,12 @@ class Trial(msgspec.Struct, frozen=True):
 
 
 class BundleRecord(msgspec.Struct, frozen=True):
-    """The stored record.
+    """The stored record; `policy_back` is the revision of the policy before the bundle.
 
-    `policy_back` is the revision of the policy before the bundle. `content` is the fingerprint of all parts when the
-    bundle came into force. Revision numbers do not tell whether a part was changed: going back makes a new revision
-    of the same text. Records of earlier versions have only numbers. `interrupted` is the SHA-256 of the bundle whose
-    last `interruptions` trials ended with the process.
+    `content` is the fingerprint of all parts: revision numbers do not tell whether a part was changed, because
+    going back makes a new revision of the same text. `interrupted` is the SHA-256 of the bundle whose last
+    `interruptions` trials ended with the process.
+
     """
 
     in_force: str = ""
@@ -103,15 +99,13 @@ class BundleRecord(msgspec.Struct, frozen=True):
 
 
 def disabled_among(monitors: Iterable[str], switches: Switches) -> str:
-    """Return the end of a record's reason that names the disabled monitors, or an empty text."""
     off = [name for name in monitors if not (switches.enabled(name) or switches.in_shadow(name))]
     return f"; disabled on this robot: {', '.join(off)} (rosrv monitor enable)" if off else ""
 
 
 class BundleGate:
-    """Control's end of the link to the process `bundles`.
-
-    `health(deprived)` leaves out denials of hosts for which `deprived(host)` is true.
+    """Control's end of the link to the process `bundles`. `health(deprived)` leaves out denials of hosts for
+    which `deprived(host)` is true.
     """
 
     def __init__(
@@ -142,7 +136,6 @@ class BundleGate:
         self._fingerprinted: tuple[object, str] = (None, "")
 
     def status(self) -> BundlesState | None:
-        """Return the state, or None if no bundles are configured or in force."""
         record, fleet = self._record, self._fleet
         if fleet.bundles.root is None and not record.in_force:
             return None
@@ -273,7 +266,6 @@ class BundleGate:
             self._save(msgspec.structs.replace(self._record, trial=None))
 
     async def _try(self, trial: Trial, contents: BundleContents) -> None:
-        """Put a bundle into force; keep it if the robot stays healthy, otherwise go back."""
         before, self._earlier = self._health(), self._policies.current
         try:
             await self._put_in_force(trial, contents)
@@ -308,7 +300,7 @@ class BundleGate:
         )
 
     async def _put_in_force(self, trial: Trial, contents: BundleContents) -> None:
-        """Bring all parts into force. Raises one of `_REFUSALS`, after which some parts may be in force."""
+        """After one of `_REFUSALS`, some parts may be in force."""
         await self._monitors.take_bundle(_sources(contents), trial.who, "of the bundle")
         load = admin.PolicyLoad(contents.policy, "of the bundle", signature=contents.policy_signature)
         await self._policies.load_with(load, trial.who, _cases(contents))
@@ -327,8 +319,8 @@ class BundleGate:
             await asyncio.sleep(min(_TICK_SECONDS, max(0.0, deadline - clock.now())))
 
     def _health(self) -> RobotHealth:
-        """Return the robot's health without the effects that every activation of the bundle has: denials of
-        hosts that lost a right, and monitors that hold because they lost their state.
+        """Leave out the effects that every activation of the bundle has: denials of hosts that lost a right, and
+        monitors that hold because they lost their state.
         """
         old, new, lost = self._earlier, self._policies.current, self._lost
         if old is None:

@@ -1,8 +1,7 @@
 """Compare the robot's health before and after a change: denials, monitors, processes.
 
-A host that loses a right may cause many denials on purpose. So all denials of the robot's own nodes count, but only a
-few of every other host, and of all other hosts together little more than the number that needs attention. Denials of a
-host from which the bundle itself took a right do not count.
+All denials of the robot's own nodes count, but only a few of every other host, because one host may cause many on
+purpose.
 """
 
 import ipaddress
@@ -25,10 +24,8 @@ _OF_ONE_HOST, _OF_OTHER_HOSTS = 3, 12
 def counted_denials(
     by_host: Mapping[str, int], policy: Policy, deprived: Callable[[Address], bool] = lambda _host: False
 ) -> int:
-    """Return the number of denials that count; `by_host` has the denials of all unknown hosts under an empty
-    name.
-
-    Addresses that the policy names as one network count as one host.
+    """`by_host` has the denials of all unknown hosts under an empty name. Addresses that the policy names as one
+    network count as one host.
     """
     own, others = 0, Counter[str]()
     for host, number in by_host.items():
@@ -41,9 +38,7 @@ def counted_denials(
 
 
 class RobotHealth(NamedTuple):
-    """The robot's health; `denials` are the last minute's that count, `failing` monitors fail or hold topics,
-    `processes` keep ending.
-    """
+    """The denials of the last minute, failing monitors, and processes that keep ending."""
 
     denials: int
     failing: frozenset[str]
@@ -68,7 +63,6 @@ class RobotHealth(NamedTuple):
         )
 
     def worse_than(self, before: "RobotHealth") -> str:
-        """Return why the robot is less healthy than before; empty if it is not."""
         most = max(_MORE_OFTEN * before.denials, _ATTENTION_AT)
         if self.rejected and not before.rejected:
             return f"a relay rejects the specifications: {self.rejected[0]}"

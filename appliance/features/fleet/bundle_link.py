@@ -7,9 +7,7 @@ from appliance.formats.bundle_archive import BundleContents
 
 
 class BundleOffered(Message):
-    """The process offers a verified bundle for this robot. `path` is SITE/GROUP/VERSION.tar; `sha256`
-    identifies its archive.
-    """
+    """A verified bundle. `path` is SITE/GROUP/VERSION.tar; `sha256` identifies its archive."""
 
     path: str
     sha256: str
@@ -20,7 +18,7 @@ class BundlePollReported(Message):
     """The state of polling, after each change and each check.
 
     `checked` is when the collector's metadata were last verified (seconds since the epoch; 0: not yet).
-    `trouble` is the reason if the last check failed; `rejected`: the collector's files were not accepted.
+    `rejected`: its files were not accepted.
     """
 
     checked: float = 0.0
@@ -44,7 +42,7 @@ class BundleHealth(msgspec.Struct, frozen=True):
 
 
 class BundleStated(Message):
-    """Control reports the bundle in force, the one under commit-confirm, and the last refused one.
+    """The bundle in force, under commit-confirm, and refused last.
 
     `changed`: an operator has since changed the policy, the specifications or the hosts on the robot.
     """

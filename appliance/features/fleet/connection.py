@@ -1,10 +1,9 @@
-"""Connect to the collector over HTTPS with the robot's certificate. The collector and the network are not trusted.
+"""Connect to the collector over HTTPS with the robot's certificate. The collector and the network are not
+trusted.
 
-Invariants:
 1. Only the configured collector is asked. httpcore follows no redirect, uses no proxy and expands nothing.
-2. An exchange has one deadline: connecting, the handshake, the request, the head and the body of the answer together.
-3. An answer beyond its size limit is discarded. Compressed answers are not requested, and rejected.
-4. After a failure the connection is closed. Each connection reads the certificate files, so replaced ones apply.
+2. An exchange has one deadline for all its parts. Answers have a size limit, and compressed ones are rejected.
+3. Each connection reads the certificate files, so replaced ones apply.
 """
 
 import ssl
@@ -38,10 +37,7 @@ _FAILURES = (httpcore.TimeoutException, httpcore.NetworkError, httpcore.Protocol
 
 
 class CollectorError(Exception):
-    """The collector is unreachable or gave no usable answer.
-
-    `status` is its HTTP status, or None. `wait` is the number of seconds that it asks for; 0: none.
-    """
+    """The collector gave no usable answer. `wait` is the number of seconds that it asks for; 0: none."""
 
     def __init__(self, reason: str, status: int | None = None, wait: float = 0.0) -> None:
         super().__init__(reason)
@@ -61,13 +57,10 @@ class ConditionalAnswer(NamedTuple):
 
 
 class CollectorConnection:
-    """A connection to the collector, opened when it is needed. Not thread-safe."""
+    """A connection, opened when it is needed. Not thread-safe. Methods raise `CollectorError`."""
 
     def __init__(self, url: str, context: Callable[[], ssl.SSLContext], name: str | None = None) -> None:
-        """`url` is `https://ADDRESS:PORT`; `context` makes the TLS context of each connection, or raises `OSError`.
-
-        `name` is the name in the collector's certificate (None: the address).
-        """
+        """`url` is `https://ADDRESS:PORT`, `name` the name in the collector's certificate (None: the address)."""
         self.url = url
         self._context = context
         self._known: dict[str, ConditionalAnswer] = {}
@@ -77,11 +70,9 @@ class CollectorConnection:
         self._connection: httpcore.HTTPConnection | None = None
 
     def get(self, path: str, longest: int = _LARGEST_ANSWER) -> bytes:
-        """Return the body of an answer. Raises `CollectorError`."""
         return b"".join(self.chunks(path, longest))
 
     def get_changed(self, path: str, longest: int) -> bytes:
-        """Return the body, or the known one if its entity tag is still current. Raises `CollectorError`."""
         known = self._known.get(path)
         headers = [] if known is None else [("If-None-Match", known.tag)]
         with self._exchange("GET", path, headers) as answer:
@@ -94,26 +85,23 @@ class CollectorConnection:
             return body
 
     def chunks(self, path: str, longest: int) -> Iterator[bytes]:
-        """Yield the body in chunks. Raises `CollectorError`."""
         with self._exchange("GET", path) as answer:
             yield from _bounded(path, answer, longest)
 
     def put(
         self, path: str, content: Iterator[bytes], size: int, headers: Iterable[tuple[str, str]] = ()
     ) -> bytes:
-        """Send `size` bytes and return the answer. Raises `CollectorError`, and the errors of `content`."""
         sent = [("Content-Length", str(size)), *headers]
         with self._exchange("PUT", path, sent, content, size) as answer:
             return b"".join(_bounded(path, answer, _LARGEST_ANSWER))
 
     def post(self, path: str, body: bytes) -> bytes:
-        """Send the body and return the answer. Raises `CollectorError`."""
         sent = [("Content-Length", str(len(body)))]
         with self._exchange("POST", path, sent, iter((body,)), len(body)) as answer:
             return b"".join(_bounded(path, answer, _LARGEST_ANSWER))
 
     def events(self, path: str) -> Iterator[bytes]:
-        """Yield the parts of an event stream until it ends. Raises `CollectorError`, even if the stream is silent."""
+        """Yield the parts of an event stream until it ends or is silent."""
         with self._exchange("GET", path, [("Accept", "text/event-stream")]) as answer:
             self._deadline.begin(_SILENT_SECONDS)
             for part in _checked(path, answer).iter_stream():
@@ -122,7 +110,6 @@ class CollectorConnection:
 
     @property
     def is_open(self) -> bool:
-        """Whether the next exchange continues on the present connection."""
         connection = self._connection
         return connection is not None and connection.is_available() and not connection.has_expired()
 
@@ -140,7 +127,6 @@ class CollectorConnection:
         content: Iterator[bytes] | None = None,
         size: int = 0,
     ) -> Iterator[httpcore.Response]:
-        """Send a request and yield the head of the answer. Raises `CollectorError`."""
         self._deadline.begin(_EXCHANGE_SECONDS + size / _SLOWEST_UPLOAD)
         sent: Any = [*self._headers, *headers]  # httpcore takes text and bytes, but its types say one of them
         url = f"{self.url}/{path}"
@@ -163,7 +149,6 @@ class CollectorConnection:
             raise CollectorError(f"{self.url}/{path.partition('?')[0]}: {reason}") from error
 
     def _connected(self) -> httpcore.HTTPConnection:
-        """Return an open connection. Raises `OSError` for unusable certificate files."""
         if self._connection is None or not self.is_open:
             self.close()
             self._connection = httpcore.HTTPConnection(
@@ -173,8 +158,6 @@ class CollectorConnection:
 
 
 class _Deadline:
-    """The deadline of an exchange, which all waits on the connection share."""
-
     def __init__(self) -> None:
         self.seconds = 0.0
         self._end = 0.0
@@ -241,7 +224,6 @@ class _Stream(httpcore.NetworkStream):
 
 
 def _bounded(path: str, answer: httpcore.Response, longest: int) -> Iterator[bytes]:
-    """Yield the body of at most `longest` bytes. Raises `CollectorError`."""
     size = 0
     for part in _checked(path, answer).iter_stream():
         size += len(part)
@@ -251,7 +233,6 @@ def _bounded(path: str, answer: httpcore.Response, longest: int) -> Iterator[byt
 
 
 def _checked(path: str, answer: httpcore.Response) -> httpcore.Response:
-    """Return an expected answer; raise `CollectorError` with the collector's reason for any other."""
     if _header(answer, b"content-encoding") not in (b"", b"identity"):
         raise CollectorError(f"{path}: the collector compresses its answer")
     if answer.status in _EXPECTED:
@@ -283,7 +264,6 @@ def _header(answer: httpcore.Response, name: bytes) -> bytes:
 
 
 def trusting_context(ca: Path) -> ssl.SSLContext:
-    """Return a context that trusts only `ca`. Raises `OSError`."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.minimum_version = ssl.TLSVersion.TLSv1_3
     try:
@@ -295,10 +275,6 @@ def trusting_context(ca: Path) -> ssl.SSLContext:
 
 
 def robot_context(ca: Path, certificate: Path, key: Path) -> ssl.SSLContext:
-    """Return a context that trusts only `ca`, and presents `certificate`.
-
-    Raises `OSError`, and `CollectorError` for a certificate that is not valid now.
-    """
     context = trusting_context(ca)
     try:
         with path_for_library(certificate) as chain, path_for_library(key) as private:

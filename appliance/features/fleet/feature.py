@@ -1,4 +1,4 @@
-"""The feature fleet: one process pushes segments of the audit log to a collector, another one polls it for bundles."""
+"""Define the feature fleet, with a process for each direction."""
 
 from appliance.cli.verb_table import Group, Verb
 from appliance.configuration.sections import Sections

@@ -1,8 +1,7 @@
 """Notice after a takeover that only one appliance of a pair belongs to a fleet.
 
-Each appliance joins the collector itself. The replicated state has the fleet of the appliance that was active last: an
-active appliance that is not in this fleet pushes no log and takes no bundles, and the collector may believe that the
-robot is quiet.
+An active appliance without the earlier one's fleet pushes no log, and the collector may believe that the robot is
+quiet.
 """
 
 import msgspec
@@ -15,7 +14,7 @@ _SETTING = "fleet of the active appliance"
 
 
 class FleetOfAppliance(msgspec.Struct, frozen=True):
-    """The fleet of an appliance; the robot's name in the fleet is empty without one."""
+    """The fleet of an appliance; `robot` is empty without one."""
 
     name: str
     robot: str = ""
@@ -23,7 +22,6 @@ class FleetOfAppliance(msgspec.Struct, frozen=True):
 
 
 def compare_fleets(fleet: Fleet, store: StateStore, trail: AuditTrail, *, name: str) -> None:
-    """Record an alarm if the other appliance is in a fleet in which this one, `name`, is not. Raises `StoreError`."""
     own = FleetOfAppliance(name, fleet.robot, fleet.collector or "")
     try:
         last = msgspec.json.decode(store.settings().get(_SETTING, ""), type=FleetOfAppliance)

@@ -1,4 +1,4 @@
-"""`rosrv fleet join|leave`: push the audit log to a collector, or stop it. Both work without a running appliance."""
+"""The commands `rosrv fleet join|leave`, which work without a running appliance."""
 
 import hashlib
 import shutil
@@ -127,9 +127,10 @@ def _unfinished(state: Path) -> Path:
 
 
 def prepare_membership(folder: Path, invitation: Invitation) -> str:
-    """Write the files of the membership; return the certificate (PEM). Raises `OSError`.
+    """Write the files of the membership; return the certificate (PEM).
 
     The key and the certificate of an earlier try with this token are kept: the collector may have enrolled them.
+
     """
     token = hashlib.sha256(invitation.token.encode()).hexdigest()
     if not _is_for(folder, token):
@@ -150,10 +151,7 @@ def prepare_membership(folder: Path, invitation: Invitation) -> str:
 
 
 def _is_for(folder: Path, token: str) -> bool:
-    """Return whether `folder` has the key and a certificate of an earlier try with this token. Raises `OSError`.
-
-    A certificate that is not valid now was made before the clock was corrected: no collector has enrolled it.
-    """
+    """A certificate that is not valid now was made before the clock was corrected: no collector has enrolled it."""
     try:
         same = (folder / _USED_FOR).read_text(encoding="ascii") == token
         return same and not untimely((folder / CERTIFICATE).read_bytes(), "this machine")

@@ -13,7 +13,6 @@ _LONGEST_BUNDLE = 16 << 20
 
 
 def make_part(context: OperatorContext) -> FeaturePart:
-    """Return control's part. Raises `StoreError`."""
     fleet = context.core.sections.of(Fleet)
     if context.appliance:
         compare_fleets(fleet, context.store, context.core.trail, name=context.appliance)

@@ -1,10 +1,7 @@
 """Poll the collector: verify its metadata, offer the selected bundle to control, and report the robot's state.
 
-Invariants:
-1. A bundle is offered to control only after `VerifiedBundles` has accepted it. Control decides whether it comes into
-   force.
-2. A refused bundle is not offered again until the collector selects another one.
-3. If a step fails, the next one begins after a pause; nothing else changes on the robot.
+Only bundles that `VerifiedBundles` has accepted are offered, and a refused one not again until the collector
+selects another one.
 """
 
 import random
@@ -36,7 +33,7 @@ _REPORT_AGAIN_SECONDS = 5.0
 
 @dataclass(slots=True)
 class Poller:
-    """`stated()` returns control's last statement, or None without a link; `offer` sends a bundle to control."""
+    """Polls the collector. `stated()` returns control's last statement; `offer` sends a bundle to control."""
 
     bundles: VerifiedBundles
     connection: CollectorConnection
@@ -52,7 +49,6 @@ class Poller:
     _retry_at: float = 0.0
 
     def step(self) -> float:
-        """Return the seconds until the next step."""
         stated = self.stated()
         if stated is None:
             return _jittered(_BACK_OFF[0])
@@ -137,5 +133,5 @@ def _offered(bundle: VerifiedBundle) -> BundleOffered:
 
 
 def _jittered(seconds: float) -> float:
-    """Return the time with jitter, because robots must not ask at the same time."""
+    """Robots must not ask at the same time."""
     return seconds * random.uniform(1 - _JITTER, 1 + _JITTER)  # noqa: S311  spreads load, protects nothing

@@ -1,7 +1,6 @@
 """Run the client of bundles as a process of the appliance: lifeline, link to control, and two threads.
 
-One thread polls the collector; the other listens to its events, which only make the next poll earlier. The process
-reads no state of the appliance. It runs as a separate user, and the firewall lets it reach only the collector.
+It reads no state of the appliance. It runs as a separate user, and the firewall lets it reach only the collector.
 """
 
 import asyncio
@@ -43,10 +42,10 @@ def main(lifeline_fd: int, config: Path) -> None:
 
 
 class PollLoop:
-    """Two threads, of which one polls and the other listens to `events` at `path`.
+    """One thread polls, the other listens to events, which only make the next poll earlier.
 
-    The first poll, and those after events, are spread over some seconds, because all robots start or are
-    woken at the same time.
+    Polls are spread over some seconds, because all robots start or are woken at the same time.
+
     """
 
     def __init__(self, poller: Poller, events: CollectorConnection, path: str) -> None:
@@ -58,11 +57,11 @@ class PollLoop:
 
     @property
     def alive(self) -> bool:
-        """Whether both threads run; an exception that ends one is a logged defect."""
+        """An exception that ends a thread is a logged defect."""
         return all(thread.is_alive() for thread in self._threads)
 
     def start(self) -> None:
-        """Start the threads, as daemons: the end of the process does not wait for a hanging collector."""
+        """Start the threads as daemons: the end of the process does not wait for a hanging collector."""
         for work in (self._poll, self._listen):
             context = contextvars.copy_context()  # keeps the process name in the thread's log lines
             thread = threading.Thread(target=context.run, args=(work,), name=work.__name__, daemon=True)
@@ -70,7 +69,6 @@ class PollLoop:
             self._threads.append(thread)
 
     def stop(self, seconds: float) -> None:
-        """Wait at most `seconds` for the polling thread."""
         self._ending.set()
         self._wake.set()
         self._threads[0].join(seconds)
@@ -150,7 +148,6 @@ def _some_of(seconds: float) -> float:
 def listen(
     connection: CollectorConnection, path: str, ending: threading.Event, wake: Callable[[], None]
 ) -> None:
-    """Call `wake` at each event of the stream until `ending` is set."""
     failures = 0
     while not ending.is_set():
         try:
@@ -175,7 +172,6 @@ def make_poller(
     stated: Callable[[], BundleStated | None],
     offer: Callable[[BundleOffered], object],
 ) -> Poller:
-    """Return the poller of settings that configure bundles. Raises `OSError`."""
     wanted = fleet.bundles
     assert wanted.root is not None  # noqa: S101  the role runs only with it
     connection = robot_connection(*fleet.connection)

@@ -17,7 +17,6 @@ def main(lifeline_fd: int, config: Path) -> None:
 
 
 def make_pusher(settings: Settings, folder: Path) -> SegmentPusher:
-    """Return the pusher of settings that configure a collector. Raises `KeyUnreadableError`."""
     fleet = settings.of(Fleet)
     assert fleet.receipt_key is not None  # noqa: S101  the role runs only with it
     return SegmentPusher(

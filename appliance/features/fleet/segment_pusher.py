@@ -1,16 +1,12 @@
 """Push the log's sealed segments to the collector: in order, until each has a receipt.
 
-Invariants:
-
 1. The database is only read, so pushing never delays the log or loses its records.
-2. Memory is bounded: one record. The segment at work is a compressed file in this process's folder.
+2. Memory is bounded by one record. The segment at work is a compressed file.
 3. A segment counts only with a receipt that the collector's key signed, and that is on this disk.
-4. On each new connection the collector reports what it has: it may have been restored from a backup. Repeating a
-   segment is harmless.
+4. On each new connection the collector reports what it has: it may have been restored from a backup.
 5. Records that retention removed before they had a receipt are counted and reported (`missed`).
 6. If the log was restored from a copy, pushing continues from the last checkpoint that both have.
-7. While nothing waits, the robot states so every minute (`idle`): a robot without records is not a silent one. It does
-   not while a checkpoint waits for its signature or for a receipt.
+7. While nothing waits, the robot states so every minute: a robot without records is not a silent one.
 """
 
 import gzip
@@ -48,7 +44,7 @@ _log = structlog.get_logger()
 
 
 class PushPosition(msgspec.Struct, frozen=True):
-    """The last segment with a receipt: the number of its checkpoint, and its last sequence."""
+    """The last segment with a receipt."""
 
     log: str
     number: int = 0
@@ -56,9 +52,7 @@ class PushPosition(msgspec.Struct, frozen=True):
 
 
 class StoredHead(msgspec.Struct, frozen=True):
-    """The collector's newest checkpoint of a log (number 0: none), with the hashes of all checkpoints of this
-    number.
-    """
+    """The collector's newest checkpoint of a log (number 0: none), with the hashes of all of this number."""
 
     robot: str
     log: str
@@ -68,7 +62,7 @@ class StoredHead(msgspec.Struct, frozen=True):
 
 @dataclass(slots=True)
 class SegmentPusher:
-    """Pushes segments; its files are in `folder`. It trusts receipts of `receipt_key` (raw)."""
+    """Pushes segments with files in `folder`; the public key `receipt_key` (raw) verifies the receipts."""
 
     log: Path
     folder: Path
@@ -95,7 +89,6 @@ class SegmentPusher:
         self.collector.close()
 
     def _begin(self) -> PushPosition:
-        """Begin after the last checkpoint that the collector and the log both have."""
         log, upto = _newest_signed(self.log)
         lowest = next_segment(self.log, 0) or 1
         position, step = PushPosition(log), 1
@@ -119,7 +112,6 @@ class SegmentPusher:
         return position
 
     def _kept_sequence(self, log: str, number: int) -> int:
-        """Return the last sequence of segment `number`; 0 unless it had the last receipt."""
         try:
             kept = msgspec.json.decode((self.folder / "position.json").read_bytes(), type=PushPosition)
         except (FileNotFoundError, ValueError):
@@ -127,15 +119,11 @@ class SegmentPusher:
         return kept.sequence if (kept.log, kept.number) == (log, number) else 0
 
     def _has_log(self) -> bool:
-        """Whether there is a log; only an appliance that was never active has none."""
+        """Only an appliance that was never active has no log."""
         return self.log.exists() or (self.folder / "position.json").exists()
 
     def _state_presence(self, position: PushPosition) -> bool:
-        """Report that nothing waits, unless that was reported lately.
-
-        If the collector lacks the last segment, pushing begins again. Raises `CollectorError` and
-        `ValueError`.
-        """
+        """If the collector lacks the last segment, pushing begins again."""
         now = clock.now()
         if now < self._presence_due:
             return False
@@ -185,7 +173,6 @@ class SegmentPusher:
         return True
 
     def _write(self, file: Path, number: int) -> SegmentSummary | None:
-        """Write a segment and return its summary; None, without a file, if it is not signed yet."""
         left = _LARGEST_SEGMENT
         try:
             with (
@@ -218,7 +205,7 @@ class SegmentPusher:
             )
 
     def _keep(self, receipt: SegmentReceipt) -> None:
-        """Store a receipt, and keep only the last 16 to 32 MiB of receipts."""
+        """Keep only the last 16 to 32 MiB of receipts."""
         file = self.folder / "receipts.ndjson"
         with file.open("a+b") as kept:
             if kept.tell():  # a kill or a full disk may have left a part of a line
@@ -254,7 +241,7 @@ class SegmentPusher:
         )
 
     def _failed(self, error: Exception) -> float:
-        """Return the pause after an error; it grows, with jitter, so that robots do not return together."""
+        """Return a pause that grows, with jitter, so that robots do not return together."""
         self.collector.close()
         self._position = None
         reason = str(error) or type(error).__name__
@@ -283,7 +270,7 @@ def _sequence_of(log: Path, number: int, hashes: list[str]) -> int | None:
 
 
 def _is_passed_over(log: Path, number: int) -> bool:
-    """Return whether this checkpoint is not signed, but a later one is, so that it never will be."""
+    """The checkpoint is not signed, but a later one is, so that it never will be."""
     signed = signed_checkpoints(log, number - 1, 1)
     return bool(signed) and signed[0].number > number and next_segment(log, number - 1) == number
 

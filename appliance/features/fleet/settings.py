@@ -10,13 +10,11 @@ from appliance.configuration.sections import FeatureSection, key, section, split
 from appliance.formats.fleet_membership import FOLDER, SETTINGS, joined_settings
 
 PUSHER, POLLER = "fleet", "bundles"
-"""The names of the two roles and of their links."""
 
 _WORD = re.compile(r"[a-z0-9][a-z0-9-]{0,62}")
 
 
 def split_collector(text: str) -> tuple[str, int]:
-    """Parse `https://ADDRESS:PORT`. Raises `ValueError`."""
     protocol, _slashes, place = text.partition("://")
     if protocol != "https" or place.endswith("/"):
         raise ValueError(f"{text!r} is not https://ADDRESS:PORT, for example https://10.0.0.9:8444")
@@ -136,7 +134,6 @@ class Fleet(FeatureSection):
 
     @property
     def connection(self) -> tuple[str, Path, Path, Path, str | None]:
-        """Return the collector's URL and authority, this robot's certificate and key, and the collector's name."""
         assert self.collector and self.ca and self.certificate and self.key  # noqa: S101  checked above
         return self.collector, self.ca, self.certificate, self.key, self.name
 

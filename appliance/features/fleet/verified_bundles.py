@@ -1,15 +1,12 @@
 """Verify bundles with TUF.
 
-The collector is not trusted. It can withhold a bundle, and choose one of those that the group's key has signed and not
-withdrawn. It cannot change a bundle, bring back a withdrawn one, or give a robot the bundle of another site, group or
-later ring.
+The collector is not trusted. It can withhold a bundle, and choose one of those that the group's key has signed.
+It cannot change a bundle, bring back a withdrawn one, or give a robot the bundle of another site, group or later
+ring.
 
-Invariants:
 1. Every check refreshes the metadata first. Expired, older or badly signed metadata end the check.
-2. The trusted metadata are on the disk before a bundle is used, so neither a kill nor a power cut undoes what the
-   robot knows.
-3. A selected bundle is accepted only for the robot's own site and group, if their role has signed it and its ring may
-   take it now.
+2. The trusted metadata are on the disk before a bundle is used, so a power cut undoes nothing that the robot
+   knows.
 """
 
 import os
@@ -78,8 +75,6 @@ class SelectedBundle:
 
 
 class _Fetcher(FetcherInterface):
-    """Fetches metadata, and the timestamp with its entity tag."""
-
     def __init__(self, connection: CollectorConnection) -> None:
         self._connection = connection
 
@@ -98,7 +93,11 @@ class _Fetcher(FetcherInterface):
 
 
 class VerifiedBundles:
-    """The bundles of the robot's group, with trusted metadata in `folder`. Not thread-safe."""
+    """The bundles of the robot's group. Not thread-safe.
+
+    Methods raise `BundleRejectedError`, `BundleFolderError` and `CollectorError`.
+
+    """
 
     def __init__(
         self,
@@ -111,7 +110,7 @@ class VerifiedBundles:
         robot: str,
         clock: Callable[[], float] = clock.wall,
     ) -> None:
-        """`root` is the root metadata that the operator trusts."""
+        """The operator trusts the root metadata in `root`."""
         self._metadata = folder / "metadata"
         self._download = folder / "bundle.tar"
         self._root = root
@@ -123,10 +122,6 @@ class VerifiedBundles:
         self._updater: Updater | None = None
 
     def refresh(self) -> None:
-        """Verify the newest metadata.
-
-        Raises `BundleRejectedError`, `BundleFolderError` and `CollectorError`.
-        """
         self._updater = None
         with _translated():
             self._metadata.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -147,10 +142,7 @@ class VerifiedBundles:
         self._updater = updater
 
     def selected(self) -> SelectedBundle | None:
-        """Return the signed bundle that the collector selects for this robot, or None.
-
-        Call `refresh` before. Raises its errors, and `BundleTooEarlyError`.
-        """
+        """Call `refresh` before. Raises `BundleTooEarlyError`."""
         text = (
             self.connection.get_changed(self._selection, _LONGEST_SELECTION)
             .decode("utf-8", "replace")
@@ -177,7 +169,6 @@ class VerifiedBundles:
         return SelectedBundle(path, target)
 
     def get(self, selected: SelectedBundle) -> VerifiedBundle:
-        """Return the bundle of the target. Raises as `refresh`."""
         if self._updater is None:
             raise RuntimeError("refresh the metadata first")
         with _translated():

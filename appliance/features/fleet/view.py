@@ -1,4 +1,4 @@
-"""The states of the push of the audit log and of the bundles, with their alarms, metrics and lines."""
+"""Show the push and the bundles in the status, the alarms and the metrics."""
 
 from collections.abc import Iterator
 from typing import Annotated, Any
