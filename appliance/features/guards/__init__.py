@@ -1,1 +1,1 @@
-"""Guards: presets of specifications that stop a robot, and the commands that bring them into force."""
+"""Presets of specifications that stop a robot, and the commands that bring them into force."""

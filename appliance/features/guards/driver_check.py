@@ -1,14 +1,9 @@
-"""Measure whether a robot's own driver stops its base when commands end: `rosrv guard check-driver`.
+"""Measure whether a robot's own driver stops its base when commands end.
 
-An ordinary monitor (`monitors/guards/driver_check.rv`) withholds the motions and measures. Control loads it behind all
-other monitors, reads its line in the log, and removes it.
-
-Invariants:
-
-1. The monitor withholds only motions, once, and at most for the given time, whatever happens to control. Guards stay in
-   force: a stop by one of them, an operator or a node passes, and ends the check.
-2. Control removes the monitor after its line, when a relay process was replaced, when the client stops asking (its
-   command was killed), and at the start of control. If all of this fails, the load is rolled back as unconfirmed.
+1. A monitor withholds only motions, once, and at most for the given time, whatever happens to control. A stop by
+   a guard, an operator or a node passes, and ends the check.
+2. Control removes it after its line in the log, when a relay was replaced, when the client stops asking, and at
+   the start of control. If all of this fails, the load is rolled back as unconfirmed.
 """
 
 import asyncio
@@ -50,7 +45,7 @@ _log = structlog.get_logger()
 
 
 class DriverChecks:
-    """Begins one check at a time, and ends it; `processes()` returns the processes of the appliance."""
+    """Begins one check at a time, and ends it."""
 
     def __init__(
         self,
@@ -74,7 +69,6 @@ class DriverChecks:
         )
 
     async def begin(self, request: DriverCheckBegin, who: str) -> DriverCheck:
-        """Load the monitor. Raises `SenselessError`, and the errors of a load."""
         async with self._changing:
             return await self._begin(request, who)
 
@@ -118,7 +112,6 @@ class DriverChecks:
             await asyncio.sleep(_LOOK_SECONDS)
 
     async def look(self) -> None:
-        """End a check that no client waits for, or whose relay is gone; remove the monitor without a running check."""
         if NAME not in self._monitors.checked.monitors:
             if self._under_way():
                 self._end("interrupted", None, "its monitor was removed")
@@ -172,7 +165,6 @@ class DriverChecks:
         return [one.pid for one in self._processes() if one.role.startswith("relay")]
 
     def _text(self, request: DriverCheckBegin) -> str:
-        """Return the monitor, behind all others. Raises `SenselessError`."""
         values = {"longest": f"{request.seconds:g}", "patience": f"{request.patience:g}"}
         topics = {"command": request.command, "by": request.by}
         try:

@@ -1,4 +1,4 @@
-"""The outcomes of a driver check, as sentences and as exit statuses of `rosrv guard check-driver`."""
+"""The outcomes of a driver check, as sentences and as exit statuses."""
 
 _SENTENCES = {
     "stopped": "the driver stopped the base {:.2f} s after its last command",

@@ -1,4 +1,4 @@
-"""`rosrv guard check-driver`: measure whether a robot's own driver stops its base when commands end."""
+"""The command `rosrv guard check-driver`."""
 
 import sys
 from typing import Annotated

@@ -1,4 +1,4 @@
-"""The feature guards: `rosrv guard` makes specifications from presets, and changes them."""
+"""Define the feature guards."""
 
 from typing import TYPE_CHECKING, Any
 

@@ -7,7 +7,6 @@ from appliance.features.guards.suggestions import TopicFacts
 
 
 def facts_of(graph: Graph) -> list[TopicFacts]:
-    """Return the topics of a graph as presets need them."""
     return [
         TopicFacts(
             one.name, one.type, tuple(each.node for each in one.publishers), tuple(one.subscribers),

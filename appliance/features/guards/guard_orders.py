@@ -1,7 +1,4 @@
-"""Answer the requests about guards in control: their states, proposals, new guards and new values.
-
-A guard is an ordinary monitor, so a request becomes the requests of monitors that `rosrv guard` sends.
-"""
+"""Answer the requests about guards in control: their states, proposals, new guards and new values."""
 
 import asyncio
 from collections.abc import Callable, Mapping
@@ -103,7 +100,6 @@ class GuardOrders:
         self._acting_since = {name: self._acting_since.get(name, now) for name in acting}
 
     def state(self) -> GuardsState | None:
-        """Return the state of all guards for the status; None if there is no guard."""
         loaded = len(self._guards())
         acting = [ActingGuard(name, since) for name, since in self._acting_since.items()]
         return GuardsState(loaded, acting) if loaded else None
@@ -118,7 +114,6 @@ class GuardOrders:
         return Suggestions(_suggestions_of(self._graph()))
 
     async def new(self, request: guard_requests.GuardNew, who: str) -> Replacement:
-        """Make, load and enable a guard. Raises `SenselessError`, and the errors of a load."""
         file, text = self._made(request)
         order = admin.MonitorLoad(
             {file: text}, note=described(text), expected=request.expected, confirm_within=request.confirm_within,
@@ -127,7 +122,6 @@ class GuardOrders:
         return await self._monitors.load(order, who, enable=not request.shadow)
 
     async def set(self, request: guard_requests.GuardSet, who: str) -> GuardList:
-        """Set values of a guard. Raises `UnknownThingError`, `SenselessError`, and the errors of monitors."""
         monitors, name = self._monitors, request.name
         text, changed, constants = self._changed(name, request.values)
         given: dict[str, dict[str, GivenValue]] = {name: dict(constants)} if constants else {}
@@ -142,7 +136,6 @@ class GuardOrders:
         return await self.guards(guard_requests.GuardsWanted())
 
     async def plan(self, request: guard_requests.GuardTry, who: str) -> GuardPlan:
-        """Return the effects of a change, which is not made. Raises `UnknownThingError` and `SenselessError`."""
         monitors, name = self._monitors, request.name or request.preset
         changed: dict[str, list[str]] = {}
         if request.preset:
@@ -184,7 +177,6 @@ class GuardOrders:
         return warnings, []
 
     def _made(self, request: guard_requests.GuardNew | guard_requests.GuardTry) -> tuple[str, str]:
-        """Return the file and the text of a new guard. Raises `SenselessError`."""
         try:
             if "command" not in request.topics:
                 raise GuardError("topics has no `command`: name the topic to guard, such as /cmd_vel")
@@ -199,7 +191,6 @@ class GuardOrders:
         return file, text
 
     def _changed(self, name: str, values: Mapping[str, str]) -> tuple[str, str, dict[str, str]]:
-        """Return the text of a guard, the text with new values, and new constants. Raises `SenselessError`."""
         preset, text = self._guard(name)
         try:
             checked = {each: preset.parameter(each).checked(value) for each, value in values.items()}
@@ -223,7 +214,7 @@ class GuardOrders:
         return guards[name], self._monitors.sources.files[self._monitors.checked.monitors[name]]
 
     def _acts_of(self, name: str) -> int:
-        """Return how many messages a guard changed, dropped or published, or would have in shadow mode."""
+        """Also count what the guard would have done in shadow mode."""
         before = "shadow " if self._monitors.switches.in_shadow(name) else ""
         return sum(self._monitors.records.counts[f"{before}{kind}", name] for kind in _ACTS)
 

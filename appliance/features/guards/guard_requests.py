@@ -1,6 +1,6 @@
 """The requests of operators' tools about guards.
 
-A guard is a monitor, so the operations of monitors bring it into force, confirm, disable, resume and remove it.
+A guard is a monitor, so all other requests are those of monitors.
 """
 
 from typing import Annotated

@@ -1,8 +1,7 @@
 """The types of commands and sensors that a preset works with, as rows: where each value of the preset's text is.
 
-A preset in `monitors/guards` is a valid text for one type. For another type, `text_for` replaces the type and the
-pattern of the events on that topic. A value that the type lacks becomes a local variable: zero, or as the row defines
-it.
+A preset is a valid text for one type. For another type, the type and the pattern of the events are replaced. A
+value that the type lacks becomes a local variable.
 """
 
 import re
@@ -15,11 +14,13 @@ _LEGS = ("linear.x", "linear.y", "linear.z", "angular.x", "angular.y", "angular.
 
 @dataclass(frozen=True)
 class TypeRow:
-    """A message type: the path of each value. `parameters` and `local` replace a value that is made of fields."""
+    """The path of each value in a message type. `parameters` and `local` replace a value that is made of fields."""
 
     paths: Mapping[str, str] = field(default_factory=dict)
     stops: bool = True
-    """Whether a message can stop the robot. Otherwise a command is dropped and all its action's goals are cancelled."""
+    """Whether a message can stop the robot. Otherwise a command is dropped and all its action's goals are
+    cancelled.
+    """
     parameters: str = ""
     local: str = ""
     element: str = ""
@@ -120,7 +121,6 @@ PRIVATE = {
         "std_msgs/String",
     )
 }  # fmt: skip
-"""Rows of messages that a preset does not read."""
 
 _EVENT = re.compile(
     r"event (?P<name>\w+)\((?P<parameters>[^)]*)\) (?P<topic>\w+)\s+(?P<type>\w+/\w+)\s+'\{(?P<pattern>[^}]*)\}' \{"
@@ -133,7 +133,6 @@ _WIDTH = 110
 
 
 def text_for(text: str, topic: str, kind: str, row: TypeRow) -> str:
-    """Return the text of a preset whose events on this given topic have another type."""
     for found in reversed([*_EVENT.finditer(text)]):
         if found["topic"] == topic:
             header = _header(found, kind, row)
@@ -150,7 +149,6 @@ def text_for(text: str, topic: str, kind: str, row: TypeRow) -> str:
 
 
 def _header(found: "re.Match[str]", kind: str, row: TypeRow) -> str:
-    """Return the head of an event with the fields of a row, and variables for the values that it lacks."""
     wanted = [one.rsplit(" ", 1) for one in found["parameters"].split(", ") if one]
     bound = {name: row.paths[name] for _type, name in wanted if name in row.paths}
     parameters = ", ".join(f"{of} {name}" for of, name in wanted if name in bound)
@@ -176,7 +174,7 @@ def _end_of(text: str, start: int) -> int:
 
 
 def _cancelling(text: str) -> str:
-    """Return a text that cancels all goals where the preset publishes the safe message."""
+    """Cancel all goals where the preset publishes the safe message."""
     text = _COMMAND.sub(
         lambda found: f"{found[0]}\n    topic cancel = {found[1].removesuffix('/goal')}/cancel;", text
     )

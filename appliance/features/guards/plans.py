@@ -17,11 +17,7 @@ def planned(  # noqa: PLR0917  one caller
     values: Mapping[str, str],
     kinds: Mapping[str, str],
 ) -> Guard:
-    """Return a guard for these topics. `kinds` are the user's types for topics that no node has yet.
-
-    Raises `GuardError` if a topic of several types is neither in the graph nor in `kinds`, or has another
-    type there.
-    """
+    """`kinds` are the user's types for topics that no node has yet."""
     known = {one.name: one.type for one in graph if one.type != _UNKNOWN}
     given = preset.given_topics
     chosen = dict(topics)

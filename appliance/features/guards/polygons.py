@@ -1,4 +1,6 @@
-"""Check that the corners of a fence are those of an area: with crossing edges, a part inside would count as outside."""
+"""Check that the corners of a fence are those of an area: with crossing edges, a part inside would count as
+outside.
+"""
 
 from collections.abc import Sequence
 from itertools import combinations, pairwise
@@ -7,7 +9,6 @@ Corner = tuple[float, float]
 
 
 def fault_of(corners: Sequence[Corner]) -> str:
-    """Return why the corners, in either direction, enclose no area; empty if they do."""
     edges = [edge for edge in pairwise([*corners, corners[0]]) if edge[0] != edge[1]]
     if not edges or all(_turn(*edges[0], corner) == 0 for corner in corners):
         return "the corners are on one line"

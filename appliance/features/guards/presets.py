@@ -1,6 +1,6 @@
 """Presets: reviewed texts in `monitors/guards`, their parameters, and the texts that are made from them.
 
-A guard is an ordinary specification. Its first line names the preset, its version, the topics and their types.
+The first line of a guard names the preset, its version, the topics and their types.
 """
 
 import functools
@@ -47,7 +47,7 @@ class GuardError(UserError):
 
 @dataclass(frozen=True)
 class Parameter:
-    """A value of a preset that operators set. `loads`: the value is in the text, so a new value needs a load."""
+    """A value that operators set. `loads`: it is in the text, so a new value needs a load."""
 
     name: str
     kind: str
@@ -59,7 +59,6 @@ class Parameter:
     loads: bool = False
 
     def checked(self, value: str) -> str:
-        """Return a value in the form of the text. Raises `GuardError`."""
         if self.kind == "bool":
             if value not in {"true", "false"}:
                 raise GuardError(f"{self.name}={value}: write {self.name}=true or {self.name}=false")
@@ -118,7 +117,7 @@ _FROM = Parameter(
 
 @dataclass(frozen=True)
 class Preset:
-    """A preset: the rows of each of its topics that has several types, and the parameters that are in its text."""
+    """The rows of each topic that has several types, and the parameters in the text."""
 
     name: str
     topics: Mapping[str, Mapping[str, TypeRow]]
@@ -187,12 +186,12 @@ PRESETS = {
 }
 
 DRIVER_CHECK = Preset("driver_check", {**_MOVES, "by": types.MOTIONS})
-"""The preset of the monitor that `rosrv guard check-driver` loads for a short time; not a guard."""
+"""The monitor that `rosrv guard check-driver` loads for a short time; not a guard."""
 
 
 @dataclass(frozen=True)
 class Guard:
-    """A guard to make: its name, its preset, and for each given topic the topic and the type of its messages."""
+    """For each given topic, the topic and the type of its messages."""
 
     name: str
     preset: Preset
@@ -208,7 +207,6 @@ def preset_named(name: str) -> Preset:
 
 
 def text_of(guard: Guard) -> str:
-    """Return the specification of a guard. Raises `GuardError`."""
     preset = guard.preset
     if not _NAME.fullmatch(guard.name):
         raise GuardError(f"{guard.name!r} is not a name of a monitor: use letters, digits and _")
@@ -231,23 +229,19 @@ def text_of(guard: Guard) -> str:
 
 
 def preset_of(text: str) -> Preset | None:
-    """Return the preset that a specification was made from; None if it was not."""
     found = _FIRST_LINE.match(text)
     return PRESETS.get(found["preset"]) if found else None
 
 
 def described(text: str) -> str:
-    """Return the first line of a guard, which names its preset and its topics."""
     return text.split("\n", 1)[0].removeprefix("// ")
 
 
 def topics_in(text: str) -> dict[str, str]:
-    """Return the topics that a guard was made for, by the names that its preset has for them."""
     return {name: topic for name, topic, _kind in _made_for(text)}
 
 
 def types_in(text: str) -> dict[str, str]:
-    """Return the message types that a guard was made for, by the names of its topics."""
     return {name: kind for name, _topic, kind in _made_for(text) if kind}
 
 
@@ -259,7 +253,7 @@ def _made_for(text: str) -> Iterator[tuple[str, str, str]]:
 
 
 def loaded_values(text: str) -> dict[str, str]:
-    """Return the values of a guard that are in its text, not given: a polygon, limits, a deadline, hosts."""
+    """Return the values that are in the text, not given."""
     preset = preset_of(text)
     return {one.name: _in_text(text, one) for one in (preset.parameters if preset else ()) if one.loads}
 
@@ -283,7 +277,6 @@ def _in_text(text: str, parameter: Parameter) -> str:
 
 
 def with_values(text: str, values: Mapping[str, str]) -> str:
-    """Return the text of a guard with other values. Raises `GuardError`."""
     preset = preset_of(text)
     if preset is None:
         raise GuardError(

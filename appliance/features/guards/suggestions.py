@@ -16,7 +16,7 @@ _SCAN_OF_A_CAMERA = re.compile(r"camera|depth", re.IGNORECASE)
 
 
 class TopicFacts(NamedTuple):
-    """A topic of the graph: its type, the nodes at both ends, and messages a second."""
+    """The type of a topic, the nodes at both ends, and messages a second."""
 
     name: str
     type: str
@@ -27,7 +27,7 @@ class TopicFacts(NamedTuple):
 
 @dataclass(frozen=True)
 class Proposal:
-    """A guard that fits the graph; `measured` are values from the present rates, and all others are defaults."""
+    """`measured` are values from the present rates, and all others are defaults."""
 
     preset: str
     name: str
@@ -50,7 +50,7 @@ class Proposal:
 
 
 def proposals(graph: Iterable[TopicFacts]) -> list[Proposal]:
-    """Return guards for each topic that commands a base or an arm, in the order in which they act."""
+    """Return the guards in the order in which they act."""
     topics = list(graph)
     bases = [one for one in topics if one.type in types.VELOCITIES and _commands_a_base(one, topics)]
     arms = [one for one in topics if one.type in types.TRAJECTORIES and one.subscribers]
@@ -116,7 +116,7 @@ def _sources(
     prefer: "re.Pattern[str] | None" = None,
     avoid: "re.Pattern[str] | None" = None,
 ) -> list[TopicFacts]:
-    """Return topics of these types that a node publishes; those in the namespace of the command come first."""
+    """Topics in the namespace of the command come first."""
     found = [one for one in topics if one.type in rows and one.publishers and not _COMMAND.search(one.name)]
 
     def order(one: TopicFacts) -> tuple[bool, bool, int, str]:
@@ -135,10 +135,9 @@ def _shared(one: str, other: str) -> int:
 
 
 def _silence(topic: TopicFacts, least: float, most: float) -> dict[str, str]:
-    """Return how long a topic may be silent: five periods of its present rate; nothing without a rate."""
+    """Allow five periods of the present rate."""
     return {"silent": f"{min(max(5 / topic.rate, least), most):.3g}"} if topic.rate > 0 else {}
 
 
 def _name(preset: str, topic: TopicFacts, alone: bool) -> str:
-    """Return the name of a guard: its preset's, with the topic if the robot needs several such guards."""
     return preset if alone else f"{preset}_{re.sub(r'[^a-z0-9]+', '_', topic.name.lower()).strip('_')[-50:]}"

@@ -1,4 +1,4 @@
-"""`rosrv guard list|suggest|new|set|enforce|remove`: guards from presets, without editing a file."""
+"""The commands `rosrv guard list|suggest|new|set|enforce|remove`."""
 
 import tempfile
 from pathlib import Path
@@ -266,7 +266,6 @@ def _pairs(texts: list[str] | None, form: str) -> dict[str, str]:
 
 
 def _guard(appliance: Appliance, name: str) -> tuple[Monitors, MonitorState, str]:
-    """Return all monitors, the guard's row and its text. Raises `GuardError`."""
     loaded = appliance.ask_or_exit(admin.MonitorsWanted(texts=True))
     texts = loaded.files or {}
     guards = {row.name: row for row in loaded.monitors if preset_of(texts.get(row.file, ""))}
@@ -293,14 +292,13 @@ def _say_changed(appliance: Appliance, body: Replacement) -> None:
 
 
 def _folder(appliance: Appliance, loaded: Monitors) -> Path | None:
-    """Return the appliance's folder of specifications; None over REST, whose folder may be on another machine."""
+    """Return None over REST, whose folder may be on another machine."""
     if loaded.folder is None or appliance.place is not None:
         return None
     return Path(loaded.folder) if Path(loaded.folder).is_dir() else None
 
 
 def _write(appliance: Appliance, loaded: Monitors, file: str, text: str, *, temporary: bool = False) -> None:
-    """Write a guard into the folder of specifications, if it is on this machine and the load is permanent."""
     folder = _folder(appliance, loaded)
     if folder is None:
         obstacle = "the appliance keeps the text; it has no folder of specifications on this machine"
@@ -323,7 +321,6 @@ def _say_obstacle(appliance: Appliance, obstacle: str) -> None:
 
 
 def _plan(appliance: Appliance, request: GuardTry) -> None:
-    """Print what a change would do. Exit status 1 if it would be refused."""
     plan = appliance.ask_or_exit(request)
     if appliance.as_json:
         say_json(plan)

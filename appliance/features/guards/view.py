@@ -1,4 +1,4 @@
-"""The guards in the status: how many are loaded, and which of them limit or stop the robot now."""
+"""Show in the status which guards limit or stop the robot now."""
 
 import datetime
 from collections.abc import Iterator
