@@ -1,4 +1,4 @@
-"""The feature sso: people sign in at a provider (OpenID Connect); a process of its own speaks with the provider."""
+"""Define the feature sso, with a process of its own that speaks with the provider."""
 
 from typing import TYPE_CHECKING, Any
 

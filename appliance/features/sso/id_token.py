@@ -1,11 +1,8 @@
 """Verify an ID token (OpenID Connect Core 1.0, 3.1.3.7). No I/O; the time is a parameter.
 
-Invariants:
-
-1. Only a key of the provider that fits the token's algorithm verifies it: the kind, the curve, the use. `jwk`, `jku`
-   and `x5u` in the token are ignored, and a symmetric key is never used.
-2. Only allowed algorithms are accepted, all of them signatures by a private key.
-3. Issuer, audience, nonce, subject, expiry and time of issue are required.
+Only a key of the provider that fits the token's algorithm verifies it: the kind, the curve, the use. `jwk`, `jku`
+and `x5u` in the token are ignored, and a symmetric key is never used. Issuer, audience, nonce, subject, expiry
+and time of issue are required.
 """
 
 import base64
@@ -49,7 +46,6 @@ class Expected:
 
 
 def verify(token: str, keys: Sequence[dict[str, Any]], expected: Expected, now: float) -> dict[str, Any]:
-    """Return the claims of a valid token. Raises `SignOnRefusedError`."""
     header = _header_of(token, expected.algorithms)
     key = _key_for(header, keys)
     registry = JWSRegistry(algorithms=list(expected.algorithms), strict_check_header=False)
@@ -112,7 +108,6 @@ def _header_of(token: str, algorithms: Sequence[str]) -> dict[str, Any]:
 
 
 def _key_for(header: dict[str, Any], keys: Sequence[dict[str, Any]]) -> RSAKey | ECKey:
-    """Return the only key of the provider that can have signed the token."""
     algorithm = header["alg"]
     curve = _CURVES.get(algorithm)
     fitting = [
@@ -137,7 +132,6 @@ def _key_for(header: dict[str, Any], keys: Sequence[dict[str, Any]]) -> RSAKey |
 
 
 def _decoded(text: str) -> bytes:
-    """Decode base64url without padding. Raises `ValueError`."""
     return base64.urlsafe_b64decode(text + "=" * (-len(text) % 4))
 
 

@@ -1,7 +1,7 @@
 """Derive a person's identity and rights from verified claims. No I/O.
 
-There is no default: a person without a value that gives a role, or without the claim of the name, does not sign in. A
-name or domain from `email` needs `email_verified`, because people can claim any address at some providers.
+There is no default: without a value that gives a role, or without a name, a person does not sign in. A name or
+domain from `email` needs `email_verified`, because people can claim any address at some providers.
 """
 
 import re
@@ -17,7 +17,6 @@ _MOST_VALUES = 1000
 
 
 def identity_of(claims: Mapping[str, Any], wanted: Sso, now: float) -> SignedInPerson:
-    """Return the person whom the claims describe. Raises `SignOnRefusedError`."""
     mail = _verified_mail(claims)
     if wanted.domains and mail.rpartition("@")[2] not in wanted.domains:
         raise SignOnRefusedError(

@@ -7,7 +7,7 @@ from appliance.channel.messages.message import Message
 
 
 class SessionKeys(msgspec.Struct, frozen=True):
-    """A session's id, which a browser chose, and the verifiers of its keys, as of a token (`TokenKeys`)."""
+    """A session's id, which a browser chose, and the verifiers of its keys, as of a token."""
 
     id: str
     reading: bytes
@@ -17,8 +17,7 @@ class SessionKeys(msgspec.Struct, frozen=True):
 class SignedInPerson(msgspec.Struct, frozen=True):
     """A person; `ends` is seconds since the epoch.
 
-    `subject` is the provider's `sub`. `name` is unique among the people of the provider. `mail` is empty
-    unless it is verified. `doors` are groups of doors.
+    `subject` is the provider's `sub`. `mail` is empty unless it is verified. `doors` are groups of doors.
     """
 
     subject: str
@@ -30,7 +29,7 @@ class SignedInPerson(msgspec.Struct, frozen=True):
 
 
 class SignOnWanted(Message, frozen=True):
-    """A browser at this address begins to sign in; `again`: the person must prove who they are again."""
+    """A browser begins to sign in; `again`: the person must prove who they are again."""
 
     number: int
     keys: SessionKeys
@@ -39,7 +38,7 @@ class SignOnWanted(Message, frozen=True):
 
 
 class SignOnBegun(Message, frozen=True):
-    """The sign-on began: the browser goes to this URL, and returns with `state`."""
+    """The browser goes to this URL, and returns with `state`."""
 
     number: int
     url: str

@@ -27,7 +27,6 @@ class SsoOrders:
     """Operators' and browsers' requests; `changed()` is called when the usable sessions have changed."""
 
     def __init__(self, trail: AuditTrail, changed: Callable[[], None], *, configured: bool) -> None:
-        """Refuse all sign-ons unless `configured`."""
         self.link = Link(self._received)
         self.sessions = SessionTable()
         self._trail = trail
@@ -35,14 +34,12 @@ class SsoOrders:
         self._configured = configured
 
     async def begin(self, request: requests.SignOnBegin) -> requests.SignOnPlace:
-        """Begin a sign-on. Raises `UnavailableError`."""
         begun = await self._ask(
             lambda number: SignOnWanted(number, request.keys, request.peer, request.again), SignOnBegun
         )
         return requests.SignOnPlace(begun.url, begun.state)
 
     async def complete(self, request: requests.SignOnComplete) -> requests.SignedOn:
-        """Complete a sign-on. Raises `TokenRefusedError` and `UnavailableError`."""
         try:
             found = await self._ask(
                 lambda number: SignOnReturned(number, request.state, request.code, request.issuer),
@@ -79,14 +76,12 @@ class SsoOrders:
         return requests.SignedOnList([_shown(one) for one in self.sessions.sessions()])
 
     async def sign_out(self, request: requests.SignOut, who: str) -> requests.SignedOn:
-        """End one of the caller's sessions. Raises `UnknownThingError`."""
         session = self.sessions.end(request.session, who)
         self._ended(session, who, "signed out")
         self._changed()
         return _shown(session)
 
     async def end(self, request: requests.SessionsEnd, who: str) -> requests.SignedOnList:
-        """End all sessions of a person. Raises `UnknownThingError`."""
         ended = self.sessions.end_all(request.name)
         for one in ended:
             self._ended(one, who, f"was signed out by {who}")
@@ -105,7 +100,6 @@ class SsoOrders:
         )
 
     async def _ask(self, question: Callable[[int], messages.Message], wanted: type[M]) -> M:
-        """Return the answer of the process. Raises `TokenRefusedError`, `UnavailableError` and `UnknownThingError`."""
         if not self._configured:
             raise UnknownThingError(
                 "this appliance has no provider: name one in sso.issuer of appliance.yaml"

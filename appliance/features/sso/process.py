@@ -1,7 +1,7 @@
 """Run the client of the provider as a process of the appliance: lifeline, link to control, and sign-ons.
 
-Only this process has the client's secret, and the firewall lets only it reach the provider, and nothing else. It
-reads no state of the appliance. Control trusts it for who a person is.
+Only this process has the client's secret, and the firewall lets only it reach the provider, and nothing else.
+Control trusts it for who a person is.
 """
 
 import asyncio
@@ -46,8 +46,6 @@ def make_sign_ons(wanted: Sso) -> SignOns:
 
 
 class _Process:
-    """Answers each of control's requests in a task."""
-
     def __init__(self, wanted: Sso, lifeline_fd: int) -> None:
         lifeline = Channel(socket.socket(fileno=lifeline_fd), messages.Lifeline)
         self._child = Child(lifeline, SsoLink, said=self._said)
@@ -94,7 +92,7 @@ class _Process:
 
 
 def _secret(file: Path | None) -> str | None:
-    """Return the client's secret, read for each use so that a replaced file applies. Raises `OSError`."""
+    """Read the secret for each use, so that a replaced file applies."""
     if file is None:
         return None
     lines = read_given(file, _LONGEST_SECRET).decode().splitlines()

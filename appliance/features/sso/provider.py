@@ -1,12 +1,8 @@
 """Fetch the provider's endpoints and keys, and bound their age.
 
-Invariants:
-
-1. The discovery document has the configured issuer, so a document of another issuer is not used (OpenID Connect
-   Discovery 1.0, 4.3).
-2. Keys are fetched for each ID token, so a key that the provider adds or withdraws counts at once, with or without an
-   id. Only the provider's token endpoint sends tokens, for a code of its own: this is one request more for each.
-3. While the provider serves no keys, the last ones are used until `keys_seconds` after they were fetched.
+1. A discovery document of another issuer is not used (OpenID Connect Discovery 1.0, 4.3).
+2. Keys are fetched for each ID token, so an added or withdrawn key counts at once. While the provider serves
+   none, the last ones are used for `keys_seconds`.
 """
 
 import json
@@ -39,7 +35,7 @@ class ProviderEndpoints(msgspec.Struct, frozen=True):
 
 
 class Provider:
-    """The provider with this issuer; `exchange` reaches it."""
+    """The provider with this issuer. Methods raise `ProviderError`."""
 
     def __init__(self, issuer: str, exchange: Exchange, keys_seconds: float) -> None:
         self.issuer = issuer
@@ -49,7 +45,7 @@ class Provider:
         self._keys: tuple[float, list[dict[str, Any]]] | None = None
 
     async def endpoints(self) -> ProviderEndpoints:
-        """Return the endpoints, at most an hour old. Raises `ProviderError`."""
+        """Return the endpoints, at most an hour old."""
         if self._endpoints is None or clock.now() - self._endpoints[0] >= _FRESH_SECONDS:
             url = self.issuer.removesuffix("/") + _DISCOVERY
             try:
@@ -69,7 +65,6 @@ class Provider:
         return self._endpoints[1]
 
     async def keys(self) -> Sequence[dict[str, Any]]:
-        """Return the keys that the provider serves now, or its last ones. Raises `ProviderError`."""
         now = clock.now()
         try:
             self._keys = now, await self._fetch_keys()
@@ -79,7 +74,6 @@ class Provider:
         return self._keys[1]
 
     async def post(self, url: str, headers: Sequence[tuple[str, str]], body: bytes) -> tuple[int, bytes]:
-        """Send a request to the provider; return status and body. Raises `ProviderError`."""
         return await self._exchange("POST", url, headers, body)
 
     async def _fetch_keys(self) -> list[dict[str, Any]]:

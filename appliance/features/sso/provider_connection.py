@@ -1,12 +1,8 @@
 """Connect to the provider. Nothing that it sends is trusted before it is checked.
 
-Invariants:
-
-1. Every connection goes to `Sso.destination`, whatever host a URL has: the provider's address, or the proxy. The
-   firewall lets the process reach nothing else.
+1. Every connection goes to `Sso.destination`, whatever host a URL has. The firewall permits nothing else.
 2. TLS verifies the host of the URL. Without a proxy, all URLs have the issuer's origin.
-3. An exchange has one deadline, from connecting to the last byte. It follows no redirect, and reads at most
-   `LARGEST_ANSWER` bytes. Compressed answers are not requested, and rejected.
+3. An exchange has one deadline and a limit of bytes, and follows no redirect. Compressed answers are rejected.
 """
 
 import asyncio
@@ -55,7 +51,6 @@ class ProviderConnection:
     async def exchange(
         self, method: str, url: str, headers: Headers = (), body: bytes = b""
     ) -> ProviderAnswer:
-        """Return the answer to a request, whatever its status. Raises `ProviderError`."""
         try:
             origin = origin_of(url)
         except ValueError as error:
@@ -80,7 +75,6 @@ class ProviderConnection:
             ) from error
 
     def _pool(self) -> Pool:
-        """Return a pool whose connections all go to one destination. Raises `OSError`."""
         context = _tls(self._wanted)
         network = _OneDestination(*self._wanted.destination)
         if self._wanted.proxy is not None:
@@ -112,7 +106,7 @@ class _OneDestination(httpcore.AsyncNetworkBackend):
 
 
 def _tls(wanted: Sso) -> ssl.SSLContext:
-    """Return a TLS context, made for each exchange so that replaced files apply. Raises `OSError`."""
+    """Make a context for each exchange, so that replaced files apply."""
     if wanted.ca is None:
         context = ssl.create_default_context()
     else:
@@ -129,7 +123,6 @@ def _tls(wanted: Sso) -> ssl.SSLContext:
 
 
 async def _bounded(url: str, answer: httpcore.Response) -> bytes:
-    """Return the body. Raises `ProviderError` if it is compressed or too large."""
     for name, value in answer.headers:
         if name.lower() == b"content-encoding" and value.lower() != b"identity":
             raise ProviderError(f"{url}: the provider compresses its answer, which was not requested")

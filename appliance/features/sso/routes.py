@@ -1,11 +1,7 @@
 """`/v1/sso/begin` and `/v1/sso/complete`: a browser signs in without a token.
 
-Invariants:
-
-1. Both calls count against the limit of their address, and few run at once, so neither an unknown host nor a slow
-   provider occupies control.
-2. No answer redirects: the page goes to the provider's URL itself, and nothing in a request becomes a part of the URL's
-   host.
+Both calls count against the limit of their address, and few run at once, so neither an unknown host nor a slow
+provider occupies control. No answer redirects, and nothing in a request becomes a part of a URL's host.
 """
 
 import base64
@@ -54,15 +50,12 @@ class Returned(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class _Limits:
-    """The limits of calls that need no token."""
-
     def __init__(self, per_minute: int) -> None:
         self._buckets = Buckets(per_minute / 60, per_minute)
         self._running = 0
 
     @contextmanager
     def place(self, peer: str) -> Iterator[None]:
-        """Count a call during the block. Raises `ProblemError` (429, 503)."""
         seconds = self._buckets.take(peer, clock.now())
         if seconds:
             raise too_many("too-many-failures", "too many sign-ins from this host", seconds)

@@ -1,13 +1,10 @@
 """Keep the sessions of people in memory.
 
-Invariants:
-
-1. Sessions are never stored. They end with control's process, so a restart with changed roles, and a takeover, end all
-   of them.
-2. A session ends at its time by the system time or by the time since the boot, whichever is earlier, so a step back of
-   the clock postpones no end.
-3. A name in the audit log means one person at a time: while a person is signed in, another `sub` with this name is
-   refused. If a person's rights have changed, their next sign-on ends their earlier sessions.
+1. Sessions are never stored. A restart with changed roles, and a takeover, end all of them.
+2. A session ends by the system time or by the time since the boot, whichever is earlier, so a step back of the
+   clock postpones no end.
+3. A name in the audit log means one person at a time: while a person is signed in, another `sub` with this name
+   is refused. A sign-on with changed rights ends the person's earlier sessions.
 """
 
 from typing import NamedTuple
@@ -46,7 +43,6 @@ class SessionTable:
         return next((one for one in self.sessions() if one.id == session_id), None)
 
     def open(self, identity: SignedInPerson, keys: SessionKeys) -> tuple[Session, list[Session]]:
-        """Open a session; return it with the person's sessions that it ends. Raises `TokenRefusedError`."""
         name, now = f"{_PREFIX}{identity.name}", clock.wall()
         present = self.sessions()
         if any(one.id == keys.id for one in present):
@@ -83,7 +79,6 @@ class SessionTable:
         return session, ended
 
     def end(self, session_id: str, who: str) -> Session:
-        """End a session. Raises `UnknownThingError`."""
         found = self.of(session_id)
         if found is None or found.name != who:
             raise UnknownThingError("this is not a session of yours")
@@ -91,7 +86,6 @@ class SessionTable:
         return found
 
     def end_all(self, name: str) -> list[Session]:
-        """End all sessions of a name. Raises `UnknownThingError`."""
         ended = [one for one in self.sessions() if one.name in (name, f"{_PREFIX}{name}")]
         if not ended:
             names = ", ".join(sorted({one.name for one in self.sessions()})[:20]) or "none"

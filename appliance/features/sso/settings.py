@@ -21,7 +21,7 @@ _PORTS = {"https": 443, "http": 80}
 
 
 def origin_of(url: str) -> Origin:
-    """Return the origin of a URL; `http` is allowed only on the loopback. Raises `ValueError`."""
+    """Raise `ValueError` for `http` except on the loopback."""
     try:
         parts = urlsplit(url)
         port = parts.port or _PORTS.get(parts.scheme, 0)
@@ -188,7 +188,6 @@ class Sso(FeatureSection):
 
     @property
     def destination(self) -> tuple[str, int]:
-        """Return the only address and port to which the process connects; only with an `issuer`."""
         _protocol, host, port = split_receiver(
             f"tcp://{self.address or (self.proxy or '').partition('://')[2]}"
         )
@@ -208,7 +207,6 @@ class Sso(FeatureSection):
         return {"proxy" if self.proxy else "address": (self.proxy or self.address, self.destination[0])}
 
     def role_of(self, values: frozenset[str]) -> TokenRole | None:
-        """Return the highest role that these values of `roles_claim` give."""
         return next((role for role in _RANKING if values.intersection(self.roles.get(role, ()))), None)
 
     def door_groups_of(self, values: frozenset[str]) -> tuple[str, ...]:

@@ -1,13 +1,10 @@
 """Carry out sign-ons: OpenID Connect, authorization code with PKCE (RFC 7636, RFC 9700).
 
-Invariants:
-
-1. Each sign-on has its own state, nonce and code verifier, of 256 random bits each. A state is accepted once, within
-   `PENDING_SECONDS`.
+1. Each sign-on has its own random state, nonce and code verifier. A state is accepted once.
 2. The keys of the browser's session are bound to the sign-on when it begins. So a stolen code, state or URL gives
    no other browser a session.
-3. There are at most `_MOST` unfinished sign-ons. A further one replaces the oldest of the address that has most, so
-   that a flood from one address ends only its own sign-ons.
+3. Beyond `_MOST` sign-ons, a further one replaces the oldest of the address that has most, so that a flood from
+   one address ends only its own.
 """
 
 import base64
@@ -44,7 +41,7 @@ class _Pending(NamedTuple):
 
 
 class SignOns:
-    """The unfinished sign-ons; `secret()` returns the client's secret, if any, and may raise `OSError`."""
+    """The unfinished sign-ons; `secret()` returns the client's secret, if any."""
 
     def __init__(self, wanted: Sso, provider: Provider, secret: Callable[[], str | None]) -> None:
         self._wanted = wanted
@@ -53,7 +50,6 @@ class SignOns:
         self._pending: dict[str, _Pending] = {}  # by state, oldest first
 
     async def begin(self, keys: SessionKeys, address: str, *, again: bool) -> tuple[str, str]:
-        """Return the URL at the provider, and the state. Raises `ProviderError`."""
         endpoints = await self._provider.endpoints()
         state, nonce, verifier = (secrets.token_urlsafe(32) for _ in range(3))
         self._make_room(address)
@@ -73,10 +69,9 @@ class SignOns:
         return f"{url}{'&' if '?' in url else '?'}{urlencode(asked, quote_via=quote)}", state
 
     async def finish(self, state: str, code: str, issuer: str) -> tuple[SignedInPerson, SessionKeys, str]:
-        """Complete a sign-on; return the person, the session's keys and the address.
+        """Return the person, the session's keys and the address.
 
-        `issuer` is the parameter `iss` of the response (RFC 9207), or empty. Raises `SignOnRefusedError` and
-        `ProviderError`.
+        `issuer` is the parameter `iss` of the response (RFC 9207), or empty.
         """
         pending = self._pending.pop(state, None)
         if pending is None or pending.until <= clock.now():

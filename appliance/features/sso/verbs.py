@@ -1,4 +1,4 @@
-"""`rosrv sso list|end`: the sessions of people who signed in at the provider."""
+"""The commands `rosrv sso list|end`."""
 
 from typing import Annotated
 
