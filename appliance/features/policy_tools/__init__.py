@@ -1,1 +1,1 @@
-"""Tools for policies: check, explain, test, compare, grant and learn them, besides the running appliance."""
+"""Check, explain, test, compare, grant and learn policies, besides the running appliance."""

@@ -1,7 +1,4 @@
-"""Derive the denied request from the record of a denial, or the reason why no policy would allow the request.
-
-Every event that can be a denial has a row in `DENIALS`.
-"""
+"""Derive the denied request from the record of a denial, or the reason why no policy would allow the request."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -26,7 +23,6 @@ def is_denial(record: AuditRecord) -> bool:
 
 
 def asks_policy(record: AuditRecord) -> bool:
-    """Return whether a change of the policy might allow the request."""
     try:
         return is_denial(record) and asked_of(record) is not None
     except UngrantableError:
@@ -34,7 +30,6 @@ def asks_policy(record: AuditRecord) -> bool:
 
 
 def asked_of(record: AuditRecord) -> DecidedRequest:
-    """Return the request. Raises `UngrantableError` if no change of the policy would allow it."""
     what = DENIALS.get(record.event)
     if what is None:
         raise UngrantableError("it is not a record of a decision about a host's call")
@@ -121,4 +116,7 @@ DENIALS: dict[str, str | Callable[[AuditRecord], DecidedRequest]] = {
     "tunnel refused": "a tunnel needs a valid certificate of this appliance (rosrv host list)",
     "packets refused": "replayed packets, and packets with the address of another host, are never accepted",
 }
-"""The functions that derive the request from a record, or why no policy would allow it, by event."""
+"""The functions that derive the request from a record, or why no policy would allow it, by event.
+
+Every event that can be a denial has a row.
+"""

@@ -1,4 +1,4 @@
-"""`rosrv policy diff`: compare the texts of two policies, or their decisions on recorded requests."""
+"""The command `rosrv policy diff`, for texts or for decisions on recorded requests."""
 
 import contextlib
 import difflib
@@ -39,8 +39,6 @@ _MOST_CALLERS = 4  # names in one line
 
 @dataclass(frozen=True)
 class _Source:
-    """The text of a file or revision, and its name for people."""
-
     name: str
     text: str
 
@@ -138,7 +136,6 @@ def _known(
     robot: list[str] | None,
     enrolled: list[str] | None,
 ) -> PolicyContext:
-    """Return the hosts for a comparison; for a revision, those that the appliance knows."""
     return (
         known_of(robot, enrolled) if _are_files(old, new) else policy_in_force(appliance, robot, enrolled)[2]
     )
@@ -176,7 +173,6 @@ def _requests(file: Path | None, appliance: Appliance) -> Iterator[Request]:
 
 
 def _say_requests(differences: list[Difference]) -> None:
-    """Print the differences, once for several nodes with the same decisions."""
     equal: dict[tuple[str, ...], list[Difference]] = {}
     for one in differences:
         request = one.request

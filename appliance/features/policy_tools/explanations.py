@@ -1,7 +1,7 @@
 """Explain decisions, records and denials, and judge texts, without RVMaster.
 
-Every function here is pure, takes texts, and runs in a thread, so a client's long text costs RVMaster nothing.
-`current` is control's answer to `PolicyWanted`; if `text` is None, the policy in force is used.
+Every function is pure and runs in a thread, so a client's long text costs RVMaster nothing. If `text` is None,
+the policy in force, `current`, is used.
 """
 
 from dataclasses import replace
@@ -32,10 +32,7 @@ _GRANTED = (
 
 
 def granted(record: AuditRecord, current: PolicyKnown, *, whole_tool: bool = False) -> Granted:
-    """Return the change that grants the request. Raises `UngrantableError` if no change does.
-
-    `whole_tool`: the change also has all other rights that the stock tool of the record needs.
-    """
+    """`whole_tool`: the change also has all other rights that the stock tool of the record needs."""
     known, asked = PolicyContext.of(msgspec.structs.asdict(current)), asked_of(record)
     tool = stock_tool(asked.request.caller_id)
     if whole_tool:
@@ -62,10 +59,7 @@ def explained(
     in_full: LogEntry | None = None,
     host_in_words: HostInWords = str,
 ) -> Why:
-    """Return the explanation of a record; a denial that a policy might allow needs `current`.
-
-    `in_full`: the record that a record of repetitions continues.
-    """
+    """`in_full`: the record that a record of repetitions continues."""
     found, refusal = None, ""
     try:
         if current is not None:
@@ -80,7 +74,7 @@ def explained(
 
 
 def judge_text(text: str | None, current: PolicyKnown, *, cases: bool) -> PolicyJudgement:
-    """Return the errors and warnings of a text; with `cases`, also run the test cases beside the policy file.
+    """With `cases`, also run the test cases beside the policy file.
 
     Raises `ProblemError` with every finding if the text or the cases are invalid.
     """
@@ -96,7 +90,6 @@ def judge_text(text: str | None, current: PolicyKnown, *, cases: bool) -> Policy
 def explanation(
     text: str | None, current: PolicyKnown, *, host: str, node: str, category: Category, resource: str
 ) -> DecisionExplanation:
-    """Return why a request is decided as it is. Raises `ProblemError` if the request is invalid."""
     fields = msgspec.structs.asdict(current)
     known = PolicyContext.of(fields)
     policy = judge_text(text, current, cases=False).policy

@@ -1,4 +1,4 @@
-"""The feature policy tools: `rosrv policy` checks, explains, tests, compares, grants and learns; `rosrv audit why`."""
+"""Define the feature policy tools."""
 
 from appliance.cli.verb_table import FIRST, Group, Verb
 from appliance.features.feature import Feature

@@ -1,4 +1,4 @@
-"""`rosrv policy grant` and `rosrv audit why`: explain an audit record, and grant a denied request."""
+"""The commands `rosrv policy grant` and `rosrv audit why`."""
 
 import shlex
 from pathlib import Path
@@ -115,7 +115,7 @@ def grant(
 
 
 def _with_ends_of(file: Path, text: str) -> bytes:
-    """Return the text in bytes with the line ends of the existing file; a new file gets LF."""
+    """Keep the line ends of the existing file; a new file gets LF."""
     ends = b"\r\n" if file.is_file() and b"\r\n" in read_given(file) else b"\n"
     return text.encode().replace(b"\n", ends)
 

@@ -1,18 +1,15 @@
 """Learn a least-privilege policy from the recorded decisions of a robot.
 
-Each used right is granted to the hosts that used it; nothing else is granted. Three keys are wider than observed,
-because the next run needs them:
+Each used right is granted to the hosts that used it. Three keys are wider than observed, because the next run
+needs them:
 
 1. An anonymous node name (`/rostopic_4711_1700000000000`) becomes a pattern (`/rostopic_*`).
-2. `searchParam` needs the right to find every parameter that it tries, whether it is found or not: the next run may
-   have it, and a search without that right is denied.
-3. The key of a parameter becomes the key of its namespace (`/arm` becomes `/arm/**`). A call on a namespace needs the
-   right on every parameter in it. So a host that may access a namespace may also access narrower keys in it.
+2. `searchParam` needs the right to find every parameter that it tries: the next run may have it, and a search
+   without that right is denied.
+3. The key of a parameter becomes the key of its namespace (`/arm` becomes `/arm/**`), because a call on a
+   namespace needs the right on every parameter in it.
 
 A host that used a right with approvals only is written behind `ask`.
-
-Every line names the nodes that used the right, and how often. Hosts that occur together on several lines become a
-group. A parameter's key is left out if the key above it has the same hosts.
 """
 
 from collections import Counter
@@ -35,7 +32,7 @@ _SHOWN_NODES = 3
 class Observation:
     """A recorded request that passed, perhaps with an approval (`asked`).
 
-    `call` is the name of the call on the wire, `key` its parameter.
+    `key` is the parameter of the call on the wire.
     """
 
     request: Request
@@ -62,7 +59,6 @@ class LearnedPolicy:
 
 
 def learn(observations: Iterable[Observation], robot: Collection[Address | Network] = ()) -> LearnedPolicy:
-    """Return the policy that grants the observations; `robot` lists the addresses of the group `robot`."""
     rights: dict[tuple[Category, str], _Right] = {}
     requests = left_out = 0
     for observation in observations:
@@ -91,7 +87,6 @@ def covered(given: Network, places: Iterable[Network]) -> bool:
 
 
 def _needed(observation: Observation) -> Iterator[Request]:
-    """Yield every right that this request needs. Raises `BadWordError` if no rule can grant it."""
     for right in rights_of_call(observation.request, observation.call, observation.key or None):
         check_resource(right.request.category, right.request.resource)
         yield right.request

@@ -1,4 +1,4 @@
-"""`rosrv policy learn`: derive a least-privilege policy from the audit log."""
+"""The command `rosrv policy learn`."""
 
 import os
 import sys

@@ -1,6 +1,6 @@
 """Compute the impact of a policy on the running appliance, for `rosrv policy check --state` (or `--api`).
 
-Over the socket, this program checks the policy as a reload would; over REST, the appliance does a dry run.
+Over REST, the appliance does a dry run.
 """
 
 from dataclasses import dataclass, replace
@@ -32,7 +32,6 @@ class PolicyImpact:
 def impact_of(
     appliance: Appliance, file: Path, robot: list[str] | None, enrolled: list[str] | None
 ) -> PolicyImpact:
-    """Return the impact of a file; `robot` and `enrolled` override the appliance's. Raises `NotRunningError`."""
     if appliance.place is not None:
         return _by_dry_run(appliance, file)
     known = known_of(robot, enrolled, PolicyContext.of(asdict(appliance.ask(PolicyWanted()).given())))

@@ -1,4 +1,4 @@
-"""Read the input of the policy verbs: policies, addresses of hosts, and requests from files or the audit log."""
+"""Read the input of the policy verbs: policies, addresses of hosts, and requests."""
 
 import functools
 import ipaddress
@@ -43,7 +43,7 @@ Enrolled = Annotated[
 
 
 def read_text(file: Path) -> str:
-    """Return the text; invalid UTF-8 becomes U+FFFD, which policies allow only in comments."""
+    """Invalid UTF-8 becomes U+FFFD, which policies allow only in comments."""
     try:
         return read_given_text(file, errors="replace")
     except OSError as error:
@@ -53,14 +53,12 @@ def read_text(file: Path) -> str:
 def known_of(
     robot: list[str] | None, enrolled: list[str] | None, running: PolicyContext | None = None
 ) -> PolicyContext:
-    """Return the known hosts; options override those of the running appliance."""
     known = running or PolicyContext()
     hosts = dict(_enrolled(text) for text in enrolled or ())
     return replace(known, hosts={**known.hosts, **hosts}, robot=networks_of(robot) or known.robot)
 
 
 def networks_of(robot: list[str] | None) -> list[Network]:
-    """Return the networks of `--robot`. Exits with status 2 for an invalid network."""
     return [_network(text) for text in robot or ()]
 
 
@@ -82,10 +80,6 @@ def _enrolled(text: str) -> tuple[str, Address]:
 def policy_in_force(
     appliance: Appliance, robot: list[str] | None, enrolled: list[str] | None
 ) -> tuple[str, str, PolicyContext]:
-    """Return text, file and the known hosts, which the options override.
-
-    Exits with status 2 if no appliance answers.
-    """
     body: PolicyInForce = (
         appliance.ask_or_exit(PolicyWanted()) if appliance.place is None else _over_rest(appliance)
     )
@@ -100,7 +94,6 @@ def policy_in_force(
 
 
 def running_robot(appliance: Appliance) -> list[Network]:
-    """Return the addresses of the group `robot`. Raises `NotRunningError`."""
     body = appliance.ask(PolicyWanted()).given() if appliance.place is None else _over_rest(appliance)
     return [canonical_network(ipaddress.ip_network(place)) for place in body.robot]
 
@@ -118,7 +111,6 @@ def _over_rest(appliance: Appliance) -> PolicyInForce:
 
 
 def asking_host(text: str, policy: Policy) -> Address:
-    """Return the address in `text`, or of the one host with this name. Raises `BadWordError`."""
     try:
         return find_host(text, policy)
     except BadWordError as error:
@@ -146,19 +138,17 @@ def requests_of_file(file: Path) -> Iterator[Request]:
 
 
 def request_of(host: str, caller_id: str, category: str, resource: str) -> Request:
-    """Return the request of these words. Raises `ValueError`."""
     address = canonical_address(ipaddress.ip_address(host))
     return Request(address, str(caller_id or ""), Category(category), str(resource))
 
 
 def live_now(appliance: Appliance) -> list[LiveRight]:
-    """Return the live rights. Raises `NotRunningError`."""
     answer = appliance.ask(RegistrationsWanted())
     return [LiveRight.of(asdict(row)) for row in answer.given().registrations] if answer.ok else []
 
 
 def requests_of_audit_log(appliance: Appliance) -> Iterator[Request]:
-    """Yield the requests in the log, without folded records, which do not name their requests."""
+    """Leave out folded records, which do not name their requests."""
     decided = Filter(decision=("allow", "deny", "would deny"))
     try:
         for entry in appliance.audit().export(decided):

@@ -1,4 +1,4 @@
-"""`rosrv policy check|explain|test`: check a policy before it is in force, or explain the one in force.
+"""The commands `rosrv policy check|explain|test`.
 
 Exit status: 0 allowed, valid; 1 denied, errors, a failed case; 2 usage.
 """
@@ -127,7 +127,6 @@ def _allowing(policy: Policy, request: Request) -> Iterator[str]:
 def compiled(
     appliance: Appliance, file: Path | None, robot: list[str] | None, enrolled: list[str] | None
 ) -> Policy:
-    """Return the policy of a file, or the one in force with its blocks. Exits with status 1 if it has errors."""
     if file is not None:
         return _judge_or_exit(file, robot, enrolled).policy
     text, name, known = policy_in_force(appliance, robot, enrolled)

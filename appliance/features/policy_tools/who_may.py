@@ -14,10 +14,10 @@ from appliance.policy.rights import decide, decide_right, rights_of
 
 @dataclass(frozen=True, slots=True)
 class HostAnswer:
-    """An answer for some hosts; `network` is None for all hosts that no network of the policy contains.
+    """An answer for some hosts; `network` is None for hosts that no network of the policy contains.
 
-    `names` are the names of the network: `robot`, `host:NAME`. `through` are the words of the deciding rule
-    that include the hosts. `near`: only another right is missing, such as the right to the command.
+    `through` are the words of the deciding rule. `near`: only another right is missing, such as the right to the
+    command.
     """
 
     network: Network | None
@@ -42,6 +42,7 @@ def who_may(policy: Policy, category: Category, resource: str, node: str = "") -
 
     Without the name of a `node`, the right to a node's name is not decided. Blocks of hosts, approvals, and
     the holders of groups are ignored.
+
     """
     policy = replace(policy, blocks={}, holders=None, approved=None)
     networks = sorted(policy.hosts.networks(), key=lambda one: (one.version, one))
@@ -74,9 +75,10 @@ def _names(policy: Policy, network: Network | None) -> tuple[str, ...]:
 
 
 def _only_in(policy: Policy, network: Network, later: list[Network]) -> Address | None:
-    """Return an address that no smaller network contains, or None if they cover this one.
+    """Return an address that no smaller network contains.
 
     `later` are in order of addresses, so smaller networks follow.
+
     """
     smaller = itertools.takewhile(functools.partial(_within, network), later)
     starts = itertools.chain([network.network_address], _ends(smaller))

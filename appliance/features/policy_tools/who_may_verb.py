@@ -1,4 +1,4 @@
-"""`rosrv policy who-may`: the hosts that may publish a topic, call a service or make a call."""
+"""The command `rosrv policy who-may`."""
 
 from collections.abc import Iterator
 from ipaddress import IPv4Address
