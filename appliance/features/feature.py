@@ -1,10 +1,8 @@
 """Define all that a feature adds to the core.
 
-Invariants:
-
 1. The core knows only these classes and `table.py`. No feature imports another one.
-2. Each process loads the table, so a row imports only settings and roles. `make`, `operations` and entries of roles
-   import the rest when they are called; routes and verbs are named by strings.
+2. Each process loads the table, so a row imports only settings and roles. Everything else is imported when it is
+   called, or named by strings.
 3. No feature imports `configuration.settings` except in the entry of a process, because the settings import the
    table.
 """
@@ -58,6 +56,7 @@ class FeatureContext:
 
     `charged_to(host)` returns the name that is charged for a host's acts. `in_force()` returns the revisions of
     policy and specifications.
+
     """
 
     sections: Sections
@@ -72,9 +71,8 @@ class FeatureContext:
 class OperatorContext:
     """Objects of control that exist later, for operators' work.
 
-    `appliance` is the name of one of two appliances, empty on a single one. `received` notes that another machine has
-    all records up to a sequence. `bearers` returns the names of the tokens and sessions that may be used now.
-    `tokens_changed` sends the api the usable tokens and sessions. `kept` has the results of `Feature.keep`.
+    `appliance` is the name of one of two appliances, empty on a single one. `received` notes that another machine
+    has all records up to a sequence. `bearers` returns the usable tokens and sessions by name.
     """
 
     core: FeatureContext
@@ -97,18 +95,15 @@ class OperatorContext:
 class FeaturePart:
     """A feature's part of control.
 
-    `links` are control's ends of the links to the feature's roles, with the messages that control accepts,
-    and `longest` limits the bytes of a message. `methods` answer the feature's `operations`. `work` runs
-    until control ends; its names go into error messages. `limits` returns the use of its resources.
-    `connected(door, ticket, peer, descriptor)` passes a WebSocket of the api on; it returns an HTTP status
-    and why it is refused, or an empty text. `details` returns its additions to the details of a record
-    (`RecordDetails`). `called` answers nodes' calls of its services, by name without the appliance's own
-    name. `sessions` are the sessions of people. `holders` returns the host that holds each group
-    (`Policy.holders`). `approved` returns the approvals that last (`Policy.approved`), `hold_call` holds a
-    call that needs one, and `approve` decides about a request to a service.
+    `links` are control's ends of the links to the feature's roles, with the accepted messages, of at most
+    `longest` bytes. `work` runs until control ends; its names go into error messages. `connected(door, ticket,
+    peer, descriptor)` passes a WebSocket of the api on; it returns an HTTP status and why it is refused. `called`
+    answers nodes' calls of services, by name without the appliance's own name. `holders` and `approved` are those
+    of `Policy`; `hold_call` holds a call that needs an approval, and `approve` decides about a request to a
+    service.
 
-    `status_fields()` returns the present states of the feature by their fields in `rosrv status --json`. The
-    feature's view defines the fields (`StateView`). A state that is None or missing is null there.
+    `status_fields()` returns the states of the feature by their fields in `rosrv status --json`. A state that is
+    None or missing is null there.
     """
 
     links: "Mapping[str, tuple[Link, Any]]" = field(default_factory=dict)
@@ -133,9 +128,8 @@ class FeaturePart:
 class ConsolePart(NamedTuple):
     """A component of the console, in a file of the feature's folder `console`.
 
-    A `view` is a page with this title; the others are parts of the core's pages: `banner` is above every view, `now`
-    and `robot` are on these pages, `record` is in an audit record, and `standby` is the page of an appliance that is
-    not active.
+    A `view` is a page with this title; the others are parts of the core's pages: `banner` of every view, `record`
+    of an audit record, and `standby` the page of an appliance that is not active.
     """
 
     place: Literal["view", "banner", "now", "record", "robot", "standby"]
@@ -146,24 +140,19 @@ class ConsolePart(NamedTuple):
 
 @dataclass(frozen=True)
 class Feature:
-    """All that a feature adds: a section of `appliance.yaml`, processes, requests, verbs, and a part of
-    control.
+    """All that a feature adds.
 
-    `operations` returns the requests of operators' tools; the admin socket, REST and the client follow from
-    their rows. `answers` are the `Answer`s (`module:name`) of operations over REST that are not just
-    control's, by name, and `routes` is the function (`module:function`) that returns further routes of the
-    api for its `Services`. `without_token` lists the paths of routes that need no token. `page` returns
-    settings for the console's page. `quotas` are rows that the table of quotas lists. `recorded` is the
-    function (`module:function`) that gives `rosrv monitor replay` the recorded messages of a period.
-    `console` are components of the console; all style sheets of the folder are part of its style. `memory`
-    makes the memory that the supervisor shares with this number of relays; None if none is configured.
+    `operations` returns the requests of operators' tools, from which the admin socket, REST and the client
+    follow. `answers` are the `Answer`s (`module:name`) of operations over REST that are not just control's, and
+    `routes` is the function (`module:function`) that returns further routes; those in `without_token` need no
+    token. `recorded` is the function that gives `rosrv monitor replay` the messages of a period. `memory` makes
+    the memory that the supervisor shares with this number of relays.
 
-    `pairing(state)` returns what the start of one of two appliances needs; it raises `StartError`.
-    `state_files` are files in the state directory that the feature may write before the first start. Hooks of
-    control are named by `module:name`, so that their modules may import what imports the table. `may_start`
-    is a class of `control.assembly.active_role.StartGate`. `keep(sections, store, lifeline)` returns
-    `KeptHosts`, before the policy comes into force. `inherit(foundation, parts)` returns a `FeaturePart` once
-    control may serve and has its parts, before it serves.
+    `pairing(state)` returns what the start of one of two appliances needs; it raises `StartError`. `state_files`
+    are files in the state directory that may exist before the first start. Hooks of control are named by
+    `module:name`, so that their modules may import what imports the table: `may_start` is a `StartGate`,
+    `keep(sections, store, lifeline)` returns `KeptHosts` before the policy comes into force, and
+    `inherit(foundation, parts)` a `FeaturePart` before control serves.
     """
 
     name: str

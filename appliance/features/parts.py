@@ -62,22 +62,17 @@ class FeatureParts:
         self._parts += [feature.operate(context) for feature in FEATURES if feature.operate is not None]
 
     async def inherit(self, foundation: Any, parts: Any) -> None:
-        """Add the parts that need the other parts of control."""
         for feature in FEATURES:
             if feature.inherit is not None:
                 part: FeaturePart = await pkgutil.resolve_name(feature.inherit)(foundation, parts)
                 self._parts.append(part)
 
     def add(self, part: FeaturePart | None) -> None:
-        """Add the part that let control serve, if there is one."""
         if part is not None:
             self._parts.append(part)
 
     def link(self, role: str, index: int = 0) -> "tuple[Link, Any] | None":
-        """Return control's end of the link, with the accepted messages; None for an unknown process.
-
-        The second process of a role has the name `ROLE-2`.
-        """
+        """The second process of a role has the name `ROLE-2`."""
         name = f"{role}-{index + 1}" if index else role
         return next((part.links[name] for part in self._parts if name in part.links), None)
 
@@ -130,7 +125,6 @@ class FeatureParts:
         return ApprovalAnswered(wanted.number, _NO_APPROVALS)
 
     def sessions(self) -> "Sessions | None":
-        """Return people's sessions, or None if they sign in with tokens only."""
         return next((part.sessions for part in self._parts if part.sessions is not None), None)
 
     def hosts(self) -> TunnelHosts:

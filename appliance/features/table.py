@@ -63,7 +63,6 @@ FEATURES: tuple[Feature, ...] = (
 
 
 def memories(sections: Sections, relays: int) -> tuple[SharedMemory, ...]:
-    """Return the features' shared memory. Raises `StartError`, `OSError`."""
     return tuple(filter(None, (feature.memory(sections, relays) for feature in FEATURES)))
 
 
@@ -72,7 +71,6 @@ def recorded_messages() -> Any:
 
 
 def pairing_in(state: Path) -> "Pairing | None":
-    """Return the pairing, or None on a single appliance. Raises `StartError`."""
     found = (feature.pairing(state) for feature in FEATURES if feature.pairing is not None)
     return next(filter(None, found), None)
 

@@ -25,11 +25,11 @@ class Trouble(NamedTuple):
 
 @dataclass(frozen=True)
 class StateView(Generic[S]):
-    """`kind` defines a field of `rosrv status --json`, described by `doc`. The field belongs to the status,
-    or to its `audit`, before the field `before`, or at the end. It is null without a state; a client may rely
-    on a field that is `required`. `metrics` have no samples without a state. `line(state)` returns what
-    `rosrv status` prints: a name, and a text in rich's markup; an empty name adds the text to the line of the
-    audit log.
+    """A field `kind` of `rosrv status --json`, described by `doc`.
+
+    It belongs to the status, or to its `audit`, before the field `before`, or at the end, and is null without a
+    state, unless `required`. `line(state)` returns what `rosrv status` prints: a name, and a text in rich's
+    markup; an empty name adds the text to the line of the audit log.
     """
 
     field: str
@@ -58,7 +58,6 @@ class PairView:
         return {}
 
     def status(self, state: Any) -> Any:
-        """Return the status of an appliance that waits for the end of the other one."""
         del state
         raise _NO_PAIRS
 
@@ -70,10 +69,6 @@ class PairView:
         state: Path,
         verify: Callable[[], Any],
     ) -> tuple[Any, Callable[[Any], None]]:
-        """Return the result of verifying two logs, and the function that prints it.
-
-        `verified` is the `Verification` of the log `own`, and `verify()` returns that of `other`.
-        """
         del verified, state, verify
         raise UserError(f"{own} and {other}: this rosrv cannot verify takeovers: use one with `standby`")
 

@@ -24,7 +24,6 @@ STATES: tuple[StateView[Any], ...] = tuple(state for view in VIEWS for state in 
 
 
 def with_states(kind: type[msgspec.Struct], part: str) -> Any:
-    """Add a field for each state of a feature that belongs to this part of the status."""
     fields: list[Any] = []
     for field in msgspec.structs.fields(kind):
         defaults = {"default": field.default, "default_factory": field.default_factory}

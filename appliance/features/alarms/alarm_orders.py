@@ -41,14 +41,12 @@ class AlarmOrders:
         return self._list()
 
     async def acknowledge(self, request: AlarmAcknowledge, who: str) -> AlarmList:
-        """Record who takes care of an alarm. Raises `UnknownThingError` if there is no such alarm."""
         self._must_be_present(request.kind)
         self._handled.put(HandledAlarm(request.kind, who, clock.wall(), None, request.note))
         self._record("alarm acknowledged", f"{request.kind} is acknowledged", request.kind, who, request.note)
         return self._list()
 
     async def silence(self, request: AlarmSilence, who: str) -> AlarmList:
-        """Make an alarm a notice for a time, or end a silence. Raises `UnknownThingError` and `SenselessError`."""
         kind, seconds = request.kind, request.seconds
         if seconds is None:
             if not self._handled.end(kind):

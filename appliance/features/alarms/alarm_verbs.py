@@ -1,4 +1,4 @@
-"""`rosrv alarm list|acknowledge|silence`: the present alarms, and who takes care of them."""
+"""The commands `rosrv alarm list|acknowledge|silence`."""
 
 from typing import Annotated
 

@@ -1,4 +1,4 @@
-"""`rosrv alarm`. The core finds the present alarms (`channel/alarms.py`)."""
+"""Define the feature alarms. The core finds the present alarms (`channel/alarms.py`)."""
 
 from typing import TYPE_CHECKING, Any
 

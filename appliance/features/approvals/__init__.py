@@ -1,1 +1,1 @@
-"""Approvals: an operator permits calls of hosts that the policy lists behind `ask`, once or for some time."""
+"""An operator permits calls of hosts that the policy lists behind `ask`, once or for some time."""

@@ -1,8 +1,7 @@
-"""Hold calls that need an approval, and give and end approvals, by orders of operators and at their time.
+"""Hold calls that need an approval, and give and end approvals.
 
-A lease on a topic or a parameter takes the path of a change of the policy: all rights are decided again
-(`Policy.approved`). A service call is decided here, because the relay asks about each request. Nothing is stored:
-after a restart of control, and after a takeover, nothing is approved.
+A lease on a topic or a parameter takes the path of a change of the policy. A service call is decided here,
+because the relay asks about each request. Nothing is stored: a restart or a takeover ends all approvals.
 """
 
 import asyncio
@@ -39,17 +38,13 @@ LEASE_SECONDS = 60.0
 SILENT_SECONDS = 5.0
 """The silence that ends a lease on a motion outside the groups of `[Authority]`."""
 UNANSWERED_SECONDS = 600.0
-"""The duration of the alarm about an unanswered call."""
 
 
 class ApprovalOrders:
-    """The operators' orders about approvals; they raise `SenselessError` and `UnknownThingError`.
+    """The operators' orders; they raise `SenselessError` and `UnknownThingError`.
 
-    `first` is the number of the first held call. `decide_again()` brings the present `approved` into force,
-    and `carried_out(topics)` waits until the relays of topics have carried out their orders. `guards(topic)`
-    returns the monitors with a safe message for a topic, or None if its relay does not answer.
-
-    An order or an end takes effect before it waits for anything, so a hanging relay delays no other order.
+    `guards(topic)` returns the monitors with a safe message for a topic, or None if its relay does not answer. An
+    order or an end takes effect before it waits for anything, so a hanging relay delays no other order.
     """
 
     def __init__(
@@ -86,7 +81,6 @@ class ApprovalOrders:
         return self._held(call, request.caller_id)
 
     async def approve_call(self, wanted: ApprovalWanted) -> ApprovalAnswered:
-        """Decide about a request to a service. An approval of one call is used up."""
         answer = partial(ApprovalAnswered, wanted.number)
         if obstacle := self._trail.obstacle or self._trail.shut_out(wanted.host):
             return answer(obstacle)
@@ -145,7 +139,7 @@ class ApprovalOrders:
         )
 
     async def approve(self, request: requests.ApproveCall, who: str) -> requests.Approval:
-        """Approve a held call; a lease may be given again to extend or shorten it."""
+        """A lease may be given again to extend or shorten it."""
         entry = self._entry(request.number)
         seconds = request.seconds
         if seconds is None and entry.lease and entry.call.category is Category.CALL:
@@ -170,7 +164,7 @@ class ApprovalOrders:
         return _shown(entry)
 
     async def refuse(self, request: requests.RefuseCall, who: str) -> requests.Approval:
-        """Refuse a held call, which is then not held again when it is repeated, or end an approval."""
+        """A refused call is not held again when it is repeated."""
         entry = self._entry(request.number)
         take_effect()
         if entry.state is ApprovalState.APPROVED:
@@ -185,17 +179,14 @@ class ApprovalOrders:
     # --- the end of a time ---
 
     async def watch(self) -> None:
-        """End calls and approvals at their time; runs until cancelled."""
         async with asyncio.TaskGroup() as checks:
             while True:
                 checks.create_task(self.check())
                 await asyncio.sleep(CHECK_SECONDS)
 
     async def check(self) -> None:
-        """End the calls and approvals whose time is over, and leases of hosts that stopped publishing a
-        motion.
-
-        All of them end before this waits for the stops of the robot.
+        """End what is over, and leases of hosts that stopped publishing a motion, before any wait for a stop of
+        the robot.
         """
         ended, still = [], []
         for entry in self._table.entries():
@@ -228,9 +219,10 @@ class ApprovalOrders:
         return "" if any(asking) else "the policy no longer asks"
 
     def _silence(self, entry: ApprovalEntry) -> str:
-        """Return why a lease on a topic ends now if the topic is a motion; empty while its host is not silent.
+        """Return why silence ends a lease on a motion now.
 
         A topic is a motion if it is in a group of `[Authority]`, or if an enabled guard has a safe message for it.
+
         """
         moved, group = self._last_message(entry), self._policy().commanded(entry.call.resource)
         seconds = SILENT_SECONDS if group is None else group.lease
@@ -238,7 +230,7 @@ class ApprovalOrders:
         return f"its host was silent for {seconds:g} s" if silent else ""
 
     async def _end_if_guarded(self, entry: ApprovalEntry) -> None:
-        """End a lease of a silent host if a guard has a safe message for its topic. Ask once in each silence."""
+        """Ask once in each silence whether a guard has a safe message for the topic."""
         guards = await self._guards(entry.call.resource)
         present = self._table.entry(entry.number)
         if guards is None:
@@ -268,11 +260,11 @@ class ApprovalOrders:
         return differ
 
     async def _stop_motion(self, entry: ApprovalEntry) -> None:
-        """Let the guards stop the robot after the end of a lease on a topic, once its relay has cut the host
-        off.
+        """Let the guards stop the robot once its relay has cut the host off.
 
         They do so even if no message was reported, because relays report once a second, and forget the
         traffic of a node that has ended.
+
         """
         call = entry.call
         if not entry.lease or call.category is not Category.PUBLISH:

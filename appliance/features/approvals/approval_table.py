@@ -1,11 +1,8 @@
 """Keep the calls that wait for an approval, and the approvals. No I/O; times are monotonic seconds.
 
-Invariants:
-
 1. A call has one number while it waits, however often its host repeats it.
-2. An approval of one call is used once, by the same host, for the same service with the same arguments.
-3. A lease ends at its time, whatever happens.
-4. The entries are counted in a `Pool`, each for the host that was charged when the call came.
+2. An approval of one call is used once, by the same host, for the same service and arguments.
+3. Each entry is charged to the host that was charged when the call came.
 """
 
 from dataclasses import dataclass, replace
@@ -30,7 +27,7 @@ class ApprovalState(StrEnum):
 
 
 class HeldCall(NamedTuple):
-    """A call that needs an approval; `digest` is the SHA-256 of its arguments, empty for a topic or a parameter."""
+    """A call that needs an approval; `digest` is the SHA-256 of a service's arguments."""
 
     host: Address
     category: Category
@@ -43,7 +40,7 @@ class HeldCall(NamedTuple):
 
 
 class ChargedHost(NamedTuple):
-    """A host and its quota's key: the network by which the policy names the host, or the host's address."""
+    """A host and its quota's key: the network in the policy, or the host's address."""
 
     network: str
     named: bool
@@ -58,10 +55,10 @@ class ChargedHost(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class ApprovalEntry:
-    """A call, and the operators' decision. `arguments` are its first bytes, of `size`; `type` is its service type.
+    """A call, and the operators' decision. `arguments` are its first bytes, of `size`.
 
-    The entry ends at `until`. `once`: the approval is for one call; otherwise it is a lease for all calls of
-    the key, which began at `since`.
+    `once`: the approval is for one call; otherwise it is a lease for all calls of the key from `since` to
+    `until`.
     """
 
     number: int
@@ -102,7 +99,6 @@ class ApprovalTable:
         return self._entries.get(number)
 
     def find(self, call: HeldCall) -> ApprovalEntry | None:
-        """Return the lease for all calls of the key, or the entry of this call."""
         for one in (call._replace(digest=""), call):
             if (number := self._by_call.get(one)) is not None:
                 return self._entries[number]
@@ -119,7 +115,6 @@ class ApprovalTable:
         arguments: bytes,
         size: int,
     ) -> ApprovalEntry | str:
-        """Return the entry of a waiting call, or why its host may have no more."""
         if refusal := self.pool.take(charged):
             return refusal
         entry = ApprovalEntry(

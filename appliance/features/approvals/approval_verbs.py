@@ -1,4 +1,4 @@
-"""`rosrv approve`: list the calls that wait for an approval, and approve or refuse them."""
+"""The command `rosrv approve`."""
 
 from typing import Annotated, Any
 
@@ -67,7 +67,6 @@ def _say(appliance: Appliance, one: Approval) -> None:
 
 
 def _arguments(one: Approval) -> str:
-    """Return the arguments of a call as text, even if the type of its service is not known here."""
     if not one.sha256:
         return " with any arguments" if one.category == "call" else ""
     data = bytes.fromhex(one.arguments)

@@ -23,6 +23,7 @@ async def inherit(base: "Foundation", parts: "Parts") -> FeaturePart:
 
     The first number is random, so an operator who answers late, after a restart, does not approve another
     call.
+
     """
     relay, policy = parts.endpoints.relay, base.policies.policy
     stop = MotionStop(relay.stop, base.trail, policy)

@@ -1,4 +1,4 @@
-"""The feature approvals: `rosrv approve`, for calls of hosts behind `ask` in the policy."""
+"""Define the feature approvals."""
 
 from typing import TYPE_CHECKING, Any
 

@@ -1,8 +1,8 @@
-"""Hand groups of `[Authority]` over between hosts, by orders of operators, calls of nodes, and the end of a lease.
+"""Hand groups of `[Authority]` over between hosts, by orders of operators, calls of nodes, and the end of a
+lease.
 
-A hand-over takes the path of a change of the policy: all rights are decided again, so the relays get new orders. The
-earlier holder is cut off on every relay before the next host holds the group. Nothing is stored: after a restart of
-control, and after a takeover, each group is free.
+The earlier holder is cut off on every relay before the next host holds the group. Nothing is stored: after a
+restart or a takeover, each group is free.
 """
 
 import asyncio
@@ -27,13 +27,10 @@ CHECK_SECONDS = 0.25
 
 
 class DriveOrders:
-    """The operators' orders about groups; they raise `SenselessError`, `UnavailableError` and
-    `UnknownThingError`.
+    """The operators' orders; they raise `SenselessError`, `UnavailableError` and `UnknownThingError`.
 
-    `decide_again()` brings the present `holders` into force. `carried_out(topics)` waits until the relays of
-    these topics (None: all) have carried out their orders.
-
-    Each group has its own turn, so a hanging relay delays the next holder of a group, and no other group.
+    `carried_out(topics)` waits for the relays (None: all). Each group has its own turn, so a hanging relay delays
+    no other group.
     """
 
     def __init__(
@@ -73,7 +70,6 @@ class DriveOrders:
         return self._state(group)
 
     async def give(self, request: requests.DriveGive, who: str) -> requests.GroupState:
-        """Give a group to a host with any claim, or free it."""
         group = self._group(request.group)
         to = self._host(request.to) if request.to else None
         if to is not None and self._claim(group, to) is None:
@@ -87,7 +83,7 @@ class DriveOrders:
         return self._state(group)
 
     async def ask(self, request: requests.DriveAsk, who: str) -> requests.GroupState:
-        """Let a host wait for a group; a host that may take a free group gets it at once."""
+        """A host that may take a free group gets it at once."""
         group, host = self._group(request.group), self._host(request.host)
         async with self._turn(group):
             await self._asked(group, host, who)
@@ -96,7 +92,6 @@ class DriveOrders:
     # --- nodes ---
 
     async def take_called(self, call: OwnServiceCalled) -> OwnServiceAnswered:
-        """Give the caller's host all groups that it may take, or answer with the reason."""
         host, done, refused = address_of(call.host), [], []
         for group in self._policy().authority.values():
             claim = self._claim(group, host)
@@ -118,7 +113,6 @@ class DriveOrders:
         return OwnServiceAnswered(call.number, bool(done) and not refused, text, repeats=False)
 
     async def give_called(self, call: OwnServiceCalled) -> OwnServiceAnswered:
-        """End the authority of the caller's host over all groups."""
         host, done = address_of(call.host), []
         for group in self._policy().authority.values():
             async with self._turn(group):
@@ -138,10 +132,7 @@ class DriveOrders:
                 await asyncio.sleep(CHECK_SECONDS)
 
     async def check(self) -> None:
-        """End the authority whose lease is over, and give each group to the host that waits for it.
-
-        Every authority ends before this waits for a relay.
-        """
+        """Every authority ends before this waits for a relay."""
         groups = self._policy().authority
         if gone := self._groups.forget_others(frozenset(groups)):
             self._decide_again()
@@ -197,6 +188,7 @@ class DriveOrders:
 
         The group is freed in any case. Without `to`, the first waiting host follows, if all relays are ready. `stop`:
         the guards of the group stop the robot in between.
+
         """
         if to is not None and not self._relays_ready():
             raise UnavailableError(f"a relay starts, so {group.name} cannot be handed over: try again")

@@ -1,4 +1,4 @@
-"""`rosrv drive status|take|give|ask`: which host commands each group of `[Authority]`."""
+"""The commands `rosrv drive status|take|give|ask`."""
 
 from typing import Annotated
 

@@ -1,4 +1,4 @@
-"""The feature authority: `rosrv drive`, and the holders of the groups in `[Authority]`."""
+"""Define the feature authority."""
 
 from typing import TYPE_CHECKING, Any
 

@@ -1,12 +1,8 @@
 """Keep the holder of each group, and the hosts that wait for it. No I/O; times are monotonic seconds.
 
-Invariants:
-
-1. A group has at most one holder. `free` and `hold` are separate steps, so that the caller can cut the earlier holder
-   off before the next one holds the group.
+1. `free` and `hold` are separate steps, so that the caller can cut the earlier holder off in between.
 2. A holder loses the group once it was silent for the group's lease, or once its nodes have ended.
 3. The first waiting host that may take the group follows. A host that may only ask never follows.
-4. A group has at most `MOST_WAITING` waiting hosts, each for `WAITING_SECONDS`.
 """
 
 from collections.abc import Callable
@@ -22,7 +18,9 @@ ClaimOf = Callable[[AuthorityGroup, Address], Claim | None]
 
 @dataclass(frozen=True, slots=True)
 class Holding:
-    """A holder; `renewed` is when it last took the group again, `had_node` whether it has had a node since then."""
+    """A holder; `renewed` is when the holder last took the group again, `had_node` whether it has had a node
+    since then.
+    """
 
     host: Address
     since: float
@@ -31,7 +29,7 @@ class Holding:
 
 
 class GroupHolders:
-    """The holders of all groups; `claim_of(group, host)` returns the present claim of a host."""
+    """The holders of all groups."""
 
     def __init__(self, claim_of: ClaimOf) -> None:
         self._claim_of = claim_of
@@ -55,14 +53,12 @@ class GroupHolders:
         return list(left)
 
     def may_take(self, group: AuthorityGroup, host: Address) -> bool:
-        """Whether the group is free or the host's own, or the host may override its holder."""
         claim, holding = self._claim_of(group, host), self._held.get(group.name)
         if holding is None or holding.host == host:
             return claim in (Claim.TAKE, Claim.OVERRIDE)
         return claim is Claim.OVERRIDE
 
     def wait(self, group: AuthorityGroup, host: Address, now: float) -> bool:
-        """Let a host wait for a group; return False if too many hosts wait."""
         waiting = self.waiting(group, now)
         if host not in waiting and len(waiting) >= MOST_WAITING:
             return False
@@ -80,15 +76,12 @@ class GroupHolders:
         self._waiting.get(group, {}).pop(host, None)
 
     def seconds_left(self, group: AuthorityGroup, now: float, moved: float) -> float | None:
-        """Return the seconds until silence ends the authority, or None if the group is free.
-
-        `moved` is the time of the last message from the holder on a topic of the group.
-        """
+        """`moved` is the time of the last message from the holder on a topic of the group."""
         holding = self._held.get(group.name)
         return None if holding is None else max(holding.renewed, moved) + group.lease - now
 
     def loss(self, group: AuthorityGroup, now: float, *, moved: float, live: bool) -> str:
-        """Return why the holder loses the group now; empty if it keeps it. `live`: the holder has a live node."""
+        """`live`: the holder has a live node."""
         holding = self._held.get(group.name)
         if holding is None:
             return ""
@@ -106,7 +99,6 @@ class GroupHolders:
         return next((host for host in self.waiting(group, now) if self._claim_of(group, host) in able), None)
 
     def forget_others(self, names: frozenset[str]) -> dict[str, Holding]:
-        """Return the groups that had a holder and are no longer in the policy."""
         self._waiting = {name: queue for name, queue in self._waiting.items() if name in names}
         gone = {name: holding for name, holding in self._held.items() if name not in names}
         for name in gone:

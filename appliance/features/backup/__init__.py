@@ -1,1 +1,1 @@
-"""Backup: restore a state directory from a file, and erase it. `appliance/backup` writes the file."""
+"""Restore a state directory from a file, and erase it. `appliance/backup` writes the file."""

@@ -1,12 +1,9 @@
 """Check an archive before it is restored: it is complete, and has only entries that `back_up` writes.
 
-Invariants:
-
-1. The whole file is read and its checksum checked before any entry is used, so a damaged archive is rejected.
-2. An archive must unpack to no more than the free space, and have at most `MOST_FILES` entries, all of them regular
-   files. Headers that modify the next entry (sparse, pax, long names) are rejected, so exactly the checked entries
-   are extracted.
-3. Every name is valid for a backup and occurs once.
+1. The checksum of the whole file is checked before any entry is used.
+2. An archive must fit into the free space, and have at most `MOST_FILES` regular files. Headers that modify the
+   next entry (sparse, pax, long names) are rejected, so exactly the checked entries are extracted. Every name is
+   valid for a backup and occurs once.
 """
 
 import gzip
@@ -41,6 +38,7 @@ def checked_archive(file: Path, room: int) -> Iterator[tuple[tarfile.TarFile, li
     """Check an archive, limited to `room` unpacked bytes.
 
     Raises `BackupError`, also for read errors inside the `with` block.
+
     """
     try:
         with open_given(file) as raw:

@@ -1,4 +1,4 @@
-"""`rosrv backup`, `restore` and `purge`: save, restore and erase the state directory."""
+"""The commands `rosrv backup`, `restore` and `purge`."""
 
 import shlex
 from pathlib import Path

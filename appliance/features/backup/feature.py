@@ -1,4 +1,4 @@
-"""The feature backup: `rosrv backup`, `restore` and `purge`."""
+"""Define the feature backup."""
 
 from appliance.cli.verb_table import Verb
 from appliance.features.feature import Feature

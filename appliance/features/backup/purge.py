@@ -15,10 +15,7 @@ from appliance.supervisor.state_directory import StateDirectory, foreign
 
 
 def purge(state: Path) -> tuple[int, int]:
-    """Remove the directory; return the numbers of removed and overwritten files.
-
-    Raises `BackupError` if `state` does not exist or is in use, or if a file cannot be removed.
-    """
+    """Return the numbers of removed and overwritten files."""
     state = state.absolute()
     try:
         reason = foreign(state)

@@ -1,10 +1,8 @@
 """Restore a state directory from a backup.
 
-Invariants:
-
-1. Existing files are not overwritten, and writing starts only after the whole archive was checked (`archive.py`).
-2. An incomplete restore never becomes an appliance's state: its files are removed. After a kill or a power cut, a mark
-   remains, and `rosrv up` rejects the directory. The mark is removed once everything is on the disk.
+1. No file is overwritten, and writing starts only after the whole archive was checked.
+2. An incomplete restore never becomes an appliance's state: until everything is on the disk, there is a mark,
+   with which `rosrv up` rejects the directory.
 3. The files in a folder get their owner before the folder does. Otherwise that user could replace files by links.
 """
 
@@ -27,10 +25,6 @@ _SPARE = 64 << 20  # bytes of the disk that stay free
 
 
 def restore(file: Path, state: Path) -> list[str]:
-    """Restore a backup to `state`, ready for `rosrv up --state`; return the restored names.
-
-    As root, also set the owner of each part. Raises `BackupError`.
-    """
     with checked_archive(file, _room_in(state)) as (archive, entries), _marked(state):
         for entry in entries:
             _extract(archive, entry, state)
@@ -41,10 +35,6 @@ def restore(file: Path, state: Path) -> list[str]:
 
 
 def _room_in(state: Path) -> int:
-    """Return how many bytes may be restored to an empty or new folder.
-
-    Raises `BackupError`, also for a folder that is not empty.
-    """
     try:
         if os.path.lexists(state) and any(entry.name != _OF_THE_DISK for entry in state.iterdir()):
             raise BackupError(f"{state} is not empty, and nothing is overwritten; name another --state")
@@ -59,7 +49,7 @@ def _room_in(state: Path) -> int:
 
 @contextmanager
 def _marked(state: Path) -> Iterator[None]:
-    """Mark the folder during the restore; on an error, remove everything that was created."""
+    """On an error, remove everything that was created."""
     is_new = not state.exists()
     state.mkdir(mode=0o711, parents=True, exist_ok=True)
     state.chmod(0o711)

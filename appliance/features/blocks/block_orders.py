@@ -1,7 +1,6 @@
 """Block hosts and lift their blocks, by operators' orders and at the end of a block's time.
 
-A block takes the same path as a change of the policy: all registrations and grants are decided again, and those of the
-host are denied. When it ends, withdrawn registrations return, as after a change of the policy that grants them again.
+When a block ends, withdrawn registrations return.
 """
 
 import asyncio
@@ -81,9 +80,7 @@ async def inherit(base: Foundation, parts: Parts) -> FeaturePart:
 class BlockOrders:
     """The operators' requests; `live()` returns the rights that a change of the policy may end.
 
-    `connected()` yields the two hosts of each connection through the relay, `enrolled()` returns the
-    addresses of enrolled hosts and doors by name, `remotes()` the real addresses of hosts in tunnels by name.
-    `carried_out()` waits until the relays have carried out all orders.
+    `connected()` yields the two hosts of each connection, `remotes()` the real addresses of hosts in tunnels.
     """
 
     def __init__(
@@ -116,7 +113,6 @@ class BlockOrders:
         return requests.BlockedHosts([self._row(row) for row in self._blocks.rows().values()])
 
     async def block(self, request: HostBlock, who: str) -> requests.HostBlocked:
-        """Block a host. Raises `SenselessError`, `HostRefusedError` and `StoreError`."""
         address = self._address(request.address)
         _require_sensible(request)
         if str(address) not in self._enrolled().values():
@@ -160,7 +156,6 @@ class BlockOrders:
         return requests.HostBlocked(**asdict(shown), ended=ended, replaced=replaced, other_addresses=others)
 
     async def unblock(self, request: HostUnblock, who: str) -> requests.HostUnblocked:
-        """Lift the block of a host. Raises `SenselessError`, `UnknownThingError` and `StoreError`."""
         address = self._address(request.address)
         await self._read_clock()
         earlier = self._blocks.rows().get(address)

@@ -1,4 +1,4 @@
-"""`rosrv host block|unblock|blocks`: hosts that operators block during an incident."""
+"""The commands `rosrv host block|unblock|blocks`."""
 
 import functools
 from typing import Annotated

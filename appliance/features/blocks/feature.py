@@ -1,4 +1,4 @@
-"""The feature blocks: `rosrv host block`. The policy of the core denies the requests of blocked hosts."""
+"""Define the feature blocks. The policy of the core denies the requests of blocked hosts."""
 
 from typing import TYPE_CHECKING, Any
 

@@ -1,4 +1,4 @@
-"""The feature demo: `rosrv demo` runs the example of a simulated robot."""
+"""Define the feature demo."""
 
 from appliance.cli.verb_table import Verb
 from appliance.features.feature import Feature

@@ -1,1 +1,1 @@
-"""Evidence: signed bundles of the log, policies and recordings of an incident, made and sealed."""
+"""Signed bundles of the log, policies and recordings of an incident, made and sealed."""

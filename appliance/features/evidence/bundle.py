@@ -1,14 +1,10 @@
 """Make an evidence bundle: one ZIP file with the records of a period, the policies and monitors, and the proof.
 
-Invariants:
-1. The members in the manifest are generated twice: once for their hashes, and once to be written. If the two differ,
-   the export ends with an error.
-2. The manifest contains the hash of every member except itself and `proof.json`. The audit record of the export
-   contains the hash of the manifest. A signed checkpoint seals that record before the first byte is sent. The bundle
-   contains that record as `proof.json`.
+1. Members are generated twice, for their hashes and to be written. If the two differ, the export fails.
+2. The manifest contains the hash of every member except itself and `proof.json`: the audit record of the export,
+   with the hash of the manifest. A signed checkpoint seals that record before the first byte is sent.
 3. Records are exported as they are stored, so `verify.py` computes their hashes without the appliance's code.
-4. A run of records is complete between its ends. Records whose times are out of order (the clock was set back, or
-   retention wrote them again) become separate runs if they are far apart in the log.
+4. A run of records is complete between its ends.
 """
 
 import hashlib
@@ -62,7 +58,7 @@ _LAST_LOAD = "SELECT max(sequence) FROM record INDEXED BY record_event WHERE eve
 
 
 def verifier_program() -> str:
-    """Return the text of `verify.py`: `bundle_verifier.py`, with the text of `log_proof.py` instead of its import."""
+    """Return `bundle_verifier.py`, with the text of `log_proof.py` instead of its import."""
     program, core = map(inspect.getsource, (bundle_verifier, log_proof))
     before, _imported, rest = program.partition("from appliance.signing.log_proof import")
     own = core.partition("from __future__ import annotations\n\n")[2]
@@ -78,7 +74,7 @@ class BundleError(Exception):
 
 
 class TimeSpan(NamedTuple):
-    """A period from `since` (inclusive) to `until` (exclusive), in nanoseconds since the epoch."""
+    """A period: from `since` (inclusive) to `until` (exclusive), in nanoseconds since the epoch."""
 
     since: int
     until: int
@@ -94,10 +90,7 @@ class RecordingSelection(NamedTuple):
 def export(log: Path, wanted: TimeSpan | RecordingSelection, ask: Ask, names: Names) -> Iterator[bytes]:
     """Record and seal an export, then yield the bytes of its bundle; `ask` queries the appliance.
 
-    The page of the bundle has the `names`; its records are as they are stored.
-
-    The bundle of a recording has the recording's messages and all records of its period. Raises `BundleError`
-    and `LogUnreadableError`, also during the iteration.
+    Raises `BundleError` and `LogUnreadableError`, also during the iteration.
     """
     recording: RecordingSummary | None = None
     bag = Path()
@@ -118,7 +111,6 @@ def export(log: Path, wanted: TimeSpan | RecordingSelection, ask: Ask, names: Na
 
 
 def _recording(ask: Ask, recording_id: str) -> RecordingSummary:
-    """Return a recording, and let the recorder record that it is fetched. Raises `BundleError`."""
     fetch: Any = request_named("recording fetch")
     if fetch is None:
         raise BundleError(
@@ -129,8 +121,6 @@ def _recording(ask: Ask, recording_id: str) -> RecordingSummary:
 
 
 class _Bundle:
-    """The members of a bundle."""
-
     def __init__(  # noqa: PLR0917  one caller
         self, log: Path, span: TimeSpan, ask: Ask, recording: RecordingSummary | None, bag: Path, names: Names
     ) -> None:
@@ -197,7 +187,6 @@ class _Bundle:
         return manifest
 
     def checked(self, manifest: dict[str, Any]) -> Iterator[Member]:
-        """Yield the members again. Raises `BundleError` if one has changed or disappeared."""
         left = dict(manifest["members"])
         for name, pieces in self.members({**manifest, "missing": []}):
             digest = hashlib.sha256()
@@ -252,7 +241,7 @@ def _given(answer: AdminAnswer[A]) -> A:
 
 
 def _runs(sequences: list[int]) -> list[tuple[int, int]]:
-    """Return the first and last sequence of each run; a gap of more than `_APART` begins a new run."""
+    """A gap of more than `_APART` begins a new run."""
     runs: list[tuple[int, int]] = []
     for sequence in sequences:
         if runs and sequence - runs[-1][1] <= _APART:
@@ -282,10 +271,6 @@ def _noted(pieces: Iterable[bytes], note: Callable[[bytes], object]) -> Iterator
 
 
 def _records(log: Path, sequences: Iterable[int]) -> Iterator[bytes]:
-    """Yield records as they are stored, a page at a time: one NDJSON line each, with its position in the chain.
-
-    Raises `LogUnreadableError`.
-    """
     unique = (sequence for sequence, _same in itertools.groupby(sequences))
     pairs = itertools.pairwise(itertools.chain(unique, [0]))
     while page := list(itertools.islice(pairs, _PAGE)):

@@ -11,11 +11,11 @@ SEAL_SECONDS = 10.0
 
 
 class NotSealedError(UnavailableError):
-    """The log's newest records cannot be sealed now; the message gives the reason."""
+    """The log's newest records cannot be sealed now."""
 
 
 class EvidenceOrders:
-    """The answers to the requests of an evidence export. Its methods raise `NotSealedError`."""
+    """The requests of an evidence export. Methods raise `NotSealedError`."""
 
     def __init__(self, log: AuditLog, trail: AuditTrail, robot: str = "") -> None:
         self._log = log
@@ -27,7 +27,6 @@ class EvidenceOrders:
         return Sealed()
 
     async def exported(self, request: EvidenceExported, who: str) -> Sealed:
-        """Record an exported bundle. Once a signed checkpoint seals the record, return its id."""
         record = self._trail.happened(
             "evidence exported",
             f"{request.records} records were exported as evidence",

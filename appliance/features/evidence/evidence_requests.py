@@ -9,7 +9,7 @@ from appliance.channel.rest_operation import rest
 
 
 class Sealed(msgspec.Struct, frozen=True):
-    """A signed checkpoint seals all records; `record` is the id of the record of the request, if it made one."""
+    """A signed checkpoint seals all records; `record` is the id of the request's record."""
 
     record: str = ""
 

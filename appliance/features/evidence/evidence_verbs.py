@@ -1,4 +1,4 @@
-"""`rosrv evidence export|verify|verifier`: signed evidence of an incident in one file."""
+"""The commands `rosrv evidence export|verify|verifier`."""
 
 import errno
 import os
@@ -94,7 +94,7 @@ def export_evidence(
 
 @contextmanager
 def _naming(output: Path) -> Iterator[None]:
-    """Errors name the file that the operator named, not the unfinished one. Raises `OSError`."""
+    """Errors name the file that the operator named, not the unfinished one."""
     try:
         yield
     except OSError as error:

@@ -1,4 +1,4 @@
-"""The feature evidence: `rosrv evidence` and REST export signed bundles; control seals and records each export."""
+"""Define the feature evidence."""
 
 from typing import TYPE_CHECKING, Any
 

@@ -1,4 +1,4 @@
-"""Make the HTML page of a bundle: contents, events, and how to verify it. The same input gives the same page."""
+"""Make the HTML page of a bundle. The same input gives the same page."""
 
 import html
 import json
@@ -42,14 +42,14 @@ bundle can also change the copies inside it. The command lists the changed and m
 
 
 class Names(NamedTuple):
-    """The name of the robot (empty if it has none), and the function that shows a host as text for people."""
+    """The robot's name, and the function that shows a host as text for people."""
 
     robot: str
     host_in_words: Callable[[str], str]
 
 
 class Page:
-    """The page of a bundle, which collects its rows while the records are written."""
+    """The page collects its rows while the records are written."""
 
     def __init__(self, recording: RecordingSummary | None, names: Names) -> None:
         self._recording = recording

@@ -1,4 +1,4 @@
-"""The feature limits: `rosrv limits` and `GET /v1/limits`. Each part states the use of its own resources."""
+"""Define the feature limits. Each part states the use of its own resources."""
 
 from typing import TYPE_CHECKING, Any
 

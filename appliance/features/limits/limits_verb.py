@@ -1,4 +1,4 @@
-"""`rosrv limits`: how much of each finite resource is used."""
+"""The command `rosrv limits`."""
 
 from appliance.channel.answers.limit_answers import LimitUse
 from appliance.cli.connection.target import Appliance, speaks

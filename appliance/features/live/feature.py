@@ -1,4 +1,4 @@
-"""The feature live: `GET /v1/live`, `/v1/history` and `/v1/whoami`, which the console reads."""
+"""Define the feature live."""
 
 from appliance.features.feature import Feature
 

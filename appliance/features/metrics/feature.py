@@ -1,4 +1,4 @@
-"""The feature metrics: `GET /v1/metrics` for Prometheus. Control measures; `telemetry/metrics.py` has the names."""
+"""Define the feature metrics. Control measures; `telemetry/metrics.py` has the names."""
 
 from appliance.features.feature import Feature
 

@@ -62,7 +62,7 @@ def rendered(body: Measures, calls: Mapping[tuple[str, str], int]) -> bytes:
 
 
 def rendered_standby(state: Any, calls: Mapping[tuple[str, str], int]) -> bytes:
-    """Return the metrics of a standby, which has only its own state and the numbers of REST calls."""
+    """A standby has only its own state and the numbers of REST calls."""
     samples = {**pair_view().samples(state), "rosrv_rest_calls_total": calls.items()}
     return _page(samples, [metric for metric in METRICS if metric.name in samples])
 
@@ -191,7 +191,7 @@ def _tunnels(hosts: list[Host]) -> dict[str, _Samples]:
 
 
 def _named(processes: Sequence[ProcessInfo]) -> Iterator[tuple[str, ProcessInfo]]:
-    """Yield processes with the names of their series, because one role may have two."""
+    """One role may have two processes."""
     return zip(process_names(processes), processes, strict=True)
 
 

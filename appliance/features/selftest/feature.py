@@ -1,4 +1,4 @@
-"""The feature selftest: `rosrv selftest` checks a fresh machine, or a running appliance."""
+"""Define the feature selftest."""
 
 from appliance.cli.verb_table import Verb
 from appliance.features.feature import Feature

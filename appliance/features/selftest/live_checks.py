@@ -84,7 +84,7 @@ def _audit(appliance: Appliance) -> Iterator[SelftestFinding]:
 
 
 def _reachable(appliance: Appliance, master: str) -> str:
-    """Return the master's URI with REST's host in place of a loopback address."""
+    """Put REST's host in place of a loopback address."""
     place = appliance.place
     parts = urlsplit(master)
     if place is None or parts.hostname not in ("127.0.0.1", "::1", "localhost"):
@@ -95,7 +95,6 @@ def _reachable(appliance: Appliance, master: str) -> str:
 
 
 def check_call(appliance: Appliance, master: str) -> Iterator[SelftestFinding]:
-    """Yield findings about a call, which the appliance must answer and record."""
     before = _last(appliance)
     caller = f"{_CALLER}_{secrets.token_hex(4)}"
     began, refusal = clock.now(), ""
@@ -133,10 +132,10 @@ def _last(appliance: Appliance) -> int | None:
 
 
 def _recorded(appliance: Appliance, before: int, caller: str, refusal: str) -> bool:
-    """Whether the log has the record of a call: after the sequence `before`, or with the id in `refusal`.
+    """The record follows the sequence `before`, or has the id in `refusal`.
 
-    Poll for some seconds, with growing pauses. Raises `LogUnreadableError` or `NotRunningError` if the last
-    query failed.
+    Raises `LogUnreadableError` or `NotRunningError` if the last query failed.
+
     """
     source, deadline, pause = appliance.audit(), clock.now() + _RECORD_SECONDS, _FIRST_PAUSE
     while True:

@@ -1,7 +1,6 @@
 """Check whether this machine can run the appliance: programs, users, namespaces, firewall, tunnels, ports.
 
-The checks create a network namespace, try firewall rules and interfaces in it, and delete it again. They change
-nothing outside it.
+The checks change nothing outside a network namespace that they create and delete.
 """
 
 import os
@@ -32,7 +31,7 @@ _CHARON = Path("/usr/sbin/charon-systemd")
 
 
 def machine(settings: Settings, *, running: bool) -> Iterator[SelftestFinding]:
-    """Yield findings about this machine; `running`: an appliance with these settings already uses its ports."""
+    """`running`: an appliance with these settings already uses its ports."""
     yield from run_check("python", _python)
     yield from run_check("programs", _programs)
     yield from run_check("users", _users)

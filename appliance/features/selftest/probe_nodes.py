@@ -1,6 +1,6 @@
 """Test a running appliance with two minimal ROS nodes: a publisher and a subscriber of one message.
 
-The nodes register, answer `requestTopic`, connect, and always unregister at the end.
+They always unregister at the end.
 """
 
 import contextlib
@@ -33,7 +33,6 @@ class _Transport(xmlrpc.client.Transport):
 
 
 def call(uri: str, method: str, *arguments: Any) -> Any:
-    """Make a call and return its value. Raises `ProbeError`, `OSError`."""
     try:
         with xmlrpc.client.ServerProxy(uri, _Transport()) as server:
             answer = getattr(server, method)(*arguments)  # how the library calls a method by its name
@@ -55,7 +54,6 @@ def own_address(master: str) -> str:
 
 
 def message_through_the_relay(master: str) -> bytes:
-    """Send a message through the relay and return it. Raises `ProbeError`, `OSError`."""
     host = own_address(master)
     with _node(host) as publisher, _node(host) as subscriber:
         try:
@@ -105,8 +103,6 @@ def _fields(node: str) -> dict[str, str]:
 
 
 class _Node:
-    """A node with an API and a TCPROS port, which sends each client one message."""
-
     def __init__(self, host: str) -> None:
         self._messages = socket.create_server((host, 0), family=_family(host))
         port = self._messages.getsockname()[1]

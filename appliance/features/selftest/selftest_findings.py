@@ -22,12 +22,12 @@ def ok(check: str, text: str) -> SelftestFinding:
 
 
 def warn(check: str, text: str, advice: str) -> SelftestFinding:
-    """Return a warning: the appliance works, but the result needs attention."""
+    """The appliance works, but the result needs attention."""
     return SelftestFinding(check, "warn", text, advice)
 
 
 def fail(check: str, text: str, advice: str) -> SelftestFinding:
-    """Return a failure: the appliance cannot work until the cause is corrected."""
+    """The appliance cannot work until the cause is corrected."""
     return SelftestFinding(check, "fail", text, advice)
 
 
@@ -36,7 +36,6 @@ def skip(check: str, text: str, advice: str = "") -> SelftestFinding:
 
 
 def run_check(check: str, tries: Callable[[], Iterable[SelftestFinding]]) -> Iterator[SelftestFinding]:
-    """Yield the findings of a check; an unexpected exception becomes a failure."""
     try:
         yield from tries()
     except Exception as error:  # noqa: BLE001  any error on an unknown machine is a finding

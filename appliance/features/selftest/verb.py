@@ -1,4 +1,4 @@
-"""`rosrv selftest`: check a fresh machine, or a running appliance."""
+"""The command `rosrv selftest`."""
 
 import os
 import sys

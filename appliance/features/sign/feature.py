@@ -1,4 +1,4 @@
-"""The feature sign: `rosrv sign`. The core checks the signatures."""
+"""Define the feature sign. The core checks the signatures."""
 
 from appliance.cli.verb_table import Verb
 from appliance.features.feature import Feature

@@ -1,4 +1,4 @@
-"""`rosrv sign`: sign policies and specifications with a site key."""
+"""The command `rosrv sign`."""
 
 from pathlib import Path
 from typing import Annotated
@@ -63,7 +63,7 @@ def _private(file: Path) -> Ed25519PrivateKey:
 
 
 def _text(file: Path) -> str:
-    """Return the text of a file. Exits with status 2 unless it is UTF-8 with LF, as the appliance requires."""
+    """The appliance requires UTF-8 with LF."""
     try:
         text = read_given(file).decode("utf-8")
     except OSError as error:

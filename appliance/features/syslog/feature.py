@@ -1,4 +1,4 @@
-"""The feature syslog: a process forwards the audit log, and control reports its progress."""
+"""Define the feature syslog."""
 
 from appliance.configuration.sections import Sections
 from appliance.features.feature import Feature, FeatureContext, FeaturePart

@@ -1,13 +1,9 @@
 """Forward the committed records of the log: in order, at least once, from the stored position.
 
-Invariants:
-
 1. The database is only read, so forwarding never delays the log or loses its records.
-2. Memory is bounded: at most `_BATCH` records and `_BATCH` checkpoints at a time.
-3. The position advances only when the receiver has received the batch; failures are retried forever, with growing
-   pauses.
-4. Records that retention removed before they were sent are counted and reported (`missed`).
-5. If the log was restored from a copy, new records that reuse sequence numbers of sent records are also sent.
+2. The position advances only when the receiver has the batch.
+3. Records that retention removed before they were sent are counted and reported (`missed`).
+4. If the log was restored from a copy, new records that reuse sequence numbers of sent records are also sent.
 """
 
 from collections.abc import Callable
@@ -39,10 +35,11 @@ _log = structlog.get_logger()
 
 
 class ForwardingPosition(msgspec.Struct, frozen=True):
-    """The last record and checkpoint that the receiver has of log `log`.
+    """The last record and checkpoint that the receiver has.
 
-    The position is stored after the receiver has both, so after a crash some records are sent again. `record` is the
-    id of the last record: if the log was restored from a copy, another record may have the same sequence.
+    It is stored after the receiver has both, so after a crash some records are sent again. `record` is an id: if
+    the log was restored from a copy, another record may have the same sequence.
+
     """
 
     log: str
@@ -52,7 +49,6 @@ class ForwardingPosition(msgspec.Struct, frozen=True):
 
 
 def load_position(path: Path) -> ForwardingPosition | None:
-    """Return the stored position. Raises `ValueError` and `OSError` if the file cannot be read."""
     try:
         return msgspec.json.decode(path.read_bytes(), type=ForwardingPosition)
     except FileNotFoundError:
@@ -180,10 +176,8 @@ def _extent(path: Path) -> tuple[int, int, str]:
 
 
 def _in_log(path: Path, position: ForwardingPosition) -> ForwardingPosition:
-    """Move the position back if the log was restored from a copy. Raises `LogUnreadableError`.
-
-    A restored log continues with sequences that were already used. Ids are ordered by time, so every record with a
-    later id than the last sent record is new, even if its sequence is not.
+    """A log that was restored from a copy continues with sequences that were already used. Ids are ordered by
+    time, so every record with a later id than the last sent record is new.
     """
     with reading(path, advice="") as connection:
 

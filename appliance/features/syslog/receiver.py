@@ -1,14 +1,9 @@
 """Connections to the receiver: UDP (RFC 5426), TCP with octet counting (RFC 6587), TLS (RFC 5425).
 
-Invariants:
-
-1. `send` returns when the receiver's kernel has acknowledged every byte (TCP, TLS), or the datagrams have left (UDP).
-   Otherwise it raises `OSError`.
-2. Data from the receiver is discarded; a closed connection is detected before more is sent.
-3. TLS requires that the configured authority certifies the receiver's configured name or address.
-
-Syslog has no acknowledgements. If a receiver dies, messages that it accepted but did not process are lost; so are UDP
-packets that the network drops. The log itself keeps everything, and checkpoints reveal the gap.
+`send` returns when the receiver's kernel has acknowledged every byte (TCP, TLS), or the datagrams have left
+(UDP). A closed connection is detected before more is sent. With TLS, the configured authority certifies the
+receiver's configured name or address. Syslog has no acknowledgements, so messages that a dying receiver accepted
+are lost; checkpoints reveal the gap.
 """
 
 import fcntl
@@ -78,7 +73,6 @@ class StreamReceiver:
         self._socket: socket.socket | None = None
 
     def send(self, messages: Sequence[bytes]) -> None:
-        """Send each message after its length, and wait until all bytes are acknowledged."""
         connection = self._socket
         if connection is None:
             connection = self._socket = self._connect()
@@ -107,10 +101,7 @@ class StreamReceiver:
 
 
 def tls_context(ca: Path | None, certificate: Path | None, key: Path | None) -> ssl.SSLContext:
-    """Return the TLS context; without `ca`, the system's authorities verify the receiver.
-
-    Raises `OSError`, which names the unreadable file.
-    """
+    """Without `ca`, the system's authorities verify the receiver."""
     try:
         with nullcontext() if ca is None else path_for_library(ca) as authority:
             context = ssl.create_default_context(cafile=authority)
@@ -129,13 +120,12 @@ def tls_context(ca: Path | None, certificate: Path | None, key: Path | None) -> 
 
 
 def _await_objection(connection: socket.socket) -> None:
-    """Wait for the server's rejection of our certificate, which TLS 1.3 sends after our handshake. Raises `OSError`."""
+    """In TLS 1.3, the server's rejection of our certificate comes after our handshake."""
     select.select([connection], [], [], _OBJECTION_SECONDS)
     _require_open(connection)
 
 
 def _require_open(connection: socket.socket) -> None:
-    """Discard the receiver's data. Raise `ConnectionResetError` if it has closed the connection."""
     connection.settimeout(0)
     try:
         while True:

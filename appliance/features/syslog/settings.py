@@ -46,7 +46,6 @@ class Syslog(FeatureSection):
 
     @property
     def destination(self) -> tuple[str, str, int]:
-        """Return `to` as protocol, address and port; only if it is given."""
         return split_receiver(self.to or "")
 
     @property

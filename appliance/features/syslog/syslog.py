@@ -1,12 +1,9 @@
 r"""Format records as messages of RFC 5424. No I/O.
 
-Invariants:
-
 1. A message is printable ASCII, and `"`, `\` and `]` are escaped (RFC 5424, 6.3.3). A name chosen by a host can neither
    control a receiver or a terminal, nor end its parameter, element or message.
 2. A message has at most `longest` bytes. First the details are left out, then the text is cut; each leaves a mark. The
    sequence and id of the record are always included.
-3. The same record gives the same message; a receiver detects duplicates by `sequence`.
 """
 
 import json
@@ -61,7 +58,7 @@ class Formatter:
         return _message(head, ELEMENT, named, _shortened(text, room))
 
     def checkpoint(self, signed: SignedCheckpoint) -> bytes:
-        """Return the message of a checkpoint, which `rosrv audit verify --checkpoints` finds in the receiver's file."""
+        """`rosrv audit verify --checkpoints` finds the message in the receiver's file."""
         head = self._head(Severity.NOTICE, signed.time, "checkpoint signed")
         fields = {
             name: str(value) for name, value in msgspec.structs.asdict(signed).items() if value is not None
@@ -104,12 +101,10 @@ def _shortened(text: str, room: int) -> str:
 
 
 def _name(text: str, longest: int) -> str:
-    """Return the text as printable ASCII without spaces, or `-` (RFC 5424, 6)."""
     return "".join(character for character in text if "!" <= character <= "~")[:longest] or "-"
 
 
 def _time(time: int) -> str:
-    """Return the time as RFC 3339 with microseconds, as RFC 5424 allows, or `-` if it is out of range."""
     seconds, fraction = divmod(time, 1_000_000_000)
     try:
         moment = datetime.fromtimestamp(seconds, UTC)

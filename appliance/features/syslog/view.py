@@ -1,4 +1,4 @@
-"""The state of the forwarding to a syslog receiver, with its alarm and metrics."""
+"""Show the forwarding to a syslog receiver in the status, the alarms and the metrics."""
 
 from collections.abc import Iterator
 

@@ -1,4 +1,4 @@
-"""The feature topics: `rosrv topic` and `rosrv node` show topics and nodes, now and in the past."""
+"""Define the feature topics."""
 
 from appliance.cli.verb_table import Group, Verb
 from appliance.features.feature import Feature

@@ -1,4 +1,4 @@
-"""`rosrv node list` and `rosrv topic list`: the running robot's nodes and topics."""
+"""The commands `rosrv node list` and `rosrv topic list`."""
 
 from appliance.channel.admin import GraphWanted
 from appliance.cli.connection.target import Appliance, speaks

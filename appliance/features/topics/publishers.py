@@ -14,8 +14,8 @@ _COUNTED = "repetitions folded"
 
 @dataclass(frozen=True, slots=True)
 class PastPublisher:
-    """A publisher; `since` is nanoseconds since the epoch, and `sequence` the record of the registration or
-    of the node's return.
+    """A publisher; `since` is nanoseconds since the epoch, and `sequence` the record of the registration or of
+    the node's return.
 
     Both are None if the log has only the end of the registration.
     """
@@ -37,10 +37,7 @@ class PastPublishers:
 def publishers_at(
     export: Callable[[Filter], Iterable[LogEntry]], first: LogEntry | None, topic: str, at: int
 ) -> PastPublishers:
-    """Return the publishers of a topic `at` a time in nanoseconds since the epoch.
-
-    `export` yields the records that match a filter; `first` is the first record of the log.
-    """
+    """`first` is the first record of the log."""
     registrations = (Filter(event=event, category="publication", resource=topic) for event in _REGISTRATIONS)
     others = (Filter(event=event, until=at + 1) for event in (*_NODES, *_LOG))
     gaps = (Filter(event=event) for event in ("records lost", _COUNTED))
@@ -88,10 +85,6 @@ def _registered(past: Iterable[LogEntry]) -> list[PastPublisher]:
 def _ended_later(
     later: Iterable[LogEntry], seen: set[tuple[str | None, str | None]]
 ) -> Iterator[PastPublisher]:
-    """Yield nodes whose registration ended later, and whose beginning the log lacks.
-
-    After a loss of records, the beginning may be among the lost ones.
-    """
     for entry in later:
         if entry.record.event == "records lost":
             return
@@ -103,7 +96,6 @@ def _ended_later(
 
 
 def _counts(entry: LogEntry, topic: str, at: int) -> bool:
-    """Whether a summary may count repeated registrations of the topic, or changes of nodes."""
     detail, resource = entry.record.detail, entry.record.resource
     return (
         entry.record.event == _COUNTED

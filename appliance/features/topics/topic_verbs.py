@@ -1,4 +1,4 @@
-"""`rosrv topic echo|info|publishers`: a topic's messages, and its publishers and subscribers, now or in the past."""
+"""The commands `rosrv topic echo|info|publishers`, for the present and the past."""
 
 import re
 from collections.abc import Iterator, Mapping
@@ -173,7 +173,7 @@ def _show(message: TopicMessage, field: str | None, *, as_json: bool) -> None:
 
 
 def part_of(fields: Any, path: str) -> Any:
-    """Return the part at a path. Exits with status 2 if the field is neither there nor left out."""
+    """Exit with status 2 if the field is neither there nor left out."""
     value = fields
     for name in path.split("."):
         if isinstance(value, Mapping) and name in value:
@@ -189,7 +189,6 @@ def part_of(fields: Any, path: str) -> Any:
 
 
 def _left_out(value: Any, name: str) -> str:
-    """Return the mark of left-out values if the field may be among them."""
     if isinstance(value, Mapping):
         return str(value.get(CUT, ""))
     last = value[-1] if isinstance(value, list) and value else value
