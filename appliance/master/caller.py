@@ -1,4 +1,4 @@
-"""Define the caller and the answer of a call to RVMaster or a proxy endpoint, and the URI that a node registers."""
+"""Define the caller of RVMaster or of a proxy endpoint, and the answer to it."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -15,17 +15,17 @@ Answer = list[Value]
 
 @dataclass(frozen=True, slots=True)
 class ApiUri:
-    """The URI of a node or service: the text as received, and the parsed URI."""
+    """A URI as received, and parsed."""
 
     text: str
     uri: NodeUri
 
 
 class Caller(NamedTuple):
-    """The caller: the peer, and the `caller_id` that the peer claims.
+    """The peer, and the `caller_id` that the peer claims.
 
-    `own` marks the appliance's own nodes, which call RVMaster on a separate listener. For a call to a proxy endpoint,
-    `target` is the called incarnation.
+    `own` marks the appliance's own nodes, which have a separate listener. `target` is the incarnation whose proxy
+    endpoint is called.
     """
 
     peer: Peer

@@ -1,13 +1,9 @@
 """Charge each parameter, and the namespaces that were made for it, to the host that set the parameter.
 
-A *place* is a key where the owner changes: the parameters at this key and below have a different owner than those
-above. So there are few places, even for many parameters. Parameters that no host has set belong to the appliance
-(loopback): its own parameters, and the tree of an earlier version.
-
-Invariants:
+A *place* is a key where the owner changes. Parameters that no host has set belong to the appliance (loopback).
 
 1. The sum of the weights of all places is the weight of the tree.
-2. A place and the nearest place above it have different owners.
+2. A place and the nearest place above it have different owners, so there are few places even for many parameters.
 3. Every place except the root is a key of the tree. The journal stores the place; it is removed with its key.
 """
 
@@ -75,7 +71,6 @@ class ParameterCharges:
             place.owner = address_of(host)
 
     def held(self, parts: Sequence[str], weight: int) -> Mapping[Address, int]:
-        """Return the weight of each owner at this key and below. `weight` is the sum of these weights."""
         path = self._path(parts)
         owner = _owner(_region(path, parts))
         if len(path) <= len(parts):
@@ -87,7 +82,7 @@ class ParameterCharges:
         return held
 
     def replaced(self, parts: Sequence[str], before: int, after: int, owner: Address) -> None:
-        """Change the weight at this key from `before` to `after` (0: the key is deleted), and charge the owner."""
+        """Charge the owner for the weight `after` at this key (0: the key is deleted)."""
         path = self._path(parts)
         region = _region(path, parts)
         begun = len(path) > len(parts)  # whether the key is a place, or on the path to a place
@@ -112,7 +107,6 @@ class ParameterCharges:
         self.pool.charge(owner, after)
 
     def recount(self, tree: Tree, *, final: bool) -> None:
-        """Weigh all places again after the tree was replaced. `final`: remove places that the tree does not have."""
         self._recount(self._root, tree, measure(tree)[0], (), final=final)
 
     def _release(self, parts: Sequence[str], weight: int) -> None:
@@ -135,10 +129,6 @@ class ParameterCharges:
     def _recount(
         self, place: _Place, value: Value, weight: int, parts: tuple[str, ...], *, final: bool
     ) -> int:
-        """Weigh the places at this key and below again; return their sum.
-
-        `weight` is the weight of the key.
-        """
         owned = 0
         for name, below in list(place.below.items()):
             there = isinstance(value, dict) and name in value
@@ -188,9 +178,7 @@ def _key(parts: Sequence[str]) -> str:
 def measure(value: Value) -> tuple[int, int]:
     """Return the approximate bytes that a value takes on the wire, and its depth (0: no array or struct).
 
-    Values may be large, so they are measured level by level; a level of numbers or texts is fast.
-
-    Raises `ProtocolError` for `<nil/>`.
+    A large value is fast, because it is measured level by level. Raises `ProtocolError` for `<nil/>`.
     """
     if type(value) in _NUMBERS:
         return _VALUE, 0

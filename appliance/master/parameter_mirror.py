@@ -1,7 +1,4 @@
-"""Mirror the ROS master's parameter tree, so that the tree survives the ROS master's death. Reserve room for writes.
-
-The mirror changes exactly like the ROS master's tree, and only after the ROS master has accepted the change.
-"""
+"""Mirror the ROS master's parameter tree, so that it survives the ROS master's death."""
 
 import contextlib
 from collections.abc import Callable, Iterable
@@ -25,15 +22,13 @@ from roswire.xmlrpc import Value
 
 
 class ParameterMirror:
-    """A copy of the ROS master's parameter tree, and the hosts that are charged for its parameters.
+    """A copy of the ROS master's parameter tree, changed only after the ROS master has accepted the change.
 
     `weight` is the approximate size of the whole tree in an answer to `getParam("/")`. Size and depth are limited,
-    because the ROS master must be able to send its tree. Otherwise, it would fail for all nodes, and the tree could not
-    be read after a restart.
+    because otherwise the ROS master could not send its tree: it would fail for all nodes.
 
-    `changed()` is called at each change. `note(key, value)` is called for each change of one parameter (None: it was
-    deleted); `unnoted` is set by a change of the whole tree, until its owner has stored the tree. `since` has the
-    changes after `tree`. Changes inside `together()` are saved at its end.
+    `note(key, value)` is called for each change of one parameter (None: it was deleted); `unnoted` is set by a change
+    of the whole tree, until its owner has stored the tree.
     """
 
     def __init__(
@@ -72,11 +67,11 @@ class ParameterMirror:
             raise ProtocolError(f"parameter {key[:80]} would nest deeper than {self._depth_limit} levels")
 
     def reserve(self, key: str, weight: int, host: Address) -> "Reservation":
-        """Reserve room for a value that a host is about to set. Raises `LimitReachedError` if there is no room.
+        """Reserve room for a value that a host is about to set. Raises `LimitReachedError`.
 
-        A value that is not larger than the present value always has room. It is charged to this host within its quota,
-        or otherwise still to the previous owner. So a host can always correct a parameter, and two hosts together
-        cannot exceed their quotas.
+        A value that is not larger than the present value always has room, charged to this host within its quota, or
+        otherwise to the previous owner. So a host can always correct a parameter, and two hosts together cannot exceed
+        their quotas.
         """
         pool = self.charges.pool
         parts, before = self._place_of(key)
@@ -98,7 +93,7 @@ class ParameterMirror:
         self._changed()
 
     def set(self, key: str, value: Value, reserved: "Reservation") -> None:
-        """Set `key` (canonical) to this value. A dictionary replaces the namespace. The mirror keeps the object."""
+        """Set `key`; a dictionary replaces the namespace. The mirror keeps the object."""
         reserved.release()
         parts, before = self._place_of(key)
         self._put_in(key, value)
@@ -128,7 +123,6 @@ class ParameterMirror:
         self.charges.recount(self.tree, final=final)
 
     def _place_of(self, key: str) -> tuple[tuple[str, ...], int]:
-        """Return the topmost key that a write of `key` would create or replace, and the present weight there."""
         parts = parts_of(key)
         node: Value = self.tree
         for depth, part in enumerate(parts, 1):
@@ -161,7 +155,7 @@ class ParameterMirror:
 
 
 class Reservation:
-    """Room for a value of this weight, until the ROS master accepts or rejects the value. `owner` is charged."""
+    """Room for a value until the ROS master accepts or rejects it. `owner` is charged."""
 
     __slots__ = ("_amount", "_pool", "owner", "weight")
 
@@ -172,14 +166,12 @@ class Reservation:
         self.weight = weight
 
     def release(self) -> None:
-        """Release the room, because the value was set and charged, or was rejected."""
         if self._amount:
             self._pool.give_back(self.owner, self._amount)
             self._amount = 0
 
 
 def _with_namespaces(key: str, first: int, weight: int) -> int:
-    """Return the weight of a value, with its name and the new namespaces of its key from part `first` on."""
     if not first:
         return weight
     *namespaces, name = parts_of(key)[first - 1 :]

@@ -1,12 +1,8 @@
 """Call the hidden ROS master over reused connections. A *door* holds calls back while the ROS master is rebuilt.
 
-While the ROS master is down or not yet restored, calls of nodes wait at the door for a limited time. The reconcile
-loop shuts and opens the door, and calls through it in the meantime (`call_now`, `all_now`). Changes of registrations
-are forwarded through the open door behind the answers to nodes (`call_once`, see `reconcile/entries.py`).
-
-If the order of several calls matters, they are sent as one `system.multicall`. The ROS master is one Python process and
-does only one thing at a time, so a multicall also saves most of the cost of its calls. A fault of one part affects only
-this part.
+The reconcile loop shuts and opens the door, and calls through it in the meantime (`call_now`, `all_now`). If the order
+of several calls matters, they are sent as one `system.multicall`, which also saves most of their cost: the ROS master
+is one Python process and does only one thing at a time.
 """
 
 import asyncio
@@ -37,7 +33,6 @@ _T = TypeVar("_T")
 
 
 def limits_of_answers(limits: XmlRpcLimits, parameters: int) -> XmlRpcLimits:
-    """Return the limits of answers, which may be a parameter tree of `parameters` bytes whose values `limits` allow."""
     return replace(
         limits,
         body=4 * parameters + limits.body,
@@ -48,10 +43,7 @@ def limits_of_answers(limits: XmlRpcLimits, parameters: int) -> XmlRpcLimits:
 
 
 class RosMaster:
-    """The ROS master at `127.0.0.1:port`. `doubtful` is set when the ROS master seems to be gone.
-
-    `timeout` and `hold` are in seconds.
-    """
+    """The ROS master on the loopback. `doubtful` is set when it seems to be gone. Times are in seconds."""
 
     def __init__(
         self,
@@ -81,29 +73,25 @@ class RosMaster:
 
     @property
     def reachable(self) -> bool:
-        """Whether the door is open: the ROS master is running and complete, and no reconcile round is under way."""
+        """Whether the ROS master is complete, and no reconcile round is under way."""
         return self._open.is_set()
 
     @property
     def whole(self) -> bool:
-        """Whether the ROS master is running and complete, even while a reconcile round has shut the door."""
+        """Whether the ROS master is complete, even during a reconcile round."""
         return not self._away
 
     async def call(self, method: str, *params: Value) -> Answer:
-        """Make a call for a node once the door is open.
-
-        Raises `CallFailedError` if it stays shut.
-        """
+        """Make a call for a node once the door is open. Raises `CallFailedError` if it stays shut."""
         return await self._call(lambda: self.call_now(method, *params))
 
     async def call_in_order(self, calls: Sequence[Wanted]) -> list[Answer | CallFailedError]:
-        """Make several calls in order, like `call`; return the outcome of each."""
         return await self._call(lambda: self._in_order(calls))
 
     async def call_once(self, calls: Sequence[Wanted]) -> list[Answer | CallFailedError]:
         """Make several calls in order through the open door, and never repeat them.
 
-        If they fail, shut the door until the next round of the reconcile loop, and raise `CallFailedError`.
+        If they fail, shut the door until the next reconcile round, and raise `CallFailedError`.
         """
         try:
             return await self._pass(lambda: self._in_order(calls))
@@ -137,7 +125,6 @@ class RosMaster:
 
     @contextlib.asynccontextmanager
     async def patience(self) -> AsyncIterator[None]:
-        """Limit the time of a caller that waits for the ROS master. Raises `CallFailedError`."""
         try:
             async with asyncio.timeout(self._hold):
                 yield
@@ -145,7 +132,6 @@ class RosMaster:
             raise CallFailedError(f"the ROS master did not come back within {self._hold:g} s") from None
 
     async def _pass(self, make: Callable[[], Awaitable[_T]]) -> _T:
-        """Make a call through the open door; shut it if the ROS master refuses or breaks the connection."""
         self._enter()
         try:
             return await make()
@@ -156,7 +142,7 @@ class RosMaster:
             self._leave()
 
     async def call_now(self, method: str, *params: Value) -> Answer:
-        """Make a call for the reconcile loop, even while the door is shut. Raises `CallFailedError`."""
+        """Make a call even while the door is shut. Raises `CallFailedError`."""
         answer = _answer_to(method, await self.calls.call(method, *params))
         if isinstance(answer, CallFailedError):
             raise answer
@@ -226,7 +212,6 @@ _log = structlog.get_logger()
 
 
 def own_parameters() -> Tree:
-    """Return the parameters that `roscore` sets on a new ROS master, with a new `/run_id`."""
     tree: Tree = {"run_id": str(uuid.uuid1()), "rosdistro": os.environ.get("ROS_DISTRO", "Debian") + "\n"}
     try:
         text = _PACKAGE.read_text(encoding="utf-8")

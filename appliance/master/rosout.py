@@ -1,7 +1,6 @@
-"""Publish reports of monitors on `/rosout`, if configured: output, verdicts and faults as `rosgraph_msgs/Log`.
+"""Publish reports of monitors on `/rosout`, if configured.
 
-ROS users read this topic with `rostopic echo /rosout_agg` or rqt_console. The audit log has all reports. On `/rosout`,
-only the first report of each kind in a second has its text, as the relay sends it. At most `_A_SECOND` reports are
+Only the first report of each kind in a second has its text, as the relay sends it. At most `_A_SECOND` reports are
 published per second, with the number of omitted reports. As with a node's own logger, DEBUG is omitted.
 """
 
@@ -22,10 +21,7 @@ _ALARMING = frozenset({"violation", "fail", "timeout"})  # categories of verdict
 
 @dataclass(slots=True)
 class Rosout:
-    """Publishes reports of monitors on `/rosout` in the name of `node`; `publish(message)` sends a message.
-
-    `file_of(monitor)` returns the file that defines a monitor.
-    """
+    """Publishes reports of monitors in the name of `node`."""
 
     node: str
     publish: Callable[[OwnPublished], None]
@@ -37,7 +33,6 @@ class Rosout:
     _left_out: int = 0
 
     def reported(self, event: MonitorEvent) -> None:
-        """Publish output, a verdict or a fault of a monitor. Other events are only in the audit log."""
         level, text = _words(event)
         if level < INFO:
             return
@@ -67,7 +62,6 @@ def header(definitions: Definitions) -> OwnHeaderStated:
 
 
 def _words(event: MonitorEvent) -> tuple[int, str]:
-    """Return the level and the text of a report; level 0 if it is not for `/rosout`."""
     text, level, category = event.text, event.detail.get("level"), event.detail.get("category")
     if event.count:
         text = f"{event.count} more in the same second" + (f": {text}" if text else "")

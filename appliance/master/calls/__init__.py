@@ -1,1 +1,1 @@
-"""The Master API: the steps of a request, the table of calls, and the effect of each call."""
+"""The Master API: the table of calls, and the steps and effects of each."""

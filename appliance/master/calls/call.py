@@ -1,11 +1,7 @@
 """Define a row of a table of calls, and an attempt to make such a call.
 
-`call_table.py` defines the rows of the Master API, `node_calls.py` the rows of a proxy endpoint. A row names the method
-that carries out the call. mypy checks that the parameters of the method fit the row.
-
-Before a decision, each parameter is converted to its canonical value: a name is resolved as in the ROS master, a URI
-is parsed. The caller's name also becomes canonical, because some client libraries send `//name`. An invalid value
-raises a `PeerError` that names the parameter, as the ROS master's validators do.
+A call is decided by canonical values: names are resolved as in the ROS master, also the caller's, because some client
+libraries send `//name`.
 """
 
 import enum
@@ -29,10 +25,10 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True)
 class CallParameter(Generic[T]):
-    """A parameter of a call: its name in the ROS documentation, and the conversion to its canonical value.
+    """A parameter of a call, with the conversion to its canonical value.
 
-    `recorded`: the parameter is a resolved name, and the audit record of a command includes it. If a call has a kind,
-    its first recorded parameter is its resource.
+    The audit record of a command includes the `recorded` parameters, which are resolved names. In a call with a kind,
+    the first of them is the resource.
     """
 
     name: str
@@ -140,7 +136,6 @@ METHOD = CallParameter("method_name", _text)
 def canonicalise(
     parameters: Sequence[CallParameter[Any]], caller_id: str, values: Sequence[Value]
 ) -> tuple[object, ...]:
-    """Return the canonical values of a call's parameters. Raises `PeerError` with the parameter's name."""
     check_arity(parameters, values)
     canonical = []
     for parameter, value in zip(parameters, values, strict=True):
@@ -152,7 +147,6 @@ def canonicalise(
 
 
 def check_arity(parameters: Sequence[CallParameter[Any]], values: Sequence[Value]) -> None:
-    """Raise `ProtocolError`, with the ROS master's text, if the number of values is wrong."""
     if len(values) != len(parameters):
         raise ProtocolError("Error: bad call arity")
 
@@ -226,13 +220,12 @@ def method(perform: Callable[..., Awaitable[Value]], /, *parameters: CallParamet
 class RosCall(Generic[S]):
     """One row of a table of calls. The fields below `in_run` are derived from the others and from the policy's row.
 
-    method      the method that carries out the call, with its parameters; `system.methodHelp` returns its docstring
-    verb        the effect of the call on its resource
-    kind        the kind of the resource (None: the call is decided by its name alone, whatever its parameters are)
-    denial      the value in a denial; it has the type of the call's result, because client libraries check the type
+    method      carries out the call; `system.methodHelp` returns its docstring
+    kind        the kind of the resource (None: the call is decided by its name alone)
+    denial      the value in a denial, of the type of the call's result, which client libraries check
     command     the name of the call in the policy, if `policy/commands` does not derive the name
     tells       the answer is the value of the ROS parameter, which may be a large tree
-    in_run      adjacent calls with this flag in a multicall are decided, recorded and carried out together
+    in_run      adjacent calls with this flag in a multicall are carried out together
     """
 
     name: str
@@ -268,7 +261,6 @@ class RosCall(Generic[S]):
             object.__setattr__(self, field_name, value)
 
     def attempt(self, caller: Caller, params: Sequence[Value]) -> "Attempt":
-        """Return the call with canonical arguments and the claimed name of its caller. Raises `PeerError`."""
         if self.identity is Identity.NOBODY:
             return Attempt(caller, self, canonicalise(self.method.parameters, "", params))
         if not params:
@@ -288,11 +280,7 @@ class RosCall(Generic[S]):
 
 @dataclass(frozen=True, slots=True)
 class Attempt:
-    """A valid call: its caller, its row, and its canonical arguments in the order of the row.
-
-    `resource` is the topic, service or ROS parameter of the call, or empty. `request` is the policy's form of the call,
-    for the decision and the record.
-    """
+    """A valid call, with canonical arguments in the order of the row. `resource` may be empty."""
 
     caller: Caller
     call: RosCall[Any]
@@ -313,13 +301,12 @@ class Attempt:
 
     @property
     def value(self) -> Value:
-        """Return the value to which the call sets its ROS parameter, or None if the call sets no value."""
         brings = self.call.verb is CallVerb.WRITE and len(self.arguments) > 1
         return cast(Value, self.arguments[1]) if brings else None
 
     @property
     def about(self) -> dict[str, str]:
-        """Return the recorded parameters of a command, such as a key, because its request has only the call's name."""
+        """Return the recorded parameters of a command, because its request has only the call's name."""
         if self.call.category is not Category.COMMAND:
             return {}
         return {
@@ -330,7 +317,7 @@ class Attempt:
 
 
 class ServedCall(NamedTuple):
-    """A row that a listener serves, and the object whose method carries out the call."""
+    """A row, and the object whose method carries out the call."""
 
     call: RosCall[Any]
     part: Any
@@ -344,12 +331,10 @@ def served(calls: Iterable[RosCall[S]], part: S) -> dict[str, ServedCall]:
 
 
 def denial_text(decision: Decision, record: str, tell: str) -> str:
-    """Return the text for a denied caller: the reason, as far as the policy allows, and the record's id."""
     return with_record(text_for_caller(decision, tell), record)
 
 
 def with_record(text: str, record: str) -> str:
-    """Add the record's id to the text of a denial, unless the id is empty."""
     return f"{text} [{record}]" if record else text
 
 

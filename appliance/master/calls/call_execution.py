@@ -1,22 +1,12 @@
 """Carry out a call, from its parameters to its answer: canonicalise → decide → record → perform.
 
-1. A registering call waits for earlier registering calls of the same name. A write of a parameter waits for earlier
-   writes of overlapping keys. Other calls do not wait for a turn.
-2. A call that is denied at its arrival is denied at once, and other calls do not wait for it.
-3. A call that had to wait is decided again in its turn, by the policy and the registry of that time. If a call did not
-   wait, no other code ran after its decision, so the decision is still valid.
-4. If another host holds the name, its node is probed over the network before the turn.
-5. If a new policy comes into force while a call is carried out, the caller's rights are decided again afterwards. The
+1. A registering call waits for earlier registering calls of the same name, and a write of a parameter for earlier
+   writes of overlapping keys. No other call waits for a turn. Otherwise, two hosts could register a free name at the
+   same time, or another write could change the tree that a decision depends on.
+2. A call that had to wait is decided again in its turn. If a call did not wait, no other code ran after its decision.
+3. If a new policy comes into force while a call is carried out, the caller's rights are decided again afterwards. The
    revocation by the new policy could not see the result of the call yet.
-
-An error becomes a record and a well-formed answer, never an exception.
-
-Why calls wait for each other (`KeyTurns`): a registering call may wait after its decision, for its record, for its
-ports, or for earlier changes that the ROS master gets. If two hosts registered a free name at the same time, both would
-be allowed, and the later host would take the name away. The decision on a write depends on the present tree, because
-the write may overwrite a plain value above its key. Another write could set such a value after the decision and before
-the ROS master's answer. Also, two writes of one key could reach the ROS master and the mirror in different orders. A
-call that need not wait enters its turn without a switch of tasks, so its decision is still valid.
+4. An error becomes a record and a well-formed answer, never an exception.
 """
 
 import asyncio
@@ -62,7 +52,7 @@ _FAILURES = (
 
 
 class KeyTurns:
-    """The turns of running and waiting calls, in order of arrival."""
+    """The turns of running and waiting calls, in order of arrival. Keys are canonical."""
 
     def __init__(self) -> None:
         self._turns: dict[KeyTurn, None] = {}
@@ -71,16 +61,15 @@ class KeyTurns:
         return len(self._turns)
 
     def alone(self, keys: Collection[str]) -> "KeyTurn":
-        """Return a context manager that waits for earlier calls with equal or overlapping keys (canonical)."""
+        """Wait for earlier calls with equal or overlapping keys."""
         return KeyTurn(self._turns, _ended(keys))
 
     def of_name(self, name: str) -> "KeyTurn":
-        """Return a context manager that waits for earlier calls with exactly this name."""
         return self.alone([name.replace("/", ".")])
 
 
 class KeyTurn:
-    """The turn of a call, an async context manager that is entered when earlier overlapping calls are done."""
+    """The turn of a call. If it need not wait, entering it does not switch tasks, so its decision stays valid."""
 
     __slots__ = ("_done", "_keys", "_turns")
 
@@ -90,7 +79,6 @@ class KeyTurn:
         self._done: asyncio.Event | None = None  # made when another call waits for this call
 
     async def __aenter__(self) -> bool:
-        """Wait for the turn; return whether there was another call to wait for."""
         before = [turn for turn in self._turns if _meet(self._keys, turn._keys)]
         self._turns[self] = None
         try:
@@ -130,7 +118,7 @@ def _meet(mine: tuple[str, ...], others: tuple[str, ...]) -> bool:
 
 
 class ServedRequest(NamedTuple):
-    """A request: the table of calls that its listener serves, its caller, and its bulk."""
+    """A request, the table of calls of its listener, and its bulk."""
 
     table: Table
     caller: Caller
@@ -141,9 +129,7 @@ class ServedRequest(NamedTuple):
 class Execution:
     """Carries out calls. A write of at least `large` bytes waits for other large writes.
 
-    `flush` carries out the changes of the registry. `hold_call(request)` holds a call that needs an approval,
-    and returns the answer to its host. `redecide_for(host, caller_id)` revokes the rights of a caller that
-    the policy in force does not allow.
+    `hold_call(request)` holds a call that needs an approval, and returns the answer to its host.
     """
 
     gate: CallGate
@@ -174,7 +160,6 @@ class Execution:
             return self._malformed(call, visit.caller, claimed_name(params), error)
 
     async def answer(self, visit: ServedRequest, attempt: Attempt) -> Value:
-        """Decide one call and carry it out."""
         if attempt.call.tells and self.parameters.weight_of_answer(attempt) >= self.large:
             await visit.bulk.take()
         call, probe = attempt.call, None
@@ -194,7 +179,6 @@ class Execution:
             return await self._carry_out(visit, attempt, outcome)
 
     async def _in_turn(self, visit: ServedRequest, attempt: Attempt, outcome: Decision) -> Value:
-        """Carry out a write of a parameter, or a subscription to it, while no other call writes the parameter."""
         async with self._turn([attempt]) as later:
             if later:
                 outcome = self._settled(attempt)
@@ -203,8 +187,8 @@ class Execution:
     async def answer_run(self, visit: ServedRequest, run: Sequence[Attempt], weight: int) -> list[Value]:
         """Decide reads and writes of parameters one by one, and carry them out as if in order.
 
-        `weight` is the approximate number of bytes of the answers to reads.
-        No call of the run reads a parameter that an earlier call of the run writes. So all reads are carried out first.
+        No call of the run reads a parameter that an earlier call writes, so all reads are carried out first. Their
+        answers have about `weight` bytes.
         """
         if weight >= self.large:
             await visit.bulk.take()
@@ -226,7 +210,7 @@ class Execution:
 
     @contextlib.asynccontextmanager
     async def _turn(self, attempts: Sequence[Attempt]) -> AsyncIterator[bool]:
-        """Wait until no other call writes the parameters of these calls; yield whether other code may have run.
+        """Wait until no other call writes these parameters; yield whether other code may have run.
 
         A subscription also takes a turn, so its node gets the value in the answer, and then every later write.
         """
@@ -299,7 +283,6 @@ class Execution:
         return contested(outcome, probe) if isinstance(outcome, NameConflict) else outcome
 
     def _recorded(self, attempt: Attempt, decision: Decision) -> Answer | None:
-        """Record a decision; return the answer of a denial, or None if the call is allowed."""
         request, call = attempt.request, attempt.call
         if decision.asks is not None and not decision.allowed:
             decision = replace(decision, reason=f"{self.hold_call(decision.asks)}: {decision.reason}")
@@ -315,7 +298,6 @@ class Execution:
         return None if decision.allowed else [0, self._denial_text(decision, record), call.denial]
 
     async def _obstacle(self) -> str | None:
-        """Wait until the records are on disk; return the text of a denial if that is impossible, otherwise None."""
         if await self.trail.durable() is None:
             return None
         return f"denied: {NOT_RECORDED}"

@@ -1,8 +1,4 @@
-"""Define the table of the Master API, with one row for each call. Calls without a row are denied.
-
-`RosCall` explains the columns. To add a call, write its method, a row here, and the policy's row in
-`policy/commands.py`.
-"""
+"""Define the table of the Master API. Calls without a row are denied."""
 
 from typing import Any
 

@@ -1,8 +1,4 @@
-"""Decide calls: first by the policy, then by the limits per host and the binding of names to hosts.
-
-`CallGate.decide` depends only on the policy in force, the registry and the parameters, and has no side effects. If a
-node on another host holds the name, it returns a `NameConflict`. `contested` then decides by a probe of that node.
-"""
+"""Decide calls: first by the policy, then by the limits per host and the binding of names to hosts."""
 
 import ipaddress
 import math
@@ -41,7 +37,7 @@ class HostLimits:
 
 
 class CallGate:
-    """Decides calls by the policy that `policy()` returns at the time of a call."""
+    """Decides calls, without side effects. `contested` decides a `NameConflict` by a probe of the holder."""
 
     def __init__(self, policy: Callable[[], Policy], registry: Registry, limits: HostLimits) -> None:
         self._policy = policy
@@ -106,7 +102,7 @@ class CallGate:
         return None
 
     def is_own_subscriber(self, caller: Caller, topic: str) -> bool:
-        """Return whether one of the appliance's own nodes calls a proxy endpoint for a topic to which it is subscribed.
+        """Return whether an own node calls a proxy endpoint for a topic to which it is subscribed.
 
         Unlike RVMaster, proxy endpoints have no separate listener for the appliance's own nodes.
         """
@@ -129,7 +125,7 @@ class CallGate:
         return None
 
     def _too_many_names(self, host: Address) -> Decision | None:
-        """Deny a registration of a host with too many names. Hosts that the policy names as a network count as one."""
+        """Hosts that the policy names as a network count as one."""
         left = max(0, self._limits.registrations_in_all - self._registry.registrations)
         if self._registry.registrations < _TIMES_THE_REST * left:
             return None  # no host can have too many
@@ -150,7 +146,6 @@ class CallGate:
 
 
 def _of_own_node(attempt: Attempt) -> Decision:
-    """Decide calls of the appliance's own nodes: grant only rosout's fixed rights, whatever the policy says."""
     caller_id, call = attempt.caller.caller_id, attempt.call
     known = False
     if caller_id != ROSOUT:
@@ -167,7 +162,7 @@ def _of_own_node(attempt: Attempt) -> Decision:
 
 
 def _unreachable(caller: Caller, api: ApiUri) -> Decision | None:
-    """Deny a registration from another machine with a loopback URI, because other hosts could not call the node."""
+    """Deny a loopback URI from another machine, because other hosts could not call the node."""
     if caller.peer.host.is_loopback or not _is_loopback(api.uri.host):
         return None
     return _no(
@@ -177,7 +172,7 @@ def _unreachable(caller: Caller, api: ApiUri) -> Decision | None:
 
 
 def contested(contest: NameConflict, probe: Probe | None) -> Decision:
-    """Decide a name conflict by the probe of the holder; deny the call if the probe is missing or outdated."""
+    """Deny the call if the probe is missing or outdated."""
     holder = contest.holder
     if probe is not None and probe.holder is holder:
         if probe.presence is Presence.GONE:
@@ -214,5 +209,4 @@ def _is_loopback(host: str) -> bool:
 
 
 def _no(reason: str, told: str | None = None) -> Decision:
-    """Return a denial without a rule. `told` is the text for the caller if `reason` names another host."""
     return Decision(False, None, reason, told=told)

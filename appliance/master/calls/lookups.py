@@ -16,10 +16,9 @@ from roswire.xmlrpc import Value
 
 @dataclass(frozen=True, slots=True)
 class LookupCalls:
-    """The lookup calls. They are answered from the registry, with the URIs of proxies.
+    """The lookup calls, answered from the registry even while the ROS master is away.
 
-    The registry has all registrations that the policy allows, even while the ROS master is away.
-    `port` is RVMaster's port. `stop(reason)` ends the appliance. `getSystemState` omits the publisher `unseen`.
+    `getSystemState` omits the publisher `unseen`.
     """
 
     registry: Registry

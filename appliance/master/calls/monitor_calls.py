@@ -17,7 +17,7 @@ _NOBODY = (0, 0)
 
 @dataclass(frozen=True, slots=True)
 class MonitorCalls:
-    """The calls about monitors. `real_port` is the ROS master's port, `port` is RVMaster's port."""
+    """The calls about monitors. `port` is RVMaster's."""
 
     monitors: SpecificationManager
     registry: Registry

@@ -1,10 +1,7 @@
 """Answer `system.multicall`. The parts are carried out in order, and a failed part does not affect other parts.
 
-roslaunch clears and sets parameters in one multicall, and relies on the order. Adjacent reads and writes of parameters
-form a *run*. Each call of a run is decided and recorded separately, but the run waits once for the disk and for the
-ROS master. A read of a parameter that the run writes begins a new run.
-
-Other hosts have their turn after each run, and after each part outside a run.
+Adjacent reads and writes of parameters form a *run*, which waits once for the disk and for the ROS master. A read of a
+parameter that the run writes begins a new run. Other hosts have their turn after each run and each other part.
 """
 
 import asyncio
@@ -99,7 +96,6 @@ class Multicall:
         return self._refused(visit, _FORM)
 
     async def _weigh(self, visit: ServedRequest, answers: list[Value]) -> int:
-        """Return the approximate size of answers, which stay in memory until all parts are answered."""
         weight = weigh(answers, self.offload)
         if weight < self.offload:
             return weight
@@ -123,10 +119,7 @@ class Multicall:
 
 @dataclass(slots=True)
 class _Run:
-    """Parts that are carried out together, and their answers. None stands for an attempt without an answer yet.
-
-    `weight` is the approximate number of bytes of the answers to reads.
-    """
+    """Parts that are carried out together, and their answers; the answers to reads have about `weight` bytes."""
 
     answers: list[Value] = field(default_factory=list)
     attempts: list[Attempt] = field(default_factory=list)

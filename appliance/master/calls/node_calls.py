@@ -1,11 +1,8 @@
 """Answer the node API on a proxy endpoint. Other nodes and tools call the endpoint as if it were the node.
 
-The call is for the incarnation `caller.target`. Only `getPid`, `shutdown`, and `requestTopic` for unrelayed topics are
-forwarded to the node. The registry and the relay answer all other calls.
-
-If the node does not answer `getPid`, the connection is reset: `rosnode` then skips the node, but would stop at an
-error. The publisher for monitors is control itself, so `getPid` returns control's process id. `publisherUpdate` and
-`paramUpdate`, which only a master sends, are denied like unknown calls.
+Only `getPid`, `shutdown`, and `requestTopic` for unrelayed topics are forwarded to the node. If the node does not
+answer `getPid`, the connection is reset: `rosnode` then skips the node, but would stop at an error. Calls that only a
+master makes are denied like unknown calls.
 """
 
 import os
@@ -64,7 +61,7 @@ class NodeCalls:
         return [1, f"ready on {address}:{port}", ["TCPROS", address, port]]
 
     async def _negotiated_directly(self, target: Incarnation, topic: str, caller: Caller) -> Answer:
-        """Return the node's own TCPROS port, at its peer address; the host in the node's answer is ignored."""
+        """Return the node's own port, at its peer address; the host in the node's answer is ignored."""
         try:
             answer = await self.nodes.call(target, "requestTopic", caller.caller_id, topic, [["TCPROS"]])
             port = tcpros_port(answer)

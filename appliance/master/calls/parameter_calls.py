@@ -1,12 +1,8 @@
 """Carry out the parameter calls. The mirror answers most reads, because a starting node makes hundreds.
 
-The ROS master answers reads of a large tree and `searchParam`. Writes are sent to the ROS master in order, in few
-requests. While the ROS master is away or incomplete, all calls wait.
-
-`searchParam` finds parameters that the caller may read. The ROS master searches a relative key in the caller's
-namespace and then upwards. The answer must not reveal whether a parameter exists that the host may not read. So a
-global key is decided before the search. A search upwards skips keys that the host may not read. If nothing is found,
-the answer depends only on the policy.
+`searchParam` must not reveal whether a parameter exists that the host may not read. So a global key is decided before
+the search, and a search upwards skips keys that the host may not read. If nothing is found, the answer depends only on
+the policy.
 """
 
 import asyncio
@@ -36,7 +32,7 @@ _TOGETHER_BYTES = 256 << 10  # the most bytes of values in one request to the RO
 
 
 class ParameterWrite(NamedTuple):
-    """A write of a parameter for a caller. `value` None deletes the parameter."""
+    """A write of a parameter. `value` None deletes it."""
 
     caller: Caller
     key: str
@@ -45,7 +41,7 @@ class ParameterWrite(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class ParameterCalls:
-    """The parameter calls. The ROS master answers reads of at least `large` bytes."""
+    """The parameter calls. The ROS master answers reads of at least `large` bytes, and `searchParam`."""
 
     rosmaster: RosMaster
     mirror: ParameterMirror
@@ -60,7 +56,6 @@ class ParameterCalls:
         return answer if hidden is None else [0, hidden, 0]
 
     async def read(self, caller: Caller, key: str) -> Answer:
-        """Return the answer to `getParam` for a caller that may read everything."""
         there, _ = standing_at(self.mirror.tree, key)
         if not self.rosmaster.reachable or (
             isinstance(there, dict) and weigh(there, self.large) >= self.large
@@ -120,7 +115,7 @@ class ParameterCalls:
         return answer
 
     def _next_readable(self, key: str, places: dict[str, Decision], hidden: str) -> str | None:
-        """Return the name that the search would have found if parameters that may not be read did not exist."""
+        """Return the name that the search would have found if unreadable parameters did not exist."""
         levels = len([part for part in key.split("/") if part])
         names = list(places)
         for name in names[names.index(hidden) + 1 :]:
@@ -131,7 +126,6 @@ class ParameterCalls:
         return None
 
     def weight_of_answer(self, attempt: Attempt) -> int:
-        """Return the approximate bytes of the parameter's value in the answer, counted up to `large`; 0 if none."""
         if not attempt.call.tells:
             return 0
         return weigh(standing_at(self.mirror.tree, attempt.resource)[0], self.large)
@@ -143,9 +137,9 @@ class ParameterCalls:
         return outcome
 
     async def write(self, writes: Sequence[ParameterWrite]) -> list[Answer | Exception]:
-        """Carry out several writes in order, in few requests; return their outcomes.
+        """Carry out writes in order; a failed write does not affect others.
 
-        Each value is checked as if it were sent after the earlier values. A failed write does not affect others.
+        Each value is checked as if it were sent after the earlier values.
         """
         outcomes: list[Answer | Exception] = []
         waiting: list[tuple[ParameterWrite, Reservation | None]] = []
@@ -180,7 +174,6 @@ class ParameterCalls:
     async def _send(
         self, waiting: list[tuple[ParameterWrite, Reservation | None]]
     ) -> list[Answer | Exception]:
-        """Send the writes; update mirror, charges and subscribers for those that the ROS master accepted."""
         try:
             outcomes = await self._make([_wanted(write) for write, _reserved in waiting])
         finally:
@@ -224,11 +217,10 @@ def _wanted(write: ParameterWrite) -> Wanted:
 
 
 def _is_set(answer: Answer, write: ParameterWrite) -> bool:
-    """Return whether the ROS master has stored the value, given its answer to `setParam`.
+    """Return whether the ROS master has stored the value.
 
-    It stores the value before it computes the updates for subscribers, so an error of these (a name such as `a/b` in
-    a dictionary, with a subscriber to that key) comes although the value is stored. It rejects only a root that is
-    not a namespace.
+    It stores the value before it computes the updates for subscribers, so their error (a name such as `a/b` in a
+    dictionary) comes although the value is stored. It rejects only a root that is not a namespace.
     """
     return answer[0] == 1 or write.key != "/" or isinstance(write.value, dict)
 

@@ -17,15 +17,15 @@ from roswire.xmlrpc import Value
 
 @dataclass(frozen=True, slots=True)
 class ParameterRights:
-    """Checks parameters by the policy in force (`policy()`), and records denials."""
+    """Checks parameters by the policy in force, and records denials."""
 
     policy: Callable[[], Policy]
     trail: AuditTrail
 
     def hidden(self, caller: Caller, call: str, key: str, answer: Answer) -> str | None:
-        """Return a denial text if the caller may not read the answer's value, otherwise None.
+        """Return a denial text if the caller may not read the answer's value.
 
-        The call was decided by an earlier state of the parameters; the answer has their present values.
+        The decision used an earlier state of the parameters.
         """
         if answer[0] != 1 or not isinstance(answer[2], dict) or caller.own:
             return None
@@ -33,10 +33,7 @@ class ParameterRights:
         return None if decision.allowed else self.recorded(caller, call, key, decision)
 
     def may_read_value(self, incarnation: Incarnation, key: str, value: Value) -> bool:
-        """Whether a node that subscribed to `key`, or to a key above it, may read the new value. Record a denial.
-
-        The new value of a deleted parameter is an empty namespace.
-        """
+        """Whether a subscriber may read the new value (an empty namespace if it was deleted). Record a denial."""
         if incarnation.own:
             return True
         decision = self._to_read(incarnation.host, incarnation.name, key, value)

@@ -1,7 +1,4 @@
-"""Serve requests: parse the request, carry out the call or the parts of a multicall, and write the answer.
-
-The Master API and the proxy endpoints are served in the same way, with different tables of calls.
-"""
+"""Serve requests of the Master API and of proxy endpoints, from the body to the written answer."""
 
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
@@ -32,8 +29,7 @@ _INTERNAL_FAULT = -32603
 class Pipeline:
     """Serves requests by a table of calls.
 
-    Bodies and answers over `offload` bytes are parsed and written in threads. Hosts take turns for this (`bulk`).
-    Answers to other hosts wait for `before_answer`, if there is one.
+    Hosts take turns (`bulk`) for bodies and answers over `offload` bytes, which threads parse and write.
     """
 
     execution: Execution
@@ -47,7 +43,6 @@ class Pipeline:
     before_answer: Callable[[], Awaitable[None]] | None = None
 
     def handler(self, table: Table, target: Incarnation | None = None, *, own: bool = False) -> Handler:
-        """Return the handler of a listener with this table. `own`: the listener is for the appliance's own nodes."""
 
         async def handle(request: HttpRequest) -> bytes:
             await self.addresses.learn(request.peer)

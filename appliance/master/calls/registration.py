@@ -1,8 +1,7 @@
 """Carry out the calls that register and unregister topics, services, and subscriptions to parameters.
 
-RVMaster answers them from its registry. Before the answer, the change is in the registry, and in the store: a ROS 1
-node never registers twice, and control and the ROS master may die at the same time. The ROS master gets the change
-after the answer (`reconcile/entries.py`). The texts of the answers are those of the ROS master.
+Before the answer, the change is in the registry and in the store: a ROS 1 node never registers twice, and control and
+the ROS master may die at the same time.
 """
 
 from dataclasses import dataclass
@@ -122,7 +121,7 @@ class RegistrationCalls:
         return answer
 
     def _by_lookup_uri(self, caller: Caller, api: ApiUri) -> Incarnation | None:
-        """Return the node whose lookupNode URI is in the call, as `rosnode cleanup` on the node's host sends it."""
+        """Return the node of a lookupNode URI, as `rosnode cleanup` on the node's host sends it."""
         holder = self.registry.holder(caller.caller_id)
         meant = holder is not None and (holder.host, holder.outer_port) == (caller.peer.host, api.uri.port)
         return holder if meant else None

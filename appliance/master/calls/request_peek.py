@@ -1,8 +1,7 @@
-"""Parse the beginning of a request's body, for the record of a denial. The rest is not read. No I/O.
+"""Parse the beginning of a request's body, for the record of a denial. No I/O.
 
-The beginning is untrusted and a few KiB long. If it contains a complete known call, the record has the same fields as a
-decision on that call: category, resource, claimed name, and key or node. Otherwise, the record has only the name of the
-method, if it can be found.
+The beginning is untrusted and a few KiB long. A complete known call is recorded with the same fields as a decision on
+it.
 """
 
 import re
@@ -29,7 +28,7 @@ _METHOD = re.compile(rb"<methodName>\s*+([^<>&\s]{1,128}+)\s*+</methodName>")
 
 
 class PeekedRequest(NamedTuple):
-    """The readable part of a request. `about` has the same details as the record of a decision."""
+    """The readable part of a request."""
 
     category: Category
     resource: str
@@ -38,7 +37,6 @@ class PeekedRequest(NamedTuple):
 
 
 def asked_for(peer: Peer, beginning: bytes) -> PeekedRequest:
-    """Parse the beginning of a peer's request; the resource is empty if it cannot be parsed."""
     try:
         call = parse_call(beginning, _LIMITS)
     except PeerError:
@@ -69,6 +67,5 @@ def _parts(params: tuple[Value, ...]) -> str:
 
 
 def method_named(body: bytes) -> str:
-    """Return the name of the method in the beginning of a body that cannot be parsed; may be empty."""
     found = _METHOD.search(body, 0, _BEGINNING)
     return "" if found is None else found[1].decode("utf-8", "replace")

@@ -1,1 +1,1 @@
-"""The endpoints of nodes: proxies, ports, addresses, and the relays that carry their topics."""
+"""The endpoints of nodes: proxies, ports, addresses, and relays."""

@@ -1,12 +1,8 @@
-"""Deliver the calls that nodes expect from a master. Each node has its own queue, in order.
+"""Deliver the calls that nodes expect from a master. A slow or dead node does not delay other nodes.
 
-A slow or dead node does not delay other nodes. Every list of publishers is delivered, even if a newer list
-waits, because roscpp must see a removal before the following addition. The two are some time apart, because
-rospy uses only the last of lists that arrive together, and takes an ending connection for a present one.
-Calls about other topics overtake a list that waits for this reason.
-
-A failed call is repeated a few times, then dropped and reported to `troubled`. The node is then checked, and
-gets the missed updates when it answers again (`Watchlist.could_not_tell`).
+Every list of publishers is delivered, even if a newer list waits, because roscpp must see a removal before the
+following addition. The two are some time apart, because rospy uses only the last of lists that arrive together, and
+takes an ending connection for a present one. Calls about other topics overtake a list that waits for this reason.
 """
 
 import asyncio
@@ -37,9 +33,9 @@ _TEXT_BYTES = 60  # an empty text in Python's memory
 
 @dataclass(frozen=True, slots=True)
 class NodeCall:
-    """A call to a node: the method, and the parameters after the caller's name.
+    """A method, and the parameters after the caller's name.
 
-    `size` is the approximate size of the call in bytes, if known. Otherwise, `weight` measures the call.
+    `size` is the approximate size of the call in bytes, if known.
     """
 
     method: str
@@ -102,13 +98,11 @@ class _Queue:
 
 
 class Delivery:
-    """The queues of calls. `troubled(incarnation, call, why)` is called for each lost call.
+    """The queues of calls, one for each node. `troubled` is called for each call that is lost after some attempts.
 
-    A queue holds at most `bound` calls; beyond this, its oldest call is dropped. `queued` limits the bytes of each host
-    and of all hosts. If a host exceeds its limit, the oldest call of its largest queue is dropped. If all hosts
-    together exceed the limit, the host with the most bytes loses a call.
-
-    Hosts take turns for the calls under way (`at_once`), so hanging nodes of one host do not delay calls to others.
+    A queue holds at most `bound` calls, and `queued` limits the bytes of each host and of all hosts. Beyond a limit,
+    an oldest call is dropped. Hosts take turns for the calls under way (`at_once`), so hanging nodes of one host do
+    not delay calls to others.
     """
 
     def __init__(
@@ -164,7 +158,6 @@ class Delivery:
             self._held.give_back(incarnation.host, queue.weight)
 
     def _heaviest(self, host: Address) -> _Queue:
-        """Return the largest queue of this host if it exceeds its quota, otherwise of the host with the most bytes."""
         if self._held.held(host) <= self._held.bounds.host:
             host, _ = max(self._held.holders(), key=lambda holder: holder[1])
         queues = (queue for queue in self._queues.values() if queue.incarnation.host == host)

@@ -1,4 +1,4 @@
-"""The signs of life of hosts: live nodes, and the last message of a host on some topics."""
+"""The signs of life of hosts."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from appliance.policy.model import Address
 
 @dataclass(frozen=True, slots=True)
 class HostSigns:
-    """`live(host)` returns whether it has a live node, `moved(host, names)` the time of its last message; 0: none."""
+    """`moved(host, names)` returns the time of the host's last message on these topics, or 0."""
 
     live: Callable[[Address], bool]
     moved: Callable[[Address, frozenset[str]], float]

@@ -1,14 +1,10 @@
 """Call nodes at their peer address.
 
 After a node was killed, another node may get its port. So an order to shut down an earlier incarnation is not sent to
-the address of a live node. Several live nodes may share an address, because some programs serve several node names with
-one API.
+the address of a live node, and a call that finds out whether a node is there, or ends it, opens a new connection.
+Several live nodes may share an address, because some programs serve several names with one API.
 
-A node that starts gets a dozen calls in a second, so its connection is kept for the next call, for two seconds at most.
-A call that finds out whether a node is there, or ends it, always opens a new connection.
-
-Each answer of a node is a code, a text, and a number or protocol. The size limit for answers is small, because
-thousands of nodes may answer at once, and each may be compromised.
+The size limit for answers is small, because thousands of nodes may answer at once, and each may be compromised.
 """
 
 import asyncio
@@ -38,14 +34,11 @@ class NodeApiClient:
         self._round: asyncio.TimerHandle | None = None
 
     def client(self, incarnation: Incarnation, *, pool: int = 0) -> XmlRpcClient:
-        """Return a client for the node's address. Another process may use this address now."""
+        """Return a client for the node's address, which another process may use now."""
         return XmlRpcClient(incarnation.call_uri, timeout=self._timeout, pool=pool, limits=ANSWER)
 
     async def call(self, incarnation: Incarnation, method: str, *params: Value) -> Value:
-        """Call a node. Raises `CallFailedError`.
-
-        Raises `RefusedError` for a shutdown if another live node has the address.
-        """
+        """Call a node. Raises `CallFailedError`; `RefusedError` for a shutdown if another node has the address."""
         if method == "shutdown" and incarnation.life is not Life.LIVE:
             uri = incarnation.call_uri
             there = next((other for other in self._registry.live() if other.call_uri == uri), None)
@@ -56,7 +49,7 @@ class NodeApiClient:
         return await client.call(method, *params)
 
     def _kept(self, incarnation: Incarnation) -> XmlRpcClient:
-        """Return the client that keeps a connection to the node's address; beyond `_MOST_KEPT`, it keeps none."""
+        """Keep up to `_MOST_KEPT` connections, because a starting node gets a dozen calls in a second."""
         uri = incarnation.call_uri
         client = self._used.get(uri) or self._unused.pop(uri, None)
         if client is None:

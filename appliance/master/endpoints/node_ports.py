@@ -1,15 +1,8 @@
-"""Manage the ports and listening sockets of each incarnation (proxy endpoint, relays), and the advertised
-address.
+"""Manage the ports and listening sockets of each incarnation, and the advertised address.
 
-Control opens every listening socket and gives the supervisor a duplicate. So the death of control or of a
-relay does not close a port. A restarted control gets the sockets back by name.
-
-An incarnation needs one port for its proxy endpoint and one for each relay process, from the policy's
-`[Ports]` range. The port that was unused for the longest time is taken first, because a subscriber may still
-call the port of a dead node.
-
-A host may have `_TIMES_THE_REST` times as many ports as are left. Hosts that the policy names as one network count as
-one host.
+The port that was unused for the longest time is taken first, because a subscriber may still call the port of a dead
+node. A host may have `_TIMES_THE_REST` times as many ports as are left; a network that the policy names counts as one
+host.
 """
 
 import asyncio
@@ -37,11 +30,7 @@ class NoPortError(Exception):
 
 
 class NodePorts:
-    """The listening sockets of all incarnations.
-
-    `keep(name, socket)` and `drop(name)` notify the supervisor. `host` is the address that RVMaster listens on.
-    `policy()` returns the policy in force, which names the owner of a port by an address or network.
-    """
+    """The listening sockets of all incarnations. `keep` and `drop` notify the supervisor."""
 
     def __init__(
         self,
@@ -89,10 +78,7 @@ class NodePorts:
             self.taken.charge(named)
 
     def open(self, host: Address) -> tuple[int, ...]:
-        """Open listening sockets for a node of this host; return the outer port, and one port for each relay.
-
-        Raises `NoPortError`.
-        """
+        """Return the outer port, and one port for each relay. Raises `NoPortError`."""
         named = self._policy().named_as(host)
         held, left = self.taken.held(named), len(self.unused)
         if left and held >= _TIMES_THE_REST * left:
@@ -131,10 +117,6 @@ class NodePorts:
             self.unused.remove(port)
 
     def reopen(self, incarnation: Incarnation) -> bool:
-        """Open the same ports again, after a restart of the appliance; adapt them to the number of relays.
-
-        Return False if a port cannot be opened. Raises `NoPortError`.
-        """
         opened: list[sockets.socket] = []
         for port in incarnation.ports[: self._each]:
             if f"port:{port}" in self._sockets:
@@ -181,7 +163,6 @@ class NodePorts:
         self.unused = deque(sorted(self.unused, key=lambda port: (port <= last, port)))
 
     def listen(self) -> sockets.socket:
-        """Return a socket that listens on the next free port. Raises `NoPortError`."""
         for _ in range(len(self.unused)):
             port = self.unused.popleft()
             try:
@@ -205,14 +186,8 @@ _ANSWER_SECONDS = 3.0
 class AdvertisedAddresses:
     """Chooses the appliance's address that each host gets in URIs.
 
-    The setting `advertise:` has priority, if it has an address for the host's network. Otherwise, the host
-    gets the address at which it reached the appliance; behind address translation, this is the machine's
-    address.
-
-    `advertised` are (network, address) pairs. `route_to(host)` finds the machine's address that `host` used
-    (None: no translation). `listen` is the address that RVMaster, the proxy endpoints and the relay listen
-    on. `fixed` is the address of the active one of two appliances, for all hosts outside the network
-    `tunnels`.
+    A (network, address) pair of `advertised` has priority. Otherwise, a host gets the address at which it reached the
+    appliance. `fixed` is the address of the active one of two appliances, for all hosts outside the network `tunnels`.
     """
 
     def __init__(
@@ -243,7 +218,6 @@ class AdvertisedAddresses:
         return self._routes.get(peer.host) or self.listen or peer.local
 
     async def learn(self, peer: Peer) -> None:
-        """Find out once at which address this peer reaches the appliance. Call this before `address_for`."""
         if self._route_to is None or self._fixed is not None or peer.host in self._routes:
             return
         if len(self._routes) > 10_000:

@@ -1,12 +1,10 @@
-"""Serve the two endpoints of every incarnation.
+"""Serve the two endpoints of every incarnation. Neither endpoint reveals the node's real URI.
 
-The *inner* (master-side) endpoint is for the ROS master: one loopback listener serves all incarnations, and the path of
-a URI is the key of an incarnation. The *outer* (peer-side) endpoint is for other nodes; it has its own port. Neither
-endpoint reveals the node's real URI.
+The *inner* (master-side) endpoint is for the ROS master: one loopback listener serves all incarnations, and the path
+of a URI is the key of an incarnation. The *outer* (peer-side) endpoint has its own port.
 
-The ROS master's calls to a master-side endpoint are acknowledged and ignored. The ROS master joins the names in a value
-to keys that the policy did not decide, and its threads may be late. Instead, `Subscribers` makes the calls to nodes
-when a decided call is carried out: lists of publishers come from the registry, values of parameters from the call.
+The ROS master's calls are acknowledged and ignored: it joins the names in a value to keys that the policy did not
+decide. `Subscribers` calls the nodes instead.
 """
 
 import socket
@@ -22,7 +20,7 @@ from roswire.xmlrpc import build_fault, build_response
 
 @dataclass(frozen=True, slots=True)
 class ProxyEndpoints:
-    """The open endpoints. `serve()(incarnation)` makes the handler of an endpoint; `server` serves it on a socket."""
+    """The open endpoints. `serve()(incarnation)` makes the handler of an endpoint."""
 
     registry: Registry
     places: NodePorts
@@ -35,7 +33,7 @@ class ProxyEndpoints:
         return node_uri("127.0.0.1", self.inner_port, f"/{incarnation.key}/")
 
     async def open(self, incarnation: Incarnation) -> None:
-        """Serve the proxy endpoint of an incarnation; if this fails, close its ports and raise `NoPortError`."""
+        """Serve an incarnation; if this fails, close its ports and raise `NoPortError`."""
         try:
             sock = self.places.socket(incarnation.outer_port).dup()
         except OSError as error:
@@ -46,7 +44,6 @@ class ProxyEndpoints:
         await server.start()
 
     async def reopen(self, incarnation: Incarnation) -> None:
-        """Serve the proxy endpoint of a restored incarnation. Raises `NoPortError` if a port is in use."""
         ports = incarnation.ports
         if not self.places.reopen(incarnation):
             raise NoPortError(f"a port of {incarnation.name} is in use by another program")
@@ -55,7 +52,6 @@ class ProxyEndpoints:
             self.registry.mark(incarnation)
 
     def close(self, incarnation: Incarnation) -> None:
-        """Close the proxy endpoint and all ports of an incarnation, if open; the ports may be reused."""
         server = self.servers.pop(incarnation.key, None)
         if server is not None:
             server.close()
@@ -77,7 +73,6 @@ class MasterSideApi:
         return self.acknowledge(request)
 
     def acknowledge(self, request: HttpRequest) -> bytes:
-        """Acknowledge a call of the ROS master; return a fault for an unknown path."""
         if request.path != PUBLISHER_PATH and self._registry.by_key(request.path.strip("/")) is None:
             return build_fault(1, "this address serves no calls")
         return build_response([1, "", 0])

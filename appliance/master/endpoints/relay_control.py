@@ -1,14 +1,4 @@
-"""Send the relays their wanted state and the addresses of publishers, and handle their reports.
-
-The wanted state is derived from the registry (nodes, publications, services) and the grants. Each topic and service is
-sent to the relay that carries it (`allocation`). A node is sent to all relays that carry its topics or services.
-
-For each relay, control keeps the facts that it has stated. A change names what may differ; `_state_fact` compares the
-wanted fact with the stated one, and sends the difference. A new relay has no facts, so it gets all of them, between
-`StateBegan` and `StateEnded`; it removes everything else. A change that cannot be sent (the relay does not read, or
-control has no descriptor for a port) is tried again every `_AGAIN_SECONDS`. Until then, `carried_out` waits. Changes
-use half of a link's backlog, so all other messages can still be sent; the supervisor ends a relay that reads nothing.
-"""
+"""Send the relays their wanted state and the addresses of publishers, and handle their reports."""
 
 import asyncio
 from collections import deque
@@ -40,11 +30,10 @@ from roswire.xmlrpc import Value
 
 
 class RelayOutbox(Link):
-    """The link to relay `index`. A new relay gets the whole state, including all changes while there was no relay.
+    """The link to relay `index`, with the facts that control has stated: it sends only differences.
 
-    Messages with `soon` are batched for some milliseconds, or until the next message without `soon`. A starting node
-    registers about ten topics in that time. Batching is safe, because peers connect only with a grant, and grants and
-    revocations are sent at once. `orders` sends its question after all earlier messages.
+    Messages with `soon` are batched for some milliseconds, in which a starting node registers about ten topics.
+    Batching is safe, because peers connect only with a grant, and grants and revocations are sent at once.
     """
 
     def __init__(self, index: int, heard: Callable[[Any], None], lost: Callable[[str], None]) -> None:
@@ -64,10 +53,7 @@ class RelayOutbox(Link):
             self.carried_out()
 
     def orders(self) -> list[asyncio.Future[None]]:
-        """Return a list of one future, which is done when the relay has carried out its orders or has ended.
-
-        The list is empty if the relay is not connected.
-        """
+        """Return one future, done when the relay has carried out its orders or has ended; none if it is away."""
         if not self.send(messages.OrdersAsked()):
             return []
         self._orders.append(asyncio.get_running_loop().create_future())
@@ -92,9 +78,8 @@ _log = structlog.get_logger()
 class RelayControl:
     """Control's end of the links to the relays.
 
-    `broken(incarnation)` is called for lost upstreams. `own_header` is the header of control's own publications.
     `own_call` answers calls of the appliance's own service, and decides calls of monitors and requests that need an
-    approval. `monitors()` returns the specifications that relays run.
+    approval.
     """
 
     registry: Registry
@@ -121,7 +106,6 @@ class RelayControl:
 
     @property
     def presence(self) -> str:
-        """Return `connected` if all relays are connected, `away` if none is, or the number of missing relays."""
         away = sum(post.channel is None for post in self._posts)
         if not away:
             return "connected"
@@ -156,10 +140,10 @@ class RelayControl:
         self._post(TOPIC, message.topic).send(message)
 
     async def carried_out(self, topics: Iterable[str] | None = None) -> None:
-        """Wait until the relays have carried out their orders: all relays, or those that carry these topics.
+        """Wait until the relays, or those that carry these topics, have carried out their orders.
 
-        The wait ends with the link to a relay. So it is bounded for a relay that hangs: the supervisor kills the relay
-        after `ANSWER_SECONDS` without an answer, and the next one begins with these orders.
+        The supervisor kills a relay after `ANSWER_SECONDS` without an answer, and the next one begins with these
+        orders.
         """
         posts = self._posts if topics is None else {self._post(TOPIC, topic) for topic in topics}
         while any(post.unstated for post in posts):
@@ -168,17 +152,16 @@ class RelayControl:
             await asyncio.wait(waiting)
 
     async def stop(self, topic: str) -> list[str]:
-        """Have monitors of a topic send their safe messages; return the names of those that have one."""
+        """Return the names of the monitors that have a safe message and send it."""
         return await self._taps.stop(topic, self._post(TOPIC, topic).send, begin=True) or []
 
     async def guards(self, topic: str) -> list[str] | None:
-        """Return the names of monitors with a safe message for a topic; None if its relay does not answer."""
+        """Return the names of monitors with a safe message; None if the relay does not answer."""
         return await self._taps.stop(topic, self._post(TOPIC, topic).send, begin=False)
 
     async def look(
         self, topic: str, count: int, seconds: float, *, latched: bool
     ) -> list[messages.MessageSeen]:
-        """Return the next messages of a topic, as its subscribers get them. Raises `TooManyTapsError`."""
         send = self._post(TOPIC, topic).send
         return await self._taps.look(topic, count, seconds, send, latched=latched)
 
@@ -198,22 +181,18 @@ class RelayControl:
     # --- what is wanted ---
 
     def flush(self, changed: Iterable[Change]) -> None:
-        """Send the differences that these changes make, at once for a grant."""
         changes = list(changed)
         for post in self._posts:
             self._state_all(post, changes)
 
     def compare(self) -> None:
-        """Send the differences that a new policy makes: limits, named hosts, hosts that command, and approvals."""
         self.flush(self.registry.live())
 
     def withdraw_moving(self, moves: Sequence[Move]) -> None:
-        """Withdraw moving topics and services with their grants, until they have their new relays."""
         self._moving |= {(move.kind, move.name) for move in moves}
         self.flush(self._moved(moves))
 
     def place_moved(self, moves: Sequence[Move]) -> None:
-        """State moved topics and services with their grants to their new relays, after the new allocation."""
         self._moving -= {(move.kind, move.name) for move in moves}
         self.flush(self._moved(moves))
 
@@ -269,7 +248,6 @@ class RelayControl:
     def _state_fact(
         self, post: RelayOutbox, node: Incarnation, fact: Change, wanted: messages.RelayFact | None
     ) -> None:
-        """Send a fact that the relay lacks or has differently. `wanted` is None if it must not have the fact."""
         before = post.stated.get(node.key, {}).get(fact)
         if wanted == before or post.channel is None:
             return
@@ -394,7 +372,6 @@ def _flow(rate: Rate) -> messages.FlowLimit:
 
 
 def tcpros_port(answer: Value) -> int:
-    """Return the port in a node's answer to `requestTopic`, ignoring the host. Raises `CallFailedError`."""
     match answer:
         case [1, str(), ["TCPROS", str(), int(port)]] if 0 < port < 65536:
             return port

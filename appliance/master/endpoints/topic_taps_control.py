@@ -1,4 +1,4 @@
-"""Tap topics at the relays that carry them, for a limited time and only a few at once; stop what they move."""
+"""Tap topics at the relays that carry them, for a limited time and only a few at once."""
 
 import asyncio
 from collections.abc import Callable
@@ -16,7 +16,7 @@ class TooManyTapsError(Exception):
 
 
 class TapRequests:
-    """The open taps, which collect messages of topics, and the open requests for the safe messages of monitors."""
+    """The open taps, and the open requests for the safe messages of monitors."""
 
     def __init__(self) -> None:
         self._number = 0
@@ -32,7 +32,7 @@ class TapRequests:
         *,
         latched: bool,
     ) -> list[messages.MessageSeen]:
-        """Return the next `count` messages of a topic, fewer after the time limit. Raises `TooManyTapsError`."""
+        """Return the next messages, fewer after the time limit. Raises `TooManyTapsError`."""
         if len(self._open) >= MOST:
             raise TooManyTapsError(f"{MOST} queries of topics' messages are running: try again")
         self._number += 1
@@ -52,10 +52,7 @@ class TapRequests:
     async def stop(
         self, topic: str, send: Callable[[messages.Message], bool], *, begin: bool
     ) -> list[str] | None:
-        """Return the names of a topic's monitors that have a safe message; `begin`: they send it.
-
-        Return None if the relay does not answer.
-        """
+        """Return the monitors with a safe message, which they send if `begin`; None if the relay does not answer."""
         self._number += 1
         number = self._number
         begun: asyncio.Future[list[str]] = asyncio.get_running_loop().create_future()

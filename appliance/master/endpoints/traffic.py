@@ -41,7 +41,6 @@ class Traffic:
     md5sum: str = ""  # the publisher's md5sum; empty until a relay has seen it
 
     def add(self, row: TopicTraffic, now: float, over: float) -> None:
-        """Add a relay's report about the last `over` seconds. Relays report once a second, and only changed rows."""
         self.messages += row.messages
         self.bytes += row.bytes
         self.dropped += row.dropped
@@ -65,7 +64,7 @@ class Traffic:
 
 
 class RelayTraffic:
-    """The connections and traffic of all relays; `relays` is their number.
+    """The connections and traffic of all relays.
 
     `cut_off(subscriber, topic)` is called for a connection that ended although both of its nodes are registered.
     """
@@ -124,7 +123,6 @@ class RelayTraffic:
         )
 
     def moving(self, key: str, resource: str) -> bool:
-        """Return whether messages have passed in the last minute, or may have, because control started later."""
         moved = self.traffic.get((key, resource), Traffic()).moved
         return clock.now() - max(moved, self._began) < _MOVING_SECONDS
 
@@ -134,7 +132,6 @@ class RelayTraffic:
             del self.connections[number]
 
     def forgotten(self, key: str) -> None:
-        """Forget an incarnation, and add its traffic to `past`."""
         for carried in [carried for carried in self.traffic if carried[0] == key]:
             name = carried[1] if carried[1] in self.past or len(self.past) < MOST_RESOURCES else OTHERS
             self.past.setdefault(name, Traffic()).include(self.traffic.pop(carried))
@@ -146,7 +143,6 @@ class RelayTraffic:
                 self.traffic.setdefault((row.key, row.resource), Traffic()).add(row, now, over)
 
     def unrecorded(self, connections: int) -> None:
-        """Record the number of connections that began and ended while a relay had no control process."""
         if connections:
             self._trail.happened(
                 "records lost",
@@ -169,7 +165,6 @@ class RelayTraffic:
         )
 
     def closed(self, relay: int, message: messages.ConnectionClosed) -> None:
-        """Record that a connection has ended, and report a subscriber that lost its connection."""
         connection = self.connections.pop((relay, message.number), None)
         if connection is None:
             return
@@ -187,7 +182,6 @@ class RelayTraffic:
             self._cut_off(subscriber, connection.resource)
 
     def _subscriber(self, connection: messages.ConnectionOpened) -> Incarnation | None:
-        """Return the subscriber of a connection; None if it or the publisher is no longer registered, or lost."""
         topic, subscriber = connection.resource, self._registry.holder(connection.caller_id)
         publishers = self._registry.registered(Kind.PUBLICATION, topic)
         if (
@@ -200,7 +194,7 @@ class RelayTraffic:
         return subscriber
 
     def refused(self, message: messages.ConnectionRefused) -> None:
-        """Record a refused peer. If the appliance's own node connects too late, this is not recorded as an attack."""
+        """An own node that connects too late is not recorded as an attack."""
         own = self._is_own(message.host, message.caller_id, message.resource)
         self._trail.happened(
             "connection refused",
@@ -216,7 +210,6 @@ class RelayTraffic:
         )
 
     def upstream_lost(self, message: messages.UpstreamLost, host: str) -> None:
-        """Record that a relay cut a publisher at this address because of its data."""
         if message.violation:
             self._trail.happened(
                 message.violation,
@@ -230,7 +223,6 @@ class RelayTraffic:
             )
 
     def latch_refused(self, message: messages.LatchRefused, host: str) -> None:
-        """Record that a relay did not keep the latched message of a publisher at this address."""
         self._trail.happened(
             "limit exceeded",
             "its latched message is not stored for later subscribers: its host has no memory left for it in the relay",
@@ -244,7 +236,6 @@ class RelayTraffic:
         )
 
     def limited(self, row: messages.LimitedRow, rule: LimitRule | None) -> None:
-        """Record that a relay dropped messages beyond a limit (`rule`; None if the policy no longer has the rule)."""
         topic = row.topic or OTHERS
         known = topic in self._limited_topics or len(self._limited_topics) < MOST_RESOURCES
         self._limited_topics.add(name := topic if known else OTHERS)
@@ -284,7 +275,6 @@ class RelayTraffic:
         return node.name if node is not None else ""
 
     def _is_own(self, host: str, caller_id: str, topic: str) -> bool:
-        """Whether the peer is one of the appliance's own nodes, at its address, for a topic that it subscribed to."""
         holder = self._registry.holder(caller_id)
         return (
             holder is not None

@@ -49,7 +49,6 @@ class Grants:
         return self._of_node.get(key, ())
 
     def of_client(self, name: str) -> list[PermissionRow]:
-        """Return the grants of all clients with this name."""
         return list(self._of_name.get(name, ()))
 
     def give(self, row: PermissionRow) -> None:
@@ -65,7 +64,6 @@ class Grants:
             self._clear_unused(max(self._of_host, key=lambda host: len(self._of_host[host])), row)
 
     def take(self, row: PermissionRow) -> None:
-        """Revoke a grant if it exists; its connection is cut."""
         if row not in self.of(row.key):
             return
         for index, key in self._places(row):

@@ -1,8 +1,6 @@
-"""Change the registry and the grants as the calls of nodes, the policy and failures require, and record each change.
+"""Change the registry and the grants as the calls of nodes, the policy and failures require.
 
-Every change of the graph is a method here. It changes tables in memory, which note the changed keys; `Sinks` then makes
-the relays, the subscribers, the ROS master and the store agree with the tables. Only audit records are written here,
-because a record is of one change, not of a state.
+Only audit records are written here, because a record is of one change, not of a state; `Sinks` does the rest.
 """
 
 from collections.abc import Iterable
@@ -20,7 +18,7 @@ from appliance.telemetry.audit_trail import AuditTrail
 
 @dataclass(frozen=True, slots=True)
 class RosGraph:
-    """Change the graph."""
+    """All changes of the graph."""
 
     registry: Registry
     grants: Grants
@@ -41,7 +39,6 @@ class RosGraph:
             self._record("registered", reason, incarnation, kind.value, resource)
 
     def unregistered(self, incarnation: Incarnation, kind: Kind, resource: str) -> None:
-        """Remove a registration of a node, if the node has it, or else the withdrawn one."""
         if (kind, resource) not in incarnation.registrations:
             self.registry.unshelve(incarnation, kind, resource)
             return
@@ -54,7 +51,6 @@ class RosGraph:
     def revoked(
         self, incarnation: Incarnation, registration: NodeRegistration, decision: Decision, call: str
     ) -> None:
-        """Withdraw a registration that is no longer allowed, and keep it for later. `call`: see `record_revocation`."""
         kind, resource = registration.kind, registration.resource
         self.record_revocation(
             decision, str(incarnation.host), incarnation.name, kind.value, resource, call=call
@@ -63,7 +59,6 @@ class RosGraph:
         self.registry.shelve(incarnation, registration)
 
     def granted_again(self, incarnation: Incarnation, registration: NodeRegistration) -> None:
-        """Restore a registration that the policy withdrew. Forget a service that another node now offers."""
         kind, resource = registration.kind, registration.resource
         if kind is Kind.SERVICE and self._others_offer(incarnation, resource):
             self.registry.unshelve(incarnation, kind, resource)
@@ -76,8 +71,7 @@ class RosGraph:
     def _take_name(self, incarnation: Incarnation) -> None:
         """Take the name from its holder, and from all clients of other hosts.
 
-        The holder's withdrawn registrations are forgotten. Other hosts can no longer make calls under this name, so
-        their grants end.
+        Other hosts can no longer make calls under this name, so their grants end.
         """
         other = self.registry.occupant(incarnation.name)
         if other is incarnation:
@@ -104,15 +98,11 @@ class RosGraph:
         )
 
     def lost(self, incarnation: Incarnation, why: str) -> None:
-        """Suspend the registrations of a node that no longer answers, until it returns."""
         self.registry.overshadow(incarnation, clock.now())
         self._record("node lost", why, incarnation, severity=Severity.NOTICE)
 
     def returned(self, incarnation: Incarnation) -> None:
-        """Restore the registrations of a lost node that answers again.
-
-        If another node has offered a service of the lost node in the meantime, that node keeps the service.
-        """
+        """Restore registrations, except services that another node now offers."""
         self._take_name(incarnation)
         for service in incarnation.resources(Kind.SERVICE):
             if self._others_offer(incarnation, service):
@@ -130,7 +120,6 @@ class RosGraph:
         self._grant(PermissionRow(publisher.key, TOPIC, topic, str(host), caller_id))
 
     def service_granted(self, provider: Incarnation, service: str, host: Address, caller_id: str) -> None:
-        """Let a client call a service of a provider, unless the client has no name."""
         if caller_id:
             self._grant(PermissionRow(provider.key, SERVICE, service, str(host), caller_id))
 
@@ -141,13 +130,12 @@ class RosGraph:
             self.grants.give(row)
 
     def _end_grants(self, node: Incarnation, subscribed: Iterable[str]) -> None:
-        """Remove the grants of a node that ended: those of its clients, and its own for the topics it subscribed to."""
         self.grants.forget(node.key)
         for topic in subscribed:
             self._give_up(node, topic)
 
     def _give_up(self, subscriber: Incarnation, topic: str) -> None:
-        """Remove the grants of a subscriber that gave up a topic, for all publishers of the topic, also lost ones.
+        """Remove grants for all publishers of a topic, also lost ones.
 
         Grants are for a name and a host, so another subscriber with the same two keeps them.
         """
@@ -165,10 +153,6 @@ class RosGraph:
     def record_revocation(
         self, decision: Decision, host: str, caller_id: str, category: str, resource: str, *, call: str
     ) -> None:
-        """Record a withdrawal.
-
-        `call` is the call that the policy no longer allows; empty if the policy is not the reason.
-        """
         about = {"call": call, "needs": decision.needs}
         self.trail.happened(
             "revoked",

@@ -1,11 +1,7 @@
 """Decide which topics and services are relayed, and which URIs nodes get.
 
-The default, `relaying: all` and `mediation: full`, is a security boundary.
-
-With `relaying: monitored` (the thesis's mode), the relay carries only topics and services in the policy's `[Monitor]`
-and `[Authority]`, with events of a specification, or with a rule that has `ask`. For all others, nodes connect
-directly. With `mediation: monitored`, nodes also get each other's real URIs; this mode requires `relaying: monitored`.
-Both modes are faster, but not a security boundary: a node that knows a port can send any request to it.
+The default, `relaying: all` and `mediation: full`, is a security boundary. The other modes are faster, but not a
+boundary: a node that knows a port can send any request to it.
 """
 
 from collections.abc import Callable

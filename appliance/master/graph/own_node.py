@@ -1,7 +1,7 @@
 """Define the rights of the appliance's own node: rosout, a C++ program that parses the log messages of all nodes.
 
-The policy does not cover rosout, and rosout is not trusted. Under the name `/rosout`, it may make the registrations of
-an unmodified rosout, and read the parameters that roscpp reads at its start. It may do nothing else.
+rosout is not trusted. It may only make the registrations of an unmodified rosout, and read the parameters that roscpp
+reads at its start.
 """
 
 from appliance.master.graph.registry import Kind

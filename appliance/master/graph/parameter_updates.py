@@ -1,11 +1,10 @@
-"""Compute the updates for subscribers when a parameter is set or deleted, from its key and value.
+"""Compute the updates for subscribers when a parameter is set or deleted, like rosmaster's `compute_param_updates`.
 
-This works like rosmaster's `compute_param_updates`, but uses only canonical keys. The *changed key* is the canonical
-key that the policy allowed the caller to change. Subscribers get only this key and keys below it, whatever names a
-value contains:
+Only the canonical key that the policy allowed the caller to change counts, and keys below it, whatever names a value
+contains:
 
 1. Subscribers to the changed key, or to a key above it, get the changed key and its value.
-2. Subscribers to a key below the changed key get their part of the new value, or `{}` if their key is no longer set.
+2. Subscribers to a key below the changed key get their part of the new value, or `{}`.
 3. If the value is not a namespace, there are no updates for keys below the changed key.
 """
 
@@ -16,7 +15,7 @@ from roswire.xmlrpc import Value
 
 
 class ParameterUpdate(NamedTuple):
-    """An update: subscribers to `subscribed` get this value of `key`. Both keys are canonical."""
+    """Subscribers to `subscribed` get this value of `key`."""
 
     subscribed: str
     key: str
@@ -24,7 +23,7 @@ class ParameterUpdate(NamedTuple):
 
 
 def updates_of(key: str, value: Value, below: Iterable[str]) -> Iterator[ParameterUpdate]:
-    """Yield the updates for a new value of `key` (`{}` if deleted). `below` are the subscribed keys below `key`."""
+    """Yield the updates for a new value (`{}` if deleted). `below` are the subscribed keys below `key`."""
     for above in _upwards(key):
         yield ParameterUpdate(above, key, value)
     if isinstance(value, dict):
@@ -35,7 +34,7 @@ def updates_of(key: str, value: Value, below: Iterable[str]) -> Iterator[Paramet
 
 
 def settled(value: Value) -> Value:
-    """Return a snapshot of a value. Its namespaces are copied, because later calls change them in place."""
+    """Copy the namespaces of a value, because later calls change them in place."""
     return {name: settled(member) for name, member in value.items()} if isinstance(value, dict) else value
 
 

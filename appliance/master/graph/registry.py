@@ -1,12 +1,7 @@
 """Keep the registry: nodes, and their registrations. No I/O, no clock.
 
-An *incarnation* is one life of a node: a name and an API URI that were registered from one host. Two endpoints and the
-relay ports represent the node. The registry keeps the set of changed keys, also of changed grants; `Sinks` takes it.
-
-Invariants:
-
-1. At most one incarnation of a name is *live*. Only the live incarnation holds the name. An earlier incarnation of the
-   name is *replaced*, and never comes back.
+1. At most one incarnation of a name (one life of a node, with an API URI on one host) is *live*. Only it holds the
+   name. An earlier one is *replaced*, and never comes back.
 2. A live incarnation that no longer answers becomes a *shadow*. Its registrations are kept, but have no effect until
    the node returns or the shadow expires. A shadow does not hold its name.
 3. Registrations are numbered, so that a rebuilt ROS master gets them in their original order.
@@ -75,10 +70,8 @@ class NodeRegistration:
 class Incarnation:
     """One life of a node.
 
-    `api` is the URI that the node registered; its host part is not verified and never used. `told` is the address at
-    which this node reaches the appliance; all URIs for this node use it. `own` marks the appliance's own nodes (rosout,
-    and the publisher for monitors). Each relay process has a port for the incarnation: the first has `relay_port`, the
-    others have `more_relay_ports`.
+    The host part of `api`, the registered URI, is not verified and never used. `told` is the address at which this
+    node reaches the appliance; all URIs for this node use it.
     """
 
     key: str
@@ -100,10 +93,6 @@ class Incarnation:
 
     @property
     def evictable(self) -> bool:
-        """Whether this incarnation can be evicted.
-
-        It must be replaced, or have no registrations, no withdrawn registrations and no calls under way.
-        """
         return not (self.registrations or self.shelf or self.calls or self.own) or self.life is Life.REPLACED
 
     @property
@@ -120,12 +109,10 @@ class Incarnation:
 
     @property
     def real_uri(self) -> str:
-        """Return the URI of the node's own API at its peer address, for direct calls without a proxy endpoint."""
         return node_uri(str(self.host), self.api.port, self.api.path)
 
     @property
     def call_uri(self) -> NodeUri:
-        """Return the URI for calls to the node, at its peer address. rosout has a fixed address."""
         host = rosout_address.ADDRESS if self.own and not self.of_monitors else str(self.host)
         return NodeUri("http", host, self.api.port, self.api.path)
 
@@ -133,7 +120,7 @@ class Incarnation:
         return node_uri(told, self.outer_port)
 
     def uri_for(self, told: str, *, hidden: bool) -> str:
-        """Return the outer URI if `hidden`, otherwise the real URI. The appliance's own nodes have only outer URIs."""
+        """Return the outer URI if `hidden`; the appliance's own nodes have no other."""
         return self.outer_uri(told) if hidden or self.own else self.real_uri
 
     def in_order(self) -> list[NodeRegistration]:
@@ -159,7 +146,7 @@ Change = Incarnation | RegistrationKey | PermissionRow
 
 
 class Registry:
-    """All known incarnations, by key, by name and by topic. `woken` is called for the first of several changes."""
+    """All known incarnations. `woken` is called for the first of several changes."""
 
     def __init__(self, nodes_of_host: int = 500, *, woken: Callable[[], None] = lambda: None) -> None:
         self._most_of_host = nodes_of_host
@@ -197,7 +184,6 @@ class Registry:
         return self._known.get((name, host, api_text))
 
     def holder(self, name: str) -> Incarnation | None:
-        """Return the live incarnation that holds a name. It must have at least one registration."""
         incarnation = self._live.get(name)
         return incarnation if incarnation is not None and incarnation.registrations else None
 
@@ -219,11 +205,10 @@ class Registry:
         return ((kind, resource, holders.values()) for (kind, resource), holders in self._topics.items())
 
     def type_of(self, topic: str) -> str:
-        """Return the type of a topic, from the last publisher or otherwise from the first subscriber with a type."""
         return self._types.get(topic, ANY_TYPE)
 
     def types(self) -> Iterable[tuple[str, str]]:
-        """Return all topics with their types. Like the ROS master, include topics without a node."""
+        """Include topics without a node, like the ROS master."""
         return self._types.items()
 
     @property
@@ -231,7 +216,6 @@ class Registry:
         return bool(self._subscribed_keys)
 
     def subscribed_below(self, key: str) -> list[str]:
-        """Return the keys of parameters below `key` that live incarnations subscribed to, sorted."""
         keys, above = self._subscribed_keys, key.rstrip("/")
         # All keys that begin with `above/` are adjacent. `above0` is after them, because '0' follows '/' in ASCII.
         below = keys[bisect_left(keys, f"{above}/") : bisect_left(keys, f"{above}0")]
@@ -241,9 +225,9 @@ class Registry:
         return self._nodes_of.get(host, 0)
 
     def room_for(self, name: str, host: Address, api_text: str) -> Incarnation | None:
-        """Return the incarnation that a registering one replaces at its host's limit; None if there is room for both.
+        """Return the unused or lost incarnation that a new one replaces at its host's limit; None if there is room.
 
-        Only an unused or lost incarnation is replaced. Raises `HostFullError` if the host has none.
+        Raises `HostFullError`.
         """
         if self.nodes_of(host) < self._most_of_host or self.find(name, host, api_text) is not None:
             return None
@@ -253,16 +237,13 @@ class Registry:
         return evicted
 
     def _evictable_of(self, host: Address) -> Incarnation | None:
-        """Return the first incarnation of a host to evict: an evictable one, or otherwise the first that was lost."""
         mine = [incarnation for incarnation in self._by_key.values() if incarnation.host == host]
         idle = next((incarnation for incarnation in mine if incarnation.evictable), None)
         gone = (incarnation for incarnation in mine if incarnation.life is not Life.LIVE)
         return idle or min(gone, key=lambda incarnation: incarnation.changed, default=None)
 
     def evictable_for(self, host: Address) -> Incarnation | None:
-        """Return the incarnation to evict for a new one of this host: one of this host, or an evictable one of
-        another.
-        """
+        """Return one of this host, or an evictable one of another."""
         return self._evictable_of(host) or next(
             (incarnation for incarnation in self._by_key.values() if incarnation.evictable), None
         )
@@ -278,13 +259,11 @@ class Registry:
         return self._registrations_of.get(host, 0)
 
     def machines(self) -> dict[str, int]:
-        """Return the number of live nodes by address, without the appliance's own nodes."""
         return Counter(
             str(one.host) for one in self._by_key.values() if one.life is Life.LIVE and not one.own
         )
 
     def in_order(self) -> Iterator[tuple[Incarnation, NodeRegistration]]:
-        """Yield all registrations of live incarnations, in the order in which they were made."""
         pairs = [
             (incarnation, registration)
             for incarnation in self._live.values()
@@ -293,10 +272,9 @@ class Registry:
         return iter(sorted(pairs, key=lambda pair: pair[1].order))
 
     def uris_for(self, reader: Incarnation, kind: Kind, topic: str, *, hidden: bool) -> tuple[str, ...]:
-        """Return the URIs of a topic's publishers or subscribers for `reader`.
+        """Return URIs for `reader`; its own entry is the URI that it registered.
 
-        The entry of `reader` is the URI that it registered; other entries come from `Incarnation.uri_for`. The
-        appliance's own nodes reach other nodes only through the appliance.
+        The appliance's own nodes reach other nodes only through the appliance.
         """
         return tuple(
             incarnation.api_text
@@ -318,7 +296,6 @@ class Registry:
         self._nodes_of[incarnation.host] += 1
 
     def reached_at(self, incarnation: Incarnation, told: str) -> None:
-        """Note the address at which a node reaches the appliance now, which all URIs for the node use."""
         if incarnation.told != told:
             incarnation.told = told
             self.mark(incarnation)
@@ -349,7 +326,6 @@ class Registry:
         self.unshelve(incarnation, kind, resource)
 
     def shelve(self, incarnation: Incarnation, registration: NodeRegistration) -> None:
-        """Store a registration that the policy withdrew, because its node never registers again."""
         incarnation.shelf[registration.kind, registration.resource] = registration
         self.mark(RegistrationKey(incarnation, registration.kind, registration.resource, shelved=True))
 
@@ -413,7 +389,6 @@ class Registry:
         self._note_type(registration)
 
     def _note_type(self, registration: NodeRegistration) -> None:
-        """Store a topic's type as the ROS master does: the publisher's type, or otherwise the subscriber's."""
         kind, topic, told = registration.kind, registration.resource, registration.detail
         if kind not in _OF_TOPICS:
             return
@@ -423,7 +398,6 @@ class Registry:
             self._types[topic] = told
 
     def adopt_types(self, types: Iterable[tuple[str, str]]) -> None:
-        """Adopt the types of topics that the ROS master knew before control started, where no type is known."""
         self.version += 1
         for topic, told in types:
             if self.type_of(topic) == ANY_TYPE:
@@ -432,7 +406,6 @@ class Registry:
                     self._remember_unused(topic)
 
     def forget_types(self) -> None:
-        """Forget topics without a node, because a new ROS master does not know them."""
         self.version += 1
         for topic in self._unused_types:
             self._types.pop(topic, None)
@@ -461,5 +434,5 @@ class Registry:
 
 
 def new_key() -> str:
-    """Return a key of 128 random bits for a new incarnation, so that its master-side URI cannot be guessed."""
+    """Return 128 random bits, so that the master-side URI of an incarnation cannot be guessed."""
     return secrets.token_hex(16)

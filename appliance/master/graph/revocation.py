@@ -1,7 +1,6 @@
 """Decide all registrations and grants again after a change of the policy, for live nodes and for lost nodes.
 
-Registrations that are no longer allowed are withdrawn and stored. If a later policy allows them (for example after a
-rollback), they are registered again, because a ROS 1 node never registers twice.
+A registration that is no longer allowed is kept for a later policy, because a ROS 1 node never registers twice.
 """
 
 from collections.abc import Callable
@@ -29,7 +28,7 @@ CALLS = {
 
 @dataclass(frozen=True, slots=True)
 class Revocation:
-    """Decides registrations and grants again, by the present policy and the present parameters (`tree`)."""
+    """Decides rights again, by the present policy and the present parameters."""
 
     registry: Registry
     grants: Grants
@@ -48,17 +47,14 @@ class Revocation:
         ]
 
     def redecide(self) -> int:
-        """Revoke rights that the policy in force no longer allows, and restore registrations that it grants again.
-
-        Return the number of revoked rights.
-        """
+        """Revoke denied rights, and restore allowed ones; return the number of revoked rights."""
         count = self._redecide(self._registrations(), self.grants.all())
         for incarnation in self.registry.live():
             self.returned(incarnation)
         return count
 
     def redecide_for(self, host: Address, caller_id: str) -> int:
-        """Revoke denied rights of a caller whose call was decided before a policy change and carried out after it."""
+        """Revoke rights of a caller whose call was decided before a policy change and carried out after it."""
         return self._redecide(
             [pair for pair in self._registrations() if (pair[0].host, pair[0].name) == (host, caller_id)],
             [row for row in self.grants.of_client(caller_id) if row.host == str(host)],
@@ -82,7 +78,7 @@ class Revocation:
         return count
 
     def expel(self, host: Address, reason: str) -> int:
-        """Revoke all registrations and grants of a host, whatever the policy says. Return their number."""
+        """Revoke all rights of a host, whatever the policy says. Return their number."""
         count, decision = 0, Decision(False, None, reason)
         for incarnation, registration in self._registrations():
             if incarnation.host == host and not incarnation.own:
@@ -95,7 +91,6 @@ class Revocation:
         return count
 
     def returned(self, incarnation: Incarnation) -> None:
-        """Restore withdrawn registrations that are now granted, because a node never registers twice."""
         holder = self.registry.holder(incarnation.name)
         if holder is not None and holder is not incarnation:
             return

@@ -1,1 +1,1 @@
-"""Keep graph, ROS master and the robot's nodes consistent: carry out effects, check nodes, reconcile differences."""
+"""Keep graph, ROS master and the robot's nodes consistent."""

@@ -1,11 +1,8 @@
 """Find or make the incarnation of a registering call, by its name, host and API URI.
 
-An incarnation with a registering call under way is not evicted. Otherwise, two nodes that arrive at the same time
-could evict each other forever.
-
-Nodes are called at their caller's address, whatever their API's URI says: a node on a machine with several addresses
-may name another one. multimaster_fkie registers the nodes of other machines, which cannot be called there. So a new
-node whose URI names another host must have its port open, as every node has before it registers.
+multimaster_fkie registers the nodes of other machines, which cannot be called at their caller's address. But a node on
+a machine with several addresses may also name another one. So a new node whose URI names another host must have its
+port open, as every node has before it registers.
 """
 
 from collections.abc import Callable
@@ -29,7 +26,7 @@ class NodeElsewhereError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Arrivals:
-    """Finds or makes the incarnations of callers. `flush` carries out the changes of the registry."""
+    """Finds or makes the incarnations of callers."""
 
     registry: Registry
     graph: RosGraph
@@ -43,12 +40,9 @@ class Arrivals:
         return self.registry.find(caller.caller_id, caller.peer.host, api.text)
 
     async def incarnation_for(self, caller: Caller, api: ApiUri) -> Incarnation:
-        """Return the calling incarnation. An unknown caller gets a new incarnation with ports.
+        """Return the calling incarnation; an unknown caller gets a new one with ports.
 
-        At its host's limit, the new incarnation replaces an unused or lost one of the host. Raises
-        `HostFullError` if there is none, `NoPortError` if the range of ports is exhausted or control has no
-        descriptors left, and `NodeElsewhereError` if the node runs on another host; no incarnation is made
-        then.
+        Raises `HostFullError`, `NoPortError`, or `NodeElsewhereError`; then no incarnation is made.
         """
         identity = (caller.caller_id, caller.peer.host, api.text)
         incarnation = self.registry.find(*identity)
@@ -72,7 +66,6 @@ class Arrivals:
         return incarnation
 
     async def _check_place(self, caller: Caller, incarnation: Incarnation) -> None:
-        """Raise `NodeElsewhereError` if the node's URI names another host, and its port is closed on the caller's."""
         if caller.own or incarnation.api.host == caller.peer.text:
             return
         if await self.liveness.nodes.client(incarnation).refuses(_CONNECT_SECONDS):
@@ -105,7 +98,6 @@ class Arrivals:
         return incarnation
 
     def _open_ports(self, host: Address) -> tuple[int, ...]:
-        """Return ports for a node of this host. Evict unused incarnations if necessary. Raises `NoPortError`."""
         while True:
             self.flush()  # closes the ports of forgotten nodes
             try:
@@ -118,7 +110,10 @@ class Arrivals:
 
 
 class EvictionGuard:
-    """A context manager for a registering call. Its incarnation is not evicted inside the `with` block."""
+    """A registering call, whose incarnation is not evicted inside the `with` block.
+
+    Otherwise, two nodes that arrive at the same time could evict each other forever.
+    """
 
     __slots__ = ("_incarnation",)
 

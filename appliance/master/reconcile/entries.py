@@ -1,18 +1,11 @@
 """State the registrations to the hidden ROS master, after the answers to nodes.
 
-A registering call is answered from the registry, once the change is stored. The ROS master gets the change
-afterwards, with the node's inner URI; services get a stand-in URI. Clients never get these URIs. Invariants:
-
 1. No answer to a node depends on a forwarded change. All reads of the graph are answered from the registry.
-2. `_stated` has the registrations that the ROS master has, or will have after the request under way. There is one
-   request at a time.
-3. `_differing` has the keys whose wanted and stated registrations differ, in the order in which they changed. A
-   registration that ends before it was stated is never sent. So the number of keys has the bounds of the registry, and
-   no call of a node waits.
+2. `_stated` has the registrations that the ROS master has, or will have after the one request under way.
+3. `_differing` has the keys that differ from it, in the order in which they changed. So the number of keys has the
+   bounds of the registry, and no call of a node waits.
 4. A request that fails is not repeated. It shuts the door, and the next round of the reconcile loop reads what the ROS
    master has (`adopt`). The same holds after the death of control: its registry is stored.
-
-Subscriptions to parameters are not stated: the ROS master does not list them, and its updates are ignored.
 """
 
 import asyncio
@@ -37,17 +30,14 @@ _log = structlog.get_logger()
 
 
 class MasterEntry(NamedTuple):
-    """A registration at the ROS master: the URI of its node, and the type of the topic or the URI of the service."""
+    """The URI of a node, and the type of the topic or the URI of the service."""
 
     api: str
     detail: str
 
 
 class MasterRegistrations:
-    """The registrations at the ROS master. `inner_uri(node)` returns the URI by which the ROS master knows a node.
-
-    `pid` is the process id of the ROS master that has all registrations. It is None before the first such process.
-    """
+    """The registrations at the ROS master. `pid` is the ROS master that has all of them."""
 
     def __init__(
         self, rosmaster: RosMaster, registry: Registry, inner_uri: Callable[[Incarnation], str]
@@ -61,7 +51,6 @@ class MasterRegistrations:
         self.pid: int | None = None
 
     def flush(self, changed: Iterable[Change]) -> None:
-        """Note which of these changes the ROS master must get, and send them soon."""
         for change in changed:
             if isinstance(change, Incarnation):
                 for kind, resource in change.registrations:
@@ -72,7 +61,7 @@ class MasterRegistrations:
             self._sending = asyncio.get_running_loop().create_task(self._send())
 
     def adopt(self, seen: Mapping[EntryKey, MasterEntry]) -> int:
-        """Take over the ROS master's state. Return the number of registrations that it lacks or has differently."""
+        """Take over the ROS master's state. Return the number of differences from the wanted one."""
         self._stated = dict(seen)
         self._differing.clear()
         for node, registration in self._registry.in_order():
@@ -87,7 +76,6 @@ class MasterRegistrations:
         return len(self._differing)
 
     def take(self, most: int | None = None) -> list[Wanted]:
-        """Return the calls that state the next differences, in order, and count these as stated."""
         calls: list[Wanted] = []
         for key in list(self._differing):
             if most is not None and len(calls) + 2 > most:
@@ -145,5 +133,5 @@ def _calls(key: EntryKey, stated: MasterEntry | None, wanted: MasterEntry | None
 
 
 def stand_in(node: Incarnation) -> str:
-    """Return the URI under which the ROS master knows an incarnation's services. Clients never get this URI."""
+    """Return the URI of a node's services at the ROS master. Clients never get it."""
     return service_uri(node.key, node.relay_port)

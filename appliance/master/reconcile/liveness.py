@@ -1,11 +1,9 @@
 """Check nodes every few seconds, and at once after a failure.
 
-A node is *lost* in three cases: its API refuses connections several times in a row, another process answers at its
-address, or there is no answer for `silent` seconds. Refusals do not count while the robot's firewalls may shut out this
-appliance (`shut_out`, on one of two appliances). A lost node is unregistered at the ROS master, as `rosnode cleanup`
-does, and becomes a shadow that keeps its registrations. If its API answers again, the registrations are restored,
-because a ROS 1 node never registers twice. A firewall that shuts out the appliance for a moment makes all nodes of a
-host look lost, so a lost node is checked more often at first.
+A node is *lost* if its API refuses connections several times in a row, if another process answers at its address, or
+after `silent` seconds without an answer. It then keeps its registrations as a shadow until its API answers again: a
+ROS 1 node never registers twice. A firewall that shuts out the appliance for a moment makes all nodes of a host look
+lost, so a lost node is checked more often at first.
 """
 
 import asyncio
@@ -47,7 +45,7 @@ class Presence(enum.Enum):
 
 @dataclass(frozen=True, slots=True)
 class Probe:
-    """The probe of the holder of a name. `patience` is the number of seconds until a silent node is unregistered."""
+    """The probe of the holder of a name. A silent node is unregistered after `patience` seconds."""
 
     holder: Incarnation
     presence: Presence
@@ -65,7 +63,7 @@ _MADE_UP_SECONDS = 1.0  # between two repetitions for a node that keeps failing
 
 @dataclass(slots=True)
 class MissedUpdates:
-    """The updates that did not reach a node. `made_up` is the monotonic time when missed updates were last repeated."""
+    """The updates that did not reach a node. `made_up` is the monotonic time when they were last repeated."""
 
     topics: set[str] = field(default_factory=set)
     parameters: bool = False
@@ -73,7 +71,7 @@ class MissedUpdates:
 
 
 class Watchlist:
-    """The nodes to check because of a failure. Their callers add them, and `Liveness` checks them."""
+    """The nodes to check because of a failure."""
 
     def __init__(self) -> None:
         self._nodes: dict[str, Incarnation] = {}
@@ -85,7 +83,7 @@ class Watchlist:
         self._filled.set()
 
     def could_not_tell(self, node: Incarnation, call: NodeCall, why: str) -> None:
-        """Note that a call did not reach a node, which is then checked and gets the present state once it answers."""
+        """Check a node that a call did not reach; it gets the present state once it answers."""
         _log.info("a call to a node failed", node=node.name, call=call.method, why=why)
         missed = self._missed.setdefault(node.key, MissedUpdates())
         if call.method == "publisherUpdate":
@@ -94,12 +92,11 @@ class Watchlist:
         self.look_at(node)
 
     def cut_off(self, subscriber: Incarnation, topic: str) -> None:
-        """Note that a subscriber lost its connection; once it answers, it gets the list of publishers again."""
+        """Check a subscriber that lost its connection; once it answers, it gets the list of publishers again."""
         self._missed.setdefault(subscriber.key, MissedUpdates()).topics.add(topic)
         self.look_at(subscriber)
 
     def returned(self, node: Incarnation) -> None:
-        """Note that a lost node may hold connections that have ended here, for all its topics."""
         self._missed[node.key] = MissedUpdates(set(node.resources(Kind.SUBSCRIPTION)))
 
     async def filled(self) -> None:
@@ -115,10 +112,7 @@ class Watchlist:
         return missed is not None and bool(missed.topics or missed.parameters)
 
     def to_make_up(self, node: Incarnation) -> MissedUpdates | None:
-        """Return and clear the missed updates of a node.
-
-        None: it missed none, or they were repeated in the last `_MADE_UP_SECONDS`.
-        """
+        """Return and clear the missed updates, unless some were repeated in the last `_MADE_UP_SECONDS`."""
         missed, now = self._missed.get(node.key), clock.now()
         if missed is None or (missed.made_up is not None and now - missed.made_up < _MADE_UP_SECONDS):
             return None
@@ -131,10 +125,10 @@ class Watchlist:
 
 @dataclass(eq=False)
 class Liveness:
-    """Checks nodes. Hosts take turns, so that hanging nodes of one host do not delay checks of other hosts'
-    nodes.
+    """Checks nodes. Hosts take turns, so that hanging nodes of one host do not delay checks of others.
 
-    A node that refuses `refusals` connections in a row is lost, unless `shut_out()`.
+    A node that refuses `refusals` connections in a row is lost, unless the robot's firewalls may shut out this
+    appliance (`shut_out`, on one of two appliances).
     """
 
     registry: Registry
@@ -157,7 +151,6 @@ class Liveness:
         self._turns = Turns(PROBES.bounds, quota_class)
 
     async def run(self) -> None:
-        """Check all incarnations every `interval` seconds, and nodes on the watchlist at once, until cancelled."""
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(self._look_at_all())
             tasks.create_task(self._look_at_lost())
@@ -194,9 +187,9 @@ class Liveness:
             self.look_at(incarnation)
 
     def look_at(self, incarnation: Incarnation) -> None:
-        """Start a check of a node, unless one is under way.
+        """Start a check, unless one is under way.
 
-        The publisher for monitors is not checked, because it is control itself, and only the ROS master may call it.
+        The publisher for monitors is control itself, and only the ROS master may call it.
         """
         if incarnation.key not in self._checks and not incarnation.of_monitors:
             task = asyncio.get_running_loop().create_task(self.look(incarnation))
@@ -254,7 +247,6 @@ class Liveness:
             asyncio.get_running_loop().call_later(RECENTLY_LOST_SECONDS, self.look_at, incarnation)
 
     def _make_up(self, incarnation: Incarnation) -> None:
-        """Send a node the updates that it missed; first it drops the publishers to which it is not connected."""
         missed = self.watchlist.to_make_up(incarnation)
         if missed is None:
             return
@@ -265,7 +257,6 @@ class Liveness:
             self.subscribers.tell_parameters(incarnation)
 
     async def _ask(self, incarnation: Incarnation) -> tuple[bool | None, str]:
-        """Return whether a node answers (None: the node refuses connections), and the reason if it does not."""
         for attempt in range(1, self.refusals + 1):
             try:
                 await self._call(incarnation)
@@ -280,11 +271,9 @@ class Liveness:
         return False, ""
 
     async def _call(self, incarnation: Incarnation) -> None:
-        """Call a node.
+        """Call a node. Raises `CallFailedError`, and `RefusedError` also if another process has the node's port.
 
-        Raises `CallFailedError`, and `RefusedError` also if another process has the node's port. A node that
-        registers again at the same address may be a new process, so after each registration, the first process that
-        answers becomes the expected one.
+        After each registration, the first process that answers becomes the expected one.
         """
         answer = await self.nodes.call(incarnation, "getPid", RELAY_NAME)
         match answer:

@@ -1,8 +1,6 @@
 """Register the appliance's own node, which publishes for monitors and offers the appliance's service.
 
-The node is registered like any other node. Its node API has a separate path (`PUBLISHER_PATH`) on the listener of the
-master-side endpoints. The node needs no updates, so all calls of a master are only acknowledged. The relay serves its
-messages (`NodePlaced.monitors`).
+It needs no updates, so all calls of a master to its node API are only acknowledged.
 """
 
 import asyncio
@@ -28,11 +26,7 @@ _AGAIN_SECONDS = 1.0
 
 @dataclass(eq=False)
 class OwnPublisher:
-    """The node `name`, with exactly the publications in `wanted()` (topic to type) and the services in `services`.
-
-    `register(caller, topic, type, api)` makes the call `registerPublisher`. `offer(caller, service, service_api, api)`
-    makes the call `registerService`.
-    """
+    """The node `name`, with exactly the publications in `wanted()` (topic to type) and the services in `services`."""
 
     registry: Registry
     graph: RosGraph
@@ -57,7 +51,6 @@ class OwnPublisher:
         self._woken.set()
 
     async def run(self, ready: asyncio.Event) -> None:
-        """Register and unregister until cancelled. `ready` is set once the ROS master is complete."""
         await ready.wait()
         while True:
             await self._woken.wait()

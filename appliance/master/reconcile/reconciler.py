@@ -1,14 +1,10 @@
 """Reconcile the *wanted* state (the registry, the parameter mirror) with the *seen* state of the ROS master.
 
-The same loop handles all failures: the ROS master died, control died, a call was interrupted.
-
-- A new ROS master has nothing, so it gets everything again, in the original order. Calls wait at the door
-  (`rosmaster.py`) until then.
-- A registration that is wanted but not seen is made again: it was answered, but not forwarded (`entries.py`).
-- A registration that is seen but not wanted is ended: its end was answered, but not forwarded. It is never added to the
-  registry, because the registry is stored before the ROS master gets a change.
-- After a rebuild, and after a relay starts, every subscriber gets each of its lists of publishers once. After a restart
-  of control, every node gets the values of the parameters that it subscribed to.
+- A new ROS master gets everything again, in the original order. Calls wait at the door (`rosmaster.py`) until then.
+- A registration that is seen but not wanted is ended. It is never added to the registry, because the registry is
+  stored before the ROS master gets a change.
+- After a rebuild, and after a relay starts, every subscriber gets each of its lists of publishers once. After a
+  restart of control, every node gets the values of the parameters that it subscribed to.
 """
 
 import asyncio
@@ -49,7 +45,6 @@ class Reconciler:
         self.rosmaster.doubtful.set()
 
     async def run(self) -> None:
-        """Run rounds until cancelled; repeat a failed round until it succeeds."""
         while True:
             self.rosmaster.doubtful.clear()
             try:
@@ -67,7 +62,6 @@ class Reconciler:
                 pass
 
     async def round(self) -> None:
-        """Remove all differences between the ROS master and the registry."""
         async with self.rosmaster.alone():
             pid = (await self.rosmaster.call_now("getPid", NAME))[2]
             if pid == self.entries.pid:
@@ -116,7 +110,6 @@ class Reconciler:
             self.trail.happened("reconciled", text, made=made, settled=ended)
 
     async def _seen(self) -> dict[EntryKey, MasterEntry]:
-        """Return the registrations of the ROS master, without those whose URI it no longer knows."""
         state = (await self.rosmaster.call_now("getSystemState", NAME))[2]
         publishers, subscribers, services = cast(list[list[tuple[str, list[str]]]], state)
         keys = [
@@ -140,7 +133,7 @@ class Reconciler:
         }
 
     def _entry(self, key: EntryKey, api: str, service: str) -> MasterEntry:
-        """Return a registration of the ROS master, which does not tell the type; the wanted type is assumed."""
+        """The ROS master does not tell the type; the wanted type is assumed."""
         wanted = self.entries.wanted(key)
         return MasterEntry(
             api, service if key[0] is Kind.SERVICE else wanted.detail if wanted is not None else ""

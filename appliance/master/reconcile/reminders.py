@@ -1,15 +1,10 @@
 """Send subscribers their lists of publishers again, after a relay started or a topic moved to another relay.
 
-rospy reconnects only for a list that arrives *after* rospy noticed the broken connection. An earlier list has no
-effect. roscpp reconnects to a port that stayed open. After a restart of the appliance, whose ports were closed, roscpp
-gives up and ignores an unchanged list.
-
-So a subscriber that is still absent after the first reminders gets a list without the publisher, and then a
-list with the publisher again. A subscriber without a grant is handled in the same way: the policy withdrew
-and restored the topic, and the subscriber or control missed this.
-
-Whatever the reason, a subscriber is reminded in this way as long as it is absent: after `_LASTING_SECONDS`, then at
-growing intervals.
+rospy reconnects only for a list that arrives *after* rospy noticed the broken connection. roscpp reconnects to a port
+that stayed open, but after a restart of the appliance it gives up and ignores an unchanged list. So a subscriber that
+is still absent after the first reminders gets a list without the publisher, and then a list with the publisher again.
+This also helps a subscriber without a grant: the policy withdrew and restored the topic, and the subscriber or control
+missed this.
 """
 
 import asyncio
@@ -31,14 +26,14 @@ _PAUSES = (0.5, 0.5, 1.0, 1.0, 2.0, 4.0, 8.0, 16.0)  # the seconds before each c
 
 @dataclass(frozen=True, slots=True)
 class _Absence:
-    """A subscriber of a topic that is not connected: the time of its next reminder, and the pause before it."""
+    """An unconnected subscriber of a topic: the time of its next reminder, and the pause before it."""
 
     due: float
     pause: float
 
 
 class Reminders:
-    """Checks whether all subscribers are connected, at shorter intervals after a relay was attached."""
+    """Reminds absent subscribers, first after `_LASTING_SECONDS`, then at growing intervals."""
 
     def __init__(self, registry: Registry, subscribers: Subscribers) -> None:
         self._registry = registry
@@ -82,7 +77,7 @@ class Reminders:
 
 
 class RelayMoves:
-    """The interface to the relays for specifications (`specifications.relays`).
+    """The interface to the relays for specifications.
 
     A topic moves when a specification connects it with a topic or service of another relay. No relay carries the topic
     until its connections are made again.
@@ -106,7 +101,6 @@ class RelayMoves:
         self._relay.withdraw_moving(moves)
 
     def place(self, moves: Sequence[Move]) -> None:
-        """Place moved topics and services after the new allocation was adopted, and reconnect their subscribers."""
         self._relay.place_moved(moves)
         for move in moves:
             if move.kind == TOPIC:

@@ -1,15 +1,9 @@
 """Make the store, the nodes, the ROS master and the relays agree with the registry, at the end of each turn.
 
-The registry keeps the set of changed keys: nodes, registrations and grants. `Sinks.flush` gives it to each sink, which
-compares the wanted state of each key with what it has stated, and states the difference. So the same code serves a
-change, a repetition, and a sink that starts again without any state. Invariants:
-
-1. A call is answered after its changes are flushed: they are stored, and the relay has them before a peer can use them.
-   Exception: a relay that cannot take a change gets it soon (`relay_control.py`), and the orders of operators wait.
+1. A call is answered after its changes are flushed: they are stored, and the relay has them before a peer can use
+   them. Exception: a relay that cannot take a change gets it soon (`relay_control.py`), and the orders of operators
+   wait.
 2. Whatever else changes the registry, `soon` flushes it before the event loop waits again.
-3. The ROS master gets its changes behind the answers (`entries.py`).
-
-After a restart, `restore` reads the registry from the store.
 """
 
 import asyncio
@@ -82,7 +76,7 @@ class Enforcement:
     places: NodePorts
 
     def policy_changed(self, policy: Policy) -> int:
-        """Enforce a new policy, which is already in force. Return the number of revoked rights.
+        """Enforce a policy that is already in force. Return the number of revoked rights.
 
         The policy may use another range of ports, and name hosts differently.
         """
@@ -109,8 +103,8 @@ _SHELVED = "revoked "  # the prefix of the stored kind of a withdrawn registrati
 def save(changed: Sequence[Change], grants: Grants, store: StateStore) -> None:
     """Store the present state of what has changed.
 
-    After a crash, the store has all changes of a turn or none, except that a turn with thousands of changes is divided:
-    no other change, nor the standby, waits for one large write.
+    After a crash, the store has all changes of a turn or none, except that a turn with thousands of changes is
+    divided: no other change, nor the standby, waits for one large write.
     """
     for begin in range(0, len(changed), _TOGETHER):
         with store.database.together():

@@ -1,14 +1,7 @@
 """Keep the nodes informed of the lists of publishers and of the values of parameters that they subscribed to.
 
-A list is stated like a fact to a relay: for each node and topic, `Subscribers` keeps the list that the node got last,
-in the answer to its registration or in a `publisherUpdate`. A change names the topics whose lists may differ. A node
-that returns, and each node after the ROS master or a relay started again, has no stated lists, and gets them all.
-
-Values of parameters are sent with each call that sets them, because a node may count the changes. A node gets the
-present value when its subscription is restored.
-
-Lists come from the registry. The calls of the ROS master's notification threads are ignored, because they can be
-outdated, wrong, or partial (while the ROS master is rebuilt).
+Values of parameters are sent with each call that sets them, because a node may count the changes. The calls of the ROS
+master's notification threads are ignored, because they can be outdated, wrong, or partial.
 """
 
 import sys
@@ -31,10 +24,7 @@ _Stated = dict[tuple[Kind, str], tuple[str, ...]]
 
 @dataclass(frozen=True, slots=True)
 class Subscribers:
-    """The sink of nodes. `may_read_value(node, key, value)` returns whether a node may read a parameter's value.
-
-    `tree` returns the present parameters.
-    """
+    """The sink of nodes."""
 
     registry: Registry
     grants: Grants
@@ -46,7 +36,6 @@ class Subscribers:
     """The lists that each node has; for a parameter, the node has its value."""
 
     def flush(self, changed: Iterable[Change]) -> None:
-        """Send the changed lists. A replaced node is shut down, with the ROS master's text."""
         topics: dict[str, None] = {}
         for change in changed:
             match change:
@@ -98,15 +87,14 @@ class Subscribers:
     # --- lists of publishers ---
 
     def list_for(self, subscriber: Incarnation, topic: str) -> tuple[str, ...]:
-        """Return the list for the answer to a registration; only later changes are sent."""
         uris = self._publishers_for(subscriber, topic)
         self._stated.setdefault(subscriber, {})[Kind.SUBSCRIPTION, topic] = uris
         return uris
 
     def remind_all(self, concerned: Callable[[str], bool] = lambda _topic: True) -> None:
-        """Send the lists of all `concerned` topics again: after a rebuild, for a new relay or control.
+        """Send the lists of all `concerned` topics again, after a rebuild, for a new relay or control.
 
-        The list of a revoked topic is empty. It is sent again, because control may have died before it was delivered.
+        The empty list of a revoked topic is sent again, because control may have died before it was delivered.
         """
         for node in self.registry.live():
             for kind, topic in (*node.registrations, *node.shelf):
@@ -118,13 +106,13 @@ class Subscribers:
         self._state(subscriber, Kind.SUBSCRIPTION, topic)
 
     def renew_all(self, topic: str) -> None:
-        """Have every subscriber of a topic drop its publishers and connect again, at their new ports."""
+        """Have every subscriber drop a topic's publishers and connect again, at their new ports."""
         publishers = list(self.registry.registered(Kind.PUBLICATION, topic))
         for subscriber in self.registry.registered(Kind.SUBSCRIPTION, topic):
             self.renew(subscriber, topic, publishers)
 
     def renew(self, subscriber: Incarnation, topic: str, absent: Collection[Incarnation]) -> None:
-        """Have a subscriber drop these publishers and connect again, because roscpp ignores an unchanged list."""
+        """Have a subscriber drop these publishers first, because roscpp ignores an unchanged list."""
         if absent:
             gone = {publisher.outer_uri(subscriber.told) for publisher in absent}
             without = [uri for uri in self._publishers_for(subscriber, topic) if uri not in gone]
@@ -134,7 +122,7 @@ class Subscribers:
     def absent(
         self, subscribers: Iterable[Incarnation]
     ) -> Iterator[tuple[Incarnation, str, list[Incarnation]]]:
-        """Yield each relayed topic of these subscribers with the publishers that the subscriber is not connected to.
+        """Yield topics with the publishers that a subscriber is not connected to.
 
         Grants do not matter: if one was withdrawn unnoticed, the subscriber asks again only after it drops the
         publisher. So the result depends only on data that survive a restart.
@@ -156,14 +144,13 @@ class Subscribers:
     # --- values of parameters ---
 
     def value_given(self, subscriber: Incarnation, key: str) -> None:
-        """Note that the answer to a subscription has the value of a parameter; only later changes are sent."""
         self._stated.setdefault(subscriber, {})[Kind.PARAMETER, key] = ()
 
     def parameter_deleted(self, key: str) -> None:
         self.parameter_set(key, {}, None)
 
     def parameter_set(self, key: str, value: Value, caller_id: str | None) -> None:
-        """Send a value that the ROS master accepted; the caller does not get exactly this key."""
+        """Send a value to the subscribers; its setter does not get exactly this key."""
         if not self.registry.tells_parameters:
             return
         calls: dict[str, NodeCall] = {}
@@ -181,10 +168,7 @@ class Subscribers:
             self._tell_parameter(subscriber, key)
 
     def _tell_parameter(self, subscriber: Incarnation, key: str) -> None:
-        """Send a node the present value of a parameter, if the node may read this value.
-
-        The subscription was decided by the keys that existed then, so the right to read is checked again.
-        """
+        """Send the present value if the node may still read it: the subscription was decided by earlier keys."""
         present, _ = standing_at(self.tree(), key)
         value = {} if present is None else settled(present)
         if self.may_read_value(subscriber, key, value):
@@ -196,5 +180,5 @@ def _list(topic: str, uris: Iterable[str]) -> NodeCall:
 
 
 def _param_update(key: str, value: Value) -> NodeCall:
-    """Return the same call as the ROS master makes: the key ends with `/`, and the value of an unset key is `{}`."""
+    """Like the ROS master, end the key with `/`, and send `{}` for an unset key."""
     return NodeCall("paramUpdate", (f"{key.rstrip('/')}/", value), weigh(value, sys.maxsize))
