@@ -1,12 +1,7 @@
 """The data plane of a relay: carries out control's messages, and connects peers with topics and services.
 
-The data plane makes no decisions. Control's messages change the `GrantTable`. A peer is served if the table has a grant
-for its address, its `callerid`, and the topic or service in its header.
-
-Invariants:
-- Each served connection has a grant in the table; withdrawing the grant cuts the connection.
-- Without a link to control, existing grants stay valid, and no new ones are added.
-- Control's messages behind the first specifications wait until these are in force, and are then carried out in order.
+The data plane makes no decisions: a peer is served if the `GrantTable` has a grant for its address, its `callerid`,
+and the topic or service in its header. Withdrawing a grant cuts its connection.
 """
 
 import socket
@@ -97,11 +92,10 @@ class DataPlane:
         self._calls.attach(link is not None)
 
     def copy_to(self, sink: MessageSink) -> None:
-        """Copy to this sink the messages of publishers whose topics are placed from now on."""
         self._sink = sink
 
     def take(self, message: messages.Message, descriptors: tuple[int, ...]) -> bool:
-        """Carry out one message of control; return True if the message must wait for specifications."""
+        """Return True if the message must wait for specifications; later ones then wait behind it."""
         if self.interceptor.preparing:
             return True
         self._carry_out(message, descriptors)
@@ -251,7 +245,6 @@ class DataPlane:
                 other.announce()
 
     def _claims(self, relayed: RelayedTopic) -> Iterator[Mapping[str, str]]:
-        """Yield the types that a topic may have: by its publisher's last header, specifications, subscribers."""
         if relayed.header is not None:
             yield relayed.header
         yield self.interceptor.claim_of(relayed.topic)
@@ -277,14 +270,13 @@ class DataPlane:
                 subscriber.limit(flow)
 
     def _allowance(self, grant: messages.GrantInstalled) -> RateAllowance | None:
-        """Return a subscriber's allowance; publishers' motions must not use it up for a guard's stop."""
+        """Return an allowance that publishers' motions cannot use up for a guard's stop."""
         node = self._table.node(grant.key)
         if node is not None and node.monitors:
             return None
         return self._flows.of(grant.limit, grant.topic, grant.host, grant.caller_id)
 
     def _make_room(self, host: str, size: int) -> None:
-        """Free memory for a latched message: drop latched messages of hosts that hold more than this host would."""
         latched, share = self.memory.latched, self.memory.latched.of(host)
         while share.refusal(size):
             greatest, held = max(latched.holders(), key=lambda holder: holder[1], default=("", 0))
@@ -322,9 +314,9 @@ class DataPlane:
             self._link.go_on()
 
     def _ask_for_latched(self, topics: frozenset[str] | None) -> None:
-        """Make latching publishers send the messages again that monitors held back.
+        """Ask for messages that monitors held back, on these topics only (None: all).
 
-        Ask only on these topics (None: all): monitors of other topics would judge the same message twice.
+        Monitors of other topics would judge the same message twice.
         """
         for relayed in list(self.topics.values()):
             concerned = topics is None or relayed.topic in topics
@@ -371,7 +363,7 @@ class DataPlane:
         self._cut_members(relayed, reason)
 
     def _cut_members(self, relayed: RelayedTopic, reason: str) -> None:
-        """Close the connections of a removed topic, one quantum at a time: there may be thousands."""
+        """Close the connections one quantum at a time: there may be thousands."""
         for member in relayed.members:
             member.cut(reason)
             if self._loop.over():
@@ -413,7 +405,6 @@ class DataPlane:
         self.incoming_connections.add(incoming)
 
     def _make_connection_room(self, host: str) -> bool:
-        """End a connection in favour of this host: an unserved one, or one of the host with the most connections."""
         if self._pending.make_room(host):
             return True
         pool = self.ports.connected
@@ -434,7 +425,6 @@ class DataPlane:
             yield from [member for member in relayed.members if isinstance(member, Subscriber)]
 
     def _incoming_failed(self, incoming: IncomingConnection, reason: str) -> None:
-        """Forget a peer that disconnected; report its refusal if it had no grant."""
         incoming.close()
         self._forget_incoming(incoming)
         self.ports.left(incoming.host)
@@ -452,7 +442,6 @@ class DataPlane:
             self._judge(incoming, patient=True)
 
     def _judge(self, incoming: IncomingConnection, *, patient: bool) -> None:
-        """Serve or refuse the peer; if `patient`, wait for a grant that the table does not have yet."""
         fields, rest = incoming.fields, incoming.rest
         reason = flaw(fields, rest)
         if not reason:
@@ -476,7 +465,6 @@ class DataPlane:
         return self._table.restating or self.interceptor.preparing
 
     def _recheck_waiting(self, message: messages.RelayFact) -> None:
-        """Serve the waiting peers that this statement allows; a grant concerns only peers of its host."""
         hosts = self.waiting[message.key]
         if isinstance(message, messages.GrantInstalled | messages.ClientGranted):
             found = list(hosts.get(message.host, ()))
@@ -555,7 +543,7 @@ class DataPlane:
             self._by_grant.pop(peer.grant, None)
 
     def _refuse(self, asked: PeerGrant, sock: socket.socket, reason: str) -> None:
-        """Send the peer the reason, then close its connection, which counts for its host until then."""
+        """Refuse the peer, whose connection counts for its host until it is closed."""
         kind, key, name, host, caller_id = asked
         self._reporter.refused(key, (kind, name), host, caller_id, reason)
 

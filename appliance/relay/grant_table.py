@@ -1,14 +1,8 @@
 """The state that control wants: incarnations, publications, services, and the grants for them.
 
-The table answers two questions: "does this peer have a grant?" and "which topics and services are at this port?". It
-also turns a restatement into withdrawals.
-
-Invariants:
-- The relay serves only what the table lists.
-- Between `StateBegan` and `StateEnded`, all earlier facts stay valid, so a restart of control interrupts no connection.
-  `StateEnded` withdraws the facts that were not stated again. If control dies before `StateEnded`, the next
-  `StateBegan` starts over and withdraws nothing.
-- Withdrawing an incarnation withdraws its publications, services and grants.
+Between `StateBegan` and `StateEnded`, all earlier facts stay valid, so a restart of control interrupts no connection.
+`StateEnded` withdraws the facts that were not stated again. If control dies before `StateEnded`, the next `StateBegan`
+starts over and withdraws nothing. Withdrawing an incarnation withdraws its publications, services and grants.
 """
 
 from collections import Counter
@@ -55,7 +49,6 @@ class GrantTable:
         self._epoch = epoch
 
     def end(self, epoch: int) -> list[messages.Message]:
-        """End the restatement: withdraw the facts that were not restated, and return these withdrawals."""
         if self._restated is None or epoch != self._epoch:
             return []
         gone = [fact for fact in self._facts if fact not in self._restated]
@@ -88,7 +81,6 @@ class GrantTable:
         return self.quota_class(host) is QuotaClass.REGISTERED
 
     def quota_class(self, host: str) -> QuotaClass:
-        """Return the quota class of a host: registered if the host has a node or a grant."""
         return QuotaClass.REGISTERED if host in self._hosts else QuotaClass.UNKNOWN
 
     def payer(self, host: str) -> str:

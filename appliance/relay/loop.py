@@ -1,25 +1,19 @@
 """The relay's event loop: epoll and timers, single-threaded; long work runs in a thread `beside` it.
 
-The loop does not use asyncio, which costs a callback, a transport and a future for each read. Raw epoll with one bound
-method per descriptor halves the delay of a relayed message. The pump waits (`transport/pump.pyx`), and serves armed
-connections that are ready alone without Python.
+asyncio costs a callback, a transport and a future for each read. Raw epoll halves the delay of a relayed message. The
+pump waits (`transport/pump.pyx`), and serves armed connections that are ready alone without Python.
 
-Hosts share processor time by quota. Each descriptor has a *payer*: a host that the policy names, all other registered
-hosts together, all unregistered hosts together, or new connections. The relay's own descriptors (control, lifeline)
-have no payer. The descriptors of a payer beyond the first `_DIRECT` are in a second epoll, inside the loop's epoll. So
-a payer with many ready descriptors cannot hide the ready descriptors of other payers. Payers are served by deficit
-round robin in its continuous form. The payer that has used the least processor time goes first, for at most `QUANTUM`.
-Idle time earns a credit of at most one quantum, and a new payer starts behind the others. A payer is *costly* if it
-used much more than a quantum in its last turn. Before a costly payer, the other ready payers share one quantum, even if
-they have used more.
+Each descriptor has a *payer* for its processor time. The descriptors of a payer beyond the first `_DIRECT` are in a
+second epoll, so a payer with many ready descriptors cannot hide those of other payers. Payers are served by deficit
+round robin in its continuous form: the payer that has used the least processor time goes first. Idle time earns a
+credit of at most one quantum, and a new payer starts behind the others. Before a *costly* payer, which used much more
+than a quantum in its last turn, the other ready payers share one quantum.
 
-Invariants:
-- A handler is never called for a descriptor that was unwatched earlier in the same turn. `discard` closes a socket only
-  at the end of the turn, so its number cannot refer to another socket in that turn. An event that waits for the payer's
-  next turn is forgotten when its descriptor is unwatched or changed.
+- A handler is never called for a descriptor that was unwatched earlier in the same turn. `discard` closes a socket
+  only at the end of the turn, so its number cannot refer to another socket in that turn.
 - A turn calls the relay's own handlers first. Once payers have used `QUANTUM` in a turn, the turn serves no further
-  payer, except one costly payer. A payer that has used `QUANTUM` in a turn starts no further handler; the same holds
-  for the timers together. A handler with much to do stops when the quantum is `over`, and passes the rest to `later`.
+  payer, except one costly payer. A payer that has used `QUANTUM` starts no further handler; the same holds for the
+  timers together. A handler with much to do stops when the quantum is `over`, and passes the rest to `later`.
 - A handler that raises an exception has a defect: the process ends, and the supervisor starts another.
 """
 
@@ -153,7 +147,7 @@ class _WorkThread:
 
 
 class EventLoop:
-    """The loop, which watches descriptors and timers until `stop`. `processor_time` returns nanoseconds."""
+    """Watches descriptors and timers until `stop`. `processor_time` returns nanoseconds."""
 
     def __init__(self, processor_time: Callable[[], int] = time.thread_time_ns) -> None:
         self._epoll = select.epoll()
@@ -199,14 +193,13 @@ class EventLoop:
             found.direct += epoll is self._epoll
 
     def change(self, descriptor: int, events: int) -> None:
-        """Wait for other events on a watched descriptor; errors and hang-ups are always reported."""
+        """Wait for other events; errors and hang-ups are always reported."""
         watched = self._watched[descriptor]
         watched.epoll.modify(descriptor, events)
         if watched.payer is not None:
             watched.payer.events.pop(descriptor, None)
 
     def unwatch(self, descriptor: int) -> None:
-        """Call no handler for the descriptor any more; ignore an unknown descriptor."""
         watched = self._watched.pop(descriptor, None)
         if watched is None:
             return
@@ -219,13 +212,11 @@ class EventLoop:
             payer.direct -= watched.epoll is self._epoll
 
     def discard(self, sock: socket.socket) -> None:
-        """Unwatch a socket now and close it at the end of this turn."""
         if sock.fileno() >= 0:
             self.unwatch(sock.fileno())
             self._discarded.append(sock)
 
     def after(self, seconds: float, callback: Callable[[], None]) -> LoopTimer:
-        """Call `callback` once, `seconds` from now."""
         timer = LoopTimer(callback)
         heapq.heappush(self._timers, (self.clock() + seconds, next(self._order), timer))
         return timer
@@ -243,18 +234,17 @@ class EventLoop:
         return _WorkThread(self, work, done)
 
     def used(self) -> int:
-        """Return the processor time (ns) of the running handler, or since the first call if its start is unknown."""
+        """The running handler's processor time (ns), or the time since the first call if its start is unknown."""
         now = self._processor_time()
         if self._since == _UNKNOWN:
             self._since = now
         return now - self._since
 
     def over(self) -> bool:
-        """Return whether the running handler has used up its quantum; it should then pass the rest to `later`."""
         return self.used() >= QUANTUM
 
     def charge(self, payer: str, used: int) -> None:
-        """Charge this processor time to a payer, in addition to the payer of the running handler.
+        """Charge a payer in addition to the payer of the running handler.
 
         While no other descriptor is ready, the use takes time from no other host, so it leaves no debt.
         """
@@ -272,7 +262,6 @@ class EventLoop:
             self.turn(_LONGEST_WAIT)
 
     def turn(self, longest: float) -> None:
-        """Wait for at most `longest` seconds, then call ready handlers and due timers, for a quantum."""
         timers = self._timers
         if timers:
             left = timers[0][0] - self.clock()
@@ -323,7 +312,6 @@ class EventLoop:
                     payer.crowd.close()
 
     def _serve_alone(self, number: int, events: int) -> None:
-        """Serve the only ready descriptor; do not charge a short handler."""
         self._since, began = _UNKNOWN, self.pump.began or self.clock()
         handler, payer, _ = self._watched[number]
         self._alone = True
@@ -337,7 +325,6 @@ class EventLoop:
             self._floor = max(self._floor, payer.spent)
 
     def _serve_many(self, found: list[tuple[int, int]]) -> None:
-        """Call the relay's own handlers, then serve payers, those with the least use first, until a quantum is over."""
         ready = dict(self._waiting)
         for number, events in found:
             watched = self._watched.get(number)
@@ -376,7 +363,7 @@ class EventLoop:
         self._floor = max(self._floor, min(map(_spent, in_order)))
 
     def _serve(self, payer: _Payer) -> None:
-        """Serve one payer for a quantum; its events and its postponed callbacks take turns in going first."""
+        """A payer's events and its postponed callbacks take turns in going first."""
         began = self._since
         if not payer.later:
             self._call_ready(payer, began)

@@ -1,7 +1,7 @@
 """The relay as a process of the appliance: lifeline, link to control, and the loop.
 
-The process ends when the supervisor sends `Stop` or exits (which closes the lifeline). The relay outlives control:
-without a link, it continues under the existing grants until the supervisor opens a link to the next control.
+Without a link to control, it continues under the existing grants until the supervisor opens a link to the next
+control.
 """
 
 import contextlib
@@ -38,7 +38,7 @@ def main(lifeline_fd: int, index: int, limits: RelayLimits | None = None) -> Non
 
 
 class RelayProcess:
-    """Connects a `DataPlane` to the lifeline and to the current control."""
+    """The `DataPlane` with the lifeline and the current control."""
 
     def __init__(self, lifeline: socket.socket, index: int, limits: RelayLimits) -> None:
         self._index = index
@@ -85,7 +85,6 @@ class RelayProcess:
             raise TypeError(f"the supervisor sent a relay {type(message).__name__}")
 
     def _keep_state(self, given: messages.StateGiven, descriptor: int) -> None:
-        """Map memory for monitors' state; keep the state there from now on if it is this relay's own memory."""
         memory = mapped(descriptor, writable=given.own)
         if given.own:
             self._engine.interceptor.remember(StateKeeper(given, memory, self._earlier))
@@ -112,12 +111,12 @@ class RelayProcess:
 
 
 def descriptors_for(connections: int) -> int:
-    """Return the number of descriptors that a relay needs: each connection of a peer may need a second connection."""
+    """Each connection of a peer may need a second connection."""
     return 2 * connections + _DESCRIPTORS_BESIDE
 
 
 def fitted(limits: RelayLimits, descriptors: int) -> RelayLimits:
-    """Return the limits with no more connections than descriptors allow, so that surplus peers are refused."""
+    """Allow no more connections than descriptors, so that surplus peers are refused."""
     possible = max(1, (descriptors - _DESCRIPTORS_BESIDE) // 2)
     if possible >= limits.connections:
         return limits
@@ -127,7 +126,6 @@ def fitted(limits: RelayLimits, descriptors: int) -> RelayLimits:
 
 
 def _raise_descriptor_limit(wanted: int) -> int:
-    """Raise this process's limit of descriptors as far as the system allows; return the resulting limit."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     if soft != resource.RLIM_INFINITY and soft < wanted:
         reachable = wanted if hard == resource.RLIM_INFINITY else min(wanted, hard)

@@ -1,15 +1,9 @@
-"""Reports to control: connections, refusals, lost publishers, traffic.
+"""Reports to control: connections, refusals, lost publishers, traffic. A new control gets the counts so far.
 
-Without a link, the counters continue, and refusals are counted. A new control gets both counts, and the connections
-that are open or have ended since.
-
-Invariants:
 - `TrafficReported` is sent at most once per `report_every`.
 - Equal refusals within that time become one message with a count, and at most `refusals` different ones are sent. So a
   flood of unknown hosts can neither grow the relay nor fill the link.
-- Messages dropped by limits are counted separately for at most `_KEPT` limits; the others are counted together.
-- At most `_KEPT` connections that end without a link are kept for the next control process; the others are only
-  counted.
+- At most `_KEPT` limits and `_KEPT` ended connections are kept without a link; further ones are only counted.
 """
 
 from collections.abc import Callable, Mapping
@@ -90,10 +84,7 @@ class Reporter:
             self._unrecorded += 1
 
     def refused(self, key: str, asked: tuple[str, str], host: str, caller_id: str, reason: str) -> None:
-        """Report the first such refusal at once, and count repetitions until the next `tick`.
-
-        `asked` is the kind and name of the topic or service in the connection's header.
-        """
+        """Report the first such refusal at once, and count repetitions until the next `tick`."""
         kind, resource = asked
         refusal = (key, kind, resource[:_TEXT], host, caller_id[:_TEXT], reason[:_TEXT])
         if refusal in self._refused:
@@ -106,7 +97,6 @@ class Reporter:
             self._refused[folded] = self._refused.get(folded, 0) + 1
 
     def limited(self, what: _Limited, messages: int, size: int) -> None:
-        """Count messages that a limit dropped, for the next tick: one row for each limit."""
         if what not in self._limited and len(self._limited) >= _KEPT:
             what = ("", "", what[2], "", "")
         row = self._limited.setdefault(what, [0, 0])
@@ -114,10 +104,7 @@ class Reporter:
         row[1] += size
 
     def tick(self, traffic: Callable[[], list[TopicTraffic]], memory: Mapping[str, int]) -> None:
-        """Send the counts since the last tick; without a link, keep them until the next one.
-
-        `traffic` returns and resets the traffic counts; `memory` has the bytes held now in each pool.
-        """
+        """`traffic` returns and resets the traffic counts; `memory` has the bytes held now in each pool."""
         if self._link is None:
             self._silent += 1
             return

@@ -1,8 +1,6 @@
 """Tap topics: send control a few messages, parsed, as subscribers get them; an operator requests this.
 
-The relay parses the messages, because it handles untrusted bytes anyway; the definition comes from the publisher's
-header. The data for control is bounded: `roswire/message_view.py` cuts long values, and a tap sends at most
-`MOST_MESSAGES`.
+The relay parses the messages, because it handles untrusted bytes anyway; control gets bounded data.
 """
 
 from __future__ import annotations
@@ -72,7 +70,6 @@ class _Reader:
         self._reader = PublisherReader({})
 
     def read(self, data: bytes) -> tuple[str, dict[str, Any], str]:
-        """Return the type, the fields, and why only the first bytes are shown (empty if the message was parsed)."""
         header = self._topic.header or {}
         if header is not self._header:
             self._header, self._reader = header, self._made_for(header)

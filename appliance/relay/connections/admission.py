@@ -1,8 +1,7 @@
 """Check a peer's header for flaws, and compare it with the grant table.
 
-A flawed header is refused at once. A missing grant may still arrive: on the link, or in the restatement of a new
-control. roscpp never tries again after an error header. Therefore a peer without a grant waits for
-`RelayLimits.grant_seconds`, and until a restatement ends.
+roscpp never tries again after an error header. Therefore a peer without a grant waits for `RelayLimits.grant_seconds`,
+and until a restatement ends.
 """
 
 from collections.abc import Mapping
@@ -20,12 +19,11 @@ NOTHING = ("", "")
 
 
 def asked_for(fields: Mapping[str, str]) -> tuple[str, str]:
-    """Return the kind and the name of the topic or service in a header; two empty strings if there is none."""
     return next(((kind, fields[kind]) for kind in _REQUIRED if fields.get(kind)), NOTHING)
 
 
 def flaw(fields: Mapping[str, str], rest: bytes) -> str:
-    """Return why a header is rejected, in rospy's words where possible; an empty string if the header is valid."""
+    """Return why a header is rejected, in rospy's words where possible; empty if it is valid."""
     if "topic" in fields and "service" in fields:
         return "its header names a topic and a service; a connection is for one of them"
     for kind, required in _REQUIRED.items():
@@ -44,7 +42,6 @@ def flaw(fields: Mapping[str, str], rest: bytes) -> str:
 
 
 def missing(table: GrantTable, key: str, host: str, fields: Mapping[str, str]) -> str:
-    """Return which entry or grant is missing to serve this peer at the port of incarnation `key`; empty if none."""
     node = table.node(key)
     name = key if node is None else node.name
     caller_id = fields["callerid"]
@@ -64,10 +61,10 @@ def missing(table: GrantTable, key: str, host: str, fields: Mapping[str, str]) -
 
 
 def bound_name(table: GrantTable, key: str, host: str, fields: Mapping[str, str]) -> str | None:
-    """Return the name under which a client calls a service; None if it may not call the service.
+    """Return the name under which a client calls a service; None if it may not.
 
-    A client with a grant keeps its own name. A probe calls nothing, so a tool may look up a service under one name and
-    probe under another (roswtf probes as `/rosservice`). The service then sees the name of the lookup.
+    A probe calls nothing, so a tool may look up a service under one name and probe under another (roswtf probes as
+    `/rosservice`). The service then sees the name of the lookup.
     """
     caller_id, service = fields["callerid"], fields["service"]
     if table.may_call(key, service, host, caller_id):

@@ -1,9 +1,7 @@
 """The requests of service clients that need an operator's approval: control decides each of them.
 
-Invariants:
 - A request reaches the monitors and the service only after control has approved it.
-- A client waits for at most one answer, so the number of open questions is that of clients. Control gets at most
-  `MOST_OF_HOST` of a host at once, because it answers other hosts in the same thread.
+- Control gets at most `MOST_OF_HOST` of a host at once, because it answers other hosts in the same thread.
 - If control ends first, all open requests are refused.
 """
 
@@ -22,7 +20,7 @@ Answered = Callable[[str], None]
 
 
 class CallApprovals:
-    """The open questions, which `send` passes to control."""
+    """The open questions, at most one for each client."""
 
     def __init__(self, loop: EventLoop, send: Callable[[Message], None]) -> None:
         self._loop = loop
@@ -34,7 +32,7 @@ class CallApprovals:
         self._number = 0
 
     def ask(self, caller: tuple[str, str, str], type_: str, body: bytes, answered: Answered) -> int:
-        """Ask control about a request; return its number. `caller` is the service, the host and the name of the client.
+        """Return the request's number. `caller` is the service, the host and the name of the client.
 
         `answered` is called once, in a later turn of the loop, unless the request is forgotten.
         """

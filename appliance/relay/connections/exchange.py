@@ -1,12 +1,8 @@
 """The requests and replies of one service connection after the headers, without sockets.
 
-The client sends a request, and the service answers with a reply. A request that comes before the previous reply waits,
-and the relay stops reading the client (`may_read`). The relay parses every request and reply, has monitors judge it,
-and encodes it again (`_request`, `_reply`).
-
-Invariants:
 - The service has at most one request at a time. A reply without a request is an error.
-- A client that does not read its replies gets no further request through.
+- A client that does not read its replies gets no further request through, and the relay stops reading a client whose
+  request waits.
 - A request that needs an approval is held; it reaches monitors and the service only by `settle`.
 """
 
@@ -28,12 +24,9 @@ _REPLY_HEAD = 5  # bytes before the body of a reply
 
 
 class ServiceExchange:
-    """The requests and replies of one connection; `to_service(data)` and `to_client(data)` write them.
+    """The requests and replies of one connection.
 
-    `count(size)` is called for each request and reply. `held` counts the bytes of incomplete and waiting requests;
-    `held_replies` counts the bytes of incomplete replies. `asks(body)` returns whether a request is held until
-    `settle`. `judge(part, body)` returns the monitors' verdict on a
-    `request` or `response`.
+    `held` counts the bytes of incomplete and waiting requests, `held_replies` those of incomplete replies.
     """
 
     def __init__(
@@ -72,16 +65,13 @@ class ServiceExchange:
 
     @property
     def unfinished(self) -> int:
-        """Return the bytes of an incomplete request or reply; 0 while complete requests wait for their turn."""
         return self.held_replies + (0 if self._waiting else self.held)
 
     def from_client(self, data: bytes) -> None:
-        """Parse bytes from the client. Raises `PeerError` if they are not a request."""
         self.held += len(data)
         self._waiting.extend(self._requests.feed(data))
 
     def from_service(self, data: bytes) -> None:
-        """Parse bytes from the service. Raises `PeerError` if they are not a reply to a request."""
         self.held_replies += len(data)
         for reply in self._replies.feed(data):
             if not self._busy:
@@ -89,14 +79,12 @@ class ServiceExchange:
             self._reply(reply)
 
     def advance(self) -> None:
-        """Send the next waiting request. Call this only when the client has read everything written to it."""
         if self.ready:
             body = self._asking = self._waiting.popleft()
             if not self._asks(body):
                 self.settle("")
 
     def settle(self, refused: str) -> None:
-        """Pass the held request on, or refuse it with this reason."""
         body, self._asking = self._asking, None
         if body is None:
             raise RuntimeError("no request is held")

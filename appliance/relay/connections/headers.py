@@ -1,4 +1,4 @@
-"""Write the connection headers for peers, services and publishers: known fields only, with verified names.
+"""Write the connection headers for peers, services and publishers.
 
 Headers are not trusted. The sender's name is replaced by the registered one. Fields that ROS does not define are
 dropped, because no rule decides on them.
@@ -26,7 +26,6 @@ def kept(fields: Mapping[str, str]) -> dict[str, str]:
 
 
 def canonical(fields: dict[str, str]) -> dict[str, str]:
-    """Return a peer's header with the canonical form of its name, under which control has granted what it asks for."""
     try:
         return {**fields, "callerid": canonical_tool_id(fields.get("callerid", ""))}
     except InvalidNameError:
@@ -45,7 +44,6 @@ def size_of(fields: Mapping[str, str]) -> int:
 
 
 def switched_on(fields: Mapping[str, str], name: str) -> bool:
-    """Return whether a field is set, in any spelling that the client libraries accept."""
     return fields.get(name, "").lower() in _TRUE
 
 

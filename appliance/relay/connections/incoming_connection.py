@@ -1,11 +1,7 @@
 """Accepted connections until their headers are known, and refused connections.
 
-Invariants:
-- A peer has `header_seconds` and `header_bytes` for its header. Until its header is complete, a peer costs one socket
-  and the bytes that it has sent. `pending_connections` counts these bytes, and refuses a peer without memory for them.
-- A refused peer gets a TCPROS header with `error=<reason>`, as from any publisher or service. The peer has `farewell`
-  seconds to read the header. The relay shuts the connection for writing before closing it: closing a socket with unread
-  data resets the connection, and the reason would be lost.
+A refused peer gets a TCPROS header with `error=<reason>`. The relay shuts the connection for writing before closing
+it: closing a socket with unread data resets the connection, and the reason would be lost.
 """
 
 import socket
@@ -21,10 +17,9 @@ from roswire.tcpros import HeaderParser, encode_header
 
 
 class IncomingConnection:
-    """An accepted connection whose header is not complete.
+    """An accepted connection whose header is not complete, which costs one socket and the bytes received.
 
-    When the header is complete, `fields` holds it, `rest` holds the bytes after it, and `introduced(self)` is called.
-    If no header will come, `failed(self, reason)` is called. Each of the two calls ends this stage.
+    `introduced(self)` or `failed(self, reason)` ends this stage; `rest` has the bytes after the header.
     """
 
     def __init__(
@@ -57,13 +52,11 @@ class IncomingConnection:
         pending.enter(self, host)
 
     def take(self) -> socket.socket:
-        """Return the socket, which the caller owns from now on."""
         self._timer.cancel()
         self._pending.leave(self)
         return self._stream.take()
 
     def wait(self, seconds: float, callback: Callable[[], None]) -> None:
-        """Call back later, unless the connection is taken or closed by then."""
         self._timer.cancel()
         self._timer = self._loop.after(seconds, callback)
         self._stream.read(False)
@@ -99,7 +92,7 @@ class IncomingConnection:
 
 
 class RefusedConnection:
-    """A refused peer that has not read the reason yet; `ended(self)` is called when its connection is closed."""
+    """A refused peer that has not read the reason yet."""
 
     def __init__(
         self,

@@ -1,9 +1,8 @@
 """The header with which the relay introduces itself to a publisher: any type first, then the likely ones.
 
-The relay passes on any type, so it asks for `type=*`, `md5sum=*`. rospy and roscpp accept that; rosgo, roslibrust up
-to 0.9 and many nodes written by hand accept only their own type and md5sum, and some demand a `message_definition`.
-They refuse with an error header, or just close the connection. The relay then introduces itself again with each claim
-that it knows. The first accepted header is used for all later connections.
+rospy and roscpp accept `type=*`, `md5sum=*`; rosgo, roslibrust up to 0.9 and many nodes written by hand accept only
+their own type and md5sum, and some demand a `message_definition`. They refuse with an error header, or just close the
+connection.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -14,10 +13,9 @@ _MOST = 8  # claims that one publisher is asked with; subscribers choose them
 
 
 class Introductions:
-    """The header fields for the next connection to one publisher.
+    """The header fields for the next connection to one publisher; accepted fields are used for all later ones.
 
-    `claims` returns known fields `type`, `md5sum` and `message_definition`, the most likely ones first; `registered`
-    returns the type that the publisher has registered, which replaces an unknown one.
+    `claims` returns known fields, the most likely ones first; the `registered` type replaces an unknown one.
     """
 
     def __init__(

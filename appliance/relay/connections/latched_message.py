@@ -9,8 +9,7 @@ from appliance.relay.transport.memory import HostMemory
 class LatchedMessage:
     """The message that late subscribers of one topic get, or none; `share` counts its memory.
 
-    `make_room(size)` tries to free that many bytes of other hosts. `refused(size)` is called for the first
-    message that is not kept.
+    `refused(size)` is called for the first message that is not kept.
     """
 
     def __init__(
@@ -35,7 +34,6 @@ class LatchedMessage:
 
     @property
     def is_asked_again(self) -> bool:
-        """Whether there is now memory for a message that was not kept, so the publisher can send it again."""
         return self._refused_size is not None and not self._share.refusal(self._refused_size)
 
     @property
@@ -43,7 +41,6 @@ class LatchedMessage:
         return self._refused_size is not None
 
     def keep(self, batch: Batch) -> None:
-        """Keep the last message of a batch if its publisher's host has the memory."""
         self._free()
         size = len(batch.view) - batch.find_last()
         if self._share.refusal(size):

@@ -1,11 +1,9 @@
 """The relay's listening sockets, one for each incarnation, and the limits on connections.
 
-Invariants:
-- At most `connections` peers are connected, with at most `connections_per_host` from one host. All unknown hosts share
-  one quota (`RELAY_CONNECTIONS`). The limits include peers that are not served yet. If all connections are in use, a
-  peer within its quota is accepted if `make_room` ends another connection.
-- The loop has a separate payer for accepting. A flood of connections is accepted one quantum at a time, and each
-  connection is also charged to its host. When the process has no descriptor left, listening pauses.
+- The limits include peers that are not served yet. All unknown hosts share one quota (`RELAY_CONNECTIONS`). If all
+  connections are in use, a peer within its quota is accepted if `make_room` ends another connection.
+- A flood of connections is accepted one quantum at a time, and charged to its hosts. When the process has no
+  descriptor left, listening pauses.
 """
 
 import errno
@@ -23,11 +21,7 @@ _EXHAUSTED = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM}
 
 
 class ListeningPorts:
-    """Accepts peers: calls `arrived(key, sock, host)`, or `turned_away(key, host, reason)` when a limit is reached.
-
-    `quota_class(host)` returns a host's class in the table, `payer(host)` its payer in the loop. `make_room(host)` ends
-    another connection in favour of this host, and returns False if it found none to end.
-    """
+    """Accepts peers: calls `arrived(key, sock, host)`, or `turned_away(key, host, reason)` when a limit is reached."""
 
     def __init__(
         self,
@@ -50,7 +44,6 @@ class ListeningPorts:
         self.connected: Pool[str] = Pool("connections to the relay", bounds, quota_class)
 
     def open(self, key: str, descriptor: int) -> None:
-        """Listen on this socket for the incarnation, then close its earlier socket."""
         sock = socket.socket(fileno=descriptor)
         sock.setblocking(False)
         before = self._listening.get(key)
@@ -112,7 +105,6 @@ class ListeningPorts:
         self._loop.after(_NO_DESCRIPTOR_PAUSE, resume)
 
     def _take(self, host: str) -> str:
-        """Count one more connection of this host; return the reason if a limit forbids it and no other can be ended."""
         pool = self.connected
         reason = pool.take(host)
         while reason and pool.held(host) < pool.bounds.host and self._make_room(host):

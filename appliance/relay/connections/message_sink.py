@@ -11,7 +11,7 @@ class MessageStream(Protocol):
     def keeps(self) -> bool: ...
 
     def write(self, frames: memoryview, messages: int, first: int, judged: int = 0) -> None:
-        """Take frames with this number of messages, of which `first` is the first one's number.
+        """Take frames, of which `first` is the first one's number.
 
         `judged` is the time by which monitors judged them; 0: now.
         """
@@ -24,7 +24,7 @@ class MessageSink(Protocol):
     """Gets the messages of all publishers."""
 
     def open(self, topic: str, host: str, header: Mapping[str, str]) -> MessageStream | None:
-        """Begin a stream for a publisher; return None if the sink does not take its messages."""
+        """Return None if the sink does not take the publisher's messages."""
 
 
 OpenSink = Callable[[Mapping[str, Any], int, Callable[[], int]], MessageSink]

@@ -1,13 +1,8 @@
 """The service calls of monitors, which the appliance's own node makes.
 
-Control decides each call by the policy, grants it like that of another client, and answers with the port of the service
-on its relay. The relay then connects to this port as any client does. So the call passes through all checks, and its
-request and response are events of the service.
-
-Invariants:
-- At most `MOST` calls are under way, and `MOST_OF_MONITOR` of one monitor. Each ends after
-  `RelayLimits.service_seconds` at the latest.
-- Each call that does not get a successful response is reported once, as a fault of its monitor.
+The relay connects to the service's port as any client does. So the call passes through all checks, and its request and
+response are events of the service. Each call that does not get a successful response is reported once, as a fault of
+its monitor.
 """
 
 from __future__ import annotations
@@ -50,9 +45,7 @@ class _Call:
 
 
 class ServiceCalls:
-    """The calls under way, with control's other answers: calls of the appliance's own service (`own`), and
-    requests that need an approval (`approvals`).
-    """
+    """The calls under way, with control's answers about the appliance's own services and approvals."""
 
     def __init__(self, context: RelayContext) -> None:
         self.own = OwnService(context.loop, context.reporter.send)
@@ -82,7 +75,6 @@ class ServiceCalls:
             loop.after(0, lambda: self._end(number, "the appliance's control is not running"))
 
     def answered(self, message: OwnAnswer) -> None:
-        """Make the call that control has granted, or report that it was denied; or pass an answer on."""
         if isinstance(message, OwnServiceAnswered):
             self.own.answered(message)
             return
@@ -117,7 +109,6 @@ class ServiceCalls:
         )
 
     def attach(self, connected: bool) -> None:
-        """End the calls that wait for a control process that has ended."""
         self._connected = connected
         self.own.control_gone()
         self.approvals.attach(connected)

@@ -1,11 +1,9 @@
 """Extra connections that show a publisher the names of its subscribers; only action topics need them.
 
-A publisher sees one connection of the relay for all subscribers. However, an action client publishes goals and
-cancellations, and waits until *its server* subscribes to both (actionlib, `wait_for_server`). The client recognizes the
-server by the `callerid` of the status messages. On these topics the relay opens one more connection to the publisher
-for each served subscriber, with the subscriber's `callerid`. Messages on that connection are discarded. At most sixteen
-names of a host get such a connection, the action's server first: it also publishes the action's status. The relay opens
-it after it has begun to serve the subscriber, so the subscriber gets everything that the publisher sends from then on.
+An action client waits until *its server* subscribes to its goals and cancellations, and recognizes the server by the
+`callerid` of the status messages (actionlib, `wait_for_server`). At most sixteen names of a host get an extra
+connection, the action's server first. The relay opens it after it has begun to serve the subscriber, so the subscriber
+gets everything that the publisher sends from then on.
 """
 
 from collections.abc import Callable, Collection, Mapping
@@ -50,7 +48,7 @@ class ActionServers:
 
 
 class NamedSubscribers:
-    """The extra connections to one publisher of one topic, while its main connection is open (`open` to `close`)."""
+    """The extra connections to one publisher of one topic. Messages on them are discarded."""
 
     def __init__(self, context: RelayContext, topic: str, host: str) -> None:
         self._context = context
@@ -67,7 +65,6 @@ class NamedSubscribers:
         self._address, self._accepted = address, accepted
 
     def announce(self, names: Callable[[], frozenset[str]], type_name: str) -> None:
-        """Show these subscribers, as they are after this turn of the loop, if the publisher looks for names."""
         if self._address is not None and looks_for_names(type_name) and self._announcing is None:
             self._announcing = self._context.loop.after(0, lambda: self._show(names()))
 

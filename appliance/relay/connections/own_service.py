@@ -1,12 +1,8 @@
 """The services that the appliance itself offers (`std_srvs/Trigger`); control answers them through the relay.
 
-`OwnServer` replaces the connection to a node, so grants, headers, monitors and limits apply as for any other service.
-
-Invariants:
-- Control gets at most one call of a service from a host at a time, and at most one a second, so a single host cannot
-  keep control busy. Further calls of that host get the same answer if it `repeats`. An answer about the holder of a
-  group may be outdated by then, so they wait for the end of the second, and get the answer to one new call.
-- Every call is answered. If control ends first, the answer reports that control is not running.
+Control gets at most one call of a service from a host at a time, and at most one a second, so a single host cannot
+keep control busy. Further calls of that host get the same answer if it `repeats`. An answer about the holder of a
+group may be outdated by then, so they wait for the end of the second. If control ends first, the answer reports this.
 """
 
 from collections.abc import Callable
@@ -50,7 +46,6 @@ class OwnService:
         self._number = 0
 
     def call(self, service: str, host: str, caller_id: str, server: "OwnServer") -> None:
-        """Ask control, or repeat or await the answer to this host's call of the last second."""
         last = self._calls.get((service, host))
         if last is None or 0 < last.until <= self._loop.clock():
             self._ask(service, host, caller_id, [*([] if last is None else last.waiting), server])
@@ -106,10 +101,9 @@ class OwnService:
 
 
 class OwnServer:
-    """One client's connection, with the methods of a `BufferedSocket`; `received` gets the bytes of a service.
+    """One client's connection, with the methods of a `BufferedSocket`.
 
-    `opened()` is called in the next turn of the loop. After that, `send` expects the client's header, and
-    then its requests.
+    It replaces the connection to a node, so grants, headers, monitors and limits apply as for any other service.
     """
 
     backlog = 0
@@ -132,7 +126,6 @@ class OwnServer:
         self._timer = loop.after(0, opened)
 
     def send(self, data: bytes) -> None:
-        """Take the client's header, which its grant has verified, and then its empty requests."""
         if self._greeted:
             self._own.call(*self._called, self)
             return

@@ -8,7 +8,7 @@ from roswire.tcpros import encode_frame
 
 
 class OwnTopicPublisher(Upstream):
-    """The `Upstream` of one topic that the appliance publishes; `header()` is None if no specification publishes it."""
+    """The upstream of one such topic; `header()` is None if no specification publishes it."""
 
     def __init__(self, topic: RelayedTopic, header: Callable[[], dict[str, str] | None]) -> None:
         self._topic = topic

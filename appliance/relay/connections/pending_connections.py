@@ -1,10 +1,8 @@
 """Connections that are not served yet: the memory for their headers, and the order in which they are ended.
 
-Invariants:
-- The first `_FREE` bytes of a header are not counted, so a flood of long headers does not keep out normal ones. The
-  other bytes count as memory of the connection's host.
-- When a connection must end, connections of hosts without a grant come first, and the one that has waited longest ends.
-  A connection of a host with a grant is ended only after it has waited `_PATIENCE` seconds.
+- The first `_FREE` bytes of a header are not counted, so a flood of long headers does not keep out normal ones.
+- When a connection must end, connections of hosts without a grant come first, in order of their wait. A connection of
+  a host with a grant is ended only after it has waited `_PATIENCE` seconds.
 """
 
 from collections.abc import Callable
@@ -25,11 +23,7 @@ class PendingConnection(Protocol):
 
 
 class PendingConnections:
-    """The connections that are not served yet.
-
-    `quota_class(host)` shows whether a host has a grant; `clock` is monotonic seconds; `headers` is the memory for
-    headers.
-    """
+    """The connections that are not served yet."""
 
     def __init__(
         self, clock: Callable[[], float], quota_class: Callable[[str], QuotaClass], headers: MemoryPool
@@ -54,7 +48,6 @@ class PendingConnections:
             self._headers.of(host).add(-held)
 
     def hold(self, guest: PendingConnection, size: int) -> str:
-        """Count the header bytes received so far; return the reason if there are too many, else an empty string."""
         host, before = self._hosts[guest], self._long.get(guest, 0)
         more = max(0, size - _FREE) - before
         if more <= 0:
@@ -75,7 +68,6 @@ class PendingConnections:
         return why
 
     def make_room(self, host: str) -> bool:
-        """End a connection with a lower claim than this host; return False if there is none."""
         return self._end_longest(self._waiting, host)
 
     def _end_longest(

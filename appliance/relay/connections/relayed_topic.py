@@ -1,31 +1,18 @@
 """One relayed topic of one publisher: its subscribers and the messages that they get, without sockets.
 
-A topic has one upstream (the connection to the publisher), subscribers that wait for the publisher's header, and
-subscribers that are served. The upstream stays open while a subscriber, a monitor or a tap (a consumer inside
-the appliance) needs it, and during a reload or a restart a short time longer.
-
-Subscribers stay connected when the upstream is lost. Their publication stays valid until the control process withdraws
-it, which happens when the node is gone. Cutting subscribers would be costly: rospy never reconnects to an address that
-closed its connection, and roscpp waits up to 20 s. Over the kept connections, messages continue at once. Frames are
-passed on whole (`frames`), so no subscriber gets a torn frame. Subscribers are cut only if the publisher returns with
+Subscribers stay connected when the upstream is lost, until control withdraws the publication: rospy never reconnects
+to an address that closed its connection, and roscpp waits up to 20 s. They are cut only if the publisher returns with
 another type, md5sum, definition or latching flag, because they must read the new header.
-
-Subscribers get only messages that monitors pass on, and the relay latches only these. Messages that monitors publish
-have no upstream and bypass monitors (`published`). The first messages of a new publisher are kept for subscribers that
-are about to connect (`startup_replay`).
 
 A guard's stop comes over the connection of the appliance's own publication, so it can overtake motions that wait in a
 publisher's connection, in the queue or in the kernel. Therefore each publisher's subscribers also get it behind these
 motions, and until the publisher's next message, a later subscriber gets the stop and nothing before it (`supersede`).
 
-If the publisher's host has no memory left, a latched message is passed on but not kept. A later subscriber makes the
-relay reconnect to the publisher, once memory is free again, to get the message. The other subscribers then get it
-twice.
+If the publisher's host has no memory left, a latched message is not kept. A later subscriber makes the relay reconnect
+to the publisher, once memory is free again. The other subscribers then get the message twice.
 
-While *all* subscribers are behind, the relay stops reading the publisher until a subscriber has caught up, for at most
-`queue_grace`. Therefore a subscriber that the scheduler paused for some milliseconds loses nothing. When the queue of a
-slow subscriber reaches its bounds, its oldest messages are dropped. A slow subscriber never delays the others: the
-publisher is read as long as one subscriber keeps up.
+While *all* subscribers are behind, the relay stops reading the publisher for at most `queue_grace`, so a subscriber
+that the scheduler paused for some milliseconds loses nothing.
 """
 
 from collections.abc import Callable, Collection, Mapping
@@ -57,12 +44,12 @@ class Upstream:
         """Close the connection, because the topic is no longer wanted."""
 
     def pause(self, seconds: float) -> None:
-        """Stop reading until `resume`, for at most these seconds."""
+        """Stop reading until `resume`, for at most this time."""
 
     def resume(self) -> None: ...
 
     def announce(self, names: Callable[[], frozenset[str]], type_name: str) -> None:
-        """Report new subscribers of a topic of this type; `names` is called after the current turn of the loop."""
+        """Report new subscribers; `names` is called after this turn of the loop."""
 
     def request_latched(self) -> None:
         """Make a latching publisher send its message again."""
@@ -71,7 +58,7 @@ class Upstream:
         """Repeat an open question to a new control."""
 
     def found(self, host: str, port: int) -> None:
-        """Connect to the address that control has found; ignore an answer that is no longer awaited."""
+        """Connect to this address; ignore an answer that is no longer awaited."""
 
     def refused(self) -> None:
         """Ask again later, because control has no address."""
@@ -80,10 +67,10 @@ class Upstream:
         """Apply the specifications that are in force now."""
 
     def silence(self, *, silent: bool) -> None:
-        """Take no message from the publisher, and close its connection at once; or connect again if it is wanted."""
+        """Take no message, and close the connection at once; or connect again if it is wanted."""
 
     def check_stall(self) -> None:
-        """Cut a publisher that holds memory for a message and sends nothing of it; called once a second."""
+        """Cut a publisher that holds memory for a message and sends nothing of it."""
 
     def close(self) -> None:
         """Close everything, because the publication is withdrawn."""
@@ -116,14 +103,10 @@ class _Monitoring:
 
 
 class RelayedTopic:
-    """A topic of an incarnation at `host`, with its subscribers; `share` counts the memory of its kept
-    messages.
+    """A topic of an incarnation at `host`, with its subscribers; `share` counts the memory of its kept messages.
 
-    `fresh`: the publisher has just appeared. `flow` holds the rate limits, and `limited(part, messages,
-    size)` reports the messages that they dropped. `make_room(size)` tries to free that many bytes of other
-    hosts, and `refused(message)` is called if a latched message is not kept. Once the publisher's quantum is
-    used up (`over()`), the remaining subscribers get the batch in the publisher's next turn, before more data
-    is read. `servers(topic)` returns the subscribers for which clients of an action wait.
+    The upstream stays open while a subscriber, a monitor or a tap needs it, and during a reload or a restart a short
+    time longer.
     """
 
     def __init__(
@@ -174,7 +157,6 @@ class RelayedTopic:
         return (*self._waiting, *self._served)
 
     def join(self, member: TopicSubscriber) -> None:
-        """Add a subscriber with a grant, which is served once the publisher's header is known."""
         if self._header is None:
             self._waiting[member] = None
         else:
@@ -196,10 +178,7 @@ class RelayedTopic:
         return self._header
 
     def tap(self, tap: Callable[[Batch], None], *, latched: bool) -> None:
-        """Call `tap` with each batch for subscribers, first (if `latched`) with the latched message.
-
-        The tap must not keep a batch.
-        """
+        """Call `tap` with each batch, first (if `latched`) with the latched message. The tap must not keep a batch."""
         self._taps += (tap,)
         self.differs()
         if latched and self._latch.batch is not None:
@@ -258,8 +237,7 @@ class RelayedTopic:
     ) -> None:
         """Pass messages `through` monitors from the next batch on (None: bypass them).
 
-        With `wanted`, the topic stays connected for monitors even without a subscriber. `call` returns how the pump
-        passes small frames through them (None: it cannot now).
+        With `wanted`, the topic stays connected even without a subscriber. `call` is for the pump.
         """
         before, self._monitoring = self._monitoring, _Monitoring(through, call, wanted)
         self.differs()
@@ -270,7 +248,7 @@ class RelayedTopic:
         self._spare_unwanted()
 
     def withhold(self, mask: Callable[[str], bool] | None) -> None:
-        """Withhold messages from each host for which `mask` is true at their delivery (None: from no host).
+        """Withhold messages from each host for which `mask` is true at their delivery.
 
         The latched message is the present value of the topic: a host gets it once the topic is withheld no longer.
         """
@@ -278,7 +256,6 @@ class RelayedTopic:
         self.differs()
 
     def upstream_opened(self, header: Mapping[str, str]) -> None:
-        """Begin to serve, because the publisher has answered with its header."""
         header = to_subscriber(header, self.name, self.topic)
         before, self._header = self._header, header
         self._latch.is_latching = header.get("latching", "0") == "1"
@@ -305,7 +282,6 @@ class RelayedTopic:
         return self._latch.is_lacking
 
     def upstream_closed(self) -> None:
-        """Forget the upstream's state, but keep the subscribers (see the module docstring)."""
         self._end_stream()
         self.hand_out(divided=False)
         if not self._superseded:
@@ -322,10 +298,7 @@ class RelayedTopic:
             self.differs()
 
     def received(self, batch: Batch, since: float) -> Batch | None:
-        """Pass frames of the publisher, received at `since`, through monitors to the subscribers.
-
-        Return the frames that monitors leave for the publisher's next turn (`go_on`).
-        """
+        """Pass frames on, and return those that monitors leave for the publisher's next turn (`go_on`)."""
         batch.first = self.counters.following
         self.counters.add(batch.messages, len(batch.view))
         self._reported = False
@@ -335,9 +308,9 @@ class RelayedTopic:
         return self._take(batch, passing, since)
 
     def sent(self, batch: Batch, since: float, number: int, sent: int) -> None:
-        """Continue after the pump, which has passed a batch to the first `number` subscribers.
+        """Continue after the pump has passed a batch to the first `number` subscribers, and `sent` bytes to the next.
 
-        The next subscriber has accepted `sent` bytes (negative: the number of an error).
+        If `sent` is negative, it is the number of an error.
         """
         self.counters.add(batch.messages, len(batch.view))
         self._reported = False
@@ -346,7 +319,6 @@ class RelayedTopic:
         self.counters.delayed(self._clock() - since, batch.messages)
 
     def go_on(self, rest: Batch, since: float) -> Batch | None:
-        """Like `received`, for frames that were left for later."""
         self._reported = False
         return self._take(rest, rest, since)
 
@@ -391,7 +363,6 @@ class RelayedTopic:
         return rest
 
     def published(self, batch: Batch) -> None:
-        """Send a message of a monitor to the subscribers, bypassing all monitors."""
         first = self.counters.following
         self.counters.add(batch.messages, len(batch.view))
         self._reported = False
@@ -437,7 +408,6 @@ class RelayedTopic:
         return self._served.undelivered
 
     def hand_out(self, *, divided: bool = True) -> None:
-        """Send subscribers the waiting batch; if `divided`, stop when the quantum is used up."""
         if self._served.hand_out(divided=divided):
             self._pause_or_trim()
 
@@ -452,10 +422,6 @@ class RelayedTopic:
             member.cut(reason)
 
     def tidy(self) -> None:
-        """Free temporary data, and trim queues to their bounds; called once a second.
-
-        Then pass on a latched message that was withheld, or that a rate limit delayed, if it may pass now.
-        """
         now = self._clock()
         waiting = self.flow.later(now)
         if waiting is not None:
@@ -479,7 +445,6 @@ class RelayedTopic:
         self._latch.repeat()
 
     def traffic(self) -> TopicTraffic | None:
-        """Return the counters since the last call; None if nothing has changed."""
         if self._reported and not self.counters.messages and not self._served.has_dropped:
             return None
         messages, size, counts, seconds = self.counters.take()

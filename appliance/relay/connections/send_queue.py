@@ -1,9 +1,5 @@
 """The messages that wait for one slow subscriber: bounded, the oldest dropped first, never a torn frame.
 
-The queue is used only while the socket does not accept everything. It holds the unsent rest of a partly sent frame, and
-batches, cut at frame boundaries, whose memory other subscribers' queues share.
-
-Invariants:
 - Bytes leave in the order they came; a frame whose first byte was sent is sent whole.
 - The rest of that frame counts as memory of the host. The buffer behind it is less than `LITTLE` times its size.
 - After `trim`, at most `queue_messages` frames and `queue_bytes` wait besides the one being sent.
@@ -21,7 +17,7 @@ _BEHIND = 1 << 20
 
 
 class SendQueue:
-    """The frames that wait for one subscriber."""
+    """The frames that the socket of one subscriber has not accepted. Queues share the memory of batches."""
 
     def __init__(self, limits: RelayLimits, share: HostMemory) -> None:
         self._limit_messages = limits.queue_messages
@@ -45,7 +41,6 @@ class SendQueue:
 
     @property
     def behind(self) -> bool:
-        """Whether the queue is so long that the publisher should wait, if all other subscribers are behind as well."""
         return self._size >= _BEHIND or self.full
 
     @property
@@ -58,7 +53,6 @@ class SendQueue:
 
     @property
     def full(self) -> bool:
-        """Whether another message would exceed the bounds of this queue or the memory of the host."""
         return (
             self._messages >= self._limit_messages
             or self._size >= self._limit_size
@@ -79,7 +73,6 @@ class SendQueue:
             self._count(messages, len(view))
 
     def begin(self, rest: memoryview) -> None:
-        """Put the rest of a frame (or of the connection header) at the head of the queue."""
         self._started = _apart(rest)
         self._share.add(len(rest))
 
@@ -92,7 +85,6 @@ class SendQueue:
         return views
 
     def advance(self, sent: int) -> None:
-        """Remove the first `sent` bytes of `vectors()`, which the socket has taken."""
         if self._started is not None:
             taken = min(sent, len(self._started))
             self._share.add(-taken)
@@ -115,7 +107,7 @@ class SendQueue:
             sent = 0
 
     def trim(self) -> int:
-        """Drop the oldest frames beyond the bounds, or all if the host's memory is exhausted; return how many."""
+        """Drop the oldest frames, or all if the host's memory is exhausted; return how many."""
         before = self._messages
         limit_messages, limit_size = self._limit_messages, self._limit_size
         if self._share.exhausted:
@@ -153,5 +145,4 @@ class SendQueue:
 
 
 def _apart(rest: memoryview) -> memoryview:
-    """Return the bytes, copied if they are a small part of their buffer."""
     return memoryview(bytes(rest)) if LITTLE * len(rest) <= memoryview(rest.obj).nbytes else rest

@@ -1,8 +1,4 @@
-"""The served subscribers of one topic, and the batch that some of them still have to get.
-
-Once the quantum of a publisher is used up (`over`), the remaining subscribers get the batch in the publisher's next
-turn, before more data is read.
-"""
+"""The served subscribers of one topic, and the batch that some of them still have to get."""
 
 from collections.abc import Callable, Iterator, Mapping
 from typing import Protocol
@@ -26,17 +22,17 @@ class TopicSubscriber(Protocol):
     """When the queue first became so long that the subscriber is behind; None once it has caught up."""
 
     def greet(self, header: Mapping[str, str]) -> bool:
-        """Answer with the publisher's header, or refuse a different type; return whether the subscriber is served."""
+        """Answer with the publisher's header; return False for a different type."""
 
     def deliver(self, batch: Batch) -> int:
         """Send or queue the batch; return how many messages are dropped."""
 
     def accepted(self, batch: Batch, sent: int) -> int:
-        """Like `deliver`, after the pump has sent the first `sent` bytes (negative: the number of an error)."""
+        """Like `deliver`, after the pump has sent `sent` bytes (negative: an error)."""
 
     @property
     def descriptor(self) -> int:
-        """Return the socket for the next batch, or -1 if the subscriber needs other work (a limit, a queue)."""
+        """Return the socket for the next batch, or -1 if a limit or queue needs other work."""
 
     @property
     def exhausted(self) -> bool:
@@ -46,7 +42,7 @@ class TopicSubscriber(Protocol):
     def full(self) -> bool: ...
 
     def trim(self) -> int:
-        """Drop messages beyond the bounds, oldest first; return how many."""
+        """Return how many messages were dropped."""
 
     def check_stall(self) -> None:
         """Cut the connection if it makes no progress; called once a second."""
@@ -55,7 +51,11 @@ class TopicSubscriber(Protocol):
 
 
 class ServedSubscribers:
-    """The subscribers, in the order in which they came."""
+    """The subscribers, in the order in which they came.
+
+    Once the quantum of a publisher is used up (`over`), the remaining subscribers get the batch in the publisher's
+    next turn, before more data is read.
+    """
 
     def __init__(self, over: Callable[[], bool]) -> None:
         self._over = over
@@ -71,7 +71,6 @@ class ServedSubscribers:
         return self._mask is not None
 
     def withhold(self, mask: Callable[[str], bool] | None) -> None:
-        """Send nothing to each host for which `mask` is true at the time (None: send to all)."""
         self._mask = mask
 
     def __len__(self) -> int:
@@ -98,32 +97,22 @@ class ServedSubscribers:
         return 0 if self._waits is None else len(self._waits[0].view)
 
     def deliver(self, batch: Batch, member: TopicSubscriber) -> None:
-        """Send a subscriber a batch, unless the topic is withheld from its host."""
         member.missed = self._mask is not None and self._mask(member.host)
         if not member.missed:
             self._dropped += member.deliver(batch)
 
     def send(self, batch: Batch, *, divided: bool) -> bool:
-        """Send all subscribers a batch, after the previous one; return whether a subscriber is behind."""
         behind = self.hand_out(divided=False)
         self._waits = batch, self.row
         return self.hand_out(divided=divided) or behind
 
     def go_on_behind(self, batch: Batch, number: int, sent: int) -> bool:
-        """Send the rest of a batch that the pump has passed to the first `number` subscribers.
-
-        The next subscriber has accepted `sent` bytes (negative: the number of an error). Return whether a
-        subscriber is behind.
-        """
         row = self.row
         self._waits = batch, row[number + 1 :]
         self._dropped += row[number].accepted(batch, sent)
         return self.hand_out(divided=True) or row[number].behind_since is not None
 
     def hand_out(self, *, divided: bool) -> bool:
-        """Send the waiting batch; if `divided`, stop when the quantum is used up. Return whether a subscriber
-        is behind.
-        """
         if self._waits is None:
             return False
         (batch, members), self._waits = self._waits, None
@@ -139,7 +128,6 @@ class ServedSubscribers:
         return behind
 
     def trim(self, *, stalled: bool = False) -> bool:
-        """Trim the full queues, and cut subscribers without progress (`stalled`); return whether a queue was full."""
         full = False
         for member in self.row:
             if member.full:

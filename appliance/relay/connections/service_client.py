@@ -1,9 +1,5 @@
 """The connection from a service client, and the matching connection to the service.
 
-The client's header has already been compared with the grants. The relay writes a new header for the service
-(`headers`), and writes a new header for the client from the service's answer. Then requests and replies alternate
-(`exchange`).
-
 A service that never answers delays only this client. If the service cannot be reached, or dies before its header, the
 client gets an error header, as rospy and roscpp expect. If the service dies later, the client's connection ends, as in
 plain ROS.
@@ -51,7 +47,6 @@ class ServiceTraffic:
         self.changed = True
 
     def row(self, key: str, service: str) -> TopicTraffic | None:
-        """Return the counters since the last call; None if nothing has changed."""
         if not self.changed:
             return None
         row = TopicTraffic(key, service, self.messages, self.bytes, 0, self.clients)
@@ -62,8 +57,6 @@ class ServiceTraffic:
 
 class ServiceClient:
     """One client of one service; `caller_id` is its verified name. With `own`, the appliance offers the service.
-
-    `asks()` returns whether each request needs an approval now, by the client's grant.
 
     Exactly one of two callbacks is called, once: `ended(self)` after both connections are closed, or `refuse(self,
     sock, reason)`, which takes over the client's socket.
@@ -160,14 +153,12 @@ class ServiceClient:
         )
 
     def recheck(self) -> None:
-        """Cut the client if the service does not fit the specifications in force."""
         if self._greeted:
             objection = self._context.interceptor.service_objection(self.service.service, self._header)
             if objection:
                 self.cut(objection)
 
     def check_stall(self) -> None:
-        """Cut a client whose message makes no progress and holds memory; called once a second."""
         held = (
             self._exchange.unfinished + self._client.backlog + (self._server.backlog if self._server else 0)
         )
@@ -230,7 +221,6 @@ class ServiceClient:
         self._guard(self._exchange.from_service, self._parser.rest)
 
     def _judge(self, part: str, body: bytes) -> ServiceVerdict:
-        """Return the monitors' verdict; the monitors may have changed since the client came."""
         service = self.service
         sender = (self.host, self.caller_id) if part == "request" else (service.host, service.node)
         point = ObservationPoint(service.key, service.service, *sender)
@@ -277,7 +267,6 @@ class ServiceClient:
             self._weigh()
 
     def _weigh(self) -> None:
-        """Count the memory that this connection holds; close the connection if a host has no memory left for it."""
         waiting = self._client.backlog + (self._server.backlog if self._server else 0)
         of_service = self._exchange.held_replies + size_of(self._header)
         parts = (self._exchange.held, of_service, waiting)
@@ -331,7 +320,7 @@ class ServiceClient:
 
 
 def _why(error: Exception) -> str:
-    """Return the error without the address of the service's node: the client must not learn the address."""
+    """Omit the address of the service's node: the client must not learn it."""
     return errno.errorcode.get(
         (error.errno if isinstance(error, OSError) else None) or 0, "it has no usable address"
     )

@@ -1,13 +1,10 @@
 """Keep the first messages of a new publisher for subscribers that are about to connect.
 
-A monitored topic connects to its publisher before the first real subscriber does, and the publisher sees a subscriber.
-A publisher that waits for a subscriber and then sends one message would send it to the monitor alone. Therefore its
-first messages are kept for `SECONDS`, and each subscriber that connects in that time gets them. In plain ROS that
-subscriber would have been connected in time.
+A monitored topic connects to its publisher before the first real subscriber does. A publisher that waits for a
+subscriber and then sends one message would send it to the monitor alone.
 
-Invariants:
 - Streams are not kept. If a publisher still sends `SPEECH` seconds after its first message, all kept messages are
-  dropped. New subscribers then get only later messages, as in plain ROS: a command must not be executed late.
+  dropped: a command must not be executed late.
 - The kept messages have no gap up to the latest one.
 - A subscriber that reconnects under the same name does not get the kept messages again.
 """
@@ -40,7 +37,6 @@ class StartupReplay:
         self._given: set[str] = set()
 
     def opened(self, now: float, *, alone: bool) -> None:
-        """Begin to keep messages if this is the first connection to a new publisher, and only monitors use it."""
         self.keeps = alone and now <= self._fresh_until
         self._fresh_until = now - 1  # the next connection is not its first
         self._until = now + APPEARED
@@ -50,7 +46,6 @@ class StartupReplay:
             self.forget()
 
     def add(self, batch: Batch, now: float) -> None:
-        """Keep messages; forget all if there are too many, they come too late, or memory is short."""
         self.expire(now)
         if not self.keeps:
             return
@@ -71,7 +66,6 @@ class StartupReplay:
         self._share.add(size)
 
     def give(self, caller_id: str, now: float) -> list[Batch]:
-        """Return the messages for a new subscriber, the oldest first."""
         self.expire(now)
         again = caller_id in self._given
         if self.keeps:

@@ -1,6 +1,5 @@
 """A subscriber's connection: the publisher's header, then frames.
 
-Invariants:
 - No send blocks. Bytes that the socket does not accept wait in the subscriber's `SendQueue`.
 - A subscriber that sends anything after its header is cut: its connection is for the one topic of its grant.
 """
@@ -26,8 +25,8 @@ _ANY = "*"
 class Subscriber:
     """One subscriber of one relayed topic.
 
-    Exactly one of two callbacks is called, once: `ended(self)` after the connection is closed, or, if the types differ,
-    `refuse(self, sock, reason)`, which takes over the socket.
+    Exactly one of two callbacks is called, once: `ended(self)` after the connection is closed, or, if the types
+    differ, `refuse(self, sock, reason)`, which takes over the socket.
     """
 
     def __init__(
@@ -91,10 +90,7 @@ class Subscriber:
         return True
 
     def deliver(self, batch: Batch) -> int:
-        """Send the frames, or queue the bytes that the socket does not accept.
-
-        A large batch is dropped while the host's memory is exhausted, because its unsent rest could not be kept.
-        """
+        """Drop a large batch while the host's memory is exhausted, because its unsent rest could not be kept."""
         if self._flow is not None:
             passing = self._limited(self._flow, batch)
             if passing is None:
@@ -176,7 +172,7 @@ class Subscriber:
         return self._queue.trim()
 
     def check_stall(self) -> None:
-        """Cut a subscriber that stalls within a message while its host's memory is exhausted; called once a second."""
+        """Cut a subscriber that stalls within a message while its host's memory is exhausted."""
         begun = self._queue.begun if self._queue.short else 0
         if self._stall.seen(begun, self._loop.clock()):
             self.cut("its host has no memory left in the relay, and it does not accept the rest of a message")
@@ -239,10 +235,7 @@ class Subscriber:
 
 
 def describe_mismatch(wanted: Mapping[str, str], offered: Mapping[str, str]) -> str:
-    """Return why a subscriber's header does not fit a publisher's; empty if it fits.
-
-    As in ROS, the md5sum decides.
-    """
+    """Return why the headers do not fit. As in ROS, the md5sum decides."""
     md5sum, real_md5sum = wanted.get("md5sum", _ANY), offered.get("md5sum", _ANY)
     if _ANY in {md5sum, real_md5sum} or md5sum == real_md5sum:
         return ""

@@ -4,14 +4,9 @@
       ^               |                          |                        |                  |
       +---linger------+------ refused, failed, lost: wait (doubling), then ask again --------+
 
-A silent publisher (`silence`) stays idle, even if the topic is wanted.
-
-A publisher that turns the relay's header away is asked again at once with another header, while there is one
-(`introductions`).
-
-A `PublisherConnection` tries again while the topic is wanted. The wait doubles after each failure, including a
-publisher that sends its header and then closes the connection or breaks the protocol. A connection that flowed for more
-than `retry_longest` seconds resets the wait.
+A publisher that turns the relay's header away is asked again at once with another header (`introductions`). The wait
+doubles even if a publisher sends its header and then breaks the protocol, and starts again only after a connection has
+flowed for more than `retry_longest` seconds.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -57,8 +52,7 @@ class _Attempt:
 
 
 class PublisherConnection(Upstream):
-    """The upstream of one relayed topic; `objection(header)` returns why a publisher is refused (empty:
-    accepted).
+    """The upstream of one relayed topic; `objection(header)` returns why a publisher is refused.
 
     `unsettled()`: subscribers may return after a reload or a restart.
     """
@@ -109,10 +103,7 @@ class PublisherConnection(Upstream):
             self.ask()
 
     def release(self) -> None:
-        """Close the connection after this turn of the loop, because a lazy publisher has to learn that it is unused.
-
-        Keep it for a short time while subscribers may return.
-        """
+        """Close the connection after this turn of the loop: a lazy publisher has to learn that it is unused."""
         self._wanted = False
         if self._linger is None:
             seconds = self._limits.linger if self._unsettled() else 0.0
@@ -153,7 +144,6 @@ class PublisherConnection(Upstream):
         self._close_unwanted()
 
     def pause(self, seconds: float) -> None:
-        """Stop reading until `resume`, for at most `seconds`; the data stays in the kernel's buffer."""
         if self._reader is not None:
             self._reader.pause(seconds)
 
@@ -257,7 +247,6 @@ class PublisherConnection(Upstream):
         lose(f"no connection to the publisher: {reason}")
 
     def _turned_away(self, reason: str, violation: Violation = "") -> None:
-        """Ask again with another header; lose the publisher if it has turned all of them away."""
         if self._introductions.refused():
             self._drop_connection()
             self.ask()

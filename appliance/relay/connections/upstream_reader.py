@@ -2,8 +2,7 @@
 
     WATCHED --quantum used up, or frames undelivered--> LEFT --queued--> QUEUED --next turn--> WATCHED
 
-In WATCHED the loop reports new data, and the pump passes simple frames on automatically. In LEFT and QUEUED, received
-data is left, and nothing is read. A pause stops each of these; the data stays in the kernel's buffer.
+In WATCHED, the pump passes simple frames on automatically. In LEFT and QUEUED, nothing is read.
 """
 
 import os
@@ -33,10 +32,7 @@ class _State(Enum):
 
 
 class UpstreamReader:
-    """The open connection to a publisher, behind its `header`. `lost` is called once.
-
-    `since`: when the connection opened.
-    """
+    """The open connection to a publisher. `lost` is called once."""
 
     def __init__(
         self,
@@ -72,7 +68,6 @@ class UpstreamReader:
         self._watch()
 
     def start(self, early: bytes) -> None:
-        """Take data that arrived with the publisher's header."""
         self._early = early
         self._take_early()
 
@@ -92,7 +87,6 @@ class UpstreamReader:
             self._queue()
 
     def check_stall(self) -> None:
-        """Report as lost a publisher that holds memory for a message and sends nothing of it; called once a second."""
         self._receiver.trim_buffer()
         is_read = self._pause is None and self._state is _State.WATCHED
         held = self._receiver.unfinished if is_read else 0
@@ -160,7 +154,6 @@ class UpstreamReader:
         self._continue(rest)
 
     def _arm(self) -> None:
-        """Leave the next frames to the pump if they need only the common work."""
         if self._state is not _State.WATCHED or self._early or not self._receiver.small:
             return
         simple = self._topic.simple()
@@ -182,7 +175,6 @@ class UpstreamReader:
                 self._continue(rest)
 
     def _continue(self, rest: Batch | None) -> None:
-        """Process received data until the quantum is used up; read from the publisher only when all is processed."""
         receiver = self._receiver
         while self._state is not _State.CLOSED:
             over = receiver.more and (self._pause is not None or self._loop.over())
@@ -248,7 +240,6 @@ class UpstreamReader:
 
 
 def header_refusal(context: RelayContext, host: str, size: int) -> str:
-    """Return why a header of `size` bytes of this host should not be kept; empty if it may."""
     if size > SMALL and context.memory.frames.of(host).refusal(size):
         return "the relay has no memory left for headers of this host"
     return ""

@@ -1,8 +1,4 @@
-"""The progress of one batch through the monitors.
-
-Messages that are neither dropped nor replaced stay in the buffer in which they arrived. `pieces` is the output so far.
-`run` is the position of the first message that is not in `pieces` yet.
-"""
+"""The progress of one batch through the monitors."""
 
 import struct
 
@@ -13,7 +9,11 @@ _MOST_TURNS = 64
 
 
 class BatchProgress:
-    """The progress of a batch, received at `time` (nanoseconds), through the monitors."""
+    """The progress of a batch, received at `time` (nanoseconds).
+
+    `pieces` is the output so far. Messages from position `run` on are not in it yet; unchanged ones stay in their
+    buffer.
+    """
 
     __slots__ = (
         "_batch", "_gone", "_turns", "end", "messages", "pieces", "position", "run", "stride", "time",
@@ -34,7 +34,6 @@ class BatchProgress:
         self._turns = 1
 
     def number_at(self, position: int) -> int:
-        """Return the number, within its publication, of the message at a position."""
         if self.stride:
             return self._batch.first + position // self.stride
         number, walked = self._batch.first, 0
@@ -50,7 +49,6 @@ class BatchProgress:
         return turns
 
     def walked(self, position: int, run: int, gone: int) -> None:
-        """Note the messages processed up to `position`; `gone` were dropped, the last one just before `run`."""
         if position > self.position:
             self._turns = 1
         self.position, self.run = position, run
@@ -69,7 +67,6 @@ class BatchProgress:
         self.run = following
 
     def stop(self) -> None:
-        """End the progress here, and leave the remaining messages for later."""
         batch, taken = self._batch, self.number_at(self.position) - self._batch.first
         batch.left = self.messages - taken
         self._batch, self.messages, self.end = batch.head(taken), taken, self.position

@@ -30,7 +30,6 @@ def hold_begun(monitors: "MonitorSet", message: SpecificationsStated, switches: 
 def taken(
     message: SpecificationsStated, began: list[str], monitors: "MonitorSet | None"
 ) -> SpecificationsTaken:
-    """Return the message to control about the monitors in force, and those that hold their topics."""
     held = [] if monitors is None else [one for one in monitors.monitors if one.held]
     because = {one.name: one.why_held for one in held if one.why_held}
     return SpecificationsTaken(

@@ -14,7 +14,7 @@ class HostMask:
         self._known: dict[tuple[str, str], bool] = {}
 
     def hides(self, host: str) -> bool:
-        """Return whether a host gets no message now. A host without an IP address is in every network."""
+        """A host without an IP address is in every network."""
         return any(self._contains(network, host) for network in self._networks())
 
     def _contains(self, network: str, host: str) -> bool:

@@ -1,17 +1,10 @@
 """The monitors of one relay: the specifications in force, and their effects on messages, requests and replies.
 
-A topic without an enabled event bypasses monitors; `intercepts` decides this when something changes, not per message.
-The messages of other topics go through the topic's pipeline (`topic_pipeline.py`).
-
-Invariants:
 - A fault of a monitor, or a defect of this program, drops only the current message, and is reported.
 - Refused specifications change nothing. A relay whose first specifications are refused blocks all messages.
 - Specifications are replaced between two messages. A published message goes only through later monitors.
-- The clock of monitors never goes back or jumps: it starts at the time of day when the relay started, and follows the
-  monotonic clock. All messages of a batch have the same time.
-- A message may take `budget` seconds of processor time in its monitors. Beyond that, its processing is cut off, which
-  is a fault. The messages behind it wait for their publisher's next turn. If late ticks take too long together, the
-  remaining late ticks are skipped.
+- The clock of monitors never goes back or jumps. All messages of a batch have the same time.
+- A message that takes more than `budget` seconds of processor time is cut off, which is a fault.
 """
 
 from __future__ import annotations
@@ -65,12 +58,11 @@ class ServiceVerdict:
 
 
 class Interceptor:
-    """The monitors of one relay.
+    """The monitors of one relay. A topic without an enabled event bypasses them.
 
-    `budget` is the most seconds of processor time that a message may take. `publish(message)` sends a message that a
-    monitor publishes, or makes its call of a service. `changed(topics)` is called when monitors may want other topics;
-    `topics` are those whose messages may now be judged differently (None: all). For messages of a host, `holder(host)`
-    is charged for the slices that they create, and `payer(host)` for their processor time.
+    `changed(topics)` is called when monitors may want other topics; `topics` are those whose messages may now be
+    judged differently (None: all). `holder(host)` is charged for the slices that a host's messages create, and
+    `payer(host)` for their processor time.
     """
 
     def __init__(
@@ -146,7 +138,6 @@ class Interceptor:
         self._loader.later(message)
 
     def loaded(self, message: SpecificationsStated, result: Result) -> None:
-        """Put a loaded set into force, or refuse it, and report the result to control."""
         if message is self._awaited:
             self._awaited = None
         self.invalidate_prepared()
@@ -184,7 +175,6 @@ class Interceptor:
         self._reporter.send(state_left(message, self._keeper))
 
     def holder_of(self, source: int) -> str:
-        """Return the host that is charged for the slices created by messages of this source."""
         point = self.senders.point(source)
         return self._holder("" if point is None else point.host)
 
@@ -216,7 +206,6 @@ class Interceptor:
         self._reporter.send(SpecificationsRefused(message.revision, findings[:100], message.statement))
 
     def order(self, message: MonitorSwitched | MonitorGiven | StopWanted) -> None:
-        """Switch a monitor, set its given constants, or have it send its safe message, between two messages."""
         if isinstance(message, MonitorSwitched):
             self.switch(message.name, message.enabled)
         elif isinstance(message, StopWanted):
@@ -253,7 +242,6 @@ class Interceptor:
         return self.monitors.topics_of(held)
 
     def is_guarded(self, topic: str) -> bool:
-        """Return whether an enabled monitor has a safe message for a topic."""
         return self.monitors is not None and bool(self.monitors.guards(topic))
 
     def is_stop(self, topic: str, data: bytes) -> bool:
@@ -273,25 +261,22 @@ class Interceptor:
 
     @property
     def preparing(self) -> bool:
-        """Whether specifications are being loaded that must be in force before any other message is carried out."""
+        """Whether specifications must be in force before any other message is carried out."""
         return self._awaited is not None
 
     def intercepts(self, topic: str) -> bool:
         return bool(self.blocked) or (self.monitors is not None and self.monitors.wants(topic))
 
     def wants(self, topic: str) -> bool:
-        """Return whether a monitor wants a topic's messages even without a subscriber."""
         return self.monitors is not None and self.monitors.wants(topic)
 
     def mask(self, topic: str) -> Callable[[str], bool] | None:
-        """Return which hosts get no message of a topic at present; None if no monitor may withhold it."""
         monitors = self.monitors
         if monitors is None or not monitors.may_withhold(topic):
             return None
         return HostMask(lambda: monitors.withheld_from(topic)).hides
 
     def objection(self, topic: str, header: Mapping[str, str]) -> str:
-        """Return why the monitors of a topic cannot read a publisher's messages; empty if they can."""
         monitors = self.monitors
         name = monitors.type_of(topic, shadowed=True) if monitors is not None else None
         if monitors is None or name is None:
@@ -300,7 +285,6 @@ class Interceptor:
         return self._objection(topic, objection, monitors.type_of(topic) is None)
 
     def service_objection(self, service: str, header: Mapping[str, str]) -> str:
-        """Like `objection`, for a service and the header with which it answers."""
         monitors = self.monitors
         name = monitors.service_type_of(service, shadowed=True) if monitors is not None else None
         if monitors is None or name is None:
@@ -309,7 +293,7 @@ class Interceptor:
         return self._objection(service, objection, monitors.service_type_of(service) is None)
 
     def _objection(self, resource: str, objection: str, only_tried: bool) -> str:
-        """Return the objection; empty if it concerns only monitors in shadow mode, which just miss the messages."""
+        """Monitors in shadow mode just miss messages that they cannot read."""
         self.shadow.understand(resource, objection)
         return "" if only_tried else objection
 
@@ -319,7 +303,6 @@ class Interceptor:
         return {**self._claim(self.monitors, self.monitors.publications[topic]), "latching": "0"}
 
     def claim_of(self, topic: str) -> dict[str, str]:
-        """Return the type of a topic by the specifications, with md5sum and definition; empty if they name none."""
         name = self.monitors.type_of(topic, shadowed=True) if self.monitors is not None else None
         return {} if self.monitors is None or name is None else self._claim(self.monitors, name)
 
@@ -331,7 +314,6 @@ class Interceptor:
     # --- kept state ---
 
     def keep(self, way: str) -> None:
-        """Keep the state of the monitors on a channel (`way`); call this before passing its messages on."""
         if self._keeper is not None and not self._keeper.keep(way):
             self.invalidate_prepared()
 
@@ -349,7 +331,7 @@ class Interceptor:
     # --- messages ---
 
     def time_budget(self, point: ObservationPoint) -> TimeBudget:
-        """Return the time budget for messages of a point; hosts with a common payer share one budget."""
+        """Hosts with a common payer share one budget."""
         if self._payer(point.host) != point.host:
             return self._shared_pace
         if point not in self._time_budgets:
@@ -361,7 +343,6 @@ class Interceptor:
         self._prepared.clear()
 
     def judge(self, point: ObservationPoint, part: str, body: bytes) -> ServiceVerdict:
-        """Return the verdict on a client's `request` to a service, or on the service's `response` (the `part`)."""
         service = point.resource
         if self.blocked:
             return ServiceVerdict(b"", self.blocked)
@@ -399,7 +380,7 @@ class Interceptor:
         return ServiceVerdict(body)
 
     def tick(self) -> None:
-        """Send the counts of this second; called once a second.
+        """Send the counts of this second.
 
         Prepared options stay valid after a second without an event: the next one of each kind is reported in full.
         """
@@ -433,7 +414,6 @@ class Interceptor:
     def _walked(
         self, monitors: MonitorSet, point: ObservationPoint, way: str, body: bytes, now: int
     ) -> Outcome | None:
-        """Return the fast path's outcome if counts are enough to report it, else None."""
         observer = self.observer
 
         def prepare(lane: FastLane) -> BatchOptions:
@@ -457,11 +437,9 @@ class Interceptor:
     # --- time ---
 
     def now(self) -> int:
-        """Return the time of monitors, in nanoseconds."""
         return self.offset + clock.now_ns()
 
     def schedule(self) -> None:
-        """Schedule `_advance` for the next tick or deadline, or earlier."""
         due = self.monitors.next_due if self.monitors is not None else None
         if due is None or (self._due is not None and self._due <= due):
             return

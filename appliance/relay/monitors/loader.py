@@ -1,6 +1,4 @@
-"""Load compiled specifications beside the loop, so that messages continue while a large set is loaded. Statements are
-loaded one at a time, in the order of arrival.
-"""
+"""Load compiled specifications beside the loop, so that messages continue while a large set is loaded."""
 
 from collections import deque
 from collections.abc import Callable, Hashable
@@ -17,10 +15,7 @@ Result = Union["MonitorSet", list[str]]
 
 
 class Loader:
-    """Loads specifications and calls `done(statement, result)` for each.
-
-    `holder_of(source)` returns the host that is charged for slices created by messages of a source.
-    """
+    """Loads statements in the order of arrival, and calls `done(statement, result)` for each."""
 
     def __init__(
         self,

@@ -17,7 +17,6 @@ _DEADLINES = 100  # deadlines of slices that are processed at once: some millise
 def monitor_set(
     message: SpecificationsStated, holder_of: Callable[[int], Hashable]
 ) -> MonitorSet | list[str]:
-    """Return the set of monitors of these specifications, or the reasons why there is none."""
     try:
         compiled, fast = load.loaded(message.part)
     except ValueError as error:

@@ -36,7 +36,7 @@ class PointHolder(Protocol):
 
 
 class Senders:
-    """Numbers for observation points, which identify the senders of earlier messages; the last `_SENDERS` are known."""
+    """Numbers of observation points for the senders of earlier messages; the last `_SENDERS` are known."""
 
     def __init__(self) -> None:
         self._points: OrderedDict[int, ObservationPoint] = OrderedDict()
@@ -56,11 +56,9 @@ class Senders:
         return found
 
     def hold(self, number: int, holder: PointHolder) -> None:
-        """Keep the point of this number known while `holder` exists."""
         self._holders[number] = holder
 
     def names(self, number: int) -> tuple[str, str]:
-        """Return the host and the caller id of the sender with this number; both are empty if it is not known."""
         holder = self._holders.get(number)
         point = self._points.get(number, NOWHERE) if holder is None else holder.point
         return point.host, point.caller_id
@@ -83,7 +81,7 @@ class ObservedMessage:
         self._head = head
 
     def at(self, number: int) -> "ObservedMessage":
-        """Return a copy for use after the batch, with the message's number instead of its position."""
+        """Return a copy that is valid after the batch, with the message's number."""
         return ObservedMessage(None, number, self._head)
 
     def sender(self, source: int) -> MessageSender:
@@ -92,7 +90,6 @@ class ObservedMessage:
         return MessageSender(source)
 
     def detail(self) -> Mapping[str, Any]:
-        """Return the message's number in its publication, and seq and stamp if it has a header."""
         progress, position = self._progress, self._position
         detail: dict[str, Any] = {
             "number": progress.number_at(position) if progress is not None else position

@@ -1,14 +1,9 @@
 """Report monitors' actions to control: the first event of each kind in a second in full, the others as counts.
 
-Invariants:
-- For each monitor, kind and distinction (the category of a verdict, the text of a log line without its numbers), one
-  event a second is reported in full. The others of that second become one event with a count, whose detail holds what
-  they have in common. Counts are complete.
-- The event with a count has the last text, if the texts differ at most in numbers, and the first and last text in its
-  detail if they differ. It has no text if the words differ or a text is unknown.
-- Each full report gives the sender of the message (caller id and host), and the message's number in its publication.
-- The number of distinctions is bounded (`_DISTINCT`); beyond it, events are counted under the kind alone.
-- Counters are sent after the events that they count. Once a second, counters without a reported event are sent as well.
+- Counts are complete for each monitor, kind and distinction (the category of a verdict, the text of a log line without
+  its numbers), but at most `_DISTINCT` distinctions are separate.
+- The event with a count has the last text, if the texts differ at most in numbers.
+- Counters are sent after the events that they count.
 - Without a link to the control process, at most `_KEPT` events wait; only the number of further events is reported.
 """
 
@@ -44,7 +39,7 @@ _Key = tuple[str, str, str, str, str, str]
 
 @dataclass(slots=True)
 class _Repeated:
-    """The events of a key in this second since the first one: their number, their times, what they have in common.
+    """The events of a key in this second since the first one, with what they have in common.
 
     `first_time` is 0 if it is unknown. `caller_id` is empty if there were several callers.
     """
@@ -111,8 +106,7 @@ class Observations:
     ) -> None:
         """Note an event at `point`, concerning the `observed` message.
 
-        `shared` is the detail for the count of further events with this distinction. With `only_number`, that count has
-        no text, as that of `add` without one.
+        `shared` is the detail for the count of further events, which has no text with `only_number`.
         """
         text = text[:LONGEST_TEXT]
         repeated = self._repeated(kind, monitor, point, distinction)
@@ -151,17 +145,12 @@ class Observations:
         distinction: str = "",
         shared: Mapping[str, Any] = _NOTHING,
     ) -> None:
-        """Add `count` events, the last of them at this time, and report only their number.
-
-        `first` is the time of the first event, 0 if unknown; `text` is empty if the texts are unknown.
-        """
         repeated = self._repeated(kind, monitor, point, distinction)
         if repeated is None:
             repeated = self._begin(kind, monitor, point, distinction, shared)
         repeated.add(count, first, time, text)
 
     def was_reported(self, kind: str, monitor: str, point: ObservationPoint, distinction: str = "") -> bool:
-        """Return whether such an event was already reported in this second, so the next one is only counted."""
         return self._key(kind, monitor, point, distinction) in self._told
 
     @property
@@ -169,7 +158,6 @@ class Observations:
         return bool(self._told)
 
     def tick(self) -> None:
-        """Send the counts of this second, and the state of the monitors if it changed."""
         for key, repeated in self._told.items():
             if repeated.count:
                 self._add(_count_of(key, repeated))
@@ -245,7 +233,6 @@ def _count_of(key: _Key, repeated: _Repeated) -> MonitorEvent:
 
 
 def _plain(detail: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the detail with its values converted and bounded, so that a link can carry them."""
     return {str(name)[:200]: _value(value, 3) for name, value in list(detail.items())[:_VALUES]}
 
 

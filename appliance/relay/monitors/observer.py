@@ -1,7 +1,7 @@
 """Count the actions of monitors, and turn outcomes into reports to control (`observations`).
 
-A drop is reported for the monitor that dropped the message. A change by several monitors is one record under the last
-of them, and names them all. The change counts once for each of these monitors, and once for the topic.
+A change by several monitors is one record under the last of them, and names them all. It counts once for each of these
+monitors, and once for the topic.
 """
 
 from __future__ import annotations
@@ -43,10 +43,7 @@ class _Counters:
 
 
 class Observer:
-    """Counts all actions of monitors, and reports the first event of each kind in a second in full.
-
-    For monitors in shadow mode, reports the actions that they would have taken, with `prefix` before the kind.
-    """
+    """Counts all actions of monitors. For monitors in shadow mode, `prefix` is before the kind."""
 
     def __init__(
         self,
@@ -82,11 +79,10 @@ class Observer:
         return self._observations.was_reported("drop", monitor, point)
 
     def hides_verdict(self, verdict: Verdict, point: ObservationPoint) -> bool:
-        """Return whether the next such verdict at a point is only counted."""
         return self._observations.was_reported("verdict", verdict.monitor, point, named(verdict))
 
     def asks(self, verdict: Verdict, source: int) -> bool:
-        """Return whether a verdict is reported in full and needs an explanation; at most `_EXPLAINED` a second do."""
+        """At most `_EXPLAINED` verdicts a second are reported in full and need an explanation."""
         point = self.senders.point(source) or NOWHERE
         kind = f"{self._prefix}verdict"
         if (
@@ -104,10 +100,7 @@ class Observer:
     def report(
         self, outcome: Outcome, point: ObservationPoint, observed: ObservedMessage | None = None
     ) -> None:
-        """Publish the messages of an outcome; then report everything in it except its result.
-
-        A published message may be a stop, so it waits for no report.
-        """
+        """Publish the messages of an outcome first: a stop waits for no report."""
         self._send(outcome)
         self._report(outcome, point, observed)
 
@@ -151,7 +144,6 @@ class Observer:
             self._send(judged)
 
     def _judged(self, judged: Outcome, point: ObservationPoint, data: bytes) -> None:
-        """Report the effects of a publisher's monitors on its message, which had these bytes."""
         self._report(judged, point)
         if judged.result == "dropped":
             self.dropped(judged, point, memoryview(data))
@@ -188,7 +180,6 @@ class Observer:
         size: int,
         observed: ObservedMessage | None = None,
     ) -> None:
-        """Report a change with the bytes before and after; only count later changes in the same second."""
         if point in self._shown:
             key = (tuple(outcome.changed_by), point)
             self._again[key] = self._again.get(key, 0) + 1
@@ -290,14 +281,12 @@ class Observer:
         self._again.clear()
 
     def _count_change(self, events: Sequence[str], count: int) -> list[str]:
-        """Count messages changed by these events, once for each of their monitors; return the monitors in order."""
         monitors = list(dict.fromkeys(_monitor(event) for event in events))
         for monitor in monitors:
             self._counter(monitor).changes += count
         return monitors
 
     def _settle(self) -> None:
-        """Collect the counts of the fast path: events, verdicts, drops and changes that were not reported in full."""
         for owed in self._owed:
             lane, point = owed.lane, owed.point
             dropped, changed, told = owed.take()
@@ -326,7 +315,6 @@ class Observer:
         self._owed = [owed for owed in self._owed if owed.begun]
 
     def rows(self, monitors: MonitorSet, time: int) -> list[MonitorRow]:
-        """Return the state and counters of the set's monitors in force, or of those in shadow mode."""
         self._sum_up(time)
         return [
             MonitorRow(
@@ -410,7 +398,6 @@ def _why(outcome: Outcome) -> str:
 
 
 def _said(outcome: Outcome) -> str:
-    """Return the last log line of the monitor that dropped a message, after a colon; empty if there is none."""
     said = [line.text for line in outcome.log if line.monitor == outcome.dropped_by]
     return f": {said[-1]}" if said else ""
 
@@ -424,7 +411,6 @@ def _monitor(event: str) -> str:
 
 
 def _together(events: Sequence[str]) -> list[str]:
-    """Return the events that changed a message if they belong to several monitors, else an empty list."""
     return list(events) if _monitor(events[0]) != _monitor(events[-1]) else []
 
 

@@ -1,12 +1,9 @@
 """Run monitors in shadow mode on copies of messages that have already been passed on.
 
-Invariants:
 - Their actions reach no message, subscriber or monitor in force; they are only reported.
-- They take at most `SHARE` of the processor's time, in slices; the loop continues between slices. At most `_MOST_BYTES`
-  of messages wait for them.
-- Messages beyond these limits do not reach them. This is reported, and the monitors count as incomplete. A monitor that
-  exceeds its instructions for a message or tick, or has a defect, also counts as incomplete, and rests until the second
-  is over.
+- They take at most `SHARE` of the processor's time, and the loop continues between slices.
+- At most `_MOST_BYTES` of messages wait for them. If messages are missed, the monitors count as incomplete. A monitor
+  that exceeds its instructions, or has a defect, also counts as incomplete, and rests until the second is over.
 - Ticks and deadlines are processed after the messages that arrived before them.
 """
 
@@ -73,7 +70,6 @@ class ShadowMonitors:
         return self._observer.incomplete
 
     def take(self, monitors: MonitorSet, outcome: Outcome) -> None:
-        """Use these monitors from now on; `outcome` is the outcome of their start."""
         self._monitors = monitors
         self._observer.keep(
             [monitor.name for monitor in monitors.shadowed], list(monitors.began), self._now()
@@ -83,7 +79,6 @@ class ShadowMonitors:
         self.schedule()
 
     def understand(self, resource: str, objection: str) -> None:
-        """Note why the messages of a topic or service cannot be read; an empty objection means that they can."""
         if not objection:
             self._foreign.discard(resource)
             return
@@ -120,7 +115,6 @@ class ShadowMonitors:
             self._timer.cancel()
 
     def schedule(self) -> None:
-        """Schedule a turn if messages wait, or for the time when a tick or deadline is due."""
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
@@ -192,7 +186,6 @@ class ShadowMonitors:
                 self._miss(shadow, NOWHERE, _TOO_LONG)
 
     def _rests(self, shadow: MonitorSet) -> bool:
-        """Return whether a set has used more than its share; if so, let it rest until the next second."""
         spent = shadow.late or any(monitor.context.budget < 0 for monitor in shadow.monitors)
         if spent:
             self._resting.add(shadow)

@@ -1,13 +1,11 @@
 """Keep the state of a relay's monitors in memory that outlives the process, and read the state of earlier processes.
 
-Invariants:
 - The state after a batch is written before any message of the batch is passed on, and before a monitor's message is
   published. Therefore no subscriber sees an effect of a state that can be lost.
-- Unchanged state is not written.
-- A state is reused only if it was written since the machine started, or before an orderly end of the appliance. It is
-  not reused if the machine's clock was set after it was written. A state that is not reused is `lost`, with the reason.
-- The times in a state are ages: after a takeover, the clock of monitors continues where the other appliance stopped it
-  (`continued`), so a difference between the clocks of the machines neither shortens nor extends any bound.
+- A state is reused only if it was written since the machine started, or before an orderly end of the appliance, and
+  the machine's clock was not set since. Otherwise, it is `lost`, with the reason.
+- The times in a state are ages: after a takeover, the clock of monitors continues where the other appliance stopped
+  it, so a difference between the clocks of the machines neither shortens nor extends any bound.
 """
 
 from collections.abc import Iterator, Sequence
@@ -83,7 +81,7 @@ class _Entry:
 
 
 class StateKeeper:
-    """Keeps the state of one relay in `own`; if `own` is empty at the start, reads the `earlier` memories instead."""
+    """The state of one relay in `own`; if `own` is empty at the start, that of the `earlier` memories."""
 
     def __init__(self, given: StateGiven, own: Memory, earlier: Sequence[Memory] = ()) -> None:
         self._given = given
@@ -98,7 +96,7 @@ class StateKeeper:
 
     @property
     def offset(self) -> int:
-        """Return the difference between the clock of monitors and the machine's monotonic clock, in nanoseconds."""
+        """Return the clock of monitors minus the machine's monotonic clock, in nanoseconds."""
         return self._given.offset + self.shift
 
     # --- state that an earlier process left ---
@@ -116,7 +114,6 @@ class StateKeeper:
         return found if heads or found.lost else None
 
     def kept_shift(self) -> int:
-        """Return the shift with which the newest kept state was written, minus the present shift."""
         heads = [head for head, _sections in self._readable(RecoveredState())]
         return max(heads, key=lambda head: head.written).shift - self.shift if heads else 0
 
@@ -130,7 +127,6 @@ class StateKeeper:
                 found.lost[""] = f"{_UNREADABLE}: {error}"
 
     def _distrust(self, head: _Head) -> str:
-        """Return why a state cannot be used again; empty if it can."""
         given = self._given
         if head.boot == given.boot:
             set_by = abs(head.offset - head.shift - given.offset)
@@ -146,7 +142,6 @@ class StateKeeper:
     # --- kept state ---
 
     def content(self) -> bytes:
-        """Return the kept states for `received_states` of another appliance, with the present time."""
         kept = read(self._own)
         if kept is None:
             return b""
@@ -154,7 +149,6 @@ class StateKeeper:
         return _CONTENT.encode(kept._replace(head=msgspec.msgpack.encode(head)))
 
     def changed_content(self, *, full: bool) -> bytes | None:
-        """Return the `content` for a copy; None if it has not changed since the last copy, unless `full`."""
         kept = read(self._own)
         sections = kept.sections if kept is not None else []
         if sections == self._copied and not full:
@@ -172,15 +166,11 @@ class StateKeeper:
         self._lay_out()
 
     def keep(self, channel: str) -> bool:
-        """Keep the state of the monitors that have judged messages on a topic (`EventCode.channel`).
-
-        Return False if states are now at other places (see `cells_place`).
-        """
+        """Return False if states are now at other places (see `cells_place`)."""
         entry = self._by_channel.get(channel)
         return entry is None or self._keep(entry)
 
     def keep_all(self) -> bool:
-        """Keep the state of all monitors; return False if states are now at other places."""
         stayed = [self._keep(entry) for entry in self._entries]
         return all(stayed)
 
@@ -210,7 +200,6 @@ class StateKeeper:
         return True
 
     def _keep_slices(self, entry: _Entry) -> bool:
-        """Write the parts of slices that have changed; return False if one does not fit."""
         fits = True
         for number, data in entry.group.changed_parts().items():
             entry.parts[number] = data
@@ -251,7 +240,7 @@ class StateKeeper:
 
 
 def state_left(message: StateWanted, keeper: StateKeeper | None) -> StateLeft:
-    """Return the answer to `StateWanted`. A state that is too large is not copied."""
+    """Answer `StateWanted`. A state that is too large is not copied."""
     if not message.copy:
         return StateLeft(message.number, b"" if keeper is None else keeper.content())
     content = keeper.changed_content(full=message.full) if keeper is not None else b""
@@ -261,11 +250,9 @@ def state_left(message: StateWanted, keeper: StateKeeper | None) -> StateLeft:
 
 
 def continued(message: SpecificationsStated, keeper: StateKeeper | None, now: int) -> int:
-    """Return the time to add to the clock of monitors (`now`) before their first start; the keeper also gets
-    it.
+    """Return the time to add to the clock of monitors before their first start.
 
-    After a takeover, the clock continues where the relays of the other appliance stopped it. A relay that
-    replaces another one continues its clock.
+    The clock continues where the other appliance stopped it, or the relay that this one replaces.
     """
     shift = 0
     if message.left:
@@ -289,8 +276,7 @@ def start_outcome(
 ) -> "Outcome":
     """Start the first monitors of a relay, with the state of an earlier process or of the other appliance if any.
 
-    After a takeover, `message` has the other appliance's states, or the reason why they are lost. `restarted`: this
-    relay replaces one that died. `now` is the time of monitors (ns), `continued`.
+    `restarted`: this relay replaces a dead one. `now` is the time of monitors (ns).
     """
     left = keeper.recovered() if keeper is not None else None
     if message.left or message.lost:
@@ -305,7 +291,6 @@ def start_outcome(
 
 
 def received_states(contents: Sequence[bytes]) -> RecoveredState:
-    """Return the states that the relays of another appliance left (`StateKeeper.content`)."""
     found = RecoveredState()
     for kept, head in _left(contents, found):
         if head.lost:

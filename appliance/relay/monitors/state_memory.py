@@ -1,12 +1,11 @@
 """Lay out a file of fixed size that keeps monitors' state when a relay dies; the supervisor opens the file.
 
-The file contains a magic number, a byte with the valid half (1 or 2; 0: none), and two halves. A half contains a `head`
-(the writer's data), a table, and *sections*. A section contains two places for the `base` state of a group of monitors,
-two for its `cells`, and one byte that marks the valid places. `lay_out` writes the invalid half and then the file's
-byte. `write_base` and `write_cells` write the invalid place and then the section's byte. Stores of one thread become
-visible in order, and a byte is stored as a whole. Therefore a process killed at any point leaves the state either
-before or after a write. A power cut can lose this order, so the reader uses the head to check whether the machine has
-restarted since.
+The file contains a magic number, a byte with the valid half (1 or 2; 0: none), and two halves. A half contains a
+`head` (the writer's data), a table, and *sections*. A section contains two places for the `base` state of a group of
+monitors, two for its `cells`, and one byte that marks the valid places. A writer writes what is invalid, and then the
+byte. Stores of one thread become visible in order, so a process killed at any point leaves the state either before or
+after a write. A power cut can lose this order, so the reader uses the head to check whether the machine has restarted
+since.
 """
 
 import mmap
@@ -33,7 +32,7 @@ Memory = Any
 
 
 class StoredState(NamedTuple):
-    """The content of a memory: the head, and each section's base, with its cells if they are newer than the base."""
+    """The head, and each section's base, with its cells if they are newer than the base."""
 
     head: bytes
     sections: list[tuple[bytes, bytes | None]]
@@ -62,7 +61,6 @@ class StateMemory:
         self._sections: list[_Section] = []
 
     def lay_out(self, head: bytes, sections: Sequence[tuple[bytes, int]]) -> bool:
-        """Write a new half with these bases and space for cells of these sizes; return False if they do not fit."""
         half = (len(self._memory) - _START) // 2
         rows, at = [], _HEAD.size + len(head) + _ROW.size * len(sections)
         for base, cells in sections:
@@ -86,7 +84,6 @@ class StateMemory:
         return True
 
     def write_base(self, section: int, base: bytes) -> bool:
-        """Keep a section's whole state; return False if the state does not fit in the section."""
         return self._sections[section].write_base(base)
 
     def write_cells(self, section: int, cells: bytes) -> None:
@@ -96,7 +93,7 @@ class StateMemory:
         return self._sections[section].has_cells
 
     def cells_place(self, section: int) -> CellsPlace:
-        """Return where the cells of a section are, until the next `lay_out`."""
+        """The place is valid until the next `lay_out`."""
         return self._sections[section].cells_place
 
 
@@ -155,7 +152,7 @@ def mapped(descriptor: int, *, writable: bool) -> memoryview:
 
 
 def read(memory: Memory) -> StoredState | None:
-    """Return the content of a memory; None if nothing is valid. Raises `ValueError` if it is malformed."""
+    """Return None if nothing is valid. Raises `ValueError` if the memory is malformed."""
     if len(memory) < _START or bytes(memory[:_ROOT]) != MAGIC or memory[_ROOT] == 0:
         return None
     half = (len(memory) - _START) // 2

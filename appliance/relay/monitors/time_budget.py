@@ -1,9 +1,8 @@
 """The processor time that the next message of a publication, or of a service's client, may take.
 
-A message that uses up its budget is cut off. For the next four seconds, messages get a tenth of the budget, because
-their sender may send more such messages. If a message is cut off soon after that time, the next reduction lasts twice
-as long, up to 16 seconds. A message that is cut off during a reduction does not prolong it. Hosts that the policy does
-not name share one budget, because each of many addresses could send such a message.
+After a message is cut off, messages get a tenth of the budget for a time, because their sender may send more such
+messages. Hosts that the policy does not name share one budget, because each of many addresses could send such a
+message.
 """
 
 from rosmop.run.outcomes import FUEL_PER_SECOND
@@ -26,11 +25,10 @@ class TimeBudget:
         return _REDUCED if now < self._until else 1.0
 
     def fuel(self, now: int, budget: float) -> int:
-        """Return the number of instructions that a module may use for a message now; `budget` is in seconds."""
+        """Return a number of instructions; `budget` is in seconds."""
         return int(FUEL_PER_SECOND * budget * self.part(now))
 
     def cut(self, now: int) -> None:
-        """Reduce the budget, because a message used it up."""
         if now >= self._until:
             self._length = _SHORTEST if self.recovered(now) else min(2 * self._length, _LONGEST)
             self._until = now + self._length

@@ -1,12 +1,7 @@
 """The path of one publication's messages through the monitors.
 
-The fast path takes many messages of a batch together if none needs a report. The engine takes the others one by one.
-Unchanged messages stay in the buffer in which they arrived.
-
-A message that comes alone loses most time to cold caches. Therefore the options of batches are prepared once
-(`_prepare`) and stay valid until something changes (`Interceptor.preparation`). Counts are added up for a second.
-
-The rest of a batch that exceeds the publisher's quantum (`over`) waits for its next turn (`Batch.left`).
+The fast path takes many messages of a batch together if none needs a report. A message that comes alone loses most
+time to cold caches, so the options of batches stay prepared until something changes (`Interceptor.preparation`).
 """
 
 from __future__ import annotations
@@ -34,7 +29,10 @@ _UNPREPARED = -1
 
 
 class TopicPipeline:
-    """The pipeline of one topic of one publisher, which passes batches through the topic's monitors."""
+    """The pipeline of one topic of one publisher.
+
+    The rest of a batch that exceeds the publisher's quantum waits for its next turn (`Batch.left`).
+    """
 
     def __init__(self, interceptor: Interceptor, point: ObservationPoint) -> None:
         self._interceptor = interceptor
@@ -48,7 +46,7 @@ class TopicPipeline:
         interceptor.senders.hold(self._source, self)
 
     def through(self, batch: Batch) -> Batch | None:
-        """Pass a batch through the monitors, keep their state, and return the frames to pass on (None: no frames)."""
+        """Keep the monitors' state before returning the frames to pass on."""
         judged = self._judged(batch)
         self._interceptor.keep(self.point[1])
         return judged
@@ -76,7 +74,6 @@ class TopicPipeline:
         return self._through(batch, progress)
 
     def module_call(self) -> ModuleCall | None:
-        """Return how the pump passes small frames through the monitors, until something changes; None if it cannot."""
         interceptor, monitors = self._interceptor, self._interceptor.monitors
         lane = None if monitors is None or interceptor.blocked else monitors.lane(self.point[1])
         if monitors is None or lane is None or not self._usable(monitors, lane, interceptor.now()):
@@ -126,7 +123,6 @@ class TopicPipeline:
         return lane is not self._defect and monitors.lane_ready(lane, now)
 
     def _walk(self, monitors: MonitorSet, lane: FastLane, progress: BatchProgress) -> bool:
-        """Pass messages through the fast path for a quantum; return False if the engine must take the next message."""
         interceptor = self._interceptor
         if not self._usable(monitors, lane, progress.time):
             return False

@@ -1,17 +1,13 @@
 """Find whole TCPROS frames in received bytes; every relayed message passes through this module.
 
-A frame is a 4-byte little-endian length, followed by that many bytes. `FrameReceiver` provides the receive buffer, and
-returns all whole frames after each read as one `Batch`, without copying them:
+A frame is a 4-byte little-endian length, followed by that many bytes. All whole frames of a read become one `Batch`,
+without copying them. Data sent to subscribers always ends with a whole frame.
 
-- A batch has at most `MOST` frames of unequal length, because callers loop over them. `FrameReceiver.following` returns
-  the next frames of the same read, at once or at the publisher's next turn.
-- Small frames are received into a scratch area that all receivers share. If monitors run, this area is in the memory of
-  the monitors' WebAssembly module. Only the incomplete frame at the end of a read is copied.
+- Small frames are received into a scratch area that all receivers share. If monitors run, this area is in the memory
+  of the monitors' WebAssembly module.
 - A frame larger than `LARGE` gets its own area. An area of up to 8 MiB is reused for the next large frame, unless a
-  queue has kept it. A larger area is anonymous memory, so a declared length that is never sent costs only address
-  space. While memory is short, no area is reused.
-
-Frames are passed on whole: the data sent to subscribers always ends with a whole frame.
+  queue has kept it or memory is short. A larger area is anonymous memory, so a declared length that is never sent
+  costs only address space.
 """
 
 import mmap
@@ -51,11 +47,10 @@ _unpack_length = _LENGTH.unpack_from
 class Batch:
     """Consecutive whole frames in a buffer that is reused unless they are kept.
 
-    `messages` is the number of frames, and `last` the offset of the last frame (None: not known yet). `stride` is the
-    size of each frame if all are known to be equally long, else 0. `first` is the number of the first frame in its
-    publication. `judged` is the time when monitors got the frames, by the monitors' clock (0: never), and `answer` the
-    result of their module if the pump has called it. `left` is the number of messages at the end that monitors had no
-    time for.
+    `last` is the offset of the last frame (None: not known yet). `stride` is the size of each frame if all are known
+    to be equally long, else 0. `first` is the number of the first frame in its publication. `judged` is the time when
+    monitors got the frames (0: never), and `answer` the result of their module if the pump has called it. `left` is
+    the number of messages at the end that monitors had no time for.
     """
 
     __slots__ = ("_kept", "_owned", "answer", "first", "judged", "last", "left", "messages", "stride", "view")
@@ -79,19 +74,18 @@ class Batch:
         return self._kept is not None
 
     def keep(self) -> memoryview:
-        """Return the frames in memory that will not be overwritten; copy them at most once."""
+        """Return memory that will not be overwritten; copy the frames at most once."""
         if self._kept is None:
             self._kept = self.view if self._owned else memoryview(bytes(self.view))
         return self._kept
 
     def rest(self, sent: int) -> memoryview:
-        """Return the bytes after the first `sent`, in memory that will not be overwritten; copy few bytes."""
+        """Return the bytes after the first `sent`, in memory that will not be overwritten."""
         if self._kept is None and LITTLE * (len(self.view) - sent) <= len(self.view):
             return memoryview(bytes(self.view[sent:]))
         return self.keep()[sent:]
 
     def within(self, size: float, most: int) -> int:
-        """Return how many of the first `most` frames begin within `size` bytes."""
         if size <= 0:
             return 0
         if len(self.view) <= size or most == 1:
@@ -141,18 +135,16 @@ class Scratch:
     __slots__ = ("_pump", "area")
 
     def __init__(self, pump: Pump | None = None) -> None:
-        """`pump` receives into the area as well."""
         self._pump = pump
         self.move(None)
 
     def move(self, area: memoryview | None) -> None:
-        """Use this area from the next read on; with None, use a new area."""
         self.area = memoryview(mmap.mmap(-1, SCRATCH)) if area is None else area
         if self._pump is not None:
             self._pump.receive_into(self.area)
 
     def hold(self, batch: Batch) -> Batch:
-        """Return the batch, copied into the area if it fits, because monitors are faster there."""
+        """Copy the batch into the area if it fits, because monitors are faster there."""
         size = len(batch.view)
         if size > len(self.area):
             return batch
@@ -193,10 +185,10 @@ class FrameReceiver:
         return scratch
 
     def received(self, count: int) -> Batch | None:
-        """Take `count` received bytes in the buffer; return the frames that are now complete.
+        """Return the frames that are now complete, until the next call of `buffer`.
 
-        The batch is valid until the next call of `buffer`. Raises `LimitExceededError` for a frame beyond the limit,
-        and if the publisher's host has no memory left for an unfinished frame.
+        Raises `LimitExceededError` for a frame beyond the limit, and if the publisher's host has no memory left for an
+        unfinished frame.
         """
         self._idle = False
         if self._area is not None:
@@ -204,7 +196,6 @@ class FrameReceiver:
         return self._walk(self._scratch.area, len(self._torn) + count, owned=False)
 
     def hand_over(self) -> bytes:
-        """Return the incomplete frame, which the pump continues."""
         torn, self._torn = self._torn, b""
         self._count(0)
         return torn
@@ -213,7 +204,6 @@ class FrameReceiver:
         self._torn = torn
 
     def found(self, size: int, end: int, messages: int) -> Batch:
-        """Return the whole frames that the pump has found at the start of the buffer; keep the incomplete one."""
         area = self._scratch.area
         self._idle, self._torn = False, bytes(area[size:end])
         self._count(len(self._torn))
@@ -221,11 +211,10 @@ class FrameReceiver:
 
     @property
     def more(self) -> bool:
-        """Whether received frames are left; take them with `following` before calling `buffer`."""
         return self._unwalked is not None
 
     def following(self) -> Batch | None:
-        """Return the next received frames. Raises the same errors as `received`."""
+        """Return the next frames of the same read. Raises the same errors as `received`."""
         unwalked, self._unwalked = self._unwalked, None
         if unwalked is None:
             return None
@@ -239,7 +228,7 @@ class FrameReceiver:
         return self._walk(area, size, owned=False)
 
     def set_aside(self) -> None:
-        """Copy the frames that `following` will return, because other connections use the buffer first."""
+        """Copy the frames that are left, because other connections use the buffer first."""
         if self._unwalked is not None and not self._aside:
             self._unwalked = memoryview(bytearray(self._unwalked))
             self._aside = len(self._unwalked)
@@ -247,7 +236,6 @@ class FrameReceiver:
 
     @property
     def small(self) -> bool:
-        """Whether the next bytes begin a frame or continue a small one, and no received frames are left."""
         return self._area is None and self._unwalked is None and len(self._torn) <= SMALL
 
     @property
@@ -255,7 +243,7 @@ class FrameReceiver:
         return self._filled
 
     def trim_buffer(self) -> None:
-        """Free the area if no data arrived since the last call; called once a second."""
+        """Free the area if no data arrived since the last call."""
         if self._idle and not self._filled and self._area is not None:
             self.abandon()
         self._idle = True
@@ -272,7 +260,6 @@ class FrameReceiver:
             self._counted = size
 
     def _walk(self, buffer: memoryview, end: int, *, owned: bool) -> Batch | None:
-        """Return all whole frames in `buffer[:end]`; keep the incomplete one after them."""
         limit = self._limit
         need = 0
         stride, messages = equal_frames(buffer, end)
@@ -341,7 +328,7 @@ class FrameReceiver:
 
 
 def equal_frames(buffer: memoryview, end: int) -> tuple[int, int]:
-    """Return the size and number of the frames in `buffer[:end]` if they are many and equally long, else (0, 0).
+    """Return the size and number of many equally long frames, else (0, 0).
 
     Comparing all lengths at once is cheaper than going from frame to frame.
     """
@@ -371,9 +358,9 @@ def last_frame(view: memoryview) -> int:
 
 
 def boundary_at(view: memoryview, offset: int) -> tuple[int, int]:
-    """Return how many frames end at or before byte `offset` of `view`, and where the frame with that byte ends.
+    """Return how many frames end at or before byte `offset`, and where the frame with that byte ends.
 
-    `view` begins with a frame. When `offset` is exactly between two frames, the end is `offset` itself.
+    When `offset` is exactly between two frames, the end is `offset` itself.
     """
     stride, count = equal_frames(view, len(view)) if offset > _FAR else (0, 0)
     if stride and stride * count == len(view):
@@ -387,7 +374,6 @@ def boundary_at(view: memoryview, offset: int) -> tuple[int, int]:
 
 
 def _new_area(size: int) -> memoryview:
-    """Return memory for one large frame: from the heap, or anonymous memory for more than `_KEEP_AREA` bytes."""
     return memoryview(bytearray(size) if size <= _KEEP_AREA else mmap.mmap(-1, size))
 
 

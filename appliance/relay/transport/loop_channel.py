@@ -13,13 +13,9 @@ from appliance.relay.loop import READ, WRITE, EventLoop, LoopTimer
 class LoopLink:
     """One end of a lifeline or link. `ended(reason)` is called once, when the link fails.
 
-    A message that belongs to another link, or a backlog beyond its limit, ends the link as if the other end
-    had died. A restatement of thousands of messages is carried out one quantum at a time, so that it delays
-    nothing else.
-
-    If `received` returns True, that message and later ones wait for `go_on`, and nothing more is read until
-    then. Therefore at most one `Channel.receive` of messages waits here, and the other end's backlog has its
-    own limit.
+    A message of another link, or a backlog beyond its limit, ends the link as if the other end had died. A restatement
+    of thousands of messages is carried out one quantum at a time. If `received` returns True, that message and later
+    ones wait for `go_on`, and nothing more is read until then.
     """
 
     def __init__(
@@ -53,7 +49,6 @@ class LoopLink:
             self._watch()
 
     def catch_up(self) -> None:
-        """Carry out everything that the other end has sent, unless messages wait for `go_on`."""
         if self._live and not self._waits:
             if self._end_of_link is None:
                 self._take_in()
@@ -66,7 +61,6 @@ class LoopLink:
             self.catch_up()
 
     def close(self) -> None:
-        """Close this end; `ended` is not called."""
         if self._live:
             self._live = False
             self._loop.unwatch(self._channel.fileno())
@@ -95,7 +89,7 @@ class LoopLink:
             self._watch()
 
     def _take_in(self) -> None:
-        """Read the arrived messages. If the link has ended, carry them out before reporting the end."""
+        """Carry out arrived messages before reporting the end."""
         try:
             self._arrived += self._channel.receive()
         except (ChannelClosedError, ValueError) as error:

@@ -1,13 +1,9 @@
 """Divide the relay's memory among hosts.
 
-There are four pools: incomplete frames, requests and replies; queues for slow subscribers and clients; latched
-messages; connection headers. A frame is charged to the host that sends it, a queue to the slow host. The pools are
-separate: queues cannot use the memory for frames.
+A frame is charged to the host that sends it, a queue to the slow host. Invariants, besides those of `Pool`:
 
-Invariants, besides those of `Pool`:
-
-1. A host gets no more memory once it holds as much as is free. So a single host can have half of a pool. Each of *n*
-   greedy hosts gets 1/(*n* + 1) of the pool, and the same amount stays free for the next host.
+1. A host gets no more memory once it holds as much as is free. So each of *n* greedy hosts gets 1/(*n* + 1) of the
+   pool, and the same amount stays free for the next host.
 2. Memory beyond a host's quota is freed when the relay next handles data of that host, or at the next check (once a
    second). A latched message is dropped when a host that holds less memory needs to latch one.
 """
@@ -34,14 +30,12 @@ class HostMemory:
         return self._pool.held(self._host)
 
     def add(self, size: int) -> None:
-        """Charge `size` bytes to this host; give bytes back if `size` is negative."""
         if size > 0:
             self._pool.charge(self._host, size)
         elif size:
             self._pool.give_back(self._host, -size)
 
     def refusal(self, size: int = 1) -> str:
-        """Return why this host should not hold `size` more bytes; empty if it may."""
         pool = self._pool
         held, left = pool.held(self._host) + size, pool.bounds.whole - pool.total - size
         if held > left:
@@ -69,7 +63,7 @@ class MemoryPool(Pool[str]):
 
 @dataclass(frozen=True, slots=True)
 class RelayMemory:
-    """The four pools."""
+    """The pools of incomplete frames and requests, of queues, of latched messages, and of connection headers."""
 
     frames: MemoryPool
     queues: MemoryPool
@@ -119,7 +113,7 @@ class StallDetector:
         self._since = 0.0
 
     def seen(self, held: int, now: float) -> bool:
-        """Set the bytes held now (0: nothing is unfinished); return whether the number has not changed for too long."""
+        """Return whether the bytes held (0: nothing is unfinished) have not changed for too long."""
         if not held or held != self._held:
             self._held, self._since = held, now
             return False

@@ -1,14 +1,10 @@
 """Apply the policy's rate limits, in messages and bytes per second. No I/O; callers pass the time.
 
-A limit allows a burst of `BURST` seconds. A message passes while neither unit is used up, even if the message is larger
-than the rest; later messages pay for the excess. So a publisher within the limit loses nothing, large messages pass,
-and the average holds. Messages beyond a limit are dropped.
+A message passes while neither unit is used up, even if the message is larger than the rest; later messages pay for the
+excess. So large messages pass, and the average holds.
 
-Several holders share a limit (`SharedRateLimit.of`), such as the hosts that publish a topic, or the nodes of one host.
-Invariants:
-
-1. Together the holders get what the limit allows. Each gets an equal part, in its own store. When a store is full, its
-   overflow goes to the others in equal parts (max-min fairness); when all are full, it goes to a common store.
+1. Each holder of a shared limit gets an equal part, in its own store. When a store is full, its overflow goes to the
+   others in equal parts (max-min fairness); when all are full, it goes to a common store.
 2. A holder takes from its own store first, then from the common store. So a holder within its equal part loses nothing
    because of others, and the others can use what it leaves.
 3. A store is below zero only after its holder sent a message that was too large. If that holder leaves, its debt stays
@@ -63,7 +59,6 @@ class _Store:
         self._common = min(self._common, self._most_common)
 
     def fill(self, seconds: float) -> None:
-        """Divide the amount that the limit allows in `seconds` among the holders."""
         left, room = seconds * self.rate, self._room
         for rank, name in enumerate(sorted(self._own, key=self._own.__getitem__, reverse=True)):
             given = min(left / (len(self._own) - rank), room - self._own[name])
@@ -117,7 +112,7 @@ class SharedRateLimit:
         self._holders = 0
 
     def set(self, limit: FlowLimit, now: float) -> None:
-        """Change the limit; the unused amount of the old limit carries over."""
+        """The unused amount of the old limit carries over."""
         if limit != self._limit:
             self._fill(now)
             self._limit = limit
@@ -125,7 +120,7 @@ class SharedRateLimit:
             self._bytes.set(limit.bytes)
 
     def of(self, name: str) -> "RateAllowance":
-        """Return this holder's allowance; the name counts as a holder while the allowance is referenced."""
+        """The name counts as a holder while the allowance is referenced."""
         share = self._shares.get(name)
         if share is None:
             share = self._shares[name] = RateAllowance(self, name)
@@ -149,7 +144,7 @@ class SharedRateLimit:
         return bool(self._shares)
 
     def paid(self, now: float) -> bool:
-        """Return whether everything used has been refilled, so that a new limit would not differ."""
+        """Whether everything used has been refilled, so that a new limit would not differ."""
         self._fill(now)
         return self._messages.full and self._bytes.full
 
@@ -185,10 +180,7 @@ class RateAllowance:
 
 
 class RateLimits:
-    """The limits that several connections share, by name: for a topic, a host's publishers, or a subscriber.
-
-    A limit is kept while a connection holds an allowance, and until everything used has been refilled.
-    """
+    """The limits that several connections share, by name: for a topic, a host's publishers, or a subscriber."""
 
     def __init__(self, clock: Callable[[], float]) -> None:
         self._clock = clock
@@ -196,7 +188,6 @@ class RateLimits:
         self._most = _FEW_FLOWS
 
     def of(self, limit: FlowLimit, *names: str, holder: str = "") -> RateAllowance | None:
-        """Set the limit of these names to `limit`, and return the holder's allowance; None without a limit."""
         flow = self.flows.get(names)
         if limit == UNLIMITED:
             self.flows.pop(names, None)
@@ -210,7 +201,7 @@ class RateLimits:
         return flow.of(holder)
 
     def _forget(self) -> None:
-        """Forget unheld limits (refilled ones first, then the oldest) each time the number of limits has doubled."""
+        """Forget unheld limits (refilled ones first) each time the number of limits has doubled."""
         if len(self.flows) < self._most:
             return
         now = self._clock()
@@ -222,10 +213,10 @@ class RateLimits:
 
 
 class PublicationRateLimit:
-    """The limits of one publication: the limit of its host on this topic, and the limit of the topic.
+    """The limit of a publication's host on its topic, and the limit of the topic.
 
-    `dropped(part, messages, size)` is called with the number and bytes of dropped messages. The last message of a
-    latching publisher is not lost: it waits (`later`) until it may pass, or until the next message comes.
+    The last message of a latching publisher is not lost: it waits (`later`) until it may pass, or until the next
+    message comes.
     """
 
     def __init__(self, share: HostMemory, dropped: Callable[[Part, int, int], None]) -> None:
@@ -242,7 +233,6 @@ class PublicationRateLimit:
         self.limits = self._own is not None or together is not None
 
     def passing(self, batch: Batch, now: float, *, latching: bool) -> Batch | None:
-        """Return the messages at the start of a batch that may pass; None if none may."""
         self.forget()
         part = batch
         for name, flow in self._flows():

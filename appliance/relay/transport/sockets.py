@@ -18,7 +18,6 @@ _READ_SIZE = 64 << 10
 
 
 def tune(sock: socket.socket) -> None:
-    """Make a socket non-blocking, without Nagle's delay, with keepalive and the first allowed congestion control."""
     sock.setblocking(False)
     sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
@@ -37,7 +36,6 @@ def congestion_control() -> str:
 
 
 def begin_connect(host: str, port: int) -> socket.socket:
-    """Return a socket that is connecting to the IP address `host`. Raises `OSError` if that fails at once."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
         socket.inet_pton(family, host)
@@ -58,10 +56,8 @@ def begin_connect(host: str, port: int) -> socket.socket:
 class BufferedSocket:
     """A connected (or connecting) socket with a write buffer, for everything except the fast path.
 
-    `received(data)` is called with arriving bytes, and once with b"" at the end of the connection. `opened()` is called
-    when a connecting socket is connected, and `drained()` whenever the kernel has accepted the last waiting byte.
-    `broken(reason)` is called once, when the socket fails. After `close` or `take`, no callback is called. The socket's
-    processor time is charged to `payer`.
+    `received(data)` gets b"" once at the end of the connection. `drained()` is called whenever the kernel has accepted
+    the last waiting byte, and `broken(reason)` once. After `close` or `take`, no callback is called.
     """
 
     def __init__(
@@ -118,7 +114,7 @@ class BufferedSocket:
             self._socket.shutdown(socket.SHUT_WR)
 
     def take(self) -> socket.socket:
-        """Return the socket, which the caller owns from now on; call this only when no bytes wait."""
+        """Return the socket, which the caller owns from now on; no bytes may wait."""
         self._live = False
         self._loop.unwatch(self._socket.fileno())
         return self._socket
