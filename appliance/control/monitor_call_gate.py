@@ -1,7 +1,7 @@
 """Decide the service calls of monitors by the policy, as those of a client at the appliance's own address.
 
-Relays connect to themselves, so this is the address that they listen on: 127.0.0.1, unless `listen:` names another one.
-The decision, the grant and its revocation are about the host that the relay sees.
+Relays connect to themselves, so this is the address that they listen on. The decision, the grant and its revocation
+are about the host that the relay sees.
 """
 
 import ipaddress
@@ -22,17 +22,13 @@ _CALL = "lookupService"
 
 
 def own_host(listen: str) -> str:
-    """Return the address from which relays connect to a port that they open at the address `listen`."""
     address = plain_address(listen)
     return "127.0.0.1" if address.is_unspecified else str(address)
 
 
 @dataclass(frozen=True, slots=True)
 class MonitorCallGate:
-    """Decides for the node `name` at `host`, which makes the calls, and grants them like those of another client.
-
-    `port(provider, kind, service)` returns the port of a service on its relay.
-    """
+    """Decides for the node `name` at `host`, which makes the calls."""
 
     registry: Registry
     graph: RosGraph

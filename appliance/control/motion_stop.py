@@ -18,7 +18,6 @@ Commands = set[tuple[str, str]]
 
 
 def published_before(store: StateStore, concerns: Callable[[Address, str], bool]) -> Commands:
-    """Return the topics that hosts published when the earlier control ended, if `concerns` holds for them."""
     nodes, registrations = store.load_registry()
     hosts = {node.key: node.host for node in nodes if not node.own}
     return {
@@ -31,15 +30,14 @@ def published_before(store: StateStore, concerns: Callable[[Address, str], bool]
 
 @dataclass(frozen=True, slots=True)
 class MotionStop:
-    """Stops the robot; `stop(topic)` has monitors send their safe messages, and returns the names of those monitors."""
+    """Stops the robot; `stop(topic)` returns the names of the monitors that do it."""
 
     stop: Callable[[str], Awaitable[list[str]]]
     trail: AuditTrail
     policy: Callable[[], Policy]
 
     async def after(self, host: str, topics: Iterable[str], why: str) -> None:
-        """Stop the topics that this host commanded, whose messages no longer pass, and record it even if no
-        guard stops them.
+        """Stop the topics that this host commanded, and record it even if no guard stops them.
 
         A topic without a guard needs no stop unless it is in a group of `[Authority]`.
         """
@@ -54,9 +52,7 @@ class MotionStop:
             self._record("motion not stopped", text, host, commanded)
 
     async def at_start(self, lost: Commands, relay: RelayControl) -> None:
-        """Stop topics for which the right to command ended with the earlier control, once no relay serves their
-        hosts.
-        """
+        """Stop topics whose hosts lost the right while control was away, once no relay serves these hosts."""
         while lost and relay.presence != "connected":
             await asyncio.sleep(_READY_SECONDS)
         await relay.carried_out()

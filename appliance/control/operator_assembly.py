@@ -1,4 +1,4 @@
-"""Make the parts that serve operators on the admin socket and over REST: tokens, queries and orders."""
+"""Make the parts that serve operators on the admin socket and over REST."""
 
 from dataclasses import dataclass
 from functools import partial
@@ -34,7 +34,7 @@ class Operators:
 
 
 def make_operators(base: Foundation, parts: Parts) -> Operators:
-    """Make the parts that serve operators. The specifications must already be loaded."""
+    """The specifications must already be loaded."""
     settings, trail, ends = base.settings, base.trail, parts.endpoints
     ends_of_tokens = StoredDeadlines(base.store)
     rest = Current[RestLink]()
@@ -111,7 +111,6 @@ def make_operators(base: Foundation, parts: Parts) -> Operators:
 
 
 async def _durable(base: Foundation) -> None:
-    """Wait until the records of an order are in the log, and until its changes may be answered."""
     await base.trail.durable()
     if base.role.before_answer is not None:
         await base.role.before_answer()

@@ -1,13 +1,8 @@
 """Run the control process: start its parts, serve until the supervisor stops the process, end the parts.
 
-The order of the start:
-
-1. Receive the listening sockets of an earlier control process.
-2. Open the log and the store, and bring the policy into force.
-3. Restore the registry.
-4. Serve the listeners.
-5. Register all nodes with the ROS master, in the first reconcile round.
-6. Send `Ready`.
+The order of the start: receive the listening sockets of an earlier control; open the log and the store, and bring the
+policy into force; restore the registry; serve the listeners; register all nodes with the ROS master, in the first
+reconcile round; send `Ready`.
 """
 
 import asyncio
@@ -159,7 +154,6 @@ class _Control:
         self._tasks += [loop.create_task(run_always(what, one)) for what, one in work.items()]
 
     async def announce(self, *, restarted: bool) -> None:
-        """Send `Ready`. Include the first access token if it was not shown to an operator yet."""
         base, settings = self._base, self._base.settings
         token = await self._operators.tokens.first() if settings.api_address is not None else None
         host = settings.listen_address[0]
@@ -216,7 +210,6 @@ async def _end_others(seconds: float) -> None:
 
 
 async def _restore(base: Foundation, parts: Parts) -> None:
-    """Restore the nodes of the earlier control process, with their ports and grants, as far as the policy allows."""
     core, ends = parts.core, parts.endpoints
     for name, sock in base.sockets.items():
         if name.startswith("port:"):

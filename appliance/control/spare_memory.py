@@ -1,8 +1,8 @@
 """Return unused memory of control to the system.
 
-Large values are read and written in threads, and glibc keeps up to 64 MiB of freed memory per thread. If every large
-block had its own mapping, its memory would be returned at once. But this takes twice as long, because the kernel
-allocates the pages again for each copy. So control returns the memory a little later.
+glibc keeps up to 64 MiB of freed memory for each thread that reads or writes large values. A mapping for every large
+block would return the memory at once, but take twice as long, because the kernel allocates the pages again for each
+copy.
 """
 
 import asyncio
@@ -19,7 +19,7 @@ def resident() -> int:
 
 
 async def return_spare_memory(seconds: float = _LOOK_SECONDS) -> None:
-    """Return free memory while the process has over `MUCH` bytes more than its minimum; runs until cancelled.
+    """Return free memory while the process has over `MUCH` bytes more than its minimum.
 
     This repeats even if the memory is in use, because the allocator keeps memory that is freed later.
     """

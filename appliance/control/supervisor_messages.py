@@ -27,7 +27,7 @@ _log = structlog.get_logger()
 
 
 class SupervisorMessages:
-    """Pass the supervisor's links and reports to the parts of control."""
+    """Passes the supervisor's links and reports to the parts of control."""
 
     def __init__(self, base: Foundation, parts: Parts, operators: Operators) -> None:
         self._base = base

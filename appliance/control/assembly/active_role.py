@@ -1,7 +1,4 @@
-"""The role in which control serves. A feature's hook `may_start` can make control wait for it (`StartGate`).
-
-A single appliance uses these classes and serves from its start to its end.
-"""
+"""The role in which control serves. A single appliance serves from its start to its end."""
 
 import asyncio
 from collections.abc import Awaitable, Callable, Mapping
@@ -31,10 +28,8 @@ STATE_ERRORS = (StateError, PolicyRefusedError, SpecificationsRefusedError, Stor
 class ActiveRole:
     """The right to serve, and its consequences.
 
-    `paired`: another appliance can serve in place of this one, so it may have written the state. `name` is
-    this appliance's name in its pair, `address` the address at which nodes reach the pair, and `robot` the
-    robot's address. `took_over`: this process waited for the role. The link to the api (`api`), with the pin
-    of its certificate, may already be open.
+    `paired`: another appliance can serve in place of this one, so it may have written the state. `took_over`: this
+    process waited for the role.
     """
 
     paired = False
@@ -47,23 +42,21 @@ class ActiveRole:
 
     @property
     def before_answer(self) -> Callable[[], Awaitable[None]] | None:
-        """Return the wait until all changes made so far may be answered; None: no answer waits."""
+        """Return the wait until changes may be answered; None: no answer waits."""
         return None
 
     def inherit(self, store: StateStore, age: Callable[[], int]) -> None:
-        """Take over the state, before any part reads or changes it; `age()` is the age clock of this appliance."""
+        """Take over the state, before any part reads or changes it."""
 
     def host_authority(
         self, signer: Link, store: StateStore, trail: AuditTrail, table: HostTable
     ) -> HostAuthority:
-        """Return the authority of hosts' certificates, and the appliances at which hosts open their tunnels."""
         return make_host_authority(signer, store, trail, table)
 
     def hand_tunnels_to(self, tunnels: Tunnels) -> None:
         """Give a link that is already open to the tunnels."""
 
     def in_doubt(self) -> bool:
-        """Return whether computers of the robot may refuse the connections of this appliance now."""
         return False
 
     def on_end_of_gap(self, ended: Callable[[], None]) -> None:
@@ -74,7 +67,7 @@ class ActiveRole:
 
 
 class StartGate:
-    """The decision when control may serve. `links` are control's ends of links that are needed for it."""
+    """The decision when control may serve."""
 
     links: Mapping[str, tuple[Callable[[Channel], None], Any]] = {}
 
@@ -91,6 +84,5 @@ class StartGate:
         return ActiveRole()
 
     async def begin(self, base: Any, parts: Any) -> FeaturePart | None:
-        """Return a part of control, once control has its other parts (`Foundation`, `Parts`) and before it serves."""
         del base, parts
         return None

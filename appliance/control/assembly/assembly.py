@@ -45,7 +45,6 @@ class Parts:
 
 
 def assemble(base: Foundation) -> Parts:
-    """Make the parts of RVMaster. No part serves or runs yet."""
     core = make_core(base)
     ends = make_endpoints(base, core)
     settings = base.settings

@@ -25,7 +25,7 @@ from roswire.parameter_tree import Tree
 
 @dataclass(frozen=True, slots=True)
 class Core:
-    """The core of RVMaster. `policy()` returns the policy in force; `monitors` is set once specifications load."""
+    """The core of RVMaster."""
 
     policy: Callable[[], Policy]
     registry: Registry
@@ -42,7 +42,6 @@ class Core:
 
 
 def make_core(base: Foundation) -> Core:
-    """Make the core from the registry, the policy, and the parameters in the store."""
     settings, registry, monitors = base.settings, base.registry, Current[SpecificationManager]()
     policy = base.policies.policy
 

@@ -8,7 +8,7 @@ T = TypeVar("T")
 
 
 class Current(Generic[T]):
-    """A value that is set after its readers are made. Call this object to get the value."""
+    """A value that is set after its readers are made. Calls before raise `RuntimeError`."""
 
     def __init__(self) -> None:
         self._values: list[T] = []
@@ -20,14 +20,13 @@ class Current(Generic[T]):
         return bool(self._values)
 
     def __call__(self) -> T:
-        """Return the value. Raises `RuntimeError` before it is set."""
         if not self._values:
             raise RuntimeError("this part of control is used before it is created")
         return self._values[0]
 
 
 class Later(Generic[P, T]):
-    """A function that is set after its callers are made. Raises `RuntimeError` before."""
+    """A function that is set after its callers are made."""
 
     def __init__(self) -> None:
         self._function = Current[Callable[P, T]]()

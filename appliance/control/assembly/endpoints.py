@@ -34,7 +34,7 @@ _REFUSALS_OF_A_ROBOT = (
 
 @dataclass(frozen=True, slots=True)
 class Endpoints:
-    """The endpoints. `handler()` returns the handler of a node's proxy endpoint; it is set once calls can be served."""
+    """The endpoints. `handler` is set once calls can be served."""
 
     places: NodePorts
     addresses: AdvertisedAddresses

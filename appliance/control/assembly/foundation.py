@@ -41,12 +41,7 @@ _log = structlog.get_logger()
 
 @dataclass(frozen=True, slots=True)
 class Foundation:
-    """The durable state, the policy and the listeners.
-
-    `enforcement` gets its value later. So does `in_force`, which returns the revisions of policy and specifications,
-    and `woken`, which the registry calls after a change.
-    `parameters_dirty` is set whenever the mirror of the parameters changes.
-    """
+    """The durable state, the policy and the listeners."""
 
     settings: Settings
     lifeline: ControlLifeline
@@ -85,11 +80,9 @@ async def make_foundation(
     *,
     restarted: bool,
 ) -> Foundation:
-    """Open the log and the store, read the policy and open the listeners.
+    """Make the foundation. Raises `PolicyRefusedError`, `StoreError`, and `OSError` if an address is in use.
 
     `tunnels` is set here, before the supervisor can report about tunnels.
-
-    Raises `PolicyRefusedError`, `StoreError`, and `OSError` if an address is in use.
     """
     policy, woken = Current[Policy](), Later[[], None]()
     registry = Registry(settings.limits.nodes_per_host, woken=woken)
@@ -189,7 +182,6 @@ async def make_foundation(
 
 
 def make_host_table(settings: Settings, store: StateStore) -> HostTable:
-    """Return the table of the hosts in the store, with those that hosts.yaml or a bundle declares."""
     kept = store.settings()
     declared = DeclaredHosts(settings.hosts, kept.get(BUNDLED_HOSTS, ""), kept.get(DECLARED_HOSTS, ""))
     return HostTable(store, settings.ipsec.pool, declared)
@@ -206,7 +198,6 @@ def _open_listeners(settings: Settings, lifeline: ControlLifeline) -> dict[str, 
 
 
 def open_listener(host: str, port: int) -> socket.socket:
-    """Return a listening socket. Raises `OSError` with what to do."""
     try:
         return listen(host, port)
     except OSError as error:

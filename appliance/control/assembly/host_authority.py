@@ -21,7 +21,6 @@ class HostAuthority(NamedTuple):
 def make_host_authority(
     signer: Link, store: StateStore, trail: AuditTrail, table: HostTable
 ) -> HostAuthority:
-    """Return the authority by this appliance's signer, of a single appliance."""
     authority = StoredAuthority(Authority(signer), store.hosts, replaced=lambda: _record_replaced(trail))
     return HostAuthority(authority, Appliances(store.hosts, table.revoked))
 

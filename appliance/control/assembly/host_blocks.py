@@ -1,10 +1,7 @@
 """Keep the hosts that operators block, with the ends of their blocks. The policy denies all their requests.
 
-Invariants:
-
 1. A block is stored before it takes effect, and survives restarts of control and of the appliance.
 2. A block ends by the age clock (`base/age_clock.py`): changes of the system clock neither end nor extend it.
-   Another appliance that takes the state over moves the ends to its age clock (`ActiveRole.inherit`).
 3. `reasons` is never changed, only replaced. So a policy keeps the blocks with which it was put into force.
 """
 
@@ -49,11 +46,10 @@ class BlockTable:
         return self._now + clock.since_boot_ns() - self._seen
 
     def until(self, row: HostBlockRow) -> float | None:
-        """Return the end of a block by the present system clock, in seconds since the epoch; None: it has no end."""
+        """Return the end by the present system clock; None: the block has no end."""
         return None if row.ends is None else self._wall + (row.ends - self._now) / _SECOND
 
     def put(self, address: Address, *, seconds: float | None, who: str, note: str) -> HostBlockRow:
-        """Store a block from now on, in place of an earlier block of the host."""
         ends = None if seconds is None else self._now + int(seconds * _SECOND)
         row = HostBlockRow(str(address), clock.wall(), ends, who, note)
         self._store.hosts.save_block(row)
@@ -76,7 +72,6 @@ class BlockTable:
         ]
 
     def seconds_left(self) -> float | None:
-        """Return the seconds until the first block is over; None if no block has an end."""
         ends = [row.ends for row in self._rows.values() if row.ends is not None]
         return max(0.0, (min(ends) - self._now) / _SECOND) if ends else None
 

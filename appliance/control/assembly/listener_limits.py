@@ -1,5 +1,4 @@
-"""Limit the listeners of control: RVMaster, and the peer-side and master-side proxy endpoints. Find the quota class of
-a host, from the policy and the registry (`appliance/quotas`).
+"""Limit the listeners of control, and find the quota class of a host (`appliance/quotas`).
 
 An unknown host (an address that no rule of the policy names, or that an operator blocks) is refused. If a section of
 the policy is audit-only, only a blocked host is. The beginning of the body is read first, to record the name of the
@@ -32,10 +31,7 @@ from roswire.xmlrpc import XmlRpcLimits, build_fault
 
 
 class ListenerLimits:
-    """The limits and connections of all listeners.
-
-    `policy()` returns the policy in force; `quota_class(host)` returns the quota class of a host.
-    """
+    """The limits and connections of all listeners."""
 
     def __init__(
         self,
@@ -70,7 +66,6 @@ class ListenerLimits:
         self._servers: list[HttpServer] = []
 
     async def open(self, server: HttpServer) -> None:
-        """Start a server; `close` closes it."""
         self._servers.append(server)
         await server.start()
 
@@ -83,10 +78,7 @@ class ListenerLimits:
         at_once: AtOnce = not_at_once,
         keep: bool = True,
     ) -> HttpServer:
-        """Return a server that shares the limits of all listeners.
-
-        `guarded` is false for a listener that only the appliance's own processes can reach.
-        """
+        """`guarded` is false for a listener that only the appliance's own processes can reach."""
         return HttpServer(
             sock,
             handler,
@@ -141,7 +133,6 @@ class ListenerLimits:
         self._trail.happened("malformed", reason, decision="deny", host=peer.text)
 
     def probed(self, reason: str) -> None:
-        """Handle the result of the supervisor's probe. `reason` is empty if the ROS master is hidden."""
         if bool(reason) != bool(self._unhidden):
             event = "probe failed" if reason else "probe passed"
             self._trail.happened(event, reason or "the ROS master is hidden")
@@ -167,8 +158,8 @@ def class_of(
 ) -> str:
     """Return the class that is charged for a host's processor time, and that shares turns.
 
-    The class is the address or network that the policy names. A host can have many addresses, so all hosts that only
-    `*` names share one class, or a second one if they have a registration.
+    A host can have many addresses, so all hosts that only `*` names share one class, or a second one if they have a
+    registration.
     """
     standing = policy().standing(host)
     if host.is_loopback or standing.named:
@@ -181,9 +172,9 @@ def connection_class_of(
 ) -> QuotaClass:
     """Return a host's quota class for connections.
 
-    Hosts that only `*` names share processor time as one host. So their connections must not use up the quotas of hosts
-    that the policy names. Without a registration, they count as unknown; with a registration, as named. Any of these
-    hosts can register a node, so they do not get the part for registered hosts.
+    The connections of hosts that only `*` names must not use up the quotas of hosts that the policy names. With a
+    registration, they count as named, otherwise as unknown. Any of them can register a node, so they do not get the
+    part for registered hosts.
     """
     if host.is_loopback or policy().standing(host).named:
         return quota_class(host)
@@ -203,32 +194,28 @@ def _own_node(_host: Address) -> QuotaClass:
 
 
 class HostQuotaClass:
-    """The quota class of hosts, by the policy in force and by their registrations.
-
-    `policy()` returns the policy in force. Before there is one, the hosts of records count as named, and none has a
-    reserve. `registrations(host)` returns the number of a host's registrations.
-    """
+    """The quota class of hosts, by the policy in force and by their registrations."""
 
     def __init__(self, policy: Current[Policy], registrations: Callable[[Address], int]) -> None:
         self._policy = policy
         self._registrations = registrations
 
     def __call__(self, host: Address) -> QuotaClass:
-        """Return the present quota class of a host. In audit-only mode, also an unknown host can have registrations."""
+        """In audit-only mode, also an unknown host can have registrations."""
         # The policy need not name loopback, from which the appliance's own nodes call.
         if not (host.is_loopback or self._policy().standing(host).known):
             return QuotaClass.UNKNOWN
         return QuotaClass.REGISTERED if self._registrations(host) else QuotaClass.NAMED
 
     def of_text(self, host: str) -> QuotaClass:
-        """Return the quota class of a host in an audit record. A text that is not an address counts as named."""
+        """A text that is not an address counts as named."""
         try:
             return self(address_of(host)) if self._policy else QuotaClass.NAMED
         except ValueError:
             return QuotaClass.NAMED
 
     def has_reserve(self, host: str) -> bool:
-        """Return whether the last part of the audit log's reserve is for this host: the robot, or one the policy names.
+        """Return whether the host gets the last part of the audit log's reserve.
 
         A policy that names only `*` keeps it for hosts with a registration.
         """

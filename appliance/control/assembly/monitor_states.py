@@ -85,7 +85,6 @@ def _state(monitors: SpecificationManager, name: str) -> answers.MonitorState:
 
 
 def published_now(registry: Registry, relayed: RelayTraffic) -> Published:
-    """Return the nodes that publish each topic, with their types; omit the appliance's own nodes."""
     found: dict[str, dict[str, LiveType]] = {}
     for kind, topic, nodes in registry.resources():
         if kind is Kind.PUBLICATION:

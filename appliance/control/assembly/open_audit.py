@@ -22,11 +22,7 @@ def open_audit(
     kept_for: Callable[[str], bool],
     receipts: ReceiptFloor,
 ) -> AuditLog:
-    """Return the audit log.
-
-    `class_of` returns a host's quota class; `kept_for`: whether the last of the disk is kept for it. `held_by` gets
-    processes that lock the log; `receipts` limits retention by age.
-    """
+    """`kept_for(host)`: whether the last of the disk is kept for a host. `held_by` gets processes that lock the log."""
     audit = settings.audit
     reserve = AUDIT_RESERVE.bounds.sized(
         int(audit.reserve_bytes), int(audit.reserve_bytes) // _HOSTS_IN_RESERVE

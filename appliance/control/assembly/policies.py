@@ -1,10 +1,7 @@
 """Manage the policy in force: load it, store revisions, roll back, and limit the time of an unconfirmed change.
 
-A new policy passes the gate (`policy_gate.py`) before it takes effect, also at a start. The store keeps every policy
-that came into force as a revision.
-
-Operators' changes are made one at a time. A change that expects a revision other than the one in force is rejected. A
-change is answered once it is on disk and the relays have carried it out: revoked traffic no longer passes.
+A new policy passes the gate (`policy_gate.py`) before it takes effect, also at a start. A change is answered once it
+is on disk and the relays have carried it out: revoked traffic no longer passes.
 """
 
 import asyncio
@@ -51,7 +48,7 @@ _SHOWN_NODES = 3
 
 
 class PolicyCases(NamedTuple):
-    """Test cases that come with a policy: the name of their file, and their text (None: no cases)."""
+    """The file and text of test cases that come with a policy."""
 
     file: str
     text: str | None
@@ -62,14 +59,14 @@ def kept_policy(row: RevisionRow) -> KeptPolicy:
 
 
 class RevisionChangedError(Exception):
-    """The revision in force is not the revision that the change expects; the message has both numbers."""
+    """Another revision is in force than the change expects; the message has both numbers."""
 
     def __init__(self, expected: int, found: int) -> None:
         super().__init__(f"revision {found} is in force, not {expected}: read it before you change it")
 
 
 class Policies(Revisions[RevisionRow]):
-    """The policy in force and its revisions. The marked methods answer requests about them."""
+    """The policy in force and its revisions. Operators' changes are made one at a time."""
 
     refusal = PolicyRefusedError
     outdated = RevisionChangedError
@@ -91,14 +88,10 @@ class Policies(Revisions[RevisionRow]):
         carried_out: Callable[[], Awaitable[None]],
         site_keys: Sequence[str],
     ) -> None:
-        """Prepare; `start` brings a policy into force, and sets it in `policy`.
+        """`start` brings a policy into force, and sets it in `policy`.
 
-        `hosts()` returns the addresses for `host:NAME`; the owner calls `hosts_changed` when they change. `blocks()`
-        returns the blocked hosts (`Policy.blocks`), `holders()` the hosts that hold groups (`Policy.holders`), and
-        `approved()` the approvals that last (`Policy.approved`); their owners call `decide_again` when they change.
-        `live()` returns the live rights of all hosts. `changed(before, policy)` decides all live rights again, and
-        returns the number of revocations. `carried_out()` waits until the relays have carried out all orders. With
-        `site_keys`, one of these keys must sign every policy.
+        The owner of `hosts` calls `hosts_changed`; those of `blocks`, `holders` and `approved` call `decide_again`.
+        `changed(before, policy)` decides all live rights again, and returns the number of revocations.
         """
         nothing = RevisionRow(0, "", "", 0.0, "", "")
         super().__init__(store, store.revisions, store.save_revision, nothing, LIMITS[0])
@@ -124,7 +117,6 @@ class Policies(Revisions[RevisionRow]):
         return self.policy()
 
     def in_words(self, host: str) -> str:
-        """Return `tablet (10.0.0.7)` for a host that the policy in force names."""
         policy = self.current
         if self._labelled is not policy:
             self._labels = HostNames.of(policy.text, policy.enrolled, policy.robot).labels()
@@ -142,9 +134,8 @@ class Policies(Revisions[RevisionRow]):
         """Bring a policy into force at the start of control. Raises `PolicyRefusedError`.
 
         After a crash of control (`restarted`), this is the policy that was in force. At the start of the appliance, it
-        is the file, if a reload would take it: otherwise the last revision stays in force, with an alarm. Exception: if
-        an operator's own revision (from a rollback or REST) was in force when the appliance stopped, this revision is
-        used.
+        is the file, if a reload would take it: otherwise the last revision stays in force, with an alarm. An
+        operator's own revision that was in force when the appliance stopped comes first.
         """
         kept_first = self._find_last(restarted=restarted)
         kept = kept_policy(self.in_force) if self.revision else None
@@ -162,17 +153,15 @@ class Policies(Revisions[RevisionRow]):
 
     @contextlib.asynccontextmanager
     async def _changing(self, expected: int | str | None) -> AsyncIterator[None]:
-        """Run an operator's change exclusively, then wait until it is on disk and carried out."""
         async with super()._changing(expected):
             yield
             await self.store.settled()
             await self._carried_out()
 
     async def reload(self, request: admin.PolicyReload, who: str) -> Loaded:
-        """Read the file again: check, test and load it, and decide all live rights again.
+        """Read the file again. Raises `PolicyRefusedError` and `RevisionChangedError`.
 
-        The author of the revision is always `disk`; `who` is recorded and in the note. Raises `PolicyRefusedError`.
-        Raises `RevisionChangedError` if another revision came into force in the meantime.
+        The author of the revision is always `disk`.
         """
         within, note = request.confirm_within, reloaded_by(who)
         async with self._changing(request.expected):
@@ -184,19 +173,17 @@ class Policies(Revisions[RevisionRow]):
             return self._keep(policy, signature, who=DISK, note=note, by=who, within=within)
 
     async def attempt(self, text: str, signature: str, cases: PolicyCases) -> None:
-        """Compile and test a text without loading it. Raises `PolicyRefusedError`."""
         await asyncio.to_thread(self._tested, lambda: (text, signature), "policy.ini", self.known, cases)
 
     async def load(self, request: admin.PolicyLoad, who: str) -> Loaded:
-        """Bring a given text into force, as `reload` does with the file.
+        """Bring a given text into force. Raises `PolicyRefusedError` and `RevisionChangedError`.
 
         Loading the same text again makes no new revision. Messages cite its rules as `revision N:line`, because the
-        lines of the file may differ. Raises `PolicyRefusedError` and `RevisionChangedError`.
+        lines of the file may differ.
         """
         return await self.load_with(request, who, None)
 
     async def load_with(self, request: admin.PolicyLoad, who: str, cases: PolicyCases | None) -> Loaded:
-        """Load as `load` does, with test cases that replace those beside the file (None: those of the file)."""
         given, within = (request.text, request.signature), request.confirm_within
         async with self._changing(request.expected):
             now = self.in_force
@@ -207,7 +194,6 @@ class Policies(Revisions[RevisionRow]):
             return self._keep(policy, signature, who=who, note=request.note or "posted", within=within)
 
     def hosts_changed(self) -> int:
-        """Compile the policy in force again, because hosts changed. Return the number of revocations."""
         try:
             policy = judged(self.current.text, self.in_force.signature, self.current.file, self.known)
         except PolicyRefusedError as error:  # a defect: the same text was valid before
@@ -216,25 +202,22 @@ class Policies(Revisions[RevisionRow]):
         return self._enforce(policy)
 
     def decide_again(self) -> int:
-        """Decide by the present blocks of hosts, holders of groups and approvals. Return the number of revocations."""
         return self._enforce(self.current)
 
     async def roll_back(self, request: admin.PolicyRollback, who: str) -> Loaded:
-        """Bring a kept revision into force. Raises `PolicyRefusedError` and `RevisionChangedError`."""
         async with self._changing(request.expected):
             return await self.rollback(request.revision, who=who)
 
     async def rollback(self, revision: int | None, *, who: str) -> Loaded:
-        """Bring a kept revision into force (None: the previous revision).
+        """Bring a kept revision into force (None: the previous one).
 
-        Raises `PolicyRefusedError`. Raises `RevisionChangedError` if another revision came into force in the meantime.
+        Raises `PolicyRefusedError` and `RevisionChangedError`.
         """
         row = await self._wanted(revision)
         policy = judged(row.text, row.signature, row.file, self.known)
         return self._keep(policy, row.signature, who=who, note=f"rolled back to revision {row.revision}")
 
     async def confirm(self, request: admin.PolicyConfirm, who: str) -> answers.PolicyConfirmed:
-        """Keep an unconfirmed change, if there is one. Raises `RevisionChangedError`."""
         async with self._changing(request.expected):
             waited = self.confirm_by is not None
             if waited:
@@ -247,17 +230,14 @@ class Policies(Revisions[RevisionRow]):
         return answers.PolicyRevisionList(msgspec.convert(rows, list[answers.PolicyRevision]))
 
     async def text(self, request: admin.PolicyWanted) -> answers.PolicyKnown:
-        """Return a revision and the context for checks of its text. Raises `UnknownThingError`."""
         row = await self._kept_revision(self.revision if request.revision is None else request.revision)
         return await asyncio.to_thread(self._text, row, self.known)
 
     async def one_revision(self, request: admin.PolicyRevisionWanted) -> answers.RevisionText:
-        """Return a revision with its text. Raises `UnknownThingError`."""
         row = await self._kept_revision(request.revision)
         return msgspec.convert(self._described(row), answers.RevisionText)
 
     async def compiled(self, number: int) -> Policy | None:
-        """Return a kept revision as a policy; None if it is not kept, or not valid any more."""
         try:
             row = await self._kept_revision(number)
             return judged(row.text, row.signature, row.file, self.known)
@@ -296,7 +276,7 @@ class Policies(Revisions[RevisionRow]):
     async def _prepared(
         self, read: Callable[[], tuple[str, str]], file: str, who: str, cases: PolicyCases | None = None
     ) -> tuple[Policy, str]:
-        """Read, compile and test a policy in a thread, without delay for nodes. Return it with its signature."""
+        """Work in a thread, without delay for nodes; return the policy with its signature."""
         before = self.revision
         try:
             while True:
@@ -320,13 +300,12 @@ class Policies(Revisions[RevisionRow]):
         )
 
     def _note_refused(self, reason: str) -> None:
-        """Keep why the file was refused, also for a control that follows after a crash."""
+        """Keep the reason, also for a control that follows after a crash."""
         if reason != self.file_refused:
             self.file_refused = reason
             self.store.save_setting(_REFUSED, reason)
 
     def _file_refused(self, error: PolicyRefusedError) -> None:
-        """Report in the log, the records and the status that the start refused the file."""
         self._note_refused(error.findings[0])
         text = f"revision {self.revision} stays in force, because the start refused {self.file}"
         _log.error(text, findings=error.findings[:100])

@@ -1,6 +1,5 @@
 """The gate of the policy: what the text of a policy must pass before it comes into force, at a load and at a start.
 
-A start does not go around the gate: a file that a reload refuses does not come into force at the next start either.
 The supervisor imports this module too, so it does not import the store.
 """
 
@@ -41,10 +40,7 @@ class KeptPolicy(NamedTuple):
 
 
 class StartingPolicy(NamedTuple):
-    """The policy that a start brings into force, with its signature.
-
-    `refused` is the error of the file, if the revision before it stays in force instead.
-    """
+    """The policy that a start brings into force; `refused` is the error of a file that does not."""
 
     policy: Policy
     signature: str
@@ -54,11 +50,7 @@ class StartingPolicy(NamedTuple):
 def policy_at_start(
     kept: KeptPolicy | None, file: Path, known: PolicyContext, *, kept_first: bool
 ) -> StartingPolicy:
-    """Return the policy that a start brings into force. Raises `PolicyRefusedError`.
-
-    The stored revision `kept` is used if it comes first, or if the file does not pass the gate with its test
-    cases.
-    """
+    """Return `kept` if it comes first, or if the file does not pass. Raises `PolicyRefusedError`."""
     if kept is not None and kept_first:
         try:
             return StartingPolicy(judged(kept.text, kept.signature, kept.file, known), kept.signature)
@@ -80,7 +72,6 @@ def policy_at_start(
 
 
 def read_policy(file: Path) -> tuple[str, str]:
-    """Return the file's text and signature. Raises `PolicyRefusedError`."""
     try:
         return read_given_text(file), read_signature(file)
     except (OSError, UnicodeDecodeError) as error:
@@ -88,7 +79,6 @@ def read_policy(file: Path) -> tuple[str, str]:
 
 
 def judged(text: str, signature: str, file: str, known: PolicyContext) -> Policy:
-    """Return a policy that has passed the gate. Raises `PolicyRefusedError`."""
     try:
         return judge(text, file, known, signature).accepted()
     except PolicyError as error:

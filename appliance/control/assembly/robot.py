@@ -1,6 +1,4 @@
-"""Find the addresses of the group `robot` (the robot's machine, as seen from inside the appliance's isolation), and the
-name to which a host's acts are charged.
-"""
+"""Find the addresses of the robot's machine, as seen from inside the appliance's isolation."""
 
 import ipaddress
 import socket
@@ -16,10 +14,7 @@ _ROUTES = Path("/proc/net/route")
 
 
 def robot_addresses(settings: Settings, robot: str | None = None) -> list[Address]:
-    """Return loopback with `isolation: none`, otherwise the gateway of the default route.
-
-    One of two appliances knows the address of the `robot`, which replaces the gateway's.
-    """
+    """Return loopback with `isolation: none`, otherwise the gateway of the default route."""
     if settings.isolation == "none":
         return [ipaddress.ip_address("127.0.0.1"), ipaddress.ip_address("::1")]
     if robot is not None:
@@ -29,7 +24,6 @@ def robot_addresses(settings: Settings, robot: str | None = None) -> list[Addres
 
 
 def charged_to(policy: Policy, host: str) -> str:
-    """Return the name to which a host's acts are charged."""
     try:
         address = address_of(host)
     except ValueError:
@@ -45,7 +39,6 @@ def own_address(settings: Settings) -> str:
 
 
 def master_address(settings: Settings) -> str:
-    """Return `own_address`. Without a default route, return the address in the first attached network, if any."""
     if settings.isolation != "none" and not robot_addresses(settings):
         for network, gateway in _routes():
             if int(network) and not int(gateway) and network not in settings.ipsec.pool:

@@ -14,11 +14,7 @@ _PATIENCE_SECONDS = 10.0  # a shorter failure, such as the restart of a receiver
 
 
 class ForwarderLink:
-    """The link to a forwarder, and its last report.
-
-    `to` is the receiver (None: not configured), `send` the kind of records that it gets. `received` is called with the
-    last sequence that the receiver has, after each report.
-    """
+    """The link to a forwarder, and its last report. `received` gets the last sequence that the receiver has."""
 
     def __init__(
         self,
@@ -37,7 +33,6 @@ class ForwarderLink:
         self._failure_recorded = False
 
     def status(self) -> ForwardingState | None:
-        """Return the state for `rosrv status` and the metrics, or None if no forwarding is configured."""
         if self._to is None:
             return None
         report = self._report or messages.ForwardingReported()

@@ -19,8 +19,7 @@ _ANY = 1 << 63
 
 
 class ReceiptFloor:
-    """The last record that retention by age may remove: any record, or if `holding`, only records that another
-    machine has.
+    """The last record that retention by age may remove: any record, or if `holding`, only what another machine has.
 
     While only the reserve of the log's disk is free, it may remove any record. One thread writes, another reads.
     """
@@ -31,7 +30,6 @@ class ReceiptFloor:
         self._received = 0 if holding else _ANY
 
     def received(self, sequence: int) -> None:
-        """Note that another machine has all records up to this sequence."""
         if self._received != _ANY:
             self._received = sequence
 
@@ -52,7 +50,6 @@ class SignerRequests:
         self._in_order = False  # whether the present signer has got the oldest request
 
     def want(self, number: int, text: bytes, *, oldest: bool) -> None:
-        """Request the signature of a checkpoint. The log calls this method on its own thread."""
         wanted = messages.SignatureWanted(number, text)
         self._loop.call_soon_threadsafe(partial(self._want, wanted, oldest=oldest))
 
@@ -61,7 +58,6 @@ class SignerRequests:
             self._in_order = self.link.send(message)
 
     def want_removal(self, number: int, checkpoint: bytes, newest: bytes) -> None:
-        """Request approval to remove the records up to a checkpoint. The log calls this method on its own thread."""
         message = messages.RemovalWanted(number, checkpoint, newest)
         self._loop.call_soon_threadsafe(self.link.send, message)
 

@@ -28,8 +28,7 @@ _log = structlog.get_logger()
 class Surroundings:
     """The last reports of the supervisor.
 
-    `probe` is empty before the first probe; then it is `passed` or the reason of the failure. `master` is the URI at
-    which nodes find their ROS master; it is empty before control is ready.
+    `probe` is empty before the first probe; then it is `passed` or the reason of the failure.
     """
 
     def __init__(self) -> None:
@@ -42,10 +41,8 @@ class Surroundings:
 class ControlLifeline:
     """Control's end of the lifeline.
 
-    `stopping` is set when the supervisor stops control or is gone. `enclosed(answer)` is called when the supervisor has
-    opened or closed tunnels. `links` has a function for each process that the start of control may wait for, and the
-    messages that control accepts from it: the function is called at once for each new link. Other messages are queued
-    until `hear` is called, and passed on in order. `activated` is set once one of two appliances may serve, in `epoch`.
+    `links` has a function for each process that the start of control may wait for, and the messages that control
+    accepts from it. Other messages are queued until `hear` is called.
     """
 
     def __init__(
@@ -74,7 +71,6 @@ class ControlLifeline:
         self._heard: Heard = self.queue
 
     def attach(self) -> None:
-        """Begin to receive messages. `restored` is set when all kept sockets have arrived."""
         self.channel.attach(asyncio.get_running_loop(), self._received, self._closed)
 
     def hear(self, heard: Heard) -> None:
@@ -83,7 +79,6 @@ class ControlLifeline:
             heard(*said)
 
     def hear_tunnels(self, enclosed: Enclosed) -> Enclosed:
-        """Pass the supervisor's answers about tunnels to another function; return the earlier one."""
         before, self._enclosed = self._enclosed, enclosed
         return before
 
@@ -91,7 +86,7 @@ class ControlLifeline:
         self._heard = self.queue
 
     def queue(self, message: Any, descriptors: tuple[int, ...]) -> None:
-        """Queue a message; it replaces an earlier one of its kind, because control may wait for months."""
+        """Queue a message in place of an earlier one of its kind, because control may wait for months."""
         key: tuple[object, ...] = (type(message),)
         if isinstance(message, messages.LinkOpened):
             key = (*key, message.role, message.index)
@@ -107,7 +102,6 @@ class ControlLifeline:
         self._send(message, ())
 
     def log_held(self) -> Callable[[list[int]], None]:
-        """Return a thread-safe function that tells the supervisor which processes lock the audit log."""
         loop = asyncio.get_running_loop()
 
         def report(processes: list[int]) -> None:
@@ -117,17 +111,13 @@ class ControlLifeline:
         return report
 
     def keep(self, name: str, sock: socket.socket) -> None:
-        """Have the supervisor keep a listening socket, so that it survives a crash of control."""
         self._send(messages.SocketKept(name), (sock.fileno(),))
 
     def drop(self, name: str) -> None:
         self.say(messages.SocketDropped(name))
 
     async def route_to(self, host: str) -> str | None:
-        """Return the machine's address at which `host` reaches the appliance (None: the address that `host` used).
-
-        Concurrent calls for a host share one query. At most `ROUTES_AT_ONCE` queries are open; other calls wait.
-        """
+        """Return the machine's address at which `host` reaches the appliance (None: the address that `host` used)."""
         if host not in self._routes:
             await self._free_questions.acquire()
             if host in self._routes:  # another call has sent the query in the meantime
@@ -140,14 +130,12 @@ class ControlLifeline:
         return await future
 
     async def endpoint(self) -> messages.EndpointFound:
-        """Ask the supervisor for the address at which hosts of other networks reach the appliance."""
         future: asyncio.Future[messages.EndpointFound] = asyncio.get_running_loop().create_future()
         self._endpoints.append(future)
         self.say(messages.EndpointWanted())
         return await future
 
     async def open_own_network(self, network: str, ports: list[int]) -> str:
-        """Have the supervisor add a network of the appliance's own, and open ports; return the reason of a failure."""
         future: asyncio.Future[str] = asyncio.get_running_loop().create_future()
         self._own_networks.append(future)
         self.say(messages.OwnNetworkWanted(network, ports))

@@ -23,7 +23,7 @@ class RequestHandler(Protocol):
     """The part of control that carries out requests."""
 
     async def carry_out(self, request: admin.AdminRequest[A], *, who: str) -> admin.AdminAnswer[A]:
-        """Carry out a request of `who`, and return the answer."""
+        """Carry out a request of `who`."""
 
 
 class AdminServer:
@@ -34,7 +34,7 @@ class AdminServer:
         self._decoder = msgspec.json.Decoder(AnyRequest)
 
     async def start(self, sock: socket.socket) -> asyncio.Server:
-        """Serve the listening socket. The caller must keep a reference to the returned server."""
+        """The caller must keep a reference to the returned server."""
         return await asyncio.start_unix_server(self._serve, sock=sock, limit=_LINE_LIMIT)
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -62,7 +62,7 @@ class AdminServer:
 
 
 def _given_up(writer: asyncio.StreamWriter) -> bool:
-    """Return whether the client closed the connection or its sending side. If so, its request is withdrawn."""
+    """Whether the client closed its sending side, which withdraws its request."""
     if writer.is_closing():
         return True
     found = select.poll()

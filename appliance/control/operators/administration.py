@@ -1,7 +1,4 @@
-"""Carry out operators' orders and queries, from the admin socket and from REST.
-
-Each request is a class in `appliance.channel.admin`.
-"""
+"""Carry out operators' orders and queries, from the admin socket and from REST."""
 
 from collections.abc import Awaitable, Callable, Iterable
 from typing import Any
@@ -56,11 +53,7 @@ KEPT = ORDERS | {admin.TokenAdd, admin.TokenRotate}
 
 
 class Administration:
-    """Carry out requests. `durable()` waits until all audit records are on disk, or cannot be written.
-
-    `require_room()` raises `StoreError` if the store cannot be written. Requests in `KEPT` without `full_disk` are then
-    rejected.
-    """
+    """Carries out requests. `require_room()` guards requests in `KEPT` without `full_disk`."""
 
     def __init__(
         self,
@@ -78,8 +71,7 @@ class Administration:
     async def carry_out(self, request: admin.AdminRequest[A], *, who: str) -> admin.AdminAnswer[A]:
         """Carry out a request of `who`: the name of a token, or `operator` for the admin socket.
 
-        The records of an order are in the audit log before the order is answered, so that a later search finds them. If
-        the client gives up before the order takes effect, the order is withdrawn (`appliance/base/withdrawal.py`).
+        The records of an order are in the audit log before the answer, so that a later search finds them.
         """
         method = self._methods.get(type(request))
         if method is None:

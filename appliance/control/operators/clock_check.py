@@ -1,11 +1,7 @@
 """Check whether the times of audit records are credible, for status, metrics and the log. Nothing is blocked.
 
-Four conditions are reported:
-
-1. No time service synchronises the machine's clock. The supervisor checks this condition.
-2. The clock is before the last record of the log, because it was set back, perhaps while the appliance was off.
-3. The clock advanced by more than the elapsed time.
-4. The clock is before the date of this program's files.
+It reports a clock that no time service synchronises, that is before the last record of the log or before the date of
+this program's files, or that advanced by more than the elapsed time.
 """
 
 import asyncio
@@ -21,10 +17,7 @@ _STEP_SECONDS = 2.0  # smaller steps are normal corrections of a time service
 
 
 class ClockCheck:
-    """Check the clock, and record each change once.
-
-    `behind()` returns how many seconds the clock is behind the last record, or 0.
-    """
+    """Checks the clock, and records each change once. `behind()` returns seconds behind the last record."""
 
     def __init__(
         self,
@@ -32,7 +25,6 @@ class ClockCheck:
         behind: Callable[[], float],
         started: Callable[[], float] = lambda: clock.wall() - clock.since_boot(),
     ) -> None:
-        """Begin the check. `started()` returns the machine's start by its present clock, in seconds since the epoch."""
         self._trail = trail
         self._behind = behind
         self._synchronised: bool | None = None
@@ -41,7 +33,6 @@ class ClockCheck:
         self._seen = started()
 
     def synchronisation_reported(self, synchronised: bool | None) -> None:
-        """Record whether the supervisor found a time service that synchronises the clock (None: unknown)."""
         before, self._synchronised = self._synchronised, synchronised
         if synchronised is False and before is not False:
             self._trail.happened(
@@ -62,7 +53,7 @@ class ClockCheck:
             await asyncio.sleep(_LOOK_SECONDS)
 
     def look(self) -> None:
-        """Record each step forward. Record a step back once, until the clock has caught up with the last record."""
+        """Record a step back only once, until the clock has caught up with the last record."""
         before, self._seen = self._seen, self._started()
         ahead = self._seen - before
         if ahead > _STEP_SECONDS:

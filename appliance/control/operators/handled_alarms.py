@@ -1,9 +1,5 @@
-"""Keep which alarms operators have acknowledged or silenced.
+"""Keep which alarms operators have acknowledged or silenced, over restarts and takeovers.
 
-An alarm is a present condition (`channel/alarms.py`). Acknowledgements and silences survive a
-restart and a takeover.
-
-Invariants:
 1. An acknowledgement ends with its alarm, so the same condition is a new alarm when it comes back.
 2. A silence ends at its time, also without its alarm. It ends early if the clock was set back before its beginning, so
    a wrong clock never extends it.
@@ -27,7 +23,6 @@ class HandledAlarms:
         self._rows = msgspec.json.decode(store.settings().get(_SETTING, "{}"), type=dict[str, HandledAlarm])
 
     def marked(self, status: Status) -> Status:
-        """Return the status with the acknowledged and silenced alarms; forget those that are over."""
         present = {alarm.kind for alarm in (*open_alarms(status), *activity(status))}
         now = clock.wall()
         kept = {

@@ -26,11 +26,7 @@ _DECISIONS = tuple(
 def measures_of(
     parts: Parts, meter: Meter, status: Status, hosts: list[Host], queued_deliveries: int
 ) -> Measures:
-    """Return the status, the counters of requests, and the present state of registry and relay.
-
-    At most `MOST_RESOURCES` topics and services have their own values (histograms: `MOST_DELAYED`). All others are
-    summed in `OTHERS`.
-    """
+    """All but `MOST_RESOURCES` topics and services (histograms: `MOST_DELAYED`) are summed in `OTHERS`."""
     lives = Counter(incarnation.life for incarnation in parts.core.registry.all() if not incarnation.own)
     kinds = Counter(
         registration.kind.value for node, registration in parts.core.registry.in_order() if not node.own
@@ -73,7 +69,6 @@ def _at(counts: Mapping[_Labels, int], kind: str) -> dict[str, int]:
 
 
 def carried_of(carried: RelayTraffic) -> tuple[dict[str, list[int]], dict[str, list[float]]]:
-    """Return the traffic and delays of topics and services since control started, summed over all incarnations."""
     rows: list[tuple[str, Traffic]] = [*carried.past.items()]
     rows += [(resource, traffic) for (_key, resource), traffic in carried.traffic.items()]
     return by_resource((name, (row.messages, row.bytes, row.dropped)) for name, row in rows), by_resource(
@@ -89,7 +84,6 @@ def from_zero(counts: Mapping[_Labels, int], expected: Iterable[_Labels]) -> dic
 def by_resource(
     rows: Iterable[tuple[str, tuple[_Number, ...]]], most: int = MOST_RESOURCES
 ) -> dict[str, list[_Number]]:
-    """Return the sum of the rows of each resource; all but the first `most` by name are summed in `OTHERS`."""
     sums: dict[str, list[_Number]] = {}
     for resource, values in rows:
         name = resource if resource in sums or len(sums) < most else OTHERS

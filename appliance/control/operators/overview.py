@@ -1,7 +1,4 @@
-"""Describe the graph for operators: nodes, topics, services, connections, traffic.
-
-All values are a snapshot of the registry and the relay's reports.
-"""
+"""Describe the graph for operators: nodes, topics, services, connections, traffic."""
 
 from collections.abc import Iterator
 
@@ -31,7 +28,6 @@ def graph_of(parts: Parts) -> Graph:
 
 
 def hosts_connected(parts: Parts) -> Iterator[set[str]]:
-    """Yield the two hosts of each connection through the relay: of the publisher or service, and of the client."""
     registry = parts.core.registry
     for connection in parts.core.carried.connections.values():
         holder = registry.by_key(connection.key)

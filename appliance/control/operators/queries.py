@@ -56,13 +56,7 @@ _TOPIC = (Kind.PUBLICATION, Kind.SUBSCRIPTION)
 
 @dataclass(frozen=True)
 class Queries:
-    """The answers to queries.
-
-    `features()` returns the states of the features, by their fields in the status. `audit(states)` returns the state of
-    the audit log, and `clock()` that of the machine's clock. `live()` returns the rights that a change of the policy
-    may end. `switched_off()` returns the protection that is switched off. `blocks()` returns the state of the blocks.
-    `handled(status)` adds the alarms that operators have acknowledged or silenced.
-    """
+    """The answers to queries. `live()` returns the rights that a change of the policy may end."""
 
     parts: Parts
     trail: AuditTrail
@@ -85,7 +79,6 @@ class Queries:
         return self.present()
 
     async def inventory(self, _request: admin.InventoryWanted) -> Inventory:
-        """Return the parts of the appliance, and the kernel features in use."""
         from appliance.configuration.inventory import inventory  # noqa: PLC0415  only for this query
 
         found = await asyncio.to_thread(inventory)
@@ -106,7 +99,6 @@ class Queries:
         return monitors_of(self.parts.monitors, self.parts.monitor_calls.rv_state(), texts=request.texts)
 
     async def topic_look(self, request: admin.TopicLook, who: str) -> TopicMessages:
-        """Return the next messages of a topic. Raises `UnknownThingError`, `SenselessError` and `TooManyTapsError`."""
         if not 1 <= request.messages <= MOST_MESSAGES or not 0 < request.seconds <= LONGEST_LOOK:
             raise SenselessError(f"ask for 1 to {MOST_MESSAGES} messages, within {LONGEST_LOOK:g} seconds")
         topics = {topic.name: topic for topic in graph_of(self.parts).topics}

@@ -1,4 +1,4 @@
-"""Define a row of the table of methods: the method of control that answers a request of operators' tools."""
+"""Define a row of the table of methods."""
 
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass

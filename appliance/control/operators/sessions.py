@@ -1,7 +1,7 @@
 """Define people's sessions beside tokens: what the feature that signs people in offers to the rest of control.
 
-A session is a token that a person's browser made for itself. The appliance knows only the verifiers of its keys, as for
-a token, so roles, quotas, signed orders and records treat both alike.
+A session is a token that a person's browser made for itself, so roles, quotas, signed orders and records treat both
+alike.
 """
 
 from typing import NamedTuple, Protocol
@@ -13,8 +13,7 @@ from appliance.store.access_tokens import TokenRow
 class Session(NamedTuple):
     """A person who is signed in.
 
-    `name` is their name in the audit log, `subject` the provider's permanent identifier, and `mail` empty unless it is
-    verified. `groups` are the person's groups of doors. `expires` is seconds since the epoch.
+    `subject` is the provider's permanent identifier, and `mail` empty unless it is verified. `groups` are for doors.
     """
 
     id: str
@@ -30,7 +29,7 @@ class Sessions(Protocol):
     """The sessions of this control process; they end with it."""
 
     def rows(self) -> list[TokenRow]:
-        """Return the sessions that may be used now, in the form of tokens."""
+        """Return the usable sessions, in the form of tokens."""
 
     def of(self, session_id: str) -> Session | None:
-        """Return the person of a session, or None if it has ended."""
+        """Return None if the session has ended."""

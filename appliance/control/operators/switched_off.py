@@ -1,8 +1,7 @@
 """List switched-off protection: monitors that are disabled or in shadow mode, and audit-only sections of the policy.
 
-Each item is listed with its age. After `forgotten_after`, it is recorded once, as an alarm. If a monitor is to come
-back automatically, its age grows only if it is still off after that time. Ages count the running time of the appliance,
-so they do not depend on the system clock.
+If a monitor is to come back automatically, its age grows only if it is still off after that time. Ages count the
+running time of the appliance, so they do not depend on the system clock.
 """
 
 import asyncio
@@ -78,7 +77,6 @@ class SwitchedOffWatch:
             self.look(clock.now() - before)
 
     def look(self, seconds: float) -> None:
-        """Add `seconds` to the ages, and record an alarm for each forgotten protection."""
         self._look(seconds)
         if self._ages:
             self._save()
@@ -97,7 +95,6 @@ class SwitchedOffWatch:
             )
 
     def _look(self, seconds: float) -> None:
-        """Begin new ages, end the ages of restored protection, and add `seconds` to all ages that grow."""
         off = {one.what: one for one in off_now(self._monitors, self._policies)}
         if off.keys() != self._ages.keys():
             self._ages = {what: self._ages.get(what) or _Age(one.since) for what, one in off.items()}

@@ -1,9 +1,7 @@
 """Make, rotate, list and revoke the access tokens of REST.
 
-The api gets data to recognise tokens, but never their secrets. Every creation and revocation of a token is recorded.
-The api also reports uses of tokens; a compromised api can report wrong ones.
-
-People's sessions (`sessions.py`) are usable beside tokens. A session never replaces the token with its id.
+The api gets data to recognise tokens, but never their secrets. A compromised api can report wrong uses of tokens. A
+session (`sessions.py`) never replaces the token with its id.
 """
 
 import contextlib
@@ -32,7 +30,7 @@ _MOST = 1000
 
 
 class TokenOrders:
-    """All tokens. `changed()` is called when the usable tokens have changed; `sessions()` returns people's sessions."""
+    """All tokens. `changed()` is called when the usable tokens have changed."""
 
     def __init__(
         self,
@@ -63,7 +61,7 @@ class TokenOrders:
         return answers.Tokens([self._shown(row) for row in self._rows.values()], self._uses_since)
 
     def usable(self) -> list[TokenKept]:
-        """Return the data by which the api recognises tokens and sessions. The api checks `expires`."""
+        """The api checks `expires`."""
         tokens = {row.id: row for row in self._rows.values() if row.usable(self._ends)}
         return [kept_by_api(row) for row in ({row.id: row for row in self._session_rows()} | tokens).values()]
 
@@ -78,7 +76,6 @@ class TokenOrders:
         return [] if sessions is None else sessions.rows()
 
     def used(self, token_id: str) -> None:
-        """Note that a token is used now. The time is stored unless the disk is full."""
         if token_id not in self._rows:
             return
         self._uses[token_id], now = clock.wall(), clock.now()
@@ -90,7 +87,6 @@ class TokenOrders:
             self._stored[token_id] = now
 
     async def first(self) -> str | None:
-        """Make a first token, if no token exists or if the first token was never shown. Return its text, or None."""
         if self._rows and not self._untold:
             return None
         self._untold = True
@@ -105,10 +101,7 @@ class TokenOrders:
             self._store.save_setting(_UNTOLD, "")
 
     async def add(self, request: admin.TokenAdd, who: str = "") -> answers.NewToken:
-        """Make a token by order of `who`; empty: at the first start. Only this answer contains its text.
-
-        Raises `TokenRefusedError` and `StoreError`.
-        """
+        """Make a token. `who` is empty at the first start. Raises `TokenRefusedError` and `StoreError`."""
         name, now = request.name, clock.wall()
         _require_lifetime(request.seconds)
         if self._named(name):
@@ -138,10 +131,7 @@ class TokenOrders:
         return answers.NewToken(*_fields(row), token=text)
 
     async def rotate(self, request: admin.TokenRotate, who: str = "") -> answers.RotatedToken:
-        """Replace the valid tokens of a name by a new one of the same role. Only this answer contains its text.
-
-        Raises `TokenRefusedError` and `StoreError`.
-        """
+        """Replace a name's tokens. Raises `TokenRefusedError` and `StoreError`."""
         name, now = request.name, clock.wall()
         earlier = self._require_named(name)
         last = max(earlier, key=lambda row: row.expires)
@@ -184,7 +174,7 @@ class TokenOrders:
         return answers.RotatedToken(*_fields(row), token=text, earlier=[self._shown(one) for one in ended])
 
     async def revoke(self, request: admin.TokenRevoke, who: str = "") -> answers.Token:
-        """End all valid tokens of a name now. Raises `TokenRefusedError` and `StoreError`."""
+        """End a name's tokens. Raises `TokenRefusedError` and `StoreError`."""
         ended = [self._end(row, who) for row in self._require_named(request.name)]
         await self._store.settled()
         return self._shown(ended[-1])

@@ -1,15 +1,14 @@
 """Carry out the REST requests that the api passes on, one by one, and record REST calls.
 
-These invariants ensure that a flooded or compromised api cannot block RVMaster:
+A flooded or compromised api cannot block RVMaster:
 
 1. At most `_MOST_WAITING` requests wait; further requests are answered `busy` at once. Between two requests, the event
    loop serves nodes.
 2. Requests that wait for another process (`WaitingRequest`, at most `_MOST_SLOW`) do not delay other requests.
 3. The link to the api ends if the api sends an invalid message or does not read its answers.
 4. REST requests cannot make access tokens, and RVMaster's decisions do not depend on the api.
-5. A request is withdrawn if its client is gone before the request takes effect (`appliance/base/withdrawal.py`).
-6. Every request needs a token whose role allows it. Every change also needs the client's own HTTP request, with a proof
-   if the settings require it (`rest_proof.py`). Control denies and records all other requests.
+5. Every request needs a token whose role allows it. Every change also needs the client's own HTTP request, with a
+   proof if the settings require it (`rest_proof.py`). Control denies and records all other requests.
 """
 
 import asyncio
@@ -56,10 +55,8 @@ NO_DOORS = (503, "this appliance opens no doors now")
 class RestLink:
     """The link to the api.
 
-    `served(pin)` is called with the pin by which hosts recognise the api, and `certified(sha256)`
-    with the fingerprint of its certificate. `connected(door, ticket, peer, descriptor)` passes a WebSocket on, and
-    returns a status and why it is refused. `require_proof`: every change needs a signed
-    request, because a bare token is not enough.
+    `served(pin)` gets the pin by which hosts recognise the api. `connected` passes a WebSocket on, and returns a
+    status and why it is refused.
     """
 
     def __init__(
@@ -139,7 +136,6 @@ class RestLink:
             await asyncio.sleep(0)
 
     def _begin(self, channel: Channel | None, made: RequestMade) -> None:
-        """Serve a request that waits for charon, the signer, the recorder or a topic's messages in its own task."""
         if len(self._slow) >= _MOST_SLOW:
             text = "too many long requests are running: try again"
             self._send_answer(made.number, AdminAnswer(False, error=text, trouble="busy"))
@@ -222,7 +218,6 @@ class RestLink:
             _log.error("the api does not read its answers: its link is closed")
 
     def _lost(self, wrong: str) -> None:
-        """Forget the requests of the api. `wrong` is the api's protocol error, or empty if its process ended."""
         self._waiting.clear()
         if wrong:
             _log.error("the api's link is closed; another one is started", reason=wrong)

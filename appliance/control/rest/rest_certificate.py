@@ -9,13 +9,12 @@ _SETTING = "certificate of REST"
 
 
 class RestCertificate:
-    """The last certificate that the api of this appliance reported; `appliance` is its name in a pair, or empty."""
+    """The last certificate of this appliance's api."""
 
     def __init__(self, store: StateStore, trail: AuditTrail, appliance: str) -> None:
         self._store, self._trail, self._appliance = store, trail, appliance
 
     def stated(self, sha256: str) -> None:
-        """Store the fingerprint of the certificate, and record a change; it is empty if REST is in clear text."""
         known = msgspec.json.decode(self._store.settings().get(_SETTING, "{}"), type=dict[str, str])
         earlier = known.get(self._appliance, "")
         if not sha256 or sha256 == earlier:

@@ -1,17 +1,14 @@
-"""Authenticate REST requests in the control process by the client's credentials, never by a claim of the api process.
+"""Authenticate REST requests by the client's credentials, never by a claim of the api process.
 
-Browsers and scripts connect to the api process, so it may be compromised. Invariants:
+Browsers and scripts connect to the api process, so it may be compromised.
 
 1. Every request must contain its token, or the token's reading key. A compromised api can use only the tokens that it
    has received since it was compromised.
-2. A change comes with the client's HTTP request. Control derives an order from this HTTP request
-   (`channel/rest_meaning.py`). The change must equal the derived order.
-3. A change by a reading key needs a proof: a signature of the HTTP request by the token's signing key, with a challenge
-   of the control process that is valid once. A compromised api can drop such an order, but cannot change, repeat or
-   forge it.
+2. A change must equal the order that control derives from the client's HTTP request (`channel/rest_meaning.py`).
+3. A change by a reading key needs a proof: a signature of the HTTP request by the token's signing key, with a
+   challenge that is valid once. A compromised api can drop such an order, but cannot change, repeat or forge it.
 4. A bare token authorises requests of anyone who has seen it. With the setting `api_require_proof`, a bare token does
    not authorise changes.
-5. A request that is denied here has no effect. The caller records the denial.
 """
 
 import asyncio
@@ -61,7 +58,6 @@ class Challenges:
         return f"{begun}.{self._mac(begun)}"
 
     def take(self, challenge: str, now: float) -> None:
-        """Accept a challenge, once. Raises `ChallengeRefusedError`."""
         begun, _dot, mac = challenge.rpartition(".")
         if not hmac.compare_digest(mac.encode(), self._mac(begun).encode()):
             raise ChallengeRefusedError(
@@ -98,11 +94,11 @@ class UsableTokens(Protocol):
     """The tokens of this appliance."""
 
     def usable_row(self, token_id: str) -> TokenRow | None:
-        """Return the token with this id, if it is usable now."""
+        """Return the token, if it is usable now."""
 
 
 class RequestAuthenticator:
-    """Authenticate requests by their tokens. `require_proof`: a bare token is not enough for changes."""
+    """Authenticates requests. `require_proof`: a bare token is not enough for changes."""
 
     def __init__(self, tokens: UsableTokens, *, require_proof: bool) -> None:
         self._tokens = tokens
@@ -117,10 +113,7 @@ class RequestAuthenticator:
         return Challenge(self._challenges.give(clock.now()), SECONDS)
 
     async def asker(self, made: RequestMade) -> str:
-        """Return the author of a request: the name of its token, or a fixed name if it needs no token.
-
-        Raises `UnprovenError` if the request is denied.
-        """
+        """Return the name of the request's token, or a fixed name if it needs none. Raises `UnprovenError`."""
         role = _role_for(made.request)
         if role is None:
             return "" if isinstance(made.request, admin.MetricsWanted) else _ITSELF
@@ -134,7 +127,7 @@ class RequestAuthenticator:
         return row.name
 
     async def _holder(self, shown: str) -> TokenRow:
-        """Return the usable token for a presented token or reading key. Raises `UnprovenError`."""
+        """Accept a token or a reading key. Raises `UnprovenError`."""
         parsed = parse_token(shown)
         token_id = parsed[0] if parsed is not None else reading_id(shown)
         row = self._tokens.usable_row(token_id) if token_id is not None else None
