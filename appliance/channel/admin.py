@@ -1,15 +1,8 @@
 """The requests of operators' tools to the running appliance. Each request names the struct of its answer.
 
-The admin socket carries one JSON document per line in each direction, and one request per connection at a time. It is
-in the state directory; only its owner and root may use it. It accepts all requests except `ChallengeWanted`.
-
-The api process passes on all requests with `@rest`. `channel/operations.py` has both unions, with the requests of
-features.
-
-`@rest` defines a request's row in the table of operations (`channel/rest_operation.py`): method, path, role, ETag. The
-docstring of a request is its description in the REST contract, unless the row has `words`.
-
-`expected` is the revision that the client has seen. If another revision is now in force, a change is rejected.
+Only the owner of the state directory and root may use the admin socket, which carries one JSON document per line in
+each direction. The docstring of a request with `@rest` is its description in the REST contract, unless the row has
+`words`. A change is rejected if another revision than `expected` is in force.
 """
 
 import functools
@@ -439,9 +432,9 @@ class AdminAnswer(msgspec.Struct, Generic[A], frozen=True):
     """The answer: `ok` with a body, or an error with its findings.
 
     `trouble` is the kind of an error: `request` (makes no sense), `refused` (the policy or name given is wrong),
-    `conflict` (another revision is in force than expected; `tag` is that of the monitors), `unknown` (no such thing),
-    `forbidden` (not for this client), `busy` (too much at once), `failed` (the appliance cannot do it now), `standby`
-    (only the active appliance can do it; `active` is its address).
+    `conflict` (another revision is in force than expected), `unknown` (no such thing), `forbidden` (not for this
+    client), `busy` (too much at once), `failed` (the appliance cannot do it now), `standby` (only the active appliance
+    can do it).
     """
 
     ok: bool
@@ -471,5 +464,4 @@ def answer_to(kind: type[AdminRequest[A]]) -> type[A]:
 
 
 def decode(document: bytes, request: AdminRequest[A]) -> AdminAnswer[A]:
-    """Parse control's answer to the request. Raises `ValueError`."""
     return _decoder(type(request)).decode(document)

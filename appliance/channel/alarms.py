@@ -1,4 +1,4 @@
-"""Derive alarms (present conditions that need attention) from the status: for the console, REST, `rosrv status`."""
+"""Derive alarms from the status: for the console, REST, `rosrv status`."""
 
 import datetime
 from collections.abc import Iterable, Iterator
@@ -36,7 +36,6 @@ class AlarmList(msgspec.Struct, frozen=True):
 
 
 def open_alarms(status: Status) -> list[Alarm]:
-    """Return the present alarms, the most severe first."""
     found = [*_system(status), *_policy(status), *_monitors(status)]
     found += [("warning", "ipsec", "hosts", line) for line in status.ipsec.troubles]
     found += _blocks(status.blocks)
@@ -68,7 +67,6 @@ def activity(status: Status) -> list[Alarm]:
 
 
 def _handled(status: Status, alarms: Iterable[Alarm]) -> Iterator[Alarm]:
-    """Yield the alarms, with a note if an operator acknowledged or silenced them."""
     rows = {row.kind: row for row in status.handled_alarms}
     for alarm in alarms:
         row = rows.get(alarm.kind)

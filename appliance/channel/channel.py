@@ -1,13 +1,8 @@
 """Send and receive typed messages and file descriptors over a Unix stream socket, without blocking.
 
-A frame is a 4-byte big-endian length, followed by a MessagePack document of this length. Descriptors are sent
-as SCM_RIGHTS with the first byte of their frame. The kernel never merges two sends with descriptors, so
-received descriptors are queued in order and assigned to frames in this order.
-
-The owner of a channel waits on `fileno()`, calls `receive()` when it is readable, and `flush()` when it is writable.
-
-If the peer does not read, `send` raises `ChannelFullError` beyond `limit` bytes of backlog: a defect, because both
-ends belong to the appliance. A sender that can wait does so while the channel is `crowded`.
+A frame is a 4-byte big-endian length, followed by a MessagePack document. Descriptors are sent with the first byte of
+their frame. The kernel never merges two sends with descriptors, so received descriptors are assigned to frames in
+order.
 
 The kernel may refuse a write for a while though the socket is writable: too many descriptors are on their way, or it
 has no memory. Then nothing is lost, and the channel is `delayed`: its owner calls `flush()` after `AGAIN_SECONDS`.
@@ -45,7 +40,7 @@ class ChannelClosedError(Exception):
 
 
 class ChannelFullError(Exception):
-    """The backlog has reached its limit, because the other end does not read."""
+    """The other end does not read; a defect, because both ends belong to the appliance."""
 
 
 class Channel:
@@ -79,14 +74,13 @@ class Channel:
 
     @property
     def crowded(self) -> bool:
-        """Whether more than half of the backlog is in use."""
+        """Whether a sender that can wait should, because half of the backlog is in use."""
         return self._backlog > self._limit // 2
 
     def send(self, message: Message, descriptors: tuple[int, ...] = (), *, soon: bool = False) -> None:
-        """Queue a message. Raises `ChannelFullError`.
+        """Queue a message. Raises `ChannelFullError`. Descriptors are duplicated.
 
-        Descriptors are duplicated; the caller keeps its own. `soon`: an attached channel writes the message
-        within `SOON_SECONDS`, together with other messages.
+        `soon`: an attached channel writes the message within `SOON_SECONDS`, together with other messages.
         """
         if len(descriptors) != message.descriptors:
             raise ValueError(f"{type(message).__name__} travels with {message.descriptors} descriptors")
@@ -107,7 +101,7 @@ class Channel:
             self._loop.call_later(SOON_SECONDS, self._flush_attached)
 
     def flush(self) -> None:
-        """Write as much as the kernel accepts now. Raises `ChannelClosedError` if the other end is gone."""
+        """Write as much as the kernel accepts now. Raises `ChannelClosedError`."""
         self.delayed = False
         while self._outgoing:
             data, descriptors = self._next()
@@ -143,8 +137,8 @@ class Channel:
     def receive(self) -> list[tuple[Any, tuple[int, ...]]]:
         """Return all complete messages. The caller owns the descriptors.
 
-        Raises `ChannelClosedError` if the other end is gone. Raises `ValueError`, and leaves the link unusable, if a
-        message does not belong to this link, is too long, or lacks its descriptors.
+        Raises `ChannelClosedError`. Raises `ValueError`, and leaves the link unusable, if a message does not belong to
+        this link, is too long, or lacks its descriptors.
         """
         closed = False
         for _turn in range(_MAX_READS):
@@ -198,8 +192,7 @@ class Channel:
         """Serve this end from an asyncio loop.
 
         When the other end is gone, `closed()` is called once, after the last message. `send` then raises no
-        `ChannelClosedError`. An invalid message closes the channel: `refused(reason)` is called, or `closed()` if
-        `refused` is None.
+        `ChannelClosedError`. An invalid message closes the channel: `refused(reason)` is called, or `closed()`.
         """
         self._loop = loop
 
@@ -270,7 +263,6 @@ class Channel:
         self._backlog = 0
 
     def close(self) -> None:
-        """Close this end, and descriptors that no message has claimed."""
         if self._socket.fileno() < 0:
             return
         if self._loop is not None:

@@ -1,8 +1,4 @@
-"""The lifeline and the link to control, for all children that serve control.
-
-A child answers the supervisor's pings, uses each new link instead of the previous one, and closes unexpected
-descriptors. It ends when the supervisor sends `Stop` or is gone.
-"""
+"""The lifeline and the link to control, for all children that serve control."""
 
 import asyncio
 import os
@@ -16,7 +12,7 @@ from appliance.channel.messages import Failed, LinkOpened, MemoryGiven, Message,
 
 
 class Child:
-    """A child's loop; `said(message)` gets control's messages, `linked()` is called for each new link."""
+    """A child's loop. It ends when the supervisor sends `Stop` or is gone."""
 
     def __init__(
         self,
@@ -48,7 +44,7 @@ class Child:
     def tell(self, message: Message) -> bool:
         """Send a message to control; return False if there is no link.
 
-        If control does not read, close the link and return False: control asks again over its next link.
+        If control does not read, close the link: control asks again over its next link.
         """
         try:
             return self._control.send(message)
@@ -57,7 +53,7 @@ class Child:
             return False
 
     def fail(self, reason: str, output: list[str]) -> None:
-        """Report that the child cannot serve; `output` is the output of the program that this process ran."""
+        """`output` is the output of the program that this process ran."""
         self._answer(Failed(reason, output))
 
     def close(self) -> None:

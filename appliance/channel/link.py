@@ -13,11 +13,8 @@ from appliance.channel.messages import Message
 class Link:
     """The present channel; `heard(message)` gets messages of the present process only.
 
-    `took(message, descriptors)` gets the messages with descriptors, which it then owns; without it, they are
-    closed.
-
-    `lost(reason)` is called when the process is gone and has no successor yet. The reason is empty unless the
-    process sent an invalid message.
+    `lost(reason)` is called when the process is gone and has no successor yet; the reason is empty unless the process
+    sent an invalid message.
     """
 
     def __init__(
@@ -67,10 +64,7 @@ class Link:
     async def ask(
         self, question: Callable[[int], Message], seconds: float, descriptors: tuple[int, ...] = ()
     ) -> Any:
-        """Return the answer to a question with a new number; wait at most `seconds`.
-
-        Raises `TimeoutError`, `ChannelFullError`, and `ChannelClosedError` if the process is gone.
-        """
+        """Return the answer to a question. Raises `TimeoutError`, `ChannelFullError` and `ChannelClosedError`."""
         number = next(self._numbers)
         answer = self._asked[number] = asyncio.get_running_loop().create_future()
         try:
@@ -82,13 +76,12 @@ class Link:
             del self._asked[number]
 
     def answered(self, number: int, answer: Any) -> None:
-        """Answer the open question with this number; ignore the answer if the question has ended."""
         future = self._asked.get(number)
         if future is not None and not future.done():
             future.set_result(answer)
 
     def release(self) -> Channel | None:
-        """Give the channel to another link, which gets all later messages; None if not connected."""
+        """Give the channel to another link, which gets all later messages."""
         channel, self.channel = self.channel, None
         if channel is not None:
             channel.detach()

@@ -1,10 +1,7 @@
 """Convert HTTP requests to orders, and orders to HTTP requests, by the table of operations.
 
-The api makes an order from each HTTP request, and control derives it again from the client's request and carries it
-out only if both are equal. So a compromised api cannot use a proof for another order.
-
-The api may only fill in the fields in `Operation.filled`. Other fields that a request omits have the defaults in
-`docs/reference/rest.md`.
+Control derives the api's order again from the client's request and carries it out only if both are equal. So a
+compromised api cannot use a proof for another order. The api may only fill in the fields in `Operation.filled`.
 """
 
 import json
@@ -36,7 +33,7 @@ class BadTagError(NoOrderError):
 
 
 class RestCall(NamedTuple):
-    """An order as an HTTP request; `match`: it is sent with `If-Match: *`, so it changes any revision in force."""
+    """An order as an HTTP request; `match`: `If-Match: *`, so it changes any revision in force."""
 
     method: str
     target: str
@@ -70,7 +67,6 @@ def meant(asked: ClientRequest, *, dry_run: bool = False) -> AdminRequest[Any]:
 
 
 def filled_in(order: AdminRequest[Any], given: AdminRequest[Any]) -> AdminRequest[Any]:
-    """Copy unset fields that the appliance may fill in (`Operation.filled`) from `given`."""
     operation = operation_of(order)
     if operation is None or type(order) is not type(given):
         return order
@@ -115,7 +111,6 @@ def _order(
     *,
     dry_run: bool,
 ) -> AdminRequest[Any] | None:
-    """Return None if the body belongs to another operation."""
     fields: dict[str, Any] = dict(operation.fixed)
     for name, field in operation.fields().items():
         if name in named:

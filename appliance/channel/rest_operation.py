@@ -1,7 +1,6 @@
 """Define a row of the table of operations: how clients send a request of `channel/admin.py` over REST.
 
-The api's routes (`api/routes/operation_routes.py`), the command line's calls and control's check
-(`channel/rest_meaning.py`) are derived from the rows.
+The api's routes, the command line's calls and control's check (`rest_meaning.py`) are derived from the rows.
 """
 
 import functools
@@ -26,7 +25,6 @@ class RequestParameter(NamedTuple):
 
 
 def parameter(description: str = "", *, name: str = "", **rules: Any) -> RequestParameter:
-    """Annotate a field that is sent in the path or the query; `name` is its name there, if it differs."""
     return RequestParameter(name, {**({"description": description} if description else {}), **rules})
 
 
@@ -39,7 +37,6 @@ def parameter_of(kind: Any) -> RequestParameter:
 
 
 def plain(kind: Any) -> Any:
-    """Return a type without its annotation and `| None`."""
     while True:
         if get_origin(kind) is Annotated:
             kind = get_args(kind)[0]
@@ -52,8 +49,7 @@ def plain(kind: Any) -> Any:
 class Versioned(NamedTuple):
     """A resource with an ETag, which a change must name in `If-Match`.
 
-    `where` is the path that returns the ETag. `changed` describes status 412 in the contract. A change takes at most
-    `seconds`.
+    `where` is the path that returns the ETag. `changed` describes status 412 in the contract.
     """
 
     what: str
@@ -66,10 +62,8 @@ class Versioned(NamedTuple):
 class Operation:
     """One way to send a request over REST. Without `role`, it needs no token; without `path`, it serves other routes.
 
-    A field of the request is sent in the path, in the query, in `If-Match` (`expected`), or otherwise in the body.
-
-    As a decorator of a request class, it adds a row for the request. If a class has several decorators, the top row
-    is first.
+    A field of the request is sent in the path, in the query, in `If-Match` (`expected`), or otherwise in the body. If
+    a class has several of these decorators, the top row is first.
     """
 
     role: TokenRole | None
@@ -129,7 +123,6 @@ class Operation:
         ]
 
     def least(self, given: Mapping[str, Any], *, dry_run: bool = False) -> tuple[TokenRole, str]:
-        """Return the least role for these fields, and the reason if it is not the row's role."""
         for name, doing in self.admin_with.items():
             if given.get(name):
                 return "admin", f"{doing} is for admins"

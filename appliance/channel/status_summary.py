@@ -6,7 +6,7 @@ from appliance.channel.answers.status import ProcessInfo, Status
 
 
 def probe_failed(status: Status) -> bool:
-    """Whether the probe reached the hidden ROS master past the appliance; False before the first probe."""
+    """Whether the probe failed; False before the first probe."""
     return status.probe not in ("", "passed")
 
 
@@ -30,7 +30,6 @@ def unserved(status: Status) -> str | None:
 
 
 def process_names(processes: Sequence[ProcessInfo]) -> list[str]:
-    """Return the names of processes: the role, with a number from 0 if it has several processes."""
     roles = [row.role for row in processes]
     return [
         f"{role} {roles[:place].count(role)}" if roles.count(role) > 1 else role

@@ -10,12 +10,12 @@ Observed = tuple[list[int], float]
 
 
 class Measures(msgspec.Struct, frozen=True, kw_only=True):
-    """Everything that control measures.
+    """Everything that control measures, in rows.
 
-    The rows are: `decisions` category, outcome and number; `calls` the times of calls by name; `relayed`
-    messages, bytes and dropped messages by topic or service; `delayed` buckets and their sum by topic;
-    `monitors` kind, monitor and number; `slices` the present and the largest number for each parametric
-    specification; `limited` topic, limit and number.
+    `decisions` are category, outcome and number; `calls` the times of calls by name; `relayed` messages, bytes and
+    dropped messages by topic or service; `delayed` buckets and their sum by topic; `monitors` kind, monitor and
+    number; `slices` the present and the largest number for each parametric specification; `limited` topic, limit and
+    number.
     """
 
     decisions: list[tuple[str, str, int]]

@@ -1,12 +1,8 @@
 """Every message that crosses a process boundary of the appliance, by link.
 
-A message is a frozen struct that is tagged with its class name. A link accepts only the messages of its
-union, so a process cannot receive any other kind of message. `descriptors` is the number of file descriptors,
-which are sent as SCM_RIGHTS.
-
-Strings from unknown hosts (names, header values) are carried as values, and never interpreted on the way.
-
-`messages` has the messages of all files except `messages.api`, which imports all requests of operators.
+A link accepts only the messages of its union. Strings from unknown hosts (names, header values) are carried as values,
+and never interpreted on the way. `messages` does not have those of `messages.api`, which imports all requests of
+operators.
 """
 
 # ruff: noqa: F403  so that a new message need not be listed

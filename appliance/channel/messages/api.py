@@ -1,7 +1,4 @@
-"""The link control <-> api. The api passes on each client's request and credentials; control verifies them.
-
-The api's requests are the union `RestRequest`. No request in it can make a token.
-"""
+"""The link control <-> api. The api passes on each client's request and credentials; control verifies them."""
 
 import math
 from typing import Annotated, ClassVar
@@ -27,8 +24,8 @@ class ClientRequest(msgspec.Struct, frozen=True):
 class RequestMade(Message):
     """A client's request; its answer repeats `number`.
 
-    `shown` is the token or reading key, empty if none is needed. A change also has `asked`. A request without
-    effect by `until` (seconds of the monotonic clock, which all processes share) is withdrawn.
+    `shown` is the token or reading key, empty if none is needed. A change also has `asked`. A request without effect
+    by `until` (monotonic seconds) is withdrawn.
     """
 
     number: int
@@ -52,9 +49,9 @@ class RequestAnswered(Message):
 
 
 class ConnectionPassed(Message):
-    """A WebSocket for a door, after TLS. The api has read the head of the request, and sends it again.
+    """A WebSocket for a door, after TLS, with the ticket in its URL.
 
-    `ticket` is the ticket in the URL.
+    The api has read the head of the request, and sends it again.
     """
 
     descriptors: ClassVar[int] = 1
@@ -75,7 +72,7 @@ class ConnectionAnswered(Message):
 class TokenKept(msgspec.Struct, frozen=True):
     """A usable token, without its secret; `expires` is seconds since the epoch.
 
-    `reading` is the hash of the token's reading key, empty for tokens of an early version without reading keys.
+    The hash of the reading key, `reading`, is empty for tokens of an early version.
     """
 
     id: str
@@ -102,8 +99,7 @@ class TokenUsed(Message):
 class RestCalled(Message):
     """REST calls for the audit log. `who` is the token's name, empty for an invalid token.
 
-    `count` equal calls, collected for at least a second, are one message. `duration_us` is the duration of the first.
-    `dry`: the call was a dry run.
+    `count` equal calls, collected for at least a second, are one message with the `duration_us` of the first.
     """
 
     host: str
@@ -118,10 +114,7 @@ class RestCalled(Message):
 
 
 class RestServed(Message):
-    """The api's first message, repeated for a new certificate: the pin of its key (`sha256//…`), empty in clear text.
-
-    `certificate` is the SHA-256 of the certificate.
-    """
+    """The pin of the api's key (`sha256//…`) and the SHA-256 of its certificate, empty in clear text."""
 
     pin: Annotated[str, msgspec.Meta(pattern="^(sha256//[A-Za-z0-9+/]{43}=)?$")]
     certificate: Annotated[str, msgspec.Meta(pattern="^([0-9a-f]{64})?$")] = ""

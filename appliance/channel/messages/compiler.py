@@ -6,10 +6,7 @@ from appliance.channel.messages.message import Message
 
 
 class StateOwner(msgspec.Struct, frozen=True):
-    """A monitor, identified by the digest of its state. `holds`: it holds its topics if the state is lost.
-
-    `position` is its declaration in the file.
-    """
+    """A monitor, identified by the digest of its state. `holds`: it holds its topics if the state is lost."""
 
     identity: str
     holds: bool
@@ -38,17 +35,13 @@ class GivenDeclared(msgspec.Struct, frozen=True):
 class Contents(msgspec.Struct, frozen=True):
     """The contents of valid specifications: monitors (name to file), and what they use.
 
-    `sharing` has the groups of monitors that share variables, directly or indirectly. `published_by` maps a file to
-    the topics that it publishes. `types` maps a topic to its message type, and `texts` maps such a type to its full
-    definition. `certificates` has each property of a monitor, and whether its automaton was proved equal to its
-    formula. `places` maps a topic to its first position in the files (`file:line:column`). Each relay runs its part
-    of `compiled` (`PartsWanted`).
+    `sharing` has the groups of monitors that share variables. `published_by` maps a file to the topics that it
+    publishes, `types` a topic to its message type, and `texts` such a type to its full definition. `certificates` has
+    each property of a monitor, and whether its automaton was proved equal to its formula. `places` maps a topic to
+    `file:line:column`.
 
-    `unbuilt` has the monitors of files with errors, each with its first error. They do nothing; the relay holds their
-    topics. `left_out` has the files whose topics are not known, because they cannot be parsed or a type is not
-    defined, each with its first error; nothing holds their topics.
-
-    `givens` has the constants and topics that are given to each monitor.
+    `unbuilt` has the monitors of files with errors. They do nothing; the relay holds their topics. `left_out` has the
+    files whose topics are not known; nothing holds their topics.
     """
 
     monitors: dict[str, str] = {}
@@ -72,9 +65,8 @@ class Contents(msgspec.Struct, frozen=True):
 class ContentsWanted(Message):
     """Control asks for the contents of specifications (name to text) with these message definitions.
 
-    A `dry_run` gets less processor time than an order, and builds the module too. `at_start`: files with errors do
-    not keep the others from being compiled (`Contents.unbuilt`); nor do the files `broken`, which had errors before.
-    `topics` replace topics given in the texts, by monitor and name.
+    A `dry_run` gets less processor time than an order, and builds the module too. `at_start`: files with errors, also
+    the `broken` ones of before, do not keep the others from being compiled.
     """
 
     number: int
@@ -94,7 +86,7 @@ class ContentsFound(Message):
 
 
 class CompilationRefused(Message):
-    """The specifications are rejected; `findings` has all errors (`file:line:column: error: text`), or the reason."""
+    """All errors of the specifications (`file:line:column: error: text`), or the reason."""
 
     number: int
     findings: list[str]

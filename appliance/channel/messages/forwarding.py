@@ -6,9 +6,8 @@ from appliance.channel.messages.message import Message
 class ForwardingReported(Message):
     """Progress after a change, at most once a second.
 
-    `sent` counts since the start of the process, up to record `sequence` and checkpoint `checkpoint`. `behind`
-    records wait, the oldest for `seconds`. `missed` records were removed before they could be sent. `trouble` is the
-    reason if forwarding is interrupted.
+    `sent` counts since the start of the process, up to record `sequence` and checkpoint `checkpoint`. `behind` records
+    wait, the oldest for `seconds`. `missed` records were removed before they could be sent.
     """
 
     sent: int = 0

@@ -27,25 +27,18 @@ class Stop(Message):
 
 
 class Ready(Message):
-    """A child is in service; for control, nodes may connect. `detail` is for the status: addresses, ports.
+    """A child is in service. `detail` is for the status: addresses, ports.
 
-    Control's `detail` has these keys:
-
-    - `master`: the URI for nodes
-    - `revision`: the revision of the policy
-    - `rosout_master`: the URI of the loopback listener for the appliance's own nodes
-    - `inner_port`: the port of the master-side endpoints
-    - `token`: the first access token of REST, if it was made at this start
+    Control's `detail` has `master` (the URI for nodes), `revision` (of the policy), `rosout_master` (the URI of the
+    loopback listener for the appliance's own nodes), `inner_port` (of the master-side endpoints), and `token`, the
+    first access token of REST, if it was made at this start.
     """
 
     detail: dict[str, Any] = msgspec.field(default_factory=dict)
 
 
 class Failed(Message):
-    """A child cannot serve: the supervisor stops the appliance or restarts the child.
-
-    `output` has the last lines of output of the program that the child ran.
-    """
+    """A child cannot serve. `output` has the last lines of the program that it ran."""
 
     reason: str
     output: list[str] = msgspec.field(default_factory=list)
@@ -54,9 +47,8 @@ class Failed(Message):
 class Walled(Message):
     """The first message of a child: its sandbox (docs/dev/architecture.md).
 
-    `calls` is the limit on its system calls: "listed" (only calls on a list are allowed), "usual" (calls that no
-    process of the appliance makes are forbidden) or empty. `landlock` is the ABI version of the kernel's Landlock
-    that limits its files and ports; 0 means none.
+    `calls` limits its system calls: "listed" (only those on a list), "usual" (all but those that no process of the
+    appliance makes) or empty. `landlock` is the ABI version of the kernel's Landlock; 0: none.
     """
 
     calls: str
@@ -73,7 +65,7 @@ class LinkOpened(Message):
 
 
 class SocketKept(Message):
-    """A listening socket with a unique name. The supervisor keeps it if control dies."""
+    """A listening socket, which the supervisor keeps if control dies."""
 
     descriptors: ClassVar[int] = 1
     name: str
@@ -93,9 +85,9 @@ class SocketRestored(Message):
 
 
 class SocketsRestored(Message):
-    """All kept sockets are returned; sent at every start of control, even if there are none.
+    """All kept sockets are returned; sent at every start of control.
 
-    `announced`: the caller that started the appliance has received the `Ready` of an earlier control process.
+    `announced`: the caller that started the appliance has received an earlier `Ready`.
     """
 
     count: int
@@ -103,7 +95,7 @@ class SocketsRestored(Message):
 
 
 class Announced(Message):
-    """The caller that started the appliance has received control's `Ready`, with the first token."""
+    """The caller that started the appliance has received `Ready`, with the first token."""
 
 
 class ProcessesChanged(Message):
@@ -146,7 +138,7 @@ class PolicyReloadRequested(Message):
 
 
 class RouteWanted(Message):
-    """Control asks for the machine's address by which a host reaches the appliance (isolation by a namespace)."""
+    """Control asks for the machine's address by which a host reaches the appliance."""
 
     host: str
 
@@ -159,7 +151,7 @@ class RouteFound(Message):
 
 
 class EndpointWanted(Message):
-    """Control asks for the address at which hosts of other networks reach the appliance, for kits."""
+    """Control asks for the address at which hosts of other networks reach the appliance."""
 
 
 class EndpointFound(Message):
@@ -176,7 +168,7 @@ class LogHeld(Message):
 
 
 class CompilerWanted(Message):
-    """Control has specifications to compile: start the compiler if it is not running."""
+    """Start the compiler if it is not running."""
 
 
 class ProcessWanted(Message):
@@ -209,10 +201,7 @@ class ApplianceStopRequested(Message):
 
 
 class MemoryGiven(Message):
-    """Shared memory of a feature, with the feature's `terms`.
-
-    `used_by` is the feature's function that a relay calls with them (`module:function`); other processes need none.
-    """
+    """Shared memory of a feature, with the feature's `terms` for `used_by` (`module:function`) in a relay."""
 
     descriptors: ClassVar[int] = 1
     terms: dict[str, Any]
@@ -220,12 +209,10 @@ class MemoryGiven(Message):
 
 
 class StateGiven(Message):
-    """Shared memory with the state of monitors, for a relay.
+    """Shared memory with the state of monitors, for a relay: first that of earlier lives, then its `own`.
 
-    It sends the memory of earlier lives of the appliance first, which the relay only reads, and then the relay's
-    `own`. `boot` identifies the present boot of the machine. The monitors' time (ns) is the machine's monotonic clock
-    plus `offset`. `ended_boot` identifies the boot in which the appliance last ended in order, at `ended_at` (ns
-    since the epoch).
+    The monitors' time (ns) is the monotonic clock plus `offset`. The appliance last ended in order in `ended_boot`, at
+    `ended_at` (ns since the epoch).
     """
 
     descriptors: ClassVar[int] = 1
@@ -237,7 +224,7 @@ class StateGiven(Message):
 
 
 class LeaseHeld(Message):
-    """This appliance is active until `until` (seconds of CLOCK_BOOTTIME), in this epoch.
+    """This appliance is active until `until` (seconds of CLOCK_BOOTTIME).
 
     If no later time follows, the supervisor stops all processes that serve the robot.
     """
@@ -247,10 +234,7 @@ class LeaseHeld(Message):
 
 
 class LeaseEnded(Message):
-    """This appliance is not active any more.
-
-    `renewable`: no other appliance can have had a grant so far, so a renewal in the same epoch may follow.
-    """
+    """This appliance is not active any more; `renewable`: a renewal in the same epoch may follow."""
 
     renewable: bool = False
 

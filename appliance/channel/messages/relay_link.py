@@ -1,6 +1,6 @@
 """The link control <-> relay. Control sends the wanted state; the relay reports connections, traffic and events.
 
-`key` is the key of an incarnation.
+`key` is the key of an incarnation. `named`: the policy names the host, not only all hosts (`*`).
 """
 
 from typing import Any, ClassVar, Literal, NamedTuple
@@ -28,14 +28,13 @@ class OrdersAsked(Message):
 
 
 class OrdersCarriedOut(Message):
-    """All orders before an `OrdersAsked` are carried out; several are answered in order."""
+    """All orders before an `OrdersAsked` are carried out."""
 
 
 class NodePlaced(Message):
     """An incarnation, with the listening socket that replaces its TCPROS port.
 
-    `host` is the address for calls to the node; `name` is the node's name (its `callerid`). `monitors`: the
-    incarnation is the appliance's own publisher, whose port sends the messages that monitors publish.
+    `monitors`: it is the appliance's own publisher, whose port sends the messages that monitors publish.
     """
 
     descriptors: ClassVar[int] = 1
@@ -62,12 +61,11 @@ UNLIMITED = FlowLimit()
 
 
 class PublicationPlaced(Message):
-    """A publication; its type is as registered, or `*` if unknown.
+    """A publication; its type is as registered, or `*` if unknown. Sending it again changes the limits.
 
-    `limit` applies to all publications of the topic on this host. `together` applies to all publications of
-    the topic; hosts, by `counted_as`, share it equally. Sending this message again changes the limits.
-    `named`: the policy names the node's host, not only all hosts (`*`). `silent`: the relay drops all
-    messages of the node, because its host does not hold the topic's group (`[Authority]`).
+    `limit` applies to all publications of the topic on this host. `together` applies to all publications of the topic;
+    hosts, by `counted_as`, share it equally. `silent`: the relay drops all messages of the node, because its host does
+    not hold the topic's group (`[Authority]`).
     """
 
     key: str
@@ -104,11 +102,7 @@ class ServiceWithdrawn(Message):
 
 
 class GrantInstalled(Message):
-    """A host and caller id may subscribe, up to a limit.
-
-    Sending this message again changes the limit. `named`: the policy names the host, not only all hosts
-    (`*`).
-    """
+    """A host and caller id may subscribe, up to a limit, which this message can change."""
 
     key: str
     topic: str
@@ -128,11 +122,7 @@ class GrantRevoked(Message):
 
 
 class ClientGranted(Message):
-    """A host and caller id may call the service.
-
-    `named`: the policy names the host, not only all hosts (`*`). `asks`: control approves each request
-    (`ApprovalWanted`). Sending this message again changes both.
-    """
+    """A host and caller id may call the service; `asks`: control approves each request (`ApprovalWanted`)."""
 
     key: str
     service: str
@@ -143,7 +133,7 @@ class ClientGranted(Message):
 
 
 class ClientRevoked(Message):
-    """A client may no longer call a service; the relay cuts its connections to the service."""
+    """A client may no longer call a service; the relay cuts its connections to it."""
 
     key: str
     service: str
@@ -176,7 +166,6 @@ _FACT_KINDS: dict[type, str] = {
 
 
 def identity(message: Message) -> tuple[str, ...]:
-    """Return the kind of a fact and its fields, which the statement and the withdrawal of a fact share."""
     word = _FACT_KINDS.get(type(message))
     if word is None:
         raise TypeError(f"{type(message).__name__} is not a withdrawal")
@@ -218,8 +207,7 @@ Violation = Literal["", "limit exceeded", "malformed", "connection refused"]
 class UpstreamLost(Message):
     """A connection to a publisher broke or could not be made, so control checks the node at once.
 
-    `violation` is the event to record if the relay cut the connection because of the publisher's data; otherwise
-    empty.
+    `violation` is the event to record if the relay cut the connection because of the publisher's data.
     """
 
     key: str
@@ -229,7 +217,7 @@ class UpstreamLost(Message):
 
 
 class LatchRefused(Message):
-    """A latched message was passed on but not kept, because its host's memory for them is used up."""
+    """A latched message was not kept, because its host's memory for them is used up."""
 
     key: str
     topic: str
@@ -259,10 +247,7 @@ class ConnectionClosed(Message):
 
 
 class ConnectionRefused(Message):
-    """A connection was refused; `resource` is the topic or service in the header, `kind` is "topic" or "service".
-
-    Both are empty if the header names neither.
-    """
+    """A connection was refused. `resource` and `kind` ("topic" or "service") are empty if its header names neither."""
 
     key: str
     kind: str
@@ -280,10 +265,8 @@ DELAY_BOUNDS = (0.00005, 0.0001, 0.00025, 0.0005, 0.001, 0.0025, 0.005, 0.01, 0.
 class TopicTraffic(msgspec.Struct, frozen=True, array_like=True):
     """Traffic since the last report.
 
-    `delays` counts messages by the time from their receipt to the write to the subscribers' sockets. It has a
-    count for each of `DELAY_BOUNDS` and one for longer delays, or is empty if no message was delivered.
-    `delay_seconds` is the sum of all delays. `md5sum` is from the publisher's header; it is empty while
-    unknown, and for services.
+    `delays` counts messages by the time from their receipt to the write to the subscribers' sockets: for each of
+    `DELAY_BOUNDS` and for longer delays. `md5sum` is empty while unknown, and for services.
     """
 
     key: str
@@ -300,8 +283,7 @@ class TopicTraffic(msgspec.Struct, frozen=True, array_like=True):
 class LimitedRow(msgspec.Struct, frozen=True, array_like=True):
     """Messages that a limit dropped since the last report.
 
-    `part` is the scope of the limit. `host` and `caller_id` identify the publisher, or, for a subscriber's limit, the
-    subscriber.
+    `host` and `caller_id` identify the publisher, or, for a subscriber's limit, the subscriber.
     """
 
     key: str
@@ -320,10 +302,10 @@ class MessagesLimited(Message):
 
 
 class TrafficReported(Message):
-    """Changed counters of topics and services, at most once a second.
+    """Changed counters of topics and services over `over` seconds.
 
-    The counters cover `over` seconds. `unrecorded` counts connections that began and ended while there was no control
-    process; they are not reported one by one. `memory` has the bytes that all hosts hold now, by kind.
+    `unrecorded` counts connections that began and ended while there was no control process. `memory` has the bytes
+    that all hosts hold now, by kind.
     """
 
     rows: list[TopicTraffic]
@@ -335,23 +317,18 @@ class TrafficReported(Message):
 class SpecificationsStated(Message):
     """The specifications in force, sent before any topic is placed, and at every change.
 
-    `part` is this relay's part of the compiled specifications (`rosmop/fast/serialization.py`; empty if it
-    has none). `enabled` maps each monitor of this relay to whether its events happen. `restarted`: this relay
-    replaces one that died, so its monitors with the modifier `hold` block their topics. The monitors in
-    `moved` come from another relay and start here; with `hold`, they also block their topics.
+    `part` is empty if this relay runs none of them. `restarted`: this relay replaces a dead one, so its monitors with
+    the modifier `hold` block their topics; so do those in `moved`, which come from another relay and start here.
 
-    The answer repeats `statement`, because the same revision may be sent again. `ahead`: the relay carries
-    out later messages only after these specifications are in force or rejected, so no topic is placed before
-    its monitors. The monitors in `shadows` are in shadow mode: they get copies of messages. `slices` is the
-    largest number of slices of a parametric specification.
+    The answer repeats `statement`, because the same revision may be sent again. `ahead`: the relay carries out later
+    messages only after these specifications are in force or rejected, so no topic is placed before its monitors.
 
-    After a takeover, `left` has the states that the relays of the other appliance left (`StateLeft`), and
-    `left_at` the time of its monitors by then (0: that in the states). `lost` is the reason why other states
-    are lost. In both cases the relay ignores its own memory.
+    After a takeover, `left` has the states that the relays of the other appliance left (`StateLeft`), and `left_at`
+    the time of its monitors by then (0: that in the states). `lost` is the reason why other states are lost. In both
+    cases the relay ignores its own memory.
 
-    `unbuilt` has the monitors that do nothing because their files have errors, with the errors. Unless they
-    are declared `begin`, they hold their topics. `given` has the values of given constants that differ from
-    the text, by monitor and name.
+    `unbuilt` has the monitors that do nothing because their files have errors. Unless they are declared `begin`, they
+    hold their topics.
     """
 
     revision: int
@@ -374,8 +351,8 @@ class SpecificationsStated(Message):
 class StateWanted(Message):
     """Control asks a relay for `StateLeft`.
 
-    An appliance that hands over also asks it to drop all messages from now on. `copy`: the relay continues;
-    it sends its state if that has changed since the last copy, or if `full`.
+    Without `copy`, the appliance hands over: the relay drops all messages from now on. A copy is sent if the state has
+    changed since the last copy, or if `full`.
     """
 
     number: int
@@ -386,8 +363,8 @@ class StateWanted(Message):
 class StateLeft(Message):
     """The answer to the `StateWanted` with this number.
 
-    `content` is the state of the relay's monitors (empty: it has none; None: unchanged since the last copy). `at` is
-    the time of the monitors in nanoseconds. Without `at` there is no copy.
+    `content` is empty if there is no state, and None if it is unchanged since the last copy. `at` is the time of the
+    monitors in nanoseconds; without it there is no copy.
     """
 
     number: int
@@ -436,8 +413,8 @@ class StopBegun(Message):
 class SpecificationsTaken(Message):
     """The specifications are in force.
 
-    `began` lists the monitors that started in their initial state, and `held` those that hold their topics. `because`
-    gives the reason for each monitor that holds its topics because its state was lost.
+    `began` lists the monitors that started in their initial state, `held` those that hold their topics, and `because`
+    the reasons if their state was lost.
     """
 
     revision: int
@@ -481,10 +458,7 @@ class OwnServiceCalled(Message):
 
 
 class OwnServiceAnswered(Message):
-    """A text for the client of the appliance's own service.
-
-    `repeats`: calls of the same host in the next second get this answer too.
-    """
+    """A text for the client; `repeats`: calls of the same host in the next second get it too."""
 
     number: int
     success: bool
@@ -495,8 +469,7 @@ class OwnServiceAnswered(Message):
 class ApprovalWanted(Message):
     """A client's service request waits for `ApprovalAnswered`.
 
-    `digest` is the SHA-256 of the request, `shown` its first bytes, and `size` the number of all. `type` is the
-    service's type.
+    `digest` is the SHA-256 of the request, `shown` its first bytes, and `size` the number of all.
     """
 
     number: int
@@ -534,7 +507,7 @@ class MonitorCallAnswered(Message):
 
 
 class PublicationRefused(Message):
-    """The definition of a publisher or service differs from the specifications', so the relay does not carry it."""
+    """The definition differs from the specifications', so the relay does not carry it."""
 
     key: str
     resource: str
@@ -544,15 +517,14 @@ class PublicationRefused(Message):
 class MonitorEvent(msgspec.Struct, frozen=True, array_like=True):
     """An action of a monitor. The first action of each kind in a second is complete; the others are only counted.
 
-    `kind` is verdict, drop, change, fault, log, publish or call. The prefix "shadow " marks an action that a monitor in
-    shadow mode would have taken ("shadow missed": a message that it did not get). `time` is in nanoseconds since the
-    epoch. `count` is 0 for a complete event, otherwise the number of counted events.
+    `kind` is verdict, drop, change, fault, log, publish or call, with the prefix "shadow " in shadow mode ("shadow
+    missed": a message that it did not get). `time` is in nanoseconds since the epoch. `count` is 0 for a complete
+    event.
 
-    `before` and `after` are the first bytes of the message; `size` is its whole length. `monitor` is the monitor that
-    acted, and for a change the last one; `changed_by` in the detail names the events of all monitors that changed the
-    message (in a count, only if there were several). `host` and `caller_id` identify the sender of the message:
-    publisher, client or server. They are empty for timed events; in a count, `caller_id` is empty for several senders
-    of one host. `number`, `seq` and `stamp` in the detail identify the message.
+    `before` and `after` are the first bytes of the message; `size` is its whole length. For a change, `monitor` is the
+    last one; `changed_by` in the detail names the events of all monitors that changed the message. `host` and
+    `caller_id` identify the sender of the message. They are empty for timed events; in a count, `caller_id` is empty
+    for several senders of one host.
     """
 
     kind: str
@@ -583,9 +555,8 @@ class MonitorsReported(Message):
 class MonitorRow(msgspec.Struct, frozen=True, array_like=True):
     """A monitor's counters since it was loaded, or the relay started.
 
-    A monitor in shadow mode (`shadow`) counts the drops and changes that it would have made. `missed` counts
-    the messages that it would have received if it were in force. A parametric specification has `slices`
-    slices now, and at most `slice_limit`. `withholds`: it withholds a topic from hosts now.
+    In shadow mode, drops and changes are those that it would have made, and `missed` counts messages that it would
+    have received if it were in force. `withholds`: it withholds a topic from hosts now.
     """
 
     name: str

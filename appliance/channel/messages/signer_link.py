@@ -30,10 +30,7 @@ class SignatureRefused(Message):
 
 
 class RemovalWanted(Message):
-    """Control asks to remove all records up to a checkpoint.
-
-    `checkpoint` is its text, `newest` the text of the last signed checkpoint.
-    """
+    """Control asks to remove all records up to a checkpoint; `newest` is the last signed one."""
 
     number: int
     checkpoint: bytes
@@ -66,7 +63,7 @@ class AuthorityRequest(Message):
 class AuthorityStated(Message):
     """The certificate (PEM) of the authority whose key the signer has.
 
-    `trouble` is the reason if the signer cannot use the sealed key of the other appliance's authority.
+    `trouble`: the signer cannot use the sealed key of the other appliance's authority.
     """
 
     number: int
@@ -77,8 +74,8 @@ class AuthorityStated(Message):
 class CertificateWanted(Message):
     """Control asks for a certificate; `request` is PKCS #10, in PEM.
 
-    `proof`, if given, must be a signature over the bytes of `request` by the key of the certificate `former`
-    (PEM). The authority must have issued `former` for the same name.
+    `proof`, if given, must be a signature over the bytes of `request` by the key of the certificate `former` (PEM),
+    which the authority must have issued for the same name.
     """
 
     number: int

@@ -16,8 +16,7 @@ APPLIANCE_NAME = "rosrv-appliance"  # the name in the appliance's own certificat
 class TunnelsWanted(Message):
     """Control asks for tunnels.
 
-    From now on, addresses of `pool` are accepted only through IPsec, the appliance has `address` (in `pool`), and the
-    process that runs charon is started.
+    From now on, addresses of `pool` are accepted only through IPsec, and the process that runs charon is started.
     """
 
     pool: str
