@@ -1,15 +1,11 @@
 """Accept connections, from two accept queues of the kernel, by source address.
 
-The kernel has one queue for each listening socket, in order of arrival, and an acceptor empties it quickly, several
-connections in one turn of the event loop. `accepted` then decides by host whether a connection may wait. So a host that
-connects without end does not fill the queues of other hosts.
+An acceptor empties a queue quickly, and `accepted` then decides by host whether a connection may wait. But a flood
+still delays all later connections of its queue. So two sockets of one port (`SO_REUSEPORT`) have two queues, and a BPF
+program picks the queue by address. Accepting from the second queue waits for the turn of unknown hosts (`paced`).
 
-A flood still delays all later connections of its queue. Two sockets of one port (`SO_REUSEPORT`) have two queues. A BPF
-program picks the queue of a connection by its address. Accepting from the second queue, of hosts that no policy rule
-names, waits for the turn of unknown hosts (`paced`).
-
-The queue affects only the order. After it is accepted, every connection is judged by its address. While the second
-socket does not exist (control restarts), the first socket gets all connections.
+The queue affects only the order: every connection is judged by its address afterwards. While the second socket does
+not exist (control restarts), the first socket gets all connections.
 """
 
 import array
@@ -76,7 +72,7 @@ class NamedFirst:
 
 
 class SourceQueues:
-    """`program` sends connections to it.
+    """The two queues of a port, between which `program` chooses.
 
     Raises `OSError` if the kernel does not support such programs.
     """
@@ -120,8 +116,8 @@ class SourceQueues:
 def first_for(networks: Iterable[Network], blocked: Iterable[Address] = ()) -> bytes:
     """Return the program that sends these sources, except blocked ones, to the first socket.
 
-    If there are too many addresses for a program, it ignores the blocks. If there are still too many, it sends all
-    sources to the first socket.
+    If there are too many addresses for a program, it ignores the blocks, and then sends all sources to the first
+    socket.
     """
     networks = list(networks)
     tests = [(network, FIRST) for network in networks]
@@ -145,7 +141,6 @@ def _program(tests: Sequence[tuple[Network, int]]) -> list[bytes]:
 
 
 def _tests(version: int, networks: list[tuple[Network, int]]) -> list[bytes]:
-    """Addresses are compared word by word."""
     words = 4 if version == 6 else 1
     code = []
     for word in range(words):
@@ -172,8 +167,7 @@ def _instruction(operation: int, operand: int, if_true: int = 0, if_false: int =
 class Acceptor:
     """Accepts connections; `accepted` owns the socket, and the host is charged for the time.
 
-    If it returns False (too many connections), other connections of this host in the same turn are closed at
-    once. With `paced`, accepting waits for the turn of unknown hosts.
+    If it returns False (too many connections), other connections of this host in the same turn are closed at once.
     """
 
     def __init__(

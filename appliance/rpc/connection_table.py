@@ -1,17 +1,12 @@
 """Count the connections of each host and the bytes that they hold; evict connections to make room.
 
-Invariants:
-
-1. Three pools (`appliance/quotas`) count connections, held bytes, and connections that wait for their refusal. Held
-   bytes are requests without an answer and answers that the peer has not read.
-2. A host within its own quota evicts another connection if the pool or the host's class is full. Only connections of
-   the same or a lower quota class are evicted.
-3. The lowest class is evicted first. In a class, idle connections are evicted before unfinished connections, and these
+1. A host within its own quota evicts another connection of the same or a lower quota class if the pool or the host's
+   class is full.
+2. The lowest class is evicted first. In a class, idle connections are evicted before unfinished connections, and these
    before served connections. In each stage, the longest wait is evicted first.
-4. `patience` is the minimum wait before an eviction. At RVMaster, an idle connection is evicted at once, because ROS
-   clients reconnect. An unfinished connection of the same class is evicted after one second at the earliest. A served
-   connection is never evicted.
-5. If bytes are short, the largest unfinished connection of a host with more bytes or a lower class is evicted.
+3. `patience` is the minimum wait before an eviction. At RVMaster, an idle connection is evicted at once, because ROS
+   clients reconnect. A served connection is never evicted.
+4. If bytes are short, the largest unfinished connection of a host with more bytes or a lower class is evicted.
 """
 
 import asyncio
@@ -47,7 +42,7 @@ class TrackedConnection(Protocol):
         """Return the bytes that are released when the connection ends."""
 
     def expire(self) -> None:
-        """End the connection, because the deadline has passed."""
+        """End the connection after its deadline."""
 
     def abort(self) -> None:
         """End now, and `leave` the table."""
@@ -64,8 +59,7 @@ def _of_ros(_quota_class: QuotaClass, stage: Stage, own: bool) -> float:
 
 
 class ConnectionTable(Generic[Holder]):
-    """The connections of listeners, which may share the table. `quota_class` returns the present class of a
-    host.
+    """The connections of listeners, which may share the table.
 
     `connection_class` returns the class that counts for connections (None: `quota_class`).
     """
@@ -106,7 +100,6 @@ class ConnectionTable(Generic[Holder]):
         return frozenset(self._of)
 
     def enter(self, connection: TrackedConnection, host: Holder) -> str:
-        """Add a connection, and evict another one if necessary. Return the reason if there is no room."""
         why = self._take(self.connected, host, 1)
         if not why:
             self._of[connection] = host, self.connected
@@ -114,7 +107,6 @@ class ConnectionTable(Generic[Holder]):
         return why
 
     def turn_away(self, connection: TrackedConnection, host: Holder) -> bool:
-        """Keep a connection open for its refusal. Return False if too many are kept already."""
         if self.farewells.take(host):
             return False
         self._of[connection] = host, self.farewells
@@ -128,7 +120,6 @@ class ConnectionTable(Generic[Holder]):
             pool.give_back(host)
 
     def file(self, connection: TrackedConnection, stage: Stage) -> None:
-        """Set the stage of a connection, whose wait starts again."""
         host, pool = self._of.get(connection, (None, self.farewells))
         if host is None or pool is not self.connected:
             return
@@ -139,14 +130,13 @@ class ConnectionTable(Generic[Holder]):
         self._queues[stage].put(connection, host, self._clock())
 
     def hold(self, host: Holder, size: int) -> str:
-        """Count a connection's bytes; return the reason if there are too many, which are then not counted."""
+        """Count bytes, unless there are too many; return the reason."""
         return self._take(self.held, host, size)
 
     def release(self, host: Holder, size: int) -> None:
         self.held.give_back(host, size)
 
     async def sweep(self) -> None:
-        """Close connections without progress once a second, until cancelled."""
         while True:
             await asyncio.sleep(1.0)
             now = clock.now()
@@ -176,7 +166,6 @@ class ConnectionTable(Generic[Holder]):
         return None
 
     def _to_free_bytes(self, host: Holder) -> TrackedConnection | None:
-        """Return the connection with the most bytes that may be evicted for this host."""
         mine, most = self._quota_class(host), self.held.held(host)
         able = [
             connection

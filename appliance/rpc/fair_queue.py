@@ -1,15 +1,12 @@
 """Serve hosts in turn, so that a flood of requests from one host costs other hosts little.
 
-The slots for requests are a pool of `appliance/quotas`. A request without a free slot waits. The next slot goes to the
-host with the longest wait since its last turn; the number and duration of requests do not matter.
+The next slot goes to the host with the longest wait since its last turn. Hosts that the policy names as one network
+are a *group*. A group shares one turn and at most half of the slots, so additional addresses in its network are
+useless. With `own_slots`, each known group also has one slot of its own, so a host that begins does not wait for long
+requests of guests that fill the slots.
 
-Hosts that the policy names as one network are a *group*. A group shares one turn and at most half of the slots, so
-additional addresses in its network are useless. With `own_slots`, each group also has one slot of its own, unless its
-host is unknown. So a host that begins does not wait for long requests of guests that fill the slots.
-
-Large bodies and answers have turns of their own, to save memory and time of the event loop. A parameter tree needs ten
-times its size in memory while it is copied from the ROS master to a node. The *bulk* of a request is a reservation for
-this memory. At most `AT_ONCE` requests may hold a bulk, one per host.
+A parameter tree needs ten times its size in memory while it is copied from the ROS master to a node. The *bulk* of a
+request is a reservation for this memory. At most `AT_ONCE` requests may hold a bulk, one per host.
 """
 
 import asyncio
@@ -40,11 +37,10 @@ def itself(host: Hashable) -> Hashable:
 
 
 class Turns(Generic[Holder]):
-    """The turns of hosts. While a slot is free, a request waits only if its host or group has used up its
-    quota.
+    """The turns of hosts. While a slot is free, only a host or group that has used up its quota waits.
 
-    `alike(host)` returns the group of a host. A host must pay for its audit records before it gets a slot:
-    `pause(host)` returns the seconds until the next check, or 0 if everything is paid.
+    A host must pay for its audit records before it gets a slot: `pause(host)` returns the seconds until the next
+    check.
     """
 
     def __init__(
@@ -68,7 +64,6 @@ class Turns(Generic[Holder]):
         self.waiting: OrderedDict[Hashable, OrderedDict[Holder, Queue]] = OrderedDict()
 
     async def enter(self, host: Holder) -> None:
-        """Wait for a slot; audit records must be paid first."""
         while seconds := self.pause(str(host)):
             await asyncio.sleep(seconds)
         kind = self._alike(host)
@@ -149,10 +144,7 @@ def bulk_turns(quota_class: Callable[[Address], QuotaClass]) -> Turns[Address]:
 
 
 class Bulk:
-    """Reserved on demand, and released when the request ends.
-
-    `in_thread` charges the host for work in a thread, which is not part of the request's own steps.
-    """
+    """Reserved on demand, and released when the request ends."""
 
     def __init__(self, turns: Turns[Address], host: Address, processor: ProcessorTime) -> None:
         self._turns = turns
@@ -168,13 +160,11 @@ class Bulk:
         self.give_back()
 
     async def take(self) -> None:
-        """Do nothing if the request already has it."""
         if not self.taken:
             await self._turns.enter(self._host)
             self.taken = True
 
     async def in_thread(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-        """Charge the processor time to the host."""
         used = 0.0
 
         def measured() -> T:
@@ -199,9 +189,7 @@ class Bulk:
 class LargeWrites:
     """Large values to the ROS master and to another appliance go one at a time for each host.
 
-    The ROS master is one Python process, whose threads would block each other while they read large values. The
-    changes of all hosts reach the other appliance in one order. A call that has its turn waits only for these two;
-    `stored` waits for the other appliance.
+    The threads of the ROS master would block each other while they read such values.
     """
 
     def __init__(
@@ -216,7 +204,6 @@ class LargeWrites:
 
     @contextlib.asynccontextmanager
     async def turn(self, host: Address, values: list[Value]) -> AsyncIterator[bool]:
-        """Yield whether the values are large."""
         if weigh(values, self._enough) < self._enough:
             yield False
             return
@@ -230,7 +217,6 @@ class LargeWrites:
 
 
 def text_weight(text: str) -> int:
-    """Approximate bytes on the wire, with `&`, `<` and `>` escaped."""
     if text.isascii() and not ("&" in text or "<" in text or ">" in text):
         return len(text)
     size = len(text.encode("utf-8", "surrogatepass"))

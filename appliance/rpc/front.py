@@ -1,11 +1,8 @@
 """Limit the connections of every HTTP server of the appliance: RVMaster, the proxy endpoints, and REST.
 
-The front parses requests with httptools, within limits. The server behind the front answers them. Invariants:
-
 1. A connection is in the `ConnectionTable` from its acceptance to its end, including the TLS handshake.
-2. The TLS handshake and the head of a request take at most `head_seconds` each; a head has at most `head_bytes`.
-3. At most `most_waiting` requests of a connection wait while another request is served.
-4. The sweep of the table closes a connection without progress, whatever its state.
+2. The TLS handshake and the head of a request take at most `head_seconds` each.
+3. The sweep of the table closes a connection without progress, whatever its state.
 """
 
 import asyncio
@@ -43,7 +40,10 @@ class HttpLimits:
 
 
 class Front(asyncio.BaseProtocol, ABC):
-    """The reading side of one connection. With `sock`, it is counted before it has a transport."""
+    """The reading side of one connection. With `sock`, it is counted before it has a transport.
+
+    The server behind it answers the parsed requests, of which at most `most_waiting` wait.
+    """
 
     transport: asyncio.Transport
     most_waiting: int
@@ -65,7 +65,6 @@ class Front(asyncio.BaseProtocol, ABC):
         self.allow(limits.head_seconds)
 
     def allow(self, seconds: float) -> None:
-        """Let the connection end unless it makes progress within this time."""
         self.deadline = clock.now() + seconds
 
     @abstractmethod
@@ -87,7 +86,6 @@ class Front(asyncio.BaseProtocol, ABC):
         return self._socket is None
 
     def open(self, transport: asyncio.Transport) -> bool:
-        """Begin with a transport; return False, and abort it, if the connection has ended already."""
         self.transport, self._socket = transport, None
         if self.closing or not transport.get_extra_info("peername"):
             self.abort()
@@ -117,7 +115,6 @@ class Front(asyncio.BaseProtocol, ABC):
                 self._reject_head()
 
     def _await_rest(self) -> None:
-        """Set the deadline for the rest of a request; most requests end in their first piece, and wait for nothing."""
         if self.is_quiet and (self.in_request or self.closing):
             self.connection_table.file(self, Stage.UNFINISHED)
             if not self.closing:
@@ -157,7 +154,6 @@ class Front(asyncio.BaseProtocol, ABC):
         return 0
 
     def leave(self) -> None:
-        """Remove the connection from the table; a second call has no effect."""
         self.closing = True
         self.connection_table.leave(self)
 
@@ -174,7 +170,6 @@ class Front(asyncio.BaseProtocol, ABC):
 
 
 def plain_address(text: str) -> Address:
-    """Return the address without its scope id; an IPv4-mapped IPv6 address becomes IPv4."""
     address = address_of(text.partition("%")[0])
     if isinstance(address, ipaddress.IPv6Address) and address.ipv4_mapped is not None:
         return address_of(str(address.ipv4_mapped))

@@ -1,20 +1,12 @@
 """Share the processor time of one event loop among hosts: start-time fair queueing.
 
-Work for a host is measured and charged. Invariants:
-
-1. In one turn of the loop, work runs for `TURN_SECONDS`, and the last piece may finish later. Further work waits for
-   later turns. Pieces are short: `await asyncio.sleep(0)` divides a long task.
-2. Hosts are in classes; all unknown hosts are one class. The waiting class with the least use runs next, and in this
-   class the host with the least use.
-3. This is deficit round robin without the round: a class that comes back waits for one piece of work, not for one
-   piece of every other class.
+1. In one turn of the loop, work runs for `TURN_SECONDS`, and the last piece may finish later.
+2. The waiting class of hosts with the least use runs next, and in this class the host with the least use. All unknown
+   hosts are one class.
+3. A class that comes back waits for one piece of work, not for one piece of every other class.
 4. A class cannot save up time. After a break, it starts with the use of the waiting classes.
 5. A class keeps its debt while other classes wait. All use is forgotten when a turn ends and no work waits, because a
    class that works alone takes no time from others.
-6. While no work waits and the turn has time left, work runs at once.
-
-A `HostTask` runs a coroutine in the turns of a host. asyncio starts a task in a later turn of the loop. Most requests
-wait for nothing, so a `HostTask` runs its first step when it is made, like an eager task of Python 3.12.
 """
 
 import asyncio
@@ -56,7 +48,6 @@ class Line(Generic[Key, Item]):
         return sum(map(len, self.queues.values()))
 
     def used(self, key: Key) -> float:
-        """Return the use of a key, at least `start`."""
         used, start = self._used.get(key, self.start), self.start
         return used if used > start else start
 
@@ -81,7 +72,6 @@ class Line(Generic[Key, Item]):
             queue.append(item)
 
     def pop(self) -> tuple[Key, Item]:
-        """Remove and return the next key and item; of keys with equal use, the longest waiting one is next."""
         order = self._order
         while True:
             stored, _, key = order[0]
@@ -152,7 +142,6 @@ class ProcessorTime:
             hosts.charge(host, seconds)
 
     def begin(self) -> bool:
-        """Begin a piece of work; return False if another piece is running, whose host is charged for both."""
         if self._since is not None:
             return False
         self._since = self._clock()
@@ -206,9 +195,10 @@ class ProcessorTime:
 
 
 class HostTask(asyncio.Future[T]):
-    """Its steps, from one `await` to the next, wait for the turn of a host and are charged to it.
+    """A coroutine that runs in the turns of a host, which is charged for each step.
 
-    If a piece of the host's work makes the task, the first step is part of this piece.
+    The first step runs at once, because most requests wait for nothing, and asyncio would start a task in a later
+    turn.
     """
 
     def __init__(self, time: ProcessorTime, host: Address, work: Coroutine[Any, Any, T]) -> None:
@@ -227,7 +217,6 @@ class HostTask(asyncio.Future[T]):
             _register_task(self)  # type: ignore[arg-type]  # it has the methods of a task
 
     def cancel(self, msg: Any | None = None) -> bool:
-        """Return False if the task has ended."""
         if self.done():
             return False
         self._cancels += 1
@@ -235,11 +224,9 @@ class HostTask(asyncio.Future[T]):
         return True
 
     def cancelling(self) -> int:
-        """Cancellations that `uncancel` has not undone."""
         return self._cancels
 
     def uncancel(self) -> int:
-        """Return the number of the others."""
         self._cancels = max(0, self._cancels - 1)
         return self._cancels
 
@@ -267,7 +254,6 @@ class HostTask(asyncio.Future[T]):
                 _enter_task(loop, outer)
 
     def _resume(self) -> asyncio.Future[Any] | None:
-        """Run to the next `await`, and return what is awaited. Raises `StopIteration` at the end."""
         if self._cancel_soon:
             self._cancel_soon = False
             return self._work.throw(asyncio.CancelledError())  # type: ignore[no-any-return]  # a future, or None

@@ -1,16 +1,11 @@
 """Serve XML-RPC over HTTP on a listening socket, one request at a time for each connection.
 
-`Front` parses heads and limits their size. Further invariants:
-
-1. The body is limited (`HttpLimits.body_bytes`). Each connection has at most one request in progress and one response
-   in the write buffer. Further requests wait, and reading pauses.
+1. Each connection has at most one request in progress and one response in the write buffer. Further requests wait, and
+   reading pauses.
 2. A request from a host that no policy rule names is refused before its body is complete. Only the beginning of the
    body is read, for the audit record of the refusal.
-3. Accepting, reading, and each step of a handler wait for the host's turn and are charged to it (`processor_time`).
-4. Connections, the bytes that they hold (`connection_table`) and requests being served (`fair_queue`) have quotas: for
-   each host, for unknown hosts, and for hosts with a registration.
-5. A request no longer waits for its turn once its connection has ended.
-6. A peer that exceeds a limit gets a fault that names the limit. At most a few connections wait for such a fault.
+3. A request no longer waits for its turn once its connection has ended.
+4. A peer that exceeds a limit gets a fault that names the limit. At most a few connections wait for such a fault.
 """
 
 import asyncio
@@ -92,11 +87,8 @@ class NoAnswerError(Exception):
 class HttpServer:
     """A server; `handler` returns the response body of a request.
 
-    `refuse(peer)` is called after the head of a request. If it returns a `Refusal`, this function makes the
-    answer from the beginning of the body, as far as it arrives in time. Then the connection is closed.
-    Without `keep`, every answer closes the connection. `troubled(peer, reason)` is called for each exceeded
-    limit, `malformed(peer, reason)` for each request that is invalid HTTP or not served here. The program
-    `first` sends some connections to a second socket; they are accepted in the turn of unknown hosts.
+    `refuse(peer)` is called after the head of a request; the `Refusal` makes the answer from the beginning of the
+    body. `malformed(peer, reason)` is called for each request that is invalid HTTP or not served here.
     """
 
     sock: socket.socket
@@ -184,8 +176,6 @@ class HttpServer:
 
 
 class _Connection(Front, asyncio.BufferedProtocol):
-    """Serves one request after the other."""
-
     most_waiting = _MOST_PIPELINED
 
     def __init__(self, server: HttpServer, sock: socket.socket, host: Address) -> None:
@@ -209,7 +199,6 @@ class _Connection(Front, asyncio.BufferedProtocol):
     # --- asyncio.Protocol ---
 
     def enter(self) -> bool:
-        """Enter the table, at least for a refusal; return False if that is also impossible."""
         self._too_many = self.connection_table.enter(self, self.peer.host)
         self._counted = not self._too_many
         if self._too_many and not self.connection_table.turn_away(self, self.peer.host):
@@ -359,7 +348,6 @@ class _Connection(Front, asyncio.BufferedProtocol):
             self.transport.pause_reading()
 
     def _body_is_held(self) -> bool:
-        """Count the body's bytes so far. If there are too many, refuse the request and return False."""
         unheld = len(self._body) - self._held
         too_much = self.connection_table.hold(self.peer.host, unheld) if unheld else ""
         if too_much:
@@ -375,11 +363,10 @@ class _Connection(Front, asyncio.BufferedProtocol):
 
     @property
     def holding(self) -> int:
-        """Return all held bytes, without those of a request being served."""
         return self._held + self._unsent + sum(_held_by(request) for request, _ in self._pending)
 
     def leave(self) -> None:
-        """Leave the table; a request being served continues, but its answer is dropped."""
+        """A request being served continues, but its answer is dropped."""
         if self._patience is not None:
             self._patience.cancel()
         self.server.connections.discard(self)
@@ -405,7 +392,6 @@ class _Connection(Front, asyncio.BufferedProtocol):
             self.transport.resume_reading()
 
     def _answered_at_once(self, request: HttpRequest, *, keep: bool) -> bool:
-        """Answer without a task or a slot; return False if that is not possible."""
         answer = self.server.at_once(request)
         if answer is None:
             return False
@@ -482,8 +468,8 @@ class _Connection(Front, asyncio.BufferedProtocol):
     def _write(self, status: bytes, body: bytes, *, keep: bool, unread: bool = False) -> None:
         """Write an answer; without `keep`, close the connection.
 
-        `unread`: the rest of the request is read and dropped for a while, because an immediate close would
-        reset the connection and the peer would lose the answer.
+        `unread`: the rest of the request is read and dropped for a while, because an immediate close would reset the
+        connection and the peer would lose the answer.
         """
         connection = b"keep-alive" if keep else b"close"
         head = b"HTTP/1.1 %b\r\nContent-Type: text/xml\r\nContent-Length: %d\r\nConnection: %b\r\n\r\n"
@@ -530,7 +516,7 @@ class _Connection(Front, asyncio.BufferedProtocol):
 
 
 def _has_ended(sock: socket.socket) -> bool:
-    """Whether the peer closed a connection without data. Opening the transport would take a hundred times as long."""
+    """Opening the transport of a closed connection would take a hundred times as long."""
     try:
         return not sock.recv(1, socket.MSG_PEEK)
     except BlockingIOError:
@@ -544,7 +530,6 @@ def _held_by(request: HttpRequest) -> int:
 
 
 def listen(host: str, port: int) -> socket.socket:
-    """Return a listening socket; port 0 is any free port, and `::` also accepts IPv4."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     sock = socket.socket(family, socket.SOCK_STREAM)
     try:
@@ -560,5 +545,4 @@ def listen(host: str, port: int) -> socket.socket:
 
 
 def exceeds_limit(status: bytes) -> bool:
-    """Whether a request exceeded a limit; otherwise it is wrong, however small it is."""
     return status[:3] in (b"413", b"431", b"503")

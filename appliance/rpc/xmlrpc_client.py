@@ -1,8 +1,4 @@
-"""Make the appliance's XML-RPC calls. A client with a pool reuses its connections, any other opens one for each call.
-
-Each call has a time limit, and each response has a size limit. For a slow, silent or misbehaving peer, the caller
-gets a `CallFailedError`.
-"""
+"""Make the appliance's XML-RPC calls, with a time limit for each call and a size limit for each response."""
 
 import asyncio
 import socket
@@ -41,9 +37,8 @@ class BrokenOffError(CallFailedError):
 class XmlRpcClient:
     """A client that keeps up to `pool` connections (0: a new one for each call).
 
-    `timeout` is in seconds and applies to a whole call. `bare` leaves out the header fields that the ROS
-    master does not need: each would cost it 10 µs. `disconnected` is called when the server closes a kept
-    connection.
+    `timeout` is in seconds and applies to a whole call. `bare` leaves out the header fields that the ROS master does
+    not need: each would cost it 10 µs.
     """
 
     def __init__(
@@ -69,7 +64,7 @@ class XmlRpcClient:
         self._head = head.encode("ascii")
 
     async def call(self, method: str, *params: Value) -> Value:
-        """Make a call, and return its value. Raises `CallFailedError` (or `RefusedError`)."""
+        """Make a call. Raises `CallFailedError`, also for a slow, silent or misbehaving peer."""
         body = await self._written(method, params)
         request = self._head % len(body) + body
         seconds = self._timeout + len(request) // _READ_IN_A_SECOND
@@ -89,7 +84,7 @@ class XmlRpcClient:
             raise CallFailedError(f"{self._where} answered {method} with nonsense: {error}") from error
 
     async def refuses(self, seconds: float) -> bool:
-        """Whether no server listens; a server that is silent for these seconds does not refuse."""
+        """A server that is silent for these seconds does not refuse."""
         loop = asyncio.get_running_loop()
         try:
             async with asyncio.timeout(seconds):
@@ -113,11 +108,7 @@ class XmlRpcClient:
         return node_uri(self.uri.host, self.uri.port, self.uri.path)
 
     async def _exchange(self, request: bytes, seconds: float) -> bytes:
-        """Return the response.
-
-        Raises `UnreachedError` if the time limit passes before a connection is made, `TimeoutError` if it
-        passes later, and another `OSError` if the connection fails.
-        """
+        """Return the response. Raises `UnreachedError` without a connection in time, or another `OSError`."""
         loop = asyncio.get_running_loop()
         deadline = loop.time() + seconds
         while self._idle:
@@ -154,7 +145,6 @@ class XmlRpcClient:
                 connection.close()
 
     def close(self) -> None:
-        """Close the idle connections; a call under way closes its connection at its end."""
         self._pool = 0
         while self._idle:
             self._idle.pop().close()
