@@ -1,20 +1,10 @@
-"""Limit a finite resource by host, so that no host can exhaust the resource.
+"""Limit a finite resource by host, so that no host can exhaust the resource. No I/O.
 
-`Queue` finds the longest waiting member of each quota class, so that a full pool can evict that member.
+1. All unknown hosts together hold at most `unknown`, however many addresses they have.
+2. All hosts without a registration together hold at most `whole - kept`.
+3. The pool stores nothing about a host without holdings.
 
-`Pool` is arithmetic without I/O. It counts the holdings of each host, and decides whether a host may have more. The
-owner of the resource asks the pool before each allocation.
-
-Invariants, for a pool with `Bounds(whole, host, unknown, kept)`:
-
-1. All hosts together hold at most `whole`; one host holds at most `host`.
-2. All unknown hosts together hold at most `unknown`, however many addresses they have.
-3. All hosts without a registration together hold at most `whole - kept`. The remaining `kept` is reserved for
-   registered hosts.
-4. The pool stores nothing about a host without holdings.
-
-The quota class of a host may change while the host has holdings. Each call for a host reads its present class and
-counts its holdings under that class. Other hosts are not checked.
+Each call for a host counts its holdings under its present class. Other hosts are not checked.
 """
 
 from collections import OrderedDict
@@ -66,10 +56,10 @@ class Bounds:
             )
 
     def sized(self, whole: int, host: int | None = None) -> "Bounds":
-        """Return bounds with the operator's `whole` and `host`. If `host` is None, its limit is scaled with `whole`.
+        """Return bounds with the operator's `whole` and `host` (None: scaled with `whole`).
 
-        `unknown` and `kept` are scaled with `whole` and rounded down. A nonzero `unknown` stays at least one, so that a
-        small pool can still answer an unknown host with the reason of a refusal.
+        A nonzero `unknown` stays at least one, so that a small pool can still answer an unknown host with the reason
+        of a refusal.
         """
         host = self.host * whole // self.whole if host is None else host
         unknown = self.unknown * whole // self.whole
@@ -80,11 +70,10 @@ class Bounds:
 
 
 class Pool(Generic[Holder]):
-    """The holdings of each host in one finite resource.
+    """The holdings of each host in one finite resource; its owner asks before each allocation.
 
-    In refusals, `what` is the name of the resource with its unit ("connections", "bytes of parameters"), and `unknown`
-    is the name of unknown hosts. `quota_class` returns the present class of a host. For a machine with many IPv6
-    addresses, pass its network as the host.
+    In refusals, `what` is the name of the resource with its unit, and `unknown` that of unknown hosts. For a machine
+    with many IPv6 addresses, pass its network as the host.
     """
 
     def __init__(
@@ -102,7 +91,7 @@ class Pool(Generic[Holder]):
         self._by_class = [0 for _ in QuotaClass]
 
     def refusal(self, host: Holder, amount: int = 1) -> str:
-        """Return why `host` may not have `amount` more, or an empty string if it may."""
+        """Return the reason of a refusal; empty if `host` may have `amount` more."""
         return self._refusal(host, amount, *self._look_up(host))
 
     def _refusal(self, host: Holder, amount: int, quota_class: QuotaClass, mine: int) -> str:
@@ -123,7 +112,6 @@ class Pool(Generic[Holder]):
         return ""
 
     def take(self, host: Holder, amount: int = 1) -> str:
-        """Give `host` the whole amount or nothing. Return the reason of a refusal, or an empty string."""
         quota_class, mine = self._look_up(host)
         reason = self._refusal(host, amount, quota_class, mine)
         if not reason:
@@ -131,12 +119,11 @@ class Pool(Generic[Holder]):
         return reason
 
     def charge(self, host: Holder, amount: int = 1) -> None:
-        """Count an amount without a check, because `host` already has it or can no longer be refused."""
+        """Count an amount without a check: `host` already has it or can no longer be refused."""
         quota_class, mine = self._look_up(host)
         self._set(host, quota_class, mine, mine + amount)
 
     def give_back(self, host: Holder, amount: int = 1) -> None:
-        """Take an amount back from `host`. Raises `ValueError` if `host` has less."""
         quota_class, mine = self._look_up(host)
         if amount > mine:
             raise ValueError(f"{host} returns {amount} {self.what} and has {mine}")
@@ -146,7 +133,7 @@ class Pool(Generic[Holder]):
         return self._held.get(host, _NOTHING)[1]
 
     def held_by(self, quota_class: QuotaClass) -> int:
-        """Return the holdings of all hosts that were of this quota class when they were last counted."""
+        """Count hosts by their class when they were last counted."""
         return self._by_class[quota_class]
 
     @property
@@ -176,7 +163,7 @@ _NOTHING = (QuotaClass.UNKNOWN, 0)
 
 
 class Queue(Generic[Holder, Member]):
-    """Members of hosts in order of insertion. `quota_class` returns the present quota class of a host."""
+    """Members of hosts in order of insertion."""
 
     def __init__(self, quota_class: Callable[[Holder], QuotaClass]) -> None:
         self._quota_class = quota_class
@@ -194,10 +181,6 @@ class Queue(Generic[Holder, Member]):
         return True
 
     def longest(self, quota_class: QuotaClass) -> tuple[Member, Holder, float] | None:
-        """Return the longest waiting member of this class, with its host and the start of its wait.
-
-        The present class of the host counts. Return None if no member is found.
-        """
         for _ in range(_MOST_MOVED):
             found = next(iter(self._lines[quota_class].items()), None)
             if found is None:

@@ -1,8 +1,6 @@
 """Define every finite resource that hosts can exhaust: its size, the quota of each host, and the effect of the limit.
 
-docs/reference/quotas.md is generated from `QUOTA_ROWS` (`python -m distribution.quotas_page`). Each row names the tests
-that attack its resource; `tests/unit/quotas/test_table.py` checks that these tests exist. The code takes the bounds of
-each pool from its row (`Pool("connections", RVMASTER_CONNECTIONS.bounds, …)`), so page and code always agree.
+The code and docs/reference/quotas.md take the bounds from the same rows.
 """
 
 from typing import NamedTuple
@@ -13,11 +11,10 @@ from appliance.quotas.pool import Bounds
 class QuotaRow(NamedTuple):
     """One resource and its quotas.
 
-    `thing` is the resource with its unit: "connections to RVMaster". `bounds` are the defaults. `at_limit` is the
-    effect on a host beyond its quota. `alarm` names the audit event and the metric. `shown_by` lists the tests that
-    exhaust the resource, as paths below tests/. `setting` is the key in appliance.yaml that changes the bounds
-    ("limits.connections"), or "" if there is none. `between` describes the order of hosts and which host makes room.
-    `counting` defines a host, an unknown host and the kept part, where they differ from the general rule of the page.
+    `thing` is the resource with its unit: "connections to RVMaster". `alarm` names the audit event and the metric.
+    `shown_by` lists the tests that exhaust the resource, as paths below tests/. `setting` is the key in appliance.yaml
+    that changes the bounds, or "". `between` describes the order of hosts and which host makes room. `counting`
+    defines a host, an unknown host and the kept part, where they differ from the general rule of the page.
     """
 
     thing: str
