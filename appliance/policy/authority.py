@@ -1,12 +1,5 @@
 """Read `[Authority]`: groups of topics and services that one host at a time may command.
 
-    [Authority]
-    base          = /cmd_vel /move_base/goal /move_base/cancel
-    take base     = operators
-    override base = supervisors
-    ask base      = agents
-    lease base    = 5s
-
 The section only restricts: a host that holds a group still needs its rights in `[Publishers]` and `[Clients]`.
 """
 
@@ -57,7 +50,6 @@ class AuthorityGroup:
     lease: float = DEFAULT_LEASE
 
     def claim(self, atoms: frozenset[Atom]) -> Claim | None:
-        """Return the strongest claim of a host with these atoms."""
         claims = {claim for claim, hosts in self.hosts if not hosts.isdisjoint(atoms)}
         return next((claim for claim in (Claim.OVERRIDE, Claim.TAKE, Claim.ASK) if claim in claims), None)
 
@@ -65,7 +57,6 @@ class AuthorityGroup:
 def read_authority(
     section: SectionText | None, file: str, groups: HostGroups, findings: Findings
 ) -> dict[str, AuthorityGroup]:
-    """Return the groups; invalid lines are left out and reported in `findings`."""
     found: dict[str, AuthorityGroup] = {}
     options: list[tuple[str, str, Entry]] = []
     first_lines: dict[str, int] = {}

@@ -1,16 +1,6 @@
-"""Run the test cases of a policy. `FILE.tests.yaml` lists actions that are allowed, denied, or need an approval.
+"""Run the test cases of a policy (`FILE.tests.yaml`, docs/policy.md).
 
-    given:
-      robot: 192.168.1.10
-      hosts: {ocu-1: 10.77.0.11}
-    cases:
-      - host: host:ocu-1
-        node: /joystick
-        allow: [publish /landshark_control/trigger]
-        deny: [command shutdown]
-        ask: [publish /cmd_vel]
-
-The policy is compiled with the `given` addresses, so its cases pass wherever it is deployed (docs/policy.md).
+The policy is compiled with the `given` addresses, so its cases pass wherever it is deployed.
 """
 
 import ipaddress
@@ -52,12 +42,11 @@ class CaseResult:
 
     @property
     def passed(self) -> bool:
-        """Whether the case passed; a request that passes only because of audit-only mode counts as denied."""
+        """A request that passes only because of audit-only mode counts as denied."""
         verdict = self.decision.verdict
         return self.expected == ("deny" if verdict == "would deny" else verdict)
 
     def __str__(self) -> str:
-        """Return the text, such as `landshark.ini.tests.yaml:7:13: expected allow: 10.0.0.9 is not among …`."""
         return f"{self.file}:{self.line}:{self.column}: {self.finding.text}"
 
     @property
@@ -67,8 +56,7 @@ class CaseResult:
 
 
 def run_cases(policy: Policy, text: str, file: str) -> list[CaseResult]:
-    """Return the results; `file` is the name of `text` in them. Raises `PolicyError` with all mistakes in the
-    text.
+    """Return the results. Raises `PolicyError` with all mistakes in the text.
 
     A file without cases is a mistake, because it would pass with every policy.
     """
@@ -99,8 +87,6 @@ def _compose(text: str, findings: Findings) -> _Node | None:
 
 
 class _CaseReader:
-    """Reads cases from YAML nodes, which know their line and column."""
-
     def __init__(self, policy: Policy, findings: Findings) -> None:
         self._policy = policy
         self._findings = findings
@@ -186,7 +172,6 @@ class _CaseReader:
     # --- YAML with places ---
 
     def _mapping(self, node: _Node, what: str, keys: tuple[str, ...] | None) -> _Pairs:
-        """Return the pairs of a mapping; unknown and repeated keys are errors, unless `keys` is None."""
         pairs: _Pairs = {}
         if not isinstance(node, yaml.MappingNode):
             expected = f" with {', '.join(keys)}" if keys else ""

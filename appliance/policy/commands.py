@@ -15,9 +15,7 @@ _PUBLISHERS, _SUBSCRIBERS, _SERVICES = (
 class PolicyCall(NamedTuple):
     """One call; its key in the table is its name in the policy.
 
-    category      the category of the call's decisions and audit records
     elsewhere     the sections that decide the call, if `[Commands]` does not
-    touches       how the call accesses its parameter: read or write
     node          the call adds a node to the graph or removes it, so `[Nodes]` also decides
     gives         the thing that the call gives the caller, such as a publication, until it is revoked
     silent        the answer reveals nothing about the parameter's value
@@ -39,7 +37,6 @@ class PolicyCall(NamedTuple):
 
 class _Calls(dict[str, PolicyCall]):
     def __missing__(self, name: str) -> PolicyCall:
-        """An unknown call has the row of a command."""
         return _COMMAND
 
 

@@ -31,11 +31,9 @@ class OverruledRule:
 class DecisionExplanation:
     """The decision on one category of a request.
 
-    `through` lists the words of the deciding rule that include the host (empty for a denial). `lost` lists the
-    overruled rules. `also` explains the other rights that the request needs (`policy/rights`); `allowed` covers all
-    of them. `namespace` is the denial that an allowed parameter gets if it contains other parameters at the time of
-    the call. `told` is the text of a denial for the host, as `[Options] tell` requires. `blocked`: an operator's
-    block of the host denies it, so no rule matters.
+    `through` lists the words of the deciding rule that include the host, `lost` the overruled rules, `also` the other
+    rights that the request needs. `namespace` is the denial that an allowed parameter gets if it contains other
+    parameters at the time of the call.
     """
 
     request: Request
@@ -51,7 +49,6 @@ class DecisionExplanation:
 
     @property
     def allowed(self) -> bool:
-        """Whether the request has all rights that it needs, without an approval."""
         return self.together == "allow"
 
     @property
@@ -72,7 +69,6 @@ class DecisionExplanation:
 
 
 def explain(policy: Policy, request: Request) -> DecisionExplanation:
-    """Explain a decision; the resource must be a resolved name, as for `decide`."""
     first, *others = (_explain(policy, right) for right in rights_of(request))
     return replace(first, also=tuple(others))
 
@@ -100,7 +96,6 @@ def _explain(policy: Policy, right: Right) -> DecisionExplanation:
 
 
 def render(explanation: DecisionExplanation) -> Iterator[str]:
-    """Yield the lines of an explanation; for a blocked host, the block is the whole reason."""
     yield from _render_one(explanation)
     if explanation.blocked:
         return

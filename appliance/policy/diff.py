@@ -36,7 +36,7 @@ class Difference:
 def diff(old: Policy, new: Policy, requests: Iterable[Request]) -> list[Difference]:
     """Return the requests in order of first occurrence.
 
-    Audit-only counts: a request that passes only because of this mode is not the same as a granted request.
+    A request that passes only because of audit-only mode is not the same as a granted request.
     """
     counts: dict[Request, int] = {}
     for request in requests:

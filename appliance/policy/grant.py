@@ -1,9 +1,7 @@
 """Find the smallest change of a policy's text that grants a denied request. No I/O.
 
-Each missing right changes one line. If the section has a line with the exact key, the host is added to it. Otherwise, a
-new line is added for this key. It lists the host and all hosts of the deciding rule, so the rights of other hosts do
-not change. Comments, order and blanks of the text stay. The key for the anonymous name of a stock tool is a pattern
-(`/rostopic_*`), because its numbers change with each run.
+A new line for an exact key lists the host and all hosts of the deciding rule, so the rights of other hosts do not
+change. The key for the anonymous name of a stock tool is a pattern, because its numbers change with each run.
 """
 
 import difflib
@@ -46,7 +44,7 @@ class DecidedRequest:
 
 @dataclass(frozen=True, slots=True)
 class Grant:
-    """A changed text; `added` are the lines that were changed or added (none: the request was granted before)."""
+    """A changed text; `added` are the changed or new lines (none: the request was granted before)."""
 
     text: str
     added: tuple[str, ...]
@@ -65,10 +63,7 @@ class Grant:
 
 
 def grant(text: str, file: str, known: PolicyContext, asked: DecidedRequest) -> Grant:
-    """Grant a request by changing as few lines as possible.
-
-    Raises `UngrantableError`, and `PolicyError` if the text is not a valid policy.
-    """
+    """Grant a request. Raises `UngrantableError`, and `PolicyError` if the text is not a valid policy."""
     word = _word(text, known, asked.request.host)
     policy = compile_policy(text, file=file, hosts=known.hosts, robot=known.robot)
     block = replace(policy, blocks=known.blocks).blocked(asked.request.host)
@@ -102,7 +97,6 @@ def _granted(policy: Policy, right: Right) -> bool:
 
 
 def _word(text: str, known: PolicyContext, host: Address) -> str:
-    """Return the word for a host: `host:NAME`, a group of this host alone, `robot`, or the address."""
     enrolled = next((name for name, address in known.hosts.items() if address == host), None)
     if enrolled is not None:
         return word_of(enrolled)
@@ -157,7 +151,6 @@ def _key(request: Request) -> str:
 
 
 def _below(name: str, rule: Rule | None) -> str:
-    """Return the key of the rule (`write /*/max`), or `NAME/**`."""
     of_rule = rule.key.split(" ", 1)[-1] if rule is not None else DEFAULT
     own = of_rule[1:].split("/")[len(levels(name)) :] if of_rule != DEFAULT else []
     return "/".join([name.rstrip("/"), *(own or ["**"])])

@@ -49,7 +49,6 @@ class HostGroups:
         table.put((table.network(network) for network in self.robot), self.groups[ROBOT].atom)
 
     def define(self, section: SectionText | None) -> None:
-        """Define the groups of a section; a group may name groups that are defined later."""
         if section is None:
             return
         for entry in section.entries:
@@ -79,7 +78,6 @@ class HostGroups:
             self.groups[word.text] = HostGroup(self._table.group(), word, entry.values)
 
     def read(self, words: Iterable[Word]) -> tuple[tuple[str, Atom], ...]:
-        """Yield words with their atoms; an invalid word is an error, a repetition a warning."""
         atoms: dict[Atom, str] = {}
         for word in words:
             if self._findings.full:
@@ -136,7 +134,7 @@ class HostGroups:
         return network
 
     def _robot_instead(self) -> str:
-        """Return the advice to use `robot` for the robot's nodes, because loopback is the appliance itself."""
+        """Loopback is the appliance itself, not the robot."""
         if not self.robot:
             return "(unless isolation is none): write robot if you mean the nodes of its machine"
         robot = ", ".join(str(member).removesuffix("/32").removesuffix("/128") for member in self.robot)

@@ -1,11 +1,9 @@
 """Names of hosts: `robot`, the groups of the policy, and enrolled hosts. Only this module resolves them. Pure.
 
-Invariants:
-
-1. A name means every network of its group, at any depth, and the address of the enrolled host of this name. `host:NAME`
-   means the enrolled host only, `door:NAME` the door.
-2. The label of an address is the name of the smallest network that contains it: of an enrolled host before `robot`, and
-   of `robot` before the group with the fewest networks. A network of all addresses gives no label.
+A name means every network of its group, at any depth, and the address of the enrolled host of this name. `host:NAME`
+means the enrolled host only, `door:NAME` the door. The label of an address is the name of the smallest network that
+contains it: of an enrolled host before `robot`, and of `robot` before the group with the fewest networks. A network of
+all addresses gives no label.
 """
 
 import ipaddress
@@ -52,7 +50,6 @@ class HostNames:
         return cls(groups, enrolled)
 
     def networks(self, text: str) -> tuple[Network, ...]:
-        """Return the networks of a name. Raises `UnknownHostNameError`."""
         try:
             return (canonical_network(ipaddress.ip_network(text)),)
         except ValueError:
@@ -76,7 +73,6 @@ class HostNames:
         return f"{quoted(text)} is not an address, nor the name of a group or an enrolled host{guess}"
 
     def labels(self) -> list[tuple[Network, str]]:
-        """Return networks with their labels; the first network that contains an address gives its label."""
         rows = [(-1, _network_of(address), name) for name, address in self.enrolled.items()]
         rows += [
             (0 if name == ROBOT else len(some), one, name)
@@ -91,7 +87,6 @@ class HostNames:
 
 
 def label_of(address: str, labels: Iterable[tuple[Network, str]]) -> str:
-    """Return the label of an address, or an empty text. `labels` are from `HostNames.labels`."""
     try:
         found = canonical_address(ipaddress.ip_address(address))
     except ValueError:
@@ -110,7 +105,6 @@ def _define(
     groups: dict[str, tuple[Network, ...]],
     enrolled: Mapping[str, Address],
 ) -> tuple[Network, ...]:
-    """Return the networks of a name, after those of the names in it; an invalid word has none."""
     if name not in groups:
         groups[name] = ()  # a valid policy has no cycle
         found: dict[Network, None] = {}

@@ -1,10 +1,8 @@
 """Store networks and groups as numbers, and find the numbers for an address with a prefix table.
 
-Every network and every group has a number (an *atom*). A rule has the atoms of its value. A host has the atoms of all
-networks that contain its address, and of all groups that contain these networks. A rule includes a host if they share
-an atom, so memory and time do not grow with the number of rules times the size of groups.
-
-An IPv4-mapped IPv6 address (::ffff:a.b.c.d) equals the IPv4 address.
+A host has the numbers (*atoms*) of all networks that contain its address, and of all groups that contain these
+networks. A rule includes a host if they share an atom, so memory and time do not grow with the number of rules times
+the size of groups.
 """
 
 import ipaddress
@@ -23,14 +21,12 @@ _BITS = {4: 32, 6: 128}
 
 
 def canonical_address(address: Address) -> Address:
-    """Return the address; an IPv4-mapped IPv6 address becomes IPv4."""
     if isinstance(address, ipaddress.IPv6Address):
         return address.ipv4_mapped or address
     return address
 
 
 def canonical_network(network: Network) -> Network:
-    """Return the network; a network within ::ffff:0:0/96 becomes IPv4."""
     if isinstance(network, ipaddress.IPv6Network) and network.prefixlen >= 96:
         mapped = network.network_address.ipv4_mapped
         if mapped is not None:
@@ -51,7 +47,6 @@ class HostSets:
         self._lengths: dict[int, list[tuple[int, dict[int, Atom]]]] = {4: [], 6: []}
 
     def network(self, network: Network) -> Atom:
-        """Return the atom of a network, which is added if it is new."""
         network = canonical_network(network)
         atom = self._networks.get(network)
         if atom is None:
@@ -78,7 +73,6 @@ class HostSets:
         return self._parents[atom]
 
     def atoms_of(self, address: Address) -> frozenset[Atom]:
-        """`EVERYONE` is always included."""
         address = canonical_address(address)
         number = int(address)
         waiting = [EVERYONE]
@@ -89,7 +83,6 @@ class HostSets:
         return self.above(waiting)
 
     def narrowest(self, address: Address) -> Network | None:
-        """Return the narrowest network that contains the address; None if only `*` does."""
         plain = canonical_address(address)
         bits, number = _BITS[plain.version], int(plain)
         shifts = [shift for shift, table in self._lengths[plain.version] if number >> shift in table]

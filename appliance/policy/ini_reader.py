@@ -1,8 +1,7 @@
-"""Read INI text, with the line and column of every word.
+"""Read INI text, with the line and column of every word, which configparser does not report.
 
 The text has sections `[Name]`, entries `key = value`, and comments from `#` or `;` to the end of the line. It has no
-continuation lines, no interpolation and no quotes. The reader does not know the meaning of sections and keys.
-configparser cannot be used, because it does not report columns.
+continuation lines, no interpolation and no quotes.
 """
 
 import re
@@ -44,7 +43,7 @@ class SectionText:
 
 
 def read(text: str, findings: Findings) -> list[SectionText]:
-    """Return the sections; unreadable lines are skipped and reported in `findings`."""
+    """Skip unreadable lines, and report them in `findings`."""
     if len(text) > MAXIMUM_CHARACTERS:
         findings.error(1, 1, f"the file has {len(text)} characters; the limit is {MAXIMUM_CHARACTERS}")
         return []

@@ -22,9 +22,8 @@ def approvals_of(rows: Iterable[Iterable[str]]) -> frozenset[Approval]:
 class PolicyContext:
     """The surroundings of a policy: the addresses of `host:NAME` and `robot`, and the test cases.
 
-    `cases` is None if the policy has no test cases. `cases_error` is the reason if they could not be read; it
-    rejects the policy. If `site_keys` is not empty, one of these keys must have signed the policy. `blocks`,
-    `holders` and `approved` are those of `Policy`; none of them affects checks and test cases.
+    `cases_error`, why the test cases could not be read, rejects the policy. `blocks`, `holders` and `approved` do not
+    affect checks and test cases.
     """
 
     hosts: Mapping[str, Address] = field(default_factory=dict)
@@ -78,10 +77,7 @@ class PolicyJudgement(NamedTuple):
 
 
 def judge(text: str, file: str, known: PolicyContext, signature: str = "") -> PolicyJudgement:
-    """Check a text; `file` is its name in findings and rules.
-
-    Raises `PolicyError` with all errors of the text; if it has none, of the signature or the test cases.
-    """
+    """Check a text. Raises `PolicyError` with all its errors, or else those of the signature and the test cases."""
     policy = compile_policy(text, file=file, hosts=known.hosts, robot=known.robot)
     try:
         signed_by = signer(known.site_keys, text, signature)

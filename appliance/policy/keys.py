@@ -1,20 +1,10 @@
 """The left side of a rule (a resolved ROS name, or a pattern), and the tree that finds the key for a name.
 
-    /arm/*        one level below /arm
-    /arm/**       any depth below /arm, and /arm itself; /** is everything
-    /arm*         names of one level that begin with /arm: /arm, /arm2, but not /arm/joint
-    /*/state      a star at the end of any level stands for the rest of that level
+The forms of keys, and their order, are in docs/reference/policy-file.md. Two keys tie if they are equally specific and
+match the same name; a policy with a tie is rejected.
 
-Only the most specific matching key decides. An exact name beats a pattern. A longer literal beginning (the text up to
-the first star) beats a shorter beginning. If these are equally long, a pattern without `**` beats a pattern with `**`.
-Two keys tie if they are equally specific and match the same name. A tie is an error when the policy is loaded.
-
-`KeyTree` finds exact names by hash, and patterns in a tree of levels. If stars are only at the end of keys, a look-up
-takes one step per level of the name, whatever the number of keys. A key with an earlier star makes the search branch;
-the compiler limits the number of such keys. Invariants:
-
-1. `find` returns the value of the matching key with the greatest `specificity` (compared by tests).
-2. The caller does not add a key twice, and does not add a key that ties with another key.
+A look-up takes one step per level of the name, whatever the number of keys with stars only at their end. The compiler
+limits the number of other keys.
 """
 
 from collections.abc import Iterator
@@ -50,12 +40,12 @@ class Key:
 
     @property
     def specificity(self) -> tuple[bool, int, bool]:
-        """Return the specificity; of two keys that match a name, the one with the greater specificity decides."""
+        """The matching key with the greatest specificity decides."""
         return (self.exact, len(self.literal), not self.subtree)
 
     @property
     def inner_star(self) -> bool:
-        """Whether the key has a star before the end (`/*/state`, `/arm*/**`), because only such keys can tie."""
+        """Only keys with a star before the end can tie (`/*/state`, `/arm*/**`)."""
         return any(star for _, star in (self.steps if self.subtree else self.steps[:-1]))
 
     def matches(self, name: str) -> bool:
@@ -84,12 +74,11 @@ def _compatible(one: Step, other: Step) -> bool:
 
 
 def levels(name: str) -> list[str]:
-    """Return the levels of a name; `/` has none."""
     return name[1:].split("/") if name != "/" else []
 
 
 def parse_key(text: str, *, parameter: bool = False) -> Key:
-    """Parse a key; names of parameters have a wider grammar than those of topics. Raises `BadKeyError`."""
+    """Names of parameters have a wider grammar than those of topics. Raises `BadKeyError`."""
     if not text.startswith("/"):
         raise BadKeyError(f"names here are resolved and begin with a slash: /{text.lstrip('~')}")
     if "//" in text:
@@ -114,7 +103,6 @@ def command_key(name: str) -> Key:
 
 
 def is_parameter_key(text: str) -> bool:
-    """Whether a text is a parameter's key in canonical spelling, such as `/`."""
     try:
         return text.startswith("/") and resolve_parameter(text, "") == text
     except InvalidNameError:
@@ -141,7 +129,6 @@ class _Node(Generic[Value]):
     subtree: tuple[Key, Value] | None = None
 
     def starred(self, level: str) -> Iterator["_Node[Value]"]:
-        """The longest literal beginning comes first."""
         for length, table in self.stars:
             node = table.get(level[:length])
             if node is not None:
@@ -154,7 +141,7 @@ class _Node(Generic[Value]):
 
 
 class KeyTree(Generic[Value]):
-    """Finds the value of the most specific key that matches a name."""
+    """Finds the value of the most specific key that matches a name. No key is added twice, or ties with another."""
 
     __slots__ = ("_exact", "_root")
 
@@ -174,7 +161,6 @@ class KeyTree(Generic[Value]):
             node.value = (key, value)
 
     def find(self, name: str) -> Value | None:
-        """The name is resolved; only `/**` matches `/`."""
         found = self._exact.get(name)
         if found is not None:
             return found

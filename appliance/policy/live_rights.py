@@ -1,8 +1,4 @@
-"""Find the live rights of hosts, such as publications, that a policy would end.
-
-A reload (`master/graph/revocation`) and a dry run ask: may the host make the call that gave the right now, under this
-policy? `policy/rights` lists the rights that the call needs.
-"""
+"""Find the live rights of hosts, such as publications, that a policy would end, for a reload and a dry run."""
 
 import ipaddress
 from collections.abc import Iterable, Mapping
@@ -17,10 +13,7 @@ from roswire.parameter_tree import Tree, holds_others, standing_at
 
 
 class LiveRight(NamedTuple):
-    """A right that `call` gave for `resource`, such as a publication.
-
-    `namespace`: the resource is a parameter that now contains other parameters.
-    """
+    """A right that `call` gave for `resource`; `namespace`: a parameter that now contains other parameters."""
 
     host: Address
     caller_id: str
@@ -36,7 +29,6 @@ class LiveRight(NamedTuple):
         return {**self._asdict(), "host": str(self.host)}
 
     def requests(self) -> list[Request]:
-        """Return the requests to explain: access to the parameter, if there is one, and the call."""
         asked = [request_of(self.call, self.host, self.caller_id, self.resource)]
         touch = CALLS[self.call].touches
         return asked if touch is None else [Request(self.host, self.caller_id, touch, self.resource), *asked]
@@ -54,7 +46,6 @@ class Ending:
 
 
 def live_by(call: str, host: Address, caller_id: str, resource: str, tree: Tree) -> LiveRight:
-    """`tree` is the present parameter tree."""
     namespace = CALLS[call].touches is not None and holds_others(standing_at(tree, resource)[0])
     return LiveRight(host, caller_id, call, resource, namespace)
 
@@ -65,7 +56,6 @@ def may_keep(policy: Policy, live: LiveRight) -> Decision:
 
 
 def deprived(policy: Policy, things: Iterable[LiveRight]) -> dict[Address, set[str]]:
-    """Return hosts that keep none of their live rights, with the names of their nodes."""
     lost: dict[Address, set[str]] = {}
     kept: set[Address] = set()
     for live in things:

@@ -1,7 +1,4 @@
-"""Define the policy's questions (`Request`) and answers (`Decision`).
-
-RVMaster, `rosrv policy`, REST and the console all use these two classes, so all show the same text.
-"""
+"""Define the policy's questions (`Request`) and answers (`Decision`)."""
 
 import enum
 import ipaddress
@@ -42,7 +39,6 @@ HOST, DOOR = "host:", "door:"
 
 
 def known_name(word: str) -> str | None:
-    """Return the name of a word in mappings of names, for `host:NAME` or `door:NAME`; None for any other word."""
     if word.startswith(DOOR):
         return word
     return word.removeprefix(HOST) if word.startswith(HOST) else None
@@ -54,10 +50,9 @@ def word_of(name: str) -> str:
 
 @lru_cache(4096)
 def address_of(text: str) -> Address:
-    """Return the address in a text, the same object for the same text, to speed up the look-ups of every
-    call.
+    """Return the same object for the same text, to speed up the look-ups of every call.
 
-    The result equals the address that `ipaddress` makes, and has the same hash. Raises `ValueError`.
+    It equals the address that `ipaddress` makes, and has the same hash. Raises `ValueError`.
     """
     return _IPv6(text) if ":" in text else _IPv4(text)
 
@@ -79,8 +74,8 @@ class Category(enum.StrEnum):
 class Request:
     """One question to the policy: may `host` access `resource`?
 
-    `resource` is a resolved, canonical ROS name (topic, service, parameter, node). For `Category.COMMAND`, it is the
-    exact name of a call. `caller_id` is not verified, so the policy decides by `host`.
+    `resource` is a resolved, canonical ROS name. For `Category.COMMAND`, it is the exact name of a call. `caller_id`
+    is not verified, so the policy decides by `host`.
     """
 
     host: Address
@@ -107,7 +102,6 @@ class Rule:
     line: int  # counted from 1
 
     def __str__(self) -> str:
-        """Return the text, such as `[Publishers] /arm/** (landshark.ini:12)`."""
         return f"[{self.section}] {self.key} ({self.file}:{self.line})"
 
 
@@ -115,12 +109,10 @@ class Rule:
 class Decision:
     """The answer to a `Request`.
 
-    `rule` is the rule that decided, or None if no rule matches the request. `reason` is a sentence for audit records,
-    `rosrv policy explain` and the console. `told` is the reason without names and addresses of other hosts, for the
-    caller; None if `reason` contains none (`text_for_caller`). In audit-only mode, `would_deny` is true if the rules
-    deny the request, and `allowed` is true. `needs` names the further right that decided, such as `write /arm/**`; it
-    is empty if the request itself decided. `asks` is the request that needs an operator's approval, also while it has
-    one. A call of a service that asks passes the gate, and the relay holds each of its requests.
+    `rule` is None if no rule matches. `told` is the reason without names and addresses of other hosts; None if
+    `reason` contains none. In audit-only mode, `would_deny` is true if the rules deny the request, and `allowed` is
+    true. `needs` names the further right that decided, if any. `asks` is the request that needs an operator's
+    approval, also while it has one.
     """
 
     allowed: bool
@@ -133,17 +125,15 @@ class Decision:
 
     @property
     def rank(self) -> int:
-        """Return how much is granted: nothing, with an approval, only in audit-only mode, or all."""
+        """Order: nothing is granted, with an approval, only in audit-only mode, all."""
         return 2 if self.would_deny else 1 if self.asks is not None else 3 if self.allowed else 0
 
     @property
     def verdict(self) -> Literal["allow", "deny", "would deny", "ask"]:
-        """Return the word for the policy's tools, which also know `ask`."""
         return "ask" if self.rank == 1 else self.word
 
     @property
     def word(self) -> Literal["allow", "deny", "would deny"]:
-        """Return the word in the audit log."""
         return "would deny" if self.would_deny else "allow" if self.allowed else "deny"
 
 

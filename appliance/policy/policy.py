@@ -1,10 +1,7 @@
-"""A compiled policy, and the one function that decides: `Policy.decide(request)`.
+"""A compiled policy, and the one pure function that decides: `Policy.decide(request)`.
 
-The function is pure: without I/O and without a clock.
-
-Invariants:
-1. A request that no rule grants is denied. Exception: if an extension section is missing, its requests are allowed.
-   An operator's block denies every request of its host, whatever the rules say, also in audit-only mode.
+1. A request that no rule grants is denied. Exception: if an extension section is missing, its requests are allowed. An
+   operator's block denies every request of its host, whatever the rules say, also in audit-only mode.
 2. Otherwise one rule decides a request: the rule with the most specific matching key of its section, or `default`.
 3. `Decision.reason` is a sentence shorter than 300 characters.
 4. Memory does not grow with requests: answers are kept for at most `_KEPT_DECISIONS` short resource names, and hosts.
@@ -41,8 +38,8 @@ Approval = tuple[Address, Category, str]
 class CompiledRule:
     """One line of a deciding section.
 
-    `key` is None for `default`. `words` is the value as written, `shown` as text for messages. `place` is the rule's
-    position as text; `column` is the column of its key. `asked` has the atoms of hosts that need an approval.
+    `key` is None for `default`. `words` is the value as written, `shown` as text for messages. `asked` has the atoms
+    of hosts that need an approval.
     """
 
     rule: Rule
@@ -79,7 +76,7 @@ class RuleTable:
 
 
 class HostStanding(NamedTuple):
-    """The answers of `Policy.atoms_of`, `knows`, `names`, `named_as` and `alike`, and the canonical address as text."""
+    """The answers about an address, which are kept because a policy never changes."""
 
     atoms: frozenset[Atom]
     known: bool
@@ -93,14 +90,9 @@ class HostStanding(NamedTuple):
 class Policy:
     """A compiled policy, which only `compile_policy` makes.
 
-    `text` and `file` are its source. `named` has the atoms of all hosts that a rule names. `present` lists
-    the categories that have a section. `monitored_topics` and `monitored_services` are the names in
-    `[Monitor]`. `takeover` is `same-host` or `granted`; `ports` are for proxy endpoints and relay. `enrolled`
-    and `robot` are the addresses of `host:NAME` and `robot`. `blocks` has the hosts that an operator blocks,
-    by canonical address: the end of a sentence, such as `blocked by ann`. `authority` has the groups of
-    `[Authority]`, and `holders` the host that holds each of them; a group without an entry is free. Without
-    `holders` (for checks of a text), each host with a claim counts as the holder. `approved` has the
-    approvals that last, as host, category and name. Without it, no request that needs an approval passes.
+    `named` has the atoms of all hosts that a rule names. `blocks` has the end of a sentence for each blocked host,
+    such as `blocked by ann`. A group without an entry in `holders` is free. Without `holders` (for checks of a text),
+    each host with a claim counts as the holder. Without `approved`, no request that needs an approval passes.
     """
 
     text: str
@@ -134,10 +126,7 @@ class Policy:
         self._commanded = {name: group for group in self.authority.values() for name in group.names}
 
     def decide(self, request: Request) -> Decision:
-        """Decide by the rules of the request's own category.
-
-        `policy/rights` lists the further rights that a call may need, and decides on all of them.
-        """
+        """Decide by the rules of the request's own category; `policy/rights` decides on further rights."""
         host = request.host
         key = (host.version, int(host), request.category, request.resource)
         decision = self.kept.get(key)
@@ -152,8 +141,8 @@ class Policy:
     def decide_parameter(self, request: Request, *, namespace: bool = False) -> Decision:
         """Decide access to a parameter; a rule for a name below that denies the host denies the call.
 
-        `namespace`: the parameter contains other parameters. Then the rule for contained parameters without
-        their own key must also grant the host, because an exact key `/arm` does not match `/arm/speed`.
+        `namespace`: the parameter contains other parameters. Then the rule for contained parameters without their own
+        key must also grant the host, because an exact key `/arm` does not match `/arm/speed`.
         """
         decision = self.decide(request)
         if not decision.allowed or decision.would_deny or request.category not in self.present:
@@ -170,7 +159,6 @@ class Policy:
         return kept
 
     def _decide_below(self, request: Request, namespace: bool) -> Decision | None:
-        """Return the denial by a key below, or None if all keys below grant the host."""
         table = self.tables[request.category]
         atoms = self.atoms_of(request.host)
         deciding = table.tree.below(request.resource)
@@ -194,19 +182,17 @@ class Policy:
         return self.limits.find(topic) if self.limits.rules else None
 
     def limit(self, part: LimitScope, topic: str, host: Address | None = None) -> Rate:
-        """Without `host`, the limit is that of all publishers of a topic together. No limit is `NO_LIMIT` itself."""
+        """Without `host`, return the limit of all publishers together. No limit is `NO_LIMIT` itself."""
         rule = self.limit_rule(topic)
         if rule is None:
             return NO_LIMIT
         return rule.rate(part, self.atoms_of(host) if host is not None else frozenset())
 
     def limit_on(self, request: Request) -> Rate:
-        """Return the limit on publishing or subscribing; other requests have none."""
         part = _LIMITED.get(request.category)
         return NO_LIMIT if part is None else self.limit(part, request.resource, request.host)
 
     def standing(self, address: Address) -> HostStanding:
-        """Every call of a host needs these answers; they are kept, because a policy never changes."""
         standing = self.standings.get(address)
         if standing is None:
             if len(self.standings) >= _KEPT_HOSTS:
@@ -222,15 +208,13 @@ class Policy:
         return HostStanding(atoms, known, free and network is not None, named_as, str(named_as), text)
 
     def knows(self, address: Address) -> bool:
-        """Whether a rule includes this address, and the host is not blocked. Other hosts are unknown hosts.
+        """Whether a rule includes this address, and the host is not blocked.
 
-        In audit-only mode without a rule that names a host, every host is known, because a robot is being
-        learned.
+        In audit-only mode without a rule that names a host, every host is known, because a robot is being learned.
         """
         return self.standing(address).known
 
     def serves(self, address: Address) -> bool:
-        """Whether requests of this address are read: it is known, or a section in audit-only mode lets them pass."""
         return self.knows(address) or (self._any_audit_only and self.blocked(address) is None)
 
     def blocked(self, address: Address) -> Decision | None:
@@ -242,7 +226,6 @@ class Policy:
         return self._commanded.get(name)
 
     def may_command(self, name: str, host: Address) -> bool:
-        """Whether this host may command a topic or service: no group has it, or the host holds the group."""
         group = self._commanded.get(name)
         if group is None:
             return True
@@ -251,35 +234,30 @@ class Policy:
         return self.holder(group) == canonical_address(host)
 
     def holder(self, group: AuthorityGroup) -> Address | None:
-        """Return the holder of a group if it still has a claim; None if the group is free."""
         host = (self.holders or {}).get(group.name)
         if host is None or self.blocked(host) is not None or group.claim(self.atoms_of(host)) is None:
             return None
         return host
 
     def asks_for(self, category: Category, name: str) -> bool:
-        """Whether some hosts need an approval to access this name."""
         rule = self.tables[category].tree.find(name) or self.tables[category].default
         return rule is not None and bool(rule.asked)
 
     def named_as(self, address: Address) -> Network:
-        """The address itself counts as a network."""
         return self.standing(address).named_as
 
     def alike(self, address: Address) -> str:
-        """The text of `named_as`: the same for all addresses that the policy names as one network."""
         return self.standing(address).alike
 
     def counted_as(self, address: Address) -> str:
-        """Return `alike`, or one empty string for all unknown hosts."""
+        """Return one empty string for all unknown hosts."""
         return self.alike(address) if self.knows(address) else ""
 
     def names(self, address: Address) -> bool:
-        """The policy names this address or a network that contains it; `*` and blocked hosts do not count."""
+        """`*` and blocked hosts do not count as named."""
         return self.standing(address).named
 
     def audit_only(self, category: Category) -> bool:
-        """Whether requests of this category pass although the rules deny them."""
         return self.tables[category].audit_only
 
     def atoms_of(self, address: Address) -> frozenset[Atom]:
@@ -314,8 +292,8 @@ class Policy:
     def _commanding(self, request: Request, decision: Decision, group: AuthorityGroup) -> Decision:
         """Deny a host without a claim to the group, and calls of a host that does not hold it.
 
-        The publication of a host with a claim stays registered, because a ROS 1 node never registers again.
-        The relay carries its messages only while the host holds the group.
+        The publication of a host with a claim stays registered, because a ROS 1 node never registers again. The relay
+        carries its messages only while the host holds the group.
         """
         if not decision.allowed and decision.asks is None:
             return decision
@@ -355,7 +333,7 @@ class Policy:
         return _by_rule(what, found, table.audit_only)
 
     def _asking(self, request: Request, rule: CompiledRule, audit_only: bool) -> Decision:
-        """Decide for a host that needs an approval. A service call passes: the relay holds each of its requests."""
+        """A service call passes, because the relay holds each of its requests."""
         if self._is_approved(request):
             reason = f"{self._what(request, 'may')} by {rule.place}, while an approval lasts"
             return Decision(True, rule.rule, reason, asks=request)
@@ -398,7 +376,6 @@ def _decided(allowed: bool, rule: Rule | None, reason: str, audit_only: bool) ->
 
 
 def _by_rule(what: str, rule: CompiledRule, audit_only: bool) -> Decision:
-    """Return the decision of a rule; the reason lists the allowed hosts unless it would be too long."""
     told = f"{what}, by {rule.place}"
     reason = f"{what}: {rule.shown}, by {rule.place}"
     decision = _decided(False, rule.rule, reason if len(reason) <= _LONGEST_REASON else told, audit_only)

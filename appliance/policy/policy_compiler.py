@@ -1,7 +1,4 @@
-"""Compile a policy: read the text, check every word, compile the rules.
-
-All errors are reported at once: an invalid section or value is left out, and the rest is still checked.
-"""
+"""Compile a policy. An invalid section or value is left out, so that all errors are reported at once."""
 
 from collections.abc import Collection, Mapping
 
@@ -29,9 +26,7 @@ def compile_policy(
 ) -> Policy:
     """Return the policy. Raises `PolicyError` with every error in the text.
 
-    `file` is the name of the text in findings and rules. `hosts` has the addresses of enrolled hosts
-    (`host:NAME`). A name without an address matches no host and causes a warning. `robot` lists the addresses
-    of the group `robot`.
+    A name in `hosts` without an address matches no host and causes a warning.
     """
     findings = Findings(file)
     written = _by_name(read(text, findings), findings)

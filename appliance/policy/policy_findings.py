@@ -1,6 +1,6 @@
 """Collect errors and warnings about an operator's file, with their position: `file:line:column: error: text`.
 
-Errors reject the file; warnings never do. All are reported together, so that a file can be fixed in one step.
+Errors reject the file; warnings never do.
 """
 
 import enum
@@ -27,7 +27,6 @@ class PolicyFinding:
     text: str
 
     def __str__(self) -> str:
-        """Return the text as compilers write it, such as `landshark.ini:12:5: error: …`."""
         return f"{self.file}:{self.line}:{self.column}: {self.severity}: {self.text}"
 
 
@@ -63,7 +62,6 @@ class Findings:
         return len(self._errors) >= MAXIMUM_FINDINGS
 
     def raise_errors(self) -> None:
-        """Raise `PolicyError` with all findings in the order of the file."""
         if not self._errors:
             return
         findings = sorted([*self._errors, *self.warnings])
@@ -75,7 +73,6 @@ class Findings:
 
 
 def quoted(text: str, limit: int = 60) -> str:
-    """Return untrusted text quoted, shortened and escaped."""
     shown = text if len(text) <= limit else text[: limit - 1] + "…"
     return '"' + "".join(c if c.isprintable() and c != '"' else _escaped(c) for c in shown) + '"'
 

@@ -43,7 +43,6 @@ def _shadowed_defaults(tables: Tables, findings: Findings) -> None:
 
 
 def _dead_rules(tables: Tables, table: HostSets, findings: Findings) -> None:
-    """Warn about hosts that may publish, subscribe or offer, but may not use any node name."""
     named = {atom for rule in tables[Category.NODE].rules for atom in rule.atoms}
     if EVERYONE in named:
         return
@@ -61,7 +60,6 @@ def _dead_rules(tables: Tables, table: HostSets, findings: Findings) -> None:
 
 
 def _nameless(named: set[Atom], table: HostSets) -> dict[Atom, Network]:
-    """Return, for each atom, a network that does not overlap the hosts of `[Nodes]`, if there is one."""
     networks = table.networks()
     nodes = [network for network, atom in networks.items() if not named.isdisjoint(table.above([atom]))]
     overlap = _Overlap(nodes)
@@ -78,8 +76,6 @@ def _nameless(named: set[Atom], table: HostSets) -> dict[Atom, Network]:
 
 
 class _Overlap:
-    """Finds overlaps with a set of networks."""
-
     def __init__(self, networks: list[Network]) -> None:
         self._starts: dict[int, list[int]] = {}
         self._ends: dict[int, list[int]] = {}
@@ -99,7 +95,6 @@ class _Overlap:
 def _nodes_that_cannot_start(
     tables: Tables, present: set[Category], written: Mapping[str, SectionText], findings: Findings
 ) -> None:
-    """Warn about commands that every node needs but that no host may use."""
     if Category.COMMAND not in present:
         return
     table = tables[Category.COMMAND]
@@ -119,7 +114,6 @@ def _unused_groups(groups: HostGroups, findings: Findings) -> None:
 
 
 def _missing_sections(present: set[Category], findings: Findings) -> None:
-    """Warn about missing sections, whose requests are denied for all hosts."""
     for decider in sections.DECIDERS:
         if not decider.extension and decider.categories[0] not in present:
             findings.warn(

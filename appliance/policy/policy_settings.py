@@ -21,7 +21,7 @@ _RANGE = re.compile(r"([0-9]{1,5})-([0-9]{1,5})", re.ASCII)
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """`[Options]`: takeover of node names, sections in audit-only mode, and the text for denied hosts."""
+    """Takeover of node names, sections in audit-only mode, and the text for denied hosts."""
 
     takeover: str = TAKEOVERS[0]
     audit_only: frozenset[str] = frozenset()

@@ -1,14 +1,7 @@
-"""`[Limits]`: the number of messages and bytes that may pass in a second.
+"""Read `[Limits]`: the number of messages and bytes that may pass in a second (docs/reference/policy-file.md).
 
-    /camera/** = publisher 30 Hz 10 MB/s, subscriber tablet 5 Hz
-    /scan      = publisher guests 20 Hz, topic 100 Hz 2 MB/s
-
-`publisher` limits all publishers of the topic on one host together. `subscriber` limits each subscriber. `topic` limits
-all publishers of the topic; the hosts share this limit fairly. Hosts may follow `publisher` and `subscriber`: then the
-limit applies only to nodes on these hosts.
-
-As in every section, only the most specific key counts. If several of its clauses match a host, the strictest one
-counts. A limit restricts allowed traffic; it never allows or denies a request.
+Only the most specific key counts. If several of its clauses match a host, the strictest one counts. A limit never
+allows or denies a request.
 """
 
 import re
@@ -45,7 +38,6 @@ class Rate:
         return self.messages > 0 or self.bytes > 0
 
     def __str__(self) -> str:
-        """Return the text, such as `30 Hz, 10 MB/s` or `no limit`."""
         parts = [f"{self.messages:g} Hz"] if self.messages else []
         if self.bytes:
             unit = next(unit for unit in reversed(_BYTES) if self.bytes >= _BYTES[unit] or unit == "B/s")
@@ -135,7 +127,6 @@ def read_limits(section: SectionText | None, file: str, groups: HostGroups, find
 
 
 def _key(word: Word, patterns: list[tuple[Key, int]], findings: Findings) -> Key | None:
-    """Return the key, or None for `default` and for an invalid key."""
     if word.text == DEFAULT:
         return None
     try:
@@ -189,7 +180,6 @@ def _clause(part: Word, words: list[Word], groups: HostGroups, findings: Finding
 
 
 def _rate(part: Word, words: list[Word], findings: Findings) -> Rate | None:
-    """Return a rate such as `5Hz` or `5 Hz`; report an error and return None if it is invalid."""
     found: dict[str, float] = {}
     words = list(words)
     while words:

@@ -1,10 +1,4 @@
-"""List the rights that a call needs. Only this module knows which rules must grant a call.
-
-RVMaster's gate, revocation, `explain`, test cases, `diff` and `learn` all use it. `rights_of_call` returns the rights
-of a whole call. `rights_of` returns the rights of an action that a person names (`publish /cmd_vel`). `decide` makes
-one decision on several rights.
-
-A call needs all of these rights:
+"""List the rights that a call needs. Only this module knows which rules must grant a call:
 
 1. the action itself: access to a topic or service, or the call as a command;
 2. the command that carries out the action, if `COMMAND_FOR` lists one;
@@ -41,15 +35,12 @@ class Right(NamedTuple):
     alone: bool = False
 
     def __str__(self) -> str:
-        """Return the text: `write /arm/**` for a namespace (`read /**` for all), `write /arm` for one
-        parameter, `node /it`.
-        """
+        """`write /arm/**` for a namespace (`read /**` for all), `write /arm` for one parameter, `node /it`."""
         name = self.request.resource
         return f"{self.request.category} {name.rstrip('/') + '/**' if self.namespace else name}"
 
 
 def request_of(call: str, host: Address, caller_id: str, resource: str) -> Request:
-    """The request is about the topic or service, or otherwise about the command."""
     category = CALLS[call].category
     return Request(host, caller_id, category, call if category is Category.COMMAND else resource)
 
@@ -57,10 +48,6 @@ def request_of(call: str, host: Address, caller_id: str, resource: str) -> Reque
 def rights_of_call(
     request: Request, call: str, key: str | None = None, *, value: Value = None, tree: Tree | None = None
 ) -> list[Right]:
-    """Return the rights of a call. `request` decides the call (`request_of`).
-
-    `key` and `value` are those of its parameter, and `tree` is the present parameter tree.
-    """
     row = CALLS[call]
     if key is None or row.touches is None:
         return rights_of(request)
@@ -73,16 +60,12 @@ def rights_of_call(
 
 
 def rights_to_keep(request: Request, call: str, resource: str, *, namespace: bool) -> list[Right]:
-    """Return the rights that a host needs to keep the live right of this call.
-
-    `namespace`: the resource is a parameter that contains other parameters.
-    """
     touch = CALLS[call].touches
     return rights_of(request, [] if touch is None else [Right(_of(request, touch, resource), namespace)])
 
 
 def rights_of(request: Request, touched: Iterable[Right] = ()) -> list[Right]:
-    """Return the rights of an action; `touched` are the rights on its parameters."""
+    """Return the rights of an action that a person names; `touched` are those on its parameters."""
     rights = [Right(request)]
     if (command := COMMAND_FOR.get(request.category)) is not None:
         rights.append(Right(_of(request, Category.COMMAND, command)))

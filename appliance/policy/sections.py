@@ -10,8 +10,7 @@ from appliance.policy.model import Category
 class Decider:
     """A section that decides requests; `phrases` are the words before a resource in messages.
 
-    The sections with `extension` are not in the thesis: if one is missing, its requests are allowed for all hosts. If
-    another section is missing, its requests are denied.
+    The sections with `extension` are not in the thesis: if one is missing, its requests are allowed for all hosts.
     """
 
     name: str

@@ -1,8 +1,7 @@
-"""List the rights that the stock tools of ROS need before they do what the user asked for, and replace the numbers of
-their anonymous nodes by a star. No I/O.
+"""List the rights that the stock tools of ROS need before they do what the user asked for. No I/O.
 
-A tool on a host without rights is denied one call after the other, and reports only the first one. The calls are
-those that the tools of Debian 12 made with all their verbs that only read.
+A denied tool reports only its first denied call. The calls are those that the tools of Debian 12 made with all their
+verbs that only read.
 """
 
 import re
@@ -32,7 +31,6 @@ class StockTool:
     node: bool = True
 
     def rights(self, host: Address) -> list[Right]:
-        """Return the rights that the tool needs, without those to the topics and services of its user."""
         name = f"/{self.name}_1_1000000000"
         asked = [(Category.COMMAND, call) for call in self.calls]
         if self.node:
@@ -58,7 +56,6 @@ _TOOLS = (
 
 
 def stock_tool(caller_id: str) -> StockTool | None:
-    """Return the tool of a caller such as `/rostopic`, `/rostopic_4711_1700000000000` or `/rosparam-4711`, or None."""
     if len(caller_id) > _LONGEST:
         return None
     key = key_of(caller_id)
