@@ -48,7 +48,6 @@ class RelayOutbox(Link):
     def close(self) -> None:
         super().close()
         self.stated.clear()
-        self.unstated.clear()
         while self._orders:
             self.carried_out()
 

@@ -431,8 +431,7 @@ class RelayedTopic:
             for member in self._served.row:
                 if member.missed:
                     self._served.deliver(self._latch.batch, member)
-        if self._served.trim(stalled=True):
-            self._reported = False
+        self._served.trim(stalled=True)
 
     @property
     def latched(self) -> int:

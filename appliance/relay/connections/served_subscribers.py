@@ -127,15 +127,12 @@ class ServedSubscribers:
                 behind = behind or member.behind_since is not None
         return behind
 
-    def trim(self, *, stalled: bool = False) -> bool:
-        full = False
+    def trim(self, *, stalled: bool = False) -> None:
         for member in self.row:
             if member.full:
                 self._dropped += member.trim()
-                full = True
             if stalled:
                 member.check_stall()
-        return full
 
     @property
     def has_dropped(self) -> bool:

@@ -225,7 +225,6 @@ class TopicPipeline:
                 progress.cut(position, following)
             elif result == "changed":
                 observer.changed(outcome, point, before, len(body), observed)
-                shows = False
                 if outcome.buffer is not body:
                     progress.replace(position, following, outcome.buffer)
             position = following

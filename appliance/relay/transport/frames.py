@@ -261,7 +261,6 @@ class FrameReceiver:
 
     def _walk(self, buffer: memoryview, end: int, *, owned: bool) -> Batch | None:
         limit = self._limit
-        need = 0
         stride, messages = equal_frames(buffer, end)
         position = stride * messages
         last = position - stride
@@ -362,9 +361,10 @@ def boundary_at(view: memoryview, offset: int) -> tuple[int, int]:
 
     When `offset` is exactly between two frames, the end is `offset` itself.
     """
-    stride, count = equal_frames(view, len(view)) if offset > _FAR else (0, 0)
-    if stride and stride * count == len(view):
-        return offset // stride, -(-offset // stride) * stride
+    if offset > _FAR:
+        stride, count = equal_frames(view, len(view))
+        if stride * count == len(view):
+            return offset // stride, -(-offset // stride) * stride
     position = frames = 0
     while position < offset:
         position += _unpack_length(view, position)[0] + 4
