@@ -5,6 +5,8 @@ number. A first run records which tests reach which mutant. Then each chosen mut
 process, which runs only those tests, until one fails. With `--all`, it also runs tests outside the gate. `--module
 master` changes the modules whose path contains `master` instead of the kernel. A seed then chooses the same mutants
 whatever the tests reach, so that two states of the tests can be compared.
+
+Changes without an effect are left out: None instead of False, another step of a version, a `zip` that is not strict.
 """
 
 import argparse
@@ -96,6 +98,16 @@ class _Switches(ast.NodeTransformer):
             return node
         return self._or(node, node.operand, f"{text} -> without not")
 
+    def visit_AugAssign(self, node: ast.AugAssign) -> ast.AST:
+        counts = isinstance(node.target, ast.Attribute) and node.target.attr == "version"
+        return node if counts else self.generic_visit(node)
+
+    def visit_Call(self, node: ast.Call) -> ast.AST:
+        if ast.unparse(node.func) == "zip":
+            node.args = [self.visit(argument) for argument in node.args]
+            return node
+        return self.generic_visit(node)
+
     def visit_Constant(self, node: ast.Constant) -> ast.AST:
         if not self._functions or not isinstance(node.value, bool | int):
             return node
@@ -119,7 +131,7 @@ class _Switches(ast.NodeTransformer):
     def visit_Return(self, node: ast.Return) -> ast.AST:
         text = ast.unparse(node)
         self.generic_visit(node)
-        if not self._functions or node.value is None or text == "return None":
+        if not self._functions or node.value is None or text in {"return None", "return False"}:
             return node
         node.value = self._or(node.value, ast.Constant(None), f"{text} -> return None")
         return node
