@@ -157,6 +157,7 @@ def test_any_text_is_a_policy_or_a_policy_error(text: str) -> None:
 def test_options_and_ports_have_their_documented_defaults() -> None:
     policy = compile_policy("", file="p.ini")
     assert policy.ports == range(19001, 26001)
+    assert compile_policy("[Ports]\nrange = 1024-2023\n", file="p").ports == range(1024, 2024)
     assert policy.takeover == "same-host"
     assert policy.monitored_services == frozenset()
     assert compile_policy("[Options]\ntakeover = granted\n", file="p").takeover == "granted"

@@ -398,6 +398,8 @@ def test_a_missing_directory_is_a_failure(tmp_path: Path) -> None:
     assert tried_again(log) is None
     assert log.close() is None
     assert events(path)["decision"] == 1
+    (report,) = search(path, Filter(event="log failed")).entries
+    assert report.record.detail["until"] - report.record.detail["since"] == 500_000_000
 
 
 def test_missing_earlier_log_is_an_alarm(make_log: MakeLog, path: Path) -> None:

@@ -575,7 +575,7 @@ def test_a_stuck_subscriber_is_not_waited_for() -> None:
     member = story.join()
     story.topic.upstream_opened(HEADER)
     story.topic.traffic()
-    member.behind_since, story.now = 99.0, 100.0
+    member.behind_since, story.now = 99.95, 100.0  # its grace has just ended
     story.receive(batch(b"1"))
     assert member.trimmed == 1
     assert "pause" not in "".join(story.upstream.asked)
@@ -589,6 +589,7 @@ def test_traffic_is_reported_once() -> None:
     story.topic.upstream_opened(HEADER)
     story.receive(batch(b"1", b"22"))
     assert story.topic.traffic() == TopicTraffic("k", "/chatter", 2, 11, 0, 1, [2] + [0] * 10, 0.0, "m")
+    story.topic.tidy()
     assert story.topic.traffic() is None
 
 

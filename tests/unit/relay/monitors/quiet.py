@@ -27,6 +27,9 @@ class Timers:
         while self._work:
             self._work.pop(0)()
 
+    def discard(self) -> None:
+        self._work.clear()
+
     def after(self, seconds: float, callback: Callable[[], None]) -> LoopTimer:
         timer = LoopTimer(callback)
         self.due.append((seconds, timer))
@@ -55,7 +58,7 @@ class QuietMonitors:
         self.called: list[Published] = []
         self._send = publish or (lambda topic, data: self.published.append((topic, data)))
         loop: Any = Timers()
-        self._finish = loop.finish
+        self.finish = loop.finish
         reporter: Any = self.reports
         self.interceptor = Interceptor(
             loop,
@@ -74,7 +77,7 @@ class QuietMonitors:
     def load(self, *texts: str, **more: Any) -> SpecificationsTaken:
         files = [(f"{number}.rv", text) for number, text in enumerate(texts)]
         self.interceptor.state(stated(1, files, {}, **more))
-        self._finish()
+        self.finish()
         answer = self.reports.sent[-1]
         assert isinstance(answer, SpecificationsTaken)
         return answer

@@ -398,6 +398,15 @@ def test_messages_that_were_cut_or_replaced_leave_the_rest_in_order() -> None:
     assert bytes(left.view) == encode_frame(b"another") + frames[1] + frames[3]
 
 
+def test_a_monitor_knows_the_sender_of_a_message() -> None:
+    text = """s() { event e() /t std_msgs/Bool '{}' { if (caller(e) == "/evil") { return; } } }"""
+    for together in (False, True):
+        monitored = Monitored({"x.rv": text}, definitions(), together=together)
+        traffic = Traffic("/t", encode_frame(b"\1"), 1)
+        assert [monitored.through(traffic, publisher=name)[0] for name in ("/evil", "/talker")] == [0, 1]
+        monitored.close()
+
+
 def test_only_the_named_monitor_is_resumed() -> None:
     text = "%s() { int n = 0; event e() /%s std_msgs/Bool '{}' { n += 1; } }"
     monitored = Monitored({f"{name}.rv": text % (name, name) for name in "ab"}, definitions(), together=False)

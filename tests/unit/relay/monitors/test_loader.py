@@ -4,8 +4,7 @@ import sys
 import pytest
 
 from tests.support.stated import stated
-
-pytestmark = pytest.mark.nightly
+from tests.unit.relay.monitors.quiet import QuietMonitors
 
 TEXT = "m() { event e(bool x) /t std_msgs/Bool '{data:x}' { } }"
 PROGRAM = """
@@ -30,3 +29,11 @@ def test_the_garbage_collector_looks_at_the_specifications_and_not_at_what_compi
         [sys.executable, "-c", PROGRAM, data.hex()], capture_output=True, text=True, check=True
     )
     assert int(done.stdout) < 5_000
+
+
+def test_specifications_that_are_being_loaded_are_discarded_when_the_relay_ends() -> None:
+    monitors = QuietMonitors()
+    monitors.interceptor.state(stated(1, [("m.rv", TEXT)]))
+    monitors.interceptor.close()
+    monitors.finish()
+    assert (monitors.interceptor.monitors, monitors.reports.sent) == (None, [])
