@@ -272,7 +272,7 @@ class ChainWriter:
             execute("DELETE FROM checkpoint WHERE number <= ?", (gone.last_checkpoint,))
         self.sequence, self.hash, self.last_id = sequence, digest, last_id
         self._text_through = max(through, gone.last_sequence)
-        self._connection.execute("PRAGMA incremental_vacuum(256)").fetchall()
+        self._connection.executescript("PRAGMA incremental_vacuum(256)")  # `execute` would free one page only
 
     def _check_file(self) -> None:
         if _identity(self.path) != self._file:

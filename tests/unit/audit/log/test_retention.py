@@ -45,6 +45,7 @@ def make_old(make_log: MakeLog, notary: Notary) -> None:
 
 def test_old_records_are_removed_and_that_is_recorded(make_log: MakeLog, path: Path, notary: Notary) -> None:
     make_old(make_log, notary)
+    before = path.stat().st_size
     log = make_log(checkpoint_every=100, retention=Retention(days=1))
     fresh = decision(log, reason="fresh")
     log.record(fresh)
@@ -52,6 +53,7 @@ def test_old_records_are_removed_and_that_is_recorded(make_log: MakeLog, path: P
     assert first_sequence(path) > 1900
     settle(log)
     log.close()
+    assert path.stat().st_size < before / 2
     reports = [entry.record for entry in export(path, Filter(event="records removed"))]
     removed = sum(one.detail["count"] for one in reports)
     kept = list(export(path, Filter()))
