@@ -57,8 +57,8 @@ class QuietMonitors:
         self.published: list[tuple[str, bytes]] = []
         self.called: list[Published] = []
         self._send = publish or (lambda topic, data: self.published.append((topic, data)))
-        loop: Any = Timers()
-        self.finish = loop.finish
+        self.loop = Timers()
+        loop: Any = self.loop
         reporter: Any = self.reports
         self.interceptor = Interceptor(
             loop,
@@ -77,7 +77,7 @@ class QuietMonitors:
     def load(self, *texts: str, **more: Any) -> SpecificationsTaken:
         files = [(f"{number}.rv", text) for number, text in enumerate(texts)]
         self.interceptor.state(stated(1, files, {}, **more))
-        self.finish()
+        self.loop.finish()
         answer = self.reports.sent[-1]
         assert isinstance(answer, SpecificationsTaken)
         return answer

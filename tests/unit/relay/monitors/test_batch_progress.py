@@ -36,6 +36,7 @@ from roswire.tcpros import encode_frame
 from tests.support.examples import examples
 from tests.support.relay_memory import share
 from tests.support.stated import stated
+from tests.unit.relay.monitors.quiet import QuietMonitors
 from tests.unit.transcripts import transcripts
 
 MONITORS = Path(__file__).parents[4] / "monitors"
@@ -405,6 +406,16 @@ def test_a_monitor_knows_the_sender_of_a_message() -> None:
         traffic = Traffic("/t", encode_frame(b"\1"), 1)
         assert [monitored.through(traffic, publisher=name)[0] for name in ("/evil", "/talker")] == [0, 1]
         monitored.close()
+
+
+def test_a_deadline_that_a_message_begins_wakes_the_loop() -> None:
+    monitors, wanted = QuietMonitors(), "globally: e causes done within 10ms"
+    monitors.load(f"""s() {{ event e() /t std_msgs/Bool '{{}}' {{ }} event done() /done std_msgs/Bool '{{}}' {{ }}
+        pattern: {wanted} @violation {{ }} }}""")
+    assert not monitors.loop.due
+    frame = memoryview(bytearray(encode_frame(b"\1")))
+    TopicPipeline(monitors.interceptor, ObservationPoint("k", "/t")).through(Batch(frame, 1, 0))
+    assert [seconds for seconds, _timer in monitors.loop.due] == [pytest.approx(0.01, abs=1e-6)]
 
 
 def test_only_the_named_monitor_is_resumed() -> None:

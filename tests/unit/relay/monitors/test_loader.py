@@ -35,5 +35,5 @@ def test_specifications_that_are_being_loaded_are_discarded_when_the_relay_ends(
     monitors = QuietMonitors()
     monitors.interceptor.state(stated(1, [("m.rv", TEXT)]))
     monitors.interceptor.close()
-    monitors.finish()
+    monitors.loop.finish()
     assert (monitors.interceptor.monitors, monitors.reports.sent) == (None, [])
