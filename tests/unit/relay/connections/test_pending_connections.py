@@ -53,6 +53,8 @@ def test_a_grant_counts_for_a_waiting_peer() -> None:
 def test_long_headers_make_room_for_short_ones() -> None:
     world = World()
     world.granted |= {"robot", *(f"guest{number}" for number in range(200))}
+    short = world.guest("early")
+    world.room.hold(short, 4096)
     for number in range(200):
         for host in (f"guest{number}", f"unknown{number}"):
             for _ in range(10):
@@ -63,7 +65,7 @@ def test_long_headers_make_room_for_short_ones() -> None:
     assert world.room.hold(mine, 4096) == ""
     world.now = 2.0
     assert world.room.hold(mine, 64 << 10) == ""
-    assert not mine.ended
+    assert (mine.ended, short.ended) == (False, False)
 
 
 def test_a_host_at_its_quota_of_long_headers_ends_no_other() -> None:
