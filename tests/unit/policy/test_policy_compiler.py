@@ -108,6 +108,11 @@ def test_a_file_beyond_the_limit_is_refused_with_the_limit() -> None:
     assert str(MAXIMUM_CHARACTERS) in found[0]
 
 
+def test_errors_beyond_the_limit_are_only_counted() -> None:
+    found = errors_of("[Ports]\nrange = x\n" + "x\n" * MAXIMUM_FINDINGS)
+    assert (len(found), found[-1][-27:]) == (MAXIMUM_FINDINGS + 1, "1 more errors are not shown")
+
+
 @pytest.mark.parametrize(
     "text",
     [

@@ -137,6 +137,8 @@ def test_a_reopened_log_continues(make_log: MakeLog, path: Path) -> None:
     result = verify(path)
     assert result.ok, result.findings
     assert events(path)["log begun"] == 1
+    modes = [path.with_name(name).stat().st_mode & 0o777 for name in ("audit.db", "audit.db.lock")]
+    assert modes == [0o640, 0o600]
 
 
 @pytest.mark.nightly
