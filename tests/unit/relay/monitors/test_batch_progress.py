@@ -418,6 +418,22 @@ def test_a_deadline_that_a_message_begins_wakes_the_loop() -> None:
     assert [seconds for seconds, _timer in monitors.loop.due] == [pytest.approx(0.01, abs=1e-6)]
 
 
+def test_a_deadline_of_the_engine_is_over_before_the_next_message() -> None:
+    """The prepared fast path must not go past it, although the loop has not yet called the timer."""
+    text = """s() { bool late = false;
+        event other(int c) /plain own/Plain '{count:c}' when (c != 9) { if (late) { return; } }
+        event e(int c) /plain own/Plain '{count:c}' when (c == 9) { c = 1; }
+        event done() /done std_msgs/Bool '{}' { }
+        pattern: globally: e causes done within 10ms @violation { late = true; } }"""
+    monitored, passed = Monitored({"x.rv": text}, definitions(), together=True), []
+    for milliseconds, count, messages in ((0, 5, 3), (1, 9, 1), (20, 5, 1)):
+        monitored.time += milliseconds * 1_000_000
+        body = struct.pack("<BidfBII3qI", 1, count, 2.0, 1.0, 1, 5, 7, 1, 2, 3, 0)
+        passed.append(monitored.through(Traffic("/plain", encode_frame(body) * messages, messages))[0])
+    assert passed == [3, 1, 0]
+    monitored.close()
+
+
 def test_only_the_named_monitor_is_resumed() -> None:
     text = "%s() { int n = 0; event e() /%s std_msgs/Bool '{}' { n += 1; } }"
     monitored = Monitored({f"{name}.rv": text % (name, name) for name in "ab"}, definitions(), together=False)
