@@ -105,7 +105,8 @@ def test_error_says_file_line_and_column_as_compilers_do() -> None:
 
 def test_a_file_beyond_the_limit_is_refused_with_the_limit() -> None:
     found = errors_of("#" * (MAXIMUM_CHARACTERS + 1))
-    assert str(MAXIMUM_CHARACTERS) in found[0]
+    size = f"{MAXIMUM_CHARACTERS + 1} characters; the limit is {MAXIMUM_CHARACTERS}"
+    assert found == [f"1:1: the file has {size}"]
 
 
 def test_errors_beyond_the_limit_are_only_counted() -> None:
