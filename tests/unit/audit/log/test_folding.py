@@ -137,6 +137,13 @@ def test_an_allow_ends_the_folding_it_contradicts() -> None:
     assert offer(folder, again) == [again]
 
 
+def test_an_allow_ends_every_folding_of_its_request() -> None:
+    folder = make_folder()
+    offer(folder, *(denial(reason=reason) for reason in ("no", "never") for _ in range(2)))
+    *summaries, _allow = offer(folder, denial(decision="allow"))
+    assert ([one.detail["count"] for one in summaries], len(folder)) == ([1, 1], 0)
+
+
 def test_allows_that_change_something_are_never_folded() -> None:
     folder = make_folder()
     allows = [denial(decision="allow") for _ in range(50)]
