@@ -13,9 +13,8 @@ LARGEST = 1 << 30  # bytes of a file that is not a database
 MOST_FILES = 10_000  # a usual backup has about twenty
 _LONGEST_NAME = 100  # bytes that fit into a tar header without an extension
 _DATABASES = "control/"  # the only part with databases
-# Files that exist only while the appliance runs, or that the next start makes again. `.ahead` files are also left out:
-# the copied database does not have their changes yet.
-_PASSING = ("-wal", "-shm", ".lock", ".ahead", ".new", ".sock", ".pid", "strongswan.conf")
+# Files that exist only while the appliance runs, or that the next start makes again.
+_PASSING = ("-wal", "-shm", ".lock", ".new", ".sock", ".pid", "strongswan.conf")
 # Logs of ROS, recorded messages, and what the robot knows of the fleet's signatures: older knowledge would weaken it.
 _LEFT_OUT = {"rosmaster", "rosout", "recordings", "bundles"}
 KEPT_PARTS = frozenset(role.part for role in ROLES) - _LEFT_OUT

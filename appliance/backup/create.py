@@ -5,9 +5,11 @@ Invariants:
 1. SQLite copies each database as a consistent snapshot.
 2. The log is copied first. Then the signer's memory is cut to the checkpoints in that copy, so that a restored log can
    be continued.
-3. The file contains keys, so only its owner may read it. An existing file is not overwritten; an unfinished backup is
+3. `state.ahead` has changes that were acknowledged and are not in `state.db` yet. It is copied before `state.db`, so no
+   change is in neither; a start skips those that are in both.
+4. The file contains keys, so only its owner may read it. An existing file is not overwritten; an unfinished backup is
    removed.
-4. Root reads folders of users whose processes may be compromised. Therefore links are not followed with root's rights,
+5. Root reads folders of users whose processes may be compromised. Therefore links are not followed with root's rights,
    and a file that belongs to another user is an error.
 """
 
@@ -145,7 +147,7 @@ def _names(state: Path, part: str) -> Iterator[str]:
     # An unreadable folder is an error: a backup without the keys would be useless.
     for folder, folders, names in os.walk(state / part, onerror=_raise):
         folders.sort()
-        for name in sorted(names):
+        for name in sorted(names):  # `state.ahead` comes before `state.db`
             if not is_passing(name):
                 yield (Path(folder) / name).relative_to(state).as_posix()
 

@@ -24,7 +24,7 @@ def refused(file: Path, state: Path, words: str) -> None:
     "name",
     [
         "../evil", "/etc/evil", "control/../../evil", "evil", "elsewhere/evil", "run/config.json", "api//x", "api/./x",
-        "control/audit.db-wal", "control/audit.db-shm", "control/audit.db.lock", "control/state.ahead",
+        "control/audit.db-wal", "control/audit.db-shm", "control/audit.db.lock",
         "ipsec/strongswan.conf", "ipsec/vici.sock", "rosmaster/.local/lib/python3.11/site-packages/x.pth",
         "api/\x1b[2J", "api/a\nb", "api/" + "x" * 97,
     ],

@@ -54,7 +54,7 @@ def state(tmp_path: Path) -> Path:
         connection.execute("INSERT INTO thing VALUES ('kept')")
         connection.commit()
     for name, text in (("signer/audit.key", "secret"), ("run/config.json", "{}"), ("rosmaster/log/x.log", "x"),
-                       ("control/state.ahead", "x"), ("control/audit.db.lock", ""),
+                       ("control/state.ahead", "acknowledged"), ("control/audit.db.lock", ""),
                        ("ipsec/strongswan.conf", "")):  # fmt: skip
         (state / name).write_text(text)
     (state / "signer" / "audit.key").chmod(0o600)
@@ -70,9 +70,10 @@ def test_a_backup_is_restored(state: Path, tmp_path: Path) -> None:
     assert sorted(names) == sorted(restore(file, other))
     assert {"control/audit.db", "control/audit.pub", "control/state.db", "signer/audit.key"} <= set(names)
     assert not any(
-        name.startswith(("run/", "rosmaster/")) or name.endswith((".ahead", ".lock", ".conf"))
-        for name in names
+        name.startswith(("run/", "rosmaster/")) or name.endswith((".lock", ".conf")) for name in names
     )
+    assert names.index("control/state.ahead") < names.index("control/state.db")  # no change is in neither
+    assert (other / "control" / "state.ahead").read_text() == "acknowledged"
     assert stat.S_IMODE((other / "signer" / "audit.key").stat().st_mode) == 0o600
     result = verify(other / "control" / "audit.db", signer=other / "signer")
     assert result.ok, result.findings
