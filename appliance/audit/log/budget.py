@@ -1,11 +1,9 @@
-"""Limit the bytes of audit records that each host causes over time, and more strictly on a nearly full disk. No I/O.
+"""Limit the bytes of audit records that each host causes over time, and more strictly on a nearly full disk. No
+I/O.
 
-Each record is charged to its host, and the debt shrinks by `RATE` bytes a second. Only the calls of a host above its
-quota (`AUDIT_BYTES`) wait. While only the reserve of the disk is left (`AUDIT_RESERVE`), quotas and rates are smaller,
-and the last part of the reserve is kept for the robot and for hosts that the policy names. After a restart no host
-has a registration, so registrations do not matter. Unknown hosts are not charged: their denials are folded.
-
-Use this module from one thread only; `folded`, `summarised` and `room` may be called from any thread.
+The debt of a host shrinks by `RATE`, and only the calls of a host above its quota wait. The last part of the
+disk's reserve is kept for the robot and for hosts that the policy names, because after a restart no host has a
+registration. Unknown hosts are not charged: their denials are folded.
 """
 
 import dataclasses
@@ -18,7 +16,7 @@ from appliance.quotas.pool import Bounds, Pool, QuotaClass
 from appliance.quotas.table import AUDIT_BYTES, AUDIT_RESERVE
 
 RATE = 64 << 10
-"""The bytes by which a host's debt shrinks per second; divided by `_SCARCE` on a nearly full disk."""
+"""Bytes per second; divided by `_SCARCE` on a nearly full disk."""
 
 _SCARCE = 8
 _RECORD_BYTES = 400  # on disk, with its entries in the indices
@@ -35,10 +33,10 @@ def weight(record: AuditRecord) -> int:
 
 
 class Budget:
-    """The debts of hosts. `quota_class` returns the class of a host; `clock` returns monotonic seconds.
+    """The debts of hosts, for one thread; only `folded`, `summarised` and `room` may be called from several.
 
-    `reserve` has the bounds that apply while only the reserve of the disk is left. `kept_for` returns whether the last
-    part of the reserve is kept for a host.
+    `reserve` has the bounds for the reserve of the disk, whose last part is left to hosts for which `kept_for` is
+    true.
     """
 
     def __init__(
@@ -80,11 +78,11 @@ class Budget:
             self._changes.append((record.host, weight(record)))
 
     def room(self, left: int | None) -> None:
-        """Set how many bytes of the reserve are left; None: more than the reserve is free."""
+        """`left` is None while more than the reserve is free."""
         self._left = left
 
     def shut_out(self, host: str) -> str:
-        """Return why a nearly full disk blocks this host; empty if it does not."""
+        """Return why a nearly full disk blocks this host, or an empty text."""
         left = self._left
         if left is None or left >= self._kept or self._kept_for(host):
             return ""
@@ -94,7 +92,7 @@ class Budget:
         )
 
     def owing(self, host: str) -> str:
-        """Return why calls of this host must wait; empty if they may proceed."""
+        """Return why calls of this host must wait, or an empty text."""
         if self._left is None and not self._changes and self._is_usual(host):
             return ""
         self._pay()
@@ -102,14 +100,12 @@ class Budget:
         return self.owed.refusal(host, 0)
 
     def pause(self, host: str) -> float:
-        """Return the seconds until calls of this host are checked again; 0 if they may proceed."""
         if not self.owing(host):
             return 0.0
         over = (self.owed.held(host) - self.owed.bounds.host) / self._pace
         return min(_LONGEST_PAUSE_SECONDS, max(_PAID_EVERY_SECONDS, over))
 
     def _is_usual(self, host: str) -> bool:
-        """Whether this host may proceed without `_pay`: it has no debt, or all debts are small and just updated."""
         if not (self.owed.held(host) or host in self._charged):
             return True
         owed = self.owed.total + self._charged_bytes

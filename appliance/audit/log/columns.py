@@ -1,8 +1,7 @@
 """Convert records to columns of the database and back, and hash the columns.
 
-SQLite and JSON cannot store lone surrogates (undecodable bytes), integers beyond 64 bits, or arbitrary objects. These
-are escaped, limited, or stored as their `repr`. A text longer than `LONGEST_TEXT` characters is cut and marked with its
-length. If the details exceed `LARGEST_DETAIL` bytes, only the smallest are stored, with the names of the others.
+SQLite and JSON cannot store lone surrogates, integers beyond 64 bits, or arbitrary objects, so these are escaped,
+limited, or stored as their `repr`.
 """
 
 import hashlib
@@ -32,7 +31,7 @@ _decode_detail = msgspec.json.Decoder(dict[str, Any]).decode
 
 
 class StoredColumns(NamedTuple):
-    """The columns of table `record`, in order and without the hash."""
+    """The columns of table `record`, in order."""
 
     sequence: int
     id: str
@@ -56,7 +55,7 @@ class StoredColumns(NamedTuple):
 
 
 def to_columns(record: AuditRecord, sequence: int) -> StoredColumns:
-    """Return the columns of a record with this sequence. Never fails, whatever the record contains."""
+    """Never fails, whatever the record contains."""
     try:
         columns = _columns(record, sequence)
         if isinstance(record.detail, dict) and len(columns.detail) <= LARGEST_DETAIL and _storable(columns):
@@ -107,7 +106,6 @@ def from_columns(columns: StoredColumns) -> AuditRecord:
 
 
 def plain_record(record: AuditRecord) -> AuditRecord:
-    """Return the record with all values converted to a storable form."""
     rule = record.rule
     if rule is not None:
         rule = RuleReference(_text(rule.section), _text(rule.key), _text(rule.file), _integer(rule.line) or 0)
@@ -186,7 +184,7 @@ def _text(value: object) -> str:
 
 
 def packed(columns: tuple[object, ...]) -> bytes:
-    """Return the values of `StoredColumns` as the bytes that are hashed: an array, so the encoding is injective."""
+    """Return an array, so the encoding is injective."""
     return _packer.encode(columns)
 
 

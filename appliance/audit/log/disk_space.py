@@ -9,9 +9,9 @@ _AGAIN = 1.25  # times the reserve must be free before space is no longer scarce
 
 
 class DiskSpace:
-    """The free space on the disk of the log at `path`; the last `reserve` bytes are the reserve.
+    """The free space on the disk of the log at `path`.
 
-    Each check calls `tell` with the bytes left of the reserve, or None while more than the reserve is free.
+    `tell` gets the bytes left of the last `reserve` bytes, or None while more is free.
     """
 
     def __init__(self, path: Path, reserve: int, tell: Callable[[int | None], None]) -> None:
@@ -22,10 +22,7 @@ class DiskSpace:
         self.left: int | None = None
 
     def look(self, now: float) -> bool | None:
-        """Check the disk, which is due then; return True if space just became scarce, False if scarcity just ended.
-
-        Raises `OSError`.
-        """
+        """Return True if space just became scarce, False if scarcity just ended. Raises `OSError`."""
         self.due = now + _LOOK_SECONDS
         disk = os.statvfs(self._folder)
         free, before = disk.f_bavail * disk.f_frsize, self.left

@@ -1,8 +1,4 @@
-"""Define the stable names of all events, for the documentation and for search filters.
-
-A name is never renamed and never reused for another event. A new name is added here, with its description, before it
-is recorded.
-"""
+"""Define the stable names of all events. A name is never renamed and never reused for another event."""
 
 from appliance.audit.log.record import Severity
 
@@ -221,4 +217,4 @@ SEVERITIES: dict[str, Severity] = {
     }.items()
     for name in names
 }  # fmt: skip
-"""The severity of each event for which it is fixed. For other events, the recording code gives it; default: INFO."""
+"""The severity of each event for which it is fixed; for other events, the recording code gives it."""

@@ -1,19 +1,14 @@
 """Fold repetitions, so that a flood cannot push evidence out of the log or fill the disk. No I/O, no clock.
 
-Denials, errors of peers, allowed reads, and records of a host above its budget are folded (`AuditRecord.folds`).
-
-1. The first record of a kind is written in full; each repetition counts in one summary. A record with a `count` counts
-   that many times.
-2. Memory is limited: the kinds of denials are counted in a pool (`AUDIT_KINDS`). All unknown hosts together have a
-   small quota of this pool, so they cannot displace hosts that the policy names. Above a host's quota, all its further
-   denials count as one kind. Above the quota of unknown hosts, they all share one kind. The kinds of reads are counted
-   in another pool (`AUDIT_READ_KINDS`). When this pool is full, decisions are written in full, because policies are
-   learned from them.
-3. A kind without repetition for `seconds` is forgotten; its next record is written in full.
-4. An allow ends the denial kinds of the same host, caller and request, and a denial ends the allow kinds. Their
+1. The first record of a kind is written in full; each repetition counts in one summary.
+2. Memory is limited: in the pool of denials (`AUDIT_KINDS`), all unknown hosts together have a small quota, so
+   they cannot displace hosts that the policy names. Above a quota, all further denials count as one kind. When
+   the pool of reads (`AUDIT_READ_KINDS`) is full, decisions are written in full, because policies are learned
+   from them.
+3. An allow ends the denial kinds of the same host, caller and request, and a denial ends the allow kinds. Their
    summaries are written first, then the new record in full.
-5. Counts are stored on disk, so the key of a kind has only storable texts (`storable`).
-6. A `would deny` of an audit-only policy is never folded.
+4. Counts are stored on disk, so the key of a kind has only storable texts (`storable`).
+5. A `would deny` of an audit-only policy is never folded.
 """
 
 from collections.abc import Callable, Iterator
@@ -42,7 +37,7 @@ _Holder = tuple[str | None, QuotaClass]
 
 @dataclass(frozen=True)
 class FoldSettings:
-    """The settings of folding. A summary is written every `seconds`; 0 writes every record in full."""
+    """A summary is written, or a kind without repetition forgotten, after `seconds`; 0 writes every record in full."""
 
     seconds: float = 10.0
     kinds: Bounds = AUDIT_KINDS.bounds
@@ -58,7 +53,7 @@ class FoldSettings:
 
 @dataclass(slots=True)
 class _Kind:
-    """A counted kind: its state, its pool and holder, and the subject whose contrary decision ends it."""
+    """A counted kind, and the subject whose contrary decision ends it."""
 
     state: FoldState
     pool: Pool[_Holder]
@@ -67,7 +62,7 @@ class _Kind:
 
 
 class RecordFolder:
-    """Decides whether each record is written in full or only counted. `now` is in monotonic seconds."""
+    """Decides whether a record is written in full or only counted. `now` is in monotonic seconds."""
 
     def __init__(self, settings: FoldSettings, make_id: Callable[[], str], clock: Callable[[], int]) -> None:
         self._settings = settings
@@ -91,11 +86,7 @@ class RecordFolder:
         return kind.state if kind is not None and kind.state.count else None
 
     def in_full(self, record: AuditRecord) -> str:
-        """Return the id of the record that a denial repeats, or else its own id; empty for a collective kind.
-
-        The owner calls this before it offers the record. Denials that are not offered yet are stored, so that an
-        immediate repetition finds them.
-        """
+        """Return the id of the record that a denial repeats, or else its own id; empty for a collective kind."""
         if record.decision != "deny" or not self._settings.seconds:
             return record.id
         plain = storable(record)
@@ -118,7 +109,6 @@ class RecordFolder:
         return sum(other.unknown if unknown else other.host == host for other in waiting)
 
     def offer(self, record: AuditRecord, now: float) -> Iterator[AuditRecord]:
-        """Yield the records to write: due summaries, then the record itself unless it is only counted."""
         if not self._settings.seconds:
             yield record
             return

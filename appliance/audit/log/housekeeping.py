@@ -1,9 +1,6 @@
 """Run the background work of a log: checkpoints and their signatures, the full-text index, retention.
 
-1. A failed step is repeated later (`degraded` gives the reason). Only a failure to write records counts as a failure
-   of the log.
-2. Each step is short: one step of retention, one slice of the index, a limited number of signatures.
-3. Records about a step are passed to `hold`, or appended together with it.
+A failed step is repeated later. Only a failure to write records counts as a failure of the log.
 """
 
 import asyncio
@@ -36,7 +33,6 @@ Waiter = asyncio.Future[str | None]
 
 
 def answer(waiting: Iterable[Waiter], result: str | None) -> None:
-    """Answer all waiters, with one call for each run of waiters of the same event loop."""
     for loop, group in itertools.groupby(waiting, Waiter.get_loop):
         # A closed loop raises RuntimeError; its coroutines no longer wait.
         with contextlib.suppress(RuntimeError):
@@ -55,17 +51,14 @@ MakeRecord = Callable[[str, Severity, str, dict[str, Any]], AuditRecord]
 
 @dataclass(frozen=True)
 class CheckpointSchedule:
-    """The schedule of checkpoints: every `records` records or `seconds` seconds, whichever is first."""
+    """A checkpoint is due after `records` records or `seconds` seconds, whichever is first."""
 
     records: int = 1000
     seconds: float = 60.0
 
 
 class Housekeeping:
-    """The background work of the log at `path`, in its turns; `writer` is None while the database is closed.
-
-    `now` returns the time of the present turn.
-    """
+    """The background work of one log; `writer` is None while the database is closed."""
 
     def __init__(
         self,
@@ -117,7 +110,6 @@ class Housekeeping:
             self._failing = None
 
     def next_due(self, now: float) -> float | None:
-        """Return the time of the next work; None during the pause after a failure."""
         if now < self._paused_until:
             return None
         due = self.remover.due
@@ -126,7 +118,7 @@ class Housekeeping:
     # --- between two batches of records -----------------------------------------------------------------------
 
     def after_batch(self, *, written: bool) -> None:
-        """Seal if due, and limit the lag of the full-text index: every search reads the unindexed records."""
+        """Limit also the lag of the full-text index: every search reads the unindexed records."""
         if written and self._seal_is_due():
             self.attempt(self.seal)
         if written and self._waiting:
@@ -134,7 +126,6 @@ class Housekeeping:
         self.attempt(self._index_backlog)
 
     def at_rest(self, *, quiet_since: float, busy: Callable[[], bool]) -> None:
-        """Index records and remove old ones while no record waits; the last one was written at time `quiet_since`."""
         if self.writer is not None and not busy():
             # Committing the index for a single record is too expensive: wait for more records or for a quiet period.
             quiet = self._now() - quiet_since >= _IDLE_SECONDS / 2
@@ -152,11 +143,9 @@ class Housekeeping:
         )
 
     def seal_now(self, waiter: Waiter) -> None:
-        """Seal after the next batch; answer the waiter when the checkpoint is signed."""
         self._waiting = [pending for pending in self._waiting if not pending.done()] + [waiter]
 
     def _answer_sealed(self) -> None:
-        """Let waiters for a checkpoint now wait for its signature; answer them if the checkpoint is already signed."""
         if self.writer is None or self.unsealed:
             return
         number = self.writer.checkpoint_number
@@ -170,7 +159,6 @@ class Housekeeping:
         self.unsigned = [(number, waiter) for number, waiter in self.unsigned if not which(number)]
 
     def seal(self) -> None:
-        """Make a checkpoint of all written records, record it, and request its signature."""
         writer = self.writer
         if writer is None:
             return
@@ -201,7 +189,6 @@ class Housekeeping:
             self._answer(lambda awaited: awaited <= number, None)
 
     def refused(self, number: int, reason: str) -> None:
-        """Record that the signer refused a checkpoint, or that its signature is invalid."""
         self._hold(self._make("signature refused", Severity.ALARM, reason, {"number": number}))
         self._answer(lambda awaited: awaited >= number, reason)
 
@@ -220,6 +207,5 @@ class Housekeeping:
             self.unsealed += 1
 
     def removal_approved(self, number: int, text: bytes, signature: bytes, key: bytes) -> None:
-        """Remove the records whose removal the signer signed."""
         if self.writer is not None and self.remover.approved(self.writer, number, text, signature, key):
             self.unsealed += 1

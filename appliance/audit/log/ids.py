@@ -1,8 +1,6 @@
 """Make record ids: sortable by time, unique, and ascending even if the clock is set back.
 
-An id has 20 lower-case hexadecimal characters: 16 for nanoseconds since the epoch, and 4 random ones. The random ones
-differ between sources. The time part always grows: if the clock is set back, and after a restart, it continues from
-the last id.
+The last 4 of the 20 hexadecimal digits are random, and differ between sources.
 """
 
 import secrets
@@ -16,7 +14,7 @@ _TIME_DIGITS = 16
 
 
 class IdSource:
-    """A source of ids, each greater than the previous id and than `after`; thread-safe."""
+    """Each id is greater than the previous id and than `after`. Thread-safe."""
 
     def __init__(self, after: str = "", clock: Callable[[], int] = clock.wall_ns) -> None:
         self._last = int(after[:_TIME_DIGITS], 16) if after else 0
@@ -32,7 +30,7 @@ class IdSource:
 
     @property
     def ahead(self) -> float:
-        """Return by how many seconds the last id is later than the clock (which was set back), or 0."""
+        """Return by how many seconds the clock was set back behind the last id."""
         return max(0.0, (self._last - self._clock()) / 1e9)
 
     def raise_floor(self, after: str) -> None:

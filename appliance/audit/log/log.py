@@ -1,10 +1,9 @@
 """Write the audit log: `record` puts a record into a queue, and a turn of the log writes it.
 
-1. `record` never blocks and never raises: it only appends to a queue.
+1. `record` never blocks and never raises.
 2. Records keep their order.
-3. No record is dropped silently. While the log cannot be written (`failed`), up to `queue_limit` records wait. Further
-   records are only counted, and the count is recorded later.
-4. `wait_durable` returns when all earlier records are on disk (fsync), or returns why they are not.
+3. No record is dropped silently: if the log cannot be written, records beyond `queue_limit` are counted, and the
+   count is recorded later.
 """
 
 import asyncio
@@ -56,7 +55,7 @@ class Lag(NamedTuple):
 
 
 class _LossCounter:
-    """A counter of records that did not fit into the queue; thread-safe."""
+    """Records that did not fit into the queue. Thread-safe."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -79,11 +78,8 @@ class _LossCounter:
 class AuditLog:
     """The log at `path`, open for writing; `drive` makes the driver that calls its turns, in one thread.
 
-    `durability`: `strict` writes at once (group commit), `batched` after 20 ms; both fsync. A checkpoint is made every
-    `checkpoint_every` records or `checkpoint_seconds`. A turn of the log then calls `signer(number, text)`, and the
-    owner answers with `signed` or `refused`. Likewise, `removals(number, checkpoint, newest)` requests the signature of
-    a removal; the answer is `removal_approved` or `removal_refused`. `held_by` is called with the ids of processes that
-    lock the log. `budget` has the debts of hosts; its bounds are smaller while less than `reserve` bytes are free.
+    `durability`: `strict` writes at once (group commit), `batched` after 20 ms; both fsync. The owner answers
+    requests to `signer` and `removals` with a method. `held_by` gets the ids of processes that lock the log.
     """
 
     def __init__(
@@ -149,7 +145,7 @@ class AuditLog:
     # --- for the owner, from any thread ---------------------------------------------------------------------
 
     def record(self, record: AuditRecord) -> str:
-        """Queue a record; return its id, the id of the record that it repeats, or "" if a collective kind counts it.
+        """Return the id of the record, or of the record that it repeats; "" if a collective kind counts it.
 
         The caller must not change `detail` afterwards.
         """
@@ -166,14 +162,14 @@ class AuditLog:
         return len(self._queue) + len(self._held) >= self._queue_limit
 
     async def wait_durable(self) -> str | None:
-        """Wait until all records so far are on disk; return None, or the reason why they cannot be written."""
+        """Return None after the fsync, or the reason why the records cannot be written."""
         waiter: Waiter = asyncio.get_running_loop().create_future()
         self._put(waiter)
         self._driver.hurry()
         return await waiter
 
     async def wait_signed(self) -> str | None:
-        """Wait until a signed checkpoint seals all records so far; return None, or why its signature is refused."""
+        """Return None after the signature of a checkpoint, or why it is refused."""
         waiter: Waiter = asyncio.get_running_loop().create_future()
         self._put(partial(self.housekeeping.seal_now, waiter))
         self._driver.hurry()
@@ -185,7 +181,7 @@ class AuditLog:
 
     @property
     def degraded(self) -> str | None:
-        """Return why checkpoints, index or retention are behind, or that the disk is nearly full; None otherwise."""
+        """Return why other work than writing is behind, or that the disk is nearly full."""
         return self.housekeeping.degraded or self._room.scarce
 
     @property
@@ -194,7 +190,7 @@ class AuditLog:
         return Lag(waiting, now() - self._caught_up if waiting else 0.0)
 
     def signed(self, number: int, signature: bytes, public_key: bytes) -> None:
-        """Store the signer's signature if it is valid and made with the pinned key; otherwise record it as refused."""
+        """Store the signature only if it is valid and made with the pinned key."""
         keep = partial(self.housekeeping.keep_signature, number, signature, public_key)
         self._put(partial(self.housekeeping.attempt, keep))
 
@@ -202,12 +198,12 @@ class AuditLog:
         self._put(partial(self.housekeeping.refused, number, reason))
 
     def removal_approved(self, number: int, text: bytes, signature: bytes, public_key: bytes) -> None:
-        """Remove the records up to a checkpoint, if the signer's signature of that removal is valid."""
+        """Remove the records only if the signer's signature of that removal is valid."""
         remove = partial(self.housekeeping.removal_approved, number, text, signature, public_key)
         self._put(partial(self.housekeeping.attempt, remove))
 
     def removal_refused(self, number: int, reason: str, *, early: bool = False) -> None:
-        """Request the removal again later, because the signer refused it (`early`: the records are too young)."""
+        """Request the removal again later; `early`: the records are too young for the signer."""
         self._put(partial(self.housekeeping.remover.refused, number, reason, early=early))
 
     def request_signatures(self) -> None:
@@ -215,7 +211,6 @@ class AuditLog:
         self._put(self.housekeeping.remover.ask_again)
 
     def close(self, seconds: float = _CLOSE_SECONDS) -> str | None:
-        """Write waiting records, make a last checkpoint and close; return the reason for a failure or timeout."""
         self._closing = True
         if not self._driver.end(seconds):
             return f"{self.path}: still being written after {seconds:g} s"
@@ -230,7 +225,6 @@ class AuditLog:
     # --- the turns ------------------------------------------------------------------------------------------
 
     def turn(self, now: float) -> float | None:
-        """Write a batch of the queue and do what is due at `now`; return the time of the next turn, None at the end."""
         if self._ended:
             return None
         self._now = now
@@ -326,7 +320,7 @@ class AuditLog:
                 self._held.append(self._own(event, severity, self._room.scarce or "", {"left": left}))
 
     def _attempt(self, action: Callable[[], None]) -> bool:
-        """Run an action on the database; return whether it succeeded. A failure closes the database until a retry."""
+        """Return whether the action succeeded. A failure closes the database until a retry."""
         try:
             if self._writer is None and action != self._open:
                 self._open()

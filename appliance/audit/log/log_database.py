@@ -1,7 +1,6 @@
 """Create the log's database file, and open it for writing or reading.
 
-A new log is made under a temporary name and linked when complete. An empty, cut or foreign file is therefore never an
-unfinished log: it is reported as an error and left unchanged.
+A new log is linked to its name when complete, so an empty or cut file is an error, and left unchanged.
 """
 
 import os
@@ -52,11 +51,11 @@ TEXT_OF_RECORD = (
 
 
 class LogUnreadableError(Exception):
-    """A log file is missing, damaged or foreign; the message has the remedy."""
+    """A log file is missing, damaged or foreign."""
 
 
 def create(path: Path, begun: int) -> None:
-    """Create an empty log at `path`, readable by the group of its folder; `begun` is nanoseconds since the epoch."""
+    """`begun` is nanoseconds since the epoch. The group of the folder may read the log."""
     making = name_to_make(path)
     descriptor = os.open(making, os.O_CREAT | os.O_EXCL | os.O_RDWR, 0o600)
     os.fchmod(descriptor, 0o640)
@@ -82,7 +81,7 @@ def create(path: Path, begun: int) -> None:
 
 
 def open_for_writing(path: Path) -> sqlite3.Connection:
-    """Open an existing log for its writer. Raises `LogUnreadableError` and `sqlite3.Error`."""
+    """Raises `LogUnreadableError` and `sqlite3.Error`."""
     connection = sqlite3.connect(
         _uri(path, "rw"),
         uri=True,
@@ -105,7 +104,7 @@ def _prepare_writing(connection: sqlite3.Connection) -> None:
 
 
 def open_for_reading(path: Path) -> sqlite3.Connection:
-    """Open a log for reading, even while it is written. Raises `LogUnreadableError` and `sqlite3.Error`."""
+    """Raises `LogUnreadableError` and `sqlite3.Error`."""
     if not path.parent.is_dir():
         raise LogUnreadableError(f"{path.parent}: no such directory; is the state directory right (--state)?")
     try:
@@ -127,7 +126,7 @@ def open_for_reading(path: Path) -> sqlite3.Connection:
 
 @contextmanager
 def reading(path: Path, advice: str = "; run 'rosrv audit verify'") -> Iterator[sqlite3.Connection]:
-    """Open a log for reading in a `with` block. Raises `LogUnreadableError`, also for SQLite's errors in the block."""
+    """Raises `LogUnreadableError`, also for SQLite's errors in the block."""
     try:
         with closing(open_for_reading(path)) as connection:
             yield connection

@@ -48,7 +48,7 @@ class ChainWriter:
     """The open database of a log and the head of its chain."""
 
     def __init__(self, path: Path, begun: int, continued: tuple[str, int] | None = None) -> None:
-        """Open the log at `path`; create a missing one unless a log is `continued` (its id and last sequence).
+        """Open the log that is `continued` (id and last sequence), or create a missing one.
 
         Raises `LogUnreadableError`, `sqlite3.Error` or `OSError`.
         """
@@ -130,7 +130,7 @@ class ChainWriter:
         return sequence, digest, last_id
 
     def seal(self, time: int) -> tuple[Checkpoint, bytes]:
-        """Make the next checkpoint, of all records written so far; return it and its text."""
+        """Return the checkpoint and its text."""
         checkpoint = Checkpoint(
             self.log_id,
             self.checkpoint_number + 1,
@@ -151,7 +151,7 @@ class ChainWriter:
         return checkpoint, text
 
     def unsigned(self, limit: int) -> list[tuple[int, bytes]]:
-        """Return number and text of at most `limit` unsigned checkpoints, oldest first."""
+        """Return numbers and texts, oldest first."""
         query = "SELECT number, text FROM checkpoint WHERE signature IS NULL ORDER BY number LIMIT ?"
         return self._connection.execute(query, (limit,)).fetchall()
 
@@ -160,14 +160,12 @@ class ChainWriter:
         return None if row is None else bytes(row[0])
 
     def keep_signature(self, number: int, signature: bytes, public_key: bytes) -> None:
-        """Store a checkpoint's signature, unless it already has one."""
         self._connection.execute(
             "UPDATE checkpoint SET signature = ?, public_key = ? WHERE number = ? AND signature IS NULL",
             (signature, public_key, number),
         )
 
     def open_folds(self) -> list[FoldState]:
-        """Return the counts that a crash left without a summary."""
         rows = self._connection.execute("SELECT state FROM open_fold").fetchall()
         return [msgspec.json.decode(state, type=FoldState) for (state,) in rows]
 
@@ -177,11 +175,9 @@ class ChainWriter:
 
     @property
     def text_lag(self) -> int:
-        """Return the number of records that are not in the full-text index yet; every text search reads them all."""
         return int(self.sequence - self._text_through)
 
     def index_text(self, rows: int = _TEXT_ROWS) -> bool:
-        """Add some records to the full-text index; return whether more are left."""
         through = self._text_through
         if through >= self.sequence:
             return False
@@ -206,11 +202,10 @@ class ChainWriter:
     def removable(
         self, step: int, *, signed: bool, between: tuple[int, int] | None = None
     ) -> RemovedRange | None:
-        """Return the range of about `step` oldest records that ends at a (signed) checkpoint, or None.
+        """Return the range of about `step` oldest records that ends at a (signed) checkpoint.
 
-        `between` is an age limit and the present time; the range then ends at a checkpoint made before the limit.
-        Checkpoints with a later time than the present, made while the clock was ahead, are removed with the following
-        ones. The last checkpoint always stays.
+        `between` is an age limit and the present time. Checkpoints with a later time, made while the clock was
+        ahead, are removed with the following ones. The last checkpoint always stays.
         """
         first = self._first_sequence()
         condition = "AND signature IS NOT NULL" if signed else ""
@@ -248,7 +243,6 @@ class ChainWriter:
         return b"" if row is None else bytes(row[0])
 
     def evidence(self, gone: RemovedRange) -> list[AuditRecord]:
-        """Return the denials and alarms among the records to remove, each with its position in `detail.kept`."""
         rows = self._connection.execute(
             f"SELECT {log_database.COLUMNS}, hash FROM record WHERE sequence <= ? AND"  # noqa: S608  fixed names
             " (decision = 'deny' OR severity = 'alarm') ORDER BY sequence",
@@ -257,7 +251,6 @@ class ChainWriter:
         return [as_kept(StoredColumns(*row[:-1]), row[-1]) for row in rows]
 
     def remove(self, gone: RemovedRange, report: AuditRecord, kept: Sequence[AuditRecord] = ()) -> None:
-        """In one transaction, remove records and their checkpoints, and append the report and the kept records."""
         self._check_file()
         with self._transaction() as execute:
             sequence, digest, last_id = self._insert([report, *kept])

@@ -1,7 +1,4 @@
-"""The record of the audit log: schema version 1, as documented for the CLI, REST and exports.
-
-The log assigns its `sequence` and its position in the hash chain. A written record never changes.
-"""
+"""Define the record of the audit log: schema version 1. A written record never changes."""
 
 import enum
 from typing import Any
@@ -22,7 +19,7 @@ class Severity(enum.StrEnum):
 
 
 class RuleReference(msgspec.Struct, frozen=True):
-    """The policy rule that decided: section, key, file and line (from 1)."""
+    """The policy rule that decided."""
 
     section: str
     key: str
@@ -33,12 +30,9 @@ class RuleReference(msgspec.Struct, frozen=True):
 class AuditRecord(msgspec.Struct, frozen=True, kw_only=True):
     """An event with its author, or a decision with its rule.
 
-    `id` is sortable (time first) and unique; `time` is in nanoseconds since the epoch, UTC; `decision` is `allow`,
-    `deny`, `would deny` or None; `host` is the peer's address; `duration_us` is the time from the request's arrival to
-    the decision in microseconds; `detail` has the fields specific to this event.
-
-    Two fields are for the log only and not stored. `unknown`: no rule of the policy names `host`. `folds`: repetitions
-    are only counted: this is an allowed read, or the host is over its quota.
+    `time` is in nanoseconds since the epoch; `duration_us` is the time from the request's arrival to the
+    decision. Two fields are not stored. `unknown`: no rule of the policy names `host`. `folds`: repetitions are
+    only counted, because this is an allowed read, or the host is over its quota.
     """
 
     id: str

@@ -1,8 +1,4 @@
-"""Format records as the documented JSON object, and untrusted text for a terminal.
-
-JSON is ASCII only. In text for people, all characters are escaped that a terminal could interpret or that could
-disguise a name: control characters, escape sequences, bidirectional marks.
-"""
+"""Format records as the documented JSON object, and untrusted text for a terminal."""
 
 import json
 import re
@@ -26,7 +22,7 @@ _OF_THE_RECORD = (
 
 
 _CONTENTS = ("before", "after", "before_fields", "after_fields", "conditions", "values", "why", "binding")
-"""The fields of `detail` in a monitor's record that contain parts of messages: bytes, fields, compared values."""
+"""The fields of `detail` in a monitor's record that contain parts of messages."""
 _BOUND = re.compile(r"(property \d++ of \S++ \(\w++\)|: \d++ \w++) with \w++ = ")
 
 
@@ -38,7 +34,7 @@ class LogEntry(NamedTuple):
 
 
 def rfc3339(time: int) -> str:
-    """Format nanoseconds since the epoch as RFC 3339 in UTC with nine decimals, or `@…ns` if out of range."""
+    """Format nanoseconds since the epoch, or `@…ns` if out of range."""
     seconds, fraction = divmod(time, _SECOND)
     try:
         moment = datetime.fromtimestamp(seconds, UTC)
@@ -48,7 +44,7 @@ def rfc3339(time: int) -> str:
 
 
 def without_contents(entry: LogEntry) -> LogEntry:
-    """Return the record without contents of messages, for roles that may not read them; `withheld` lists the fields."""
+    """Remove the contents of messages, for roles that may not read them."""
     detail = entry.record.detail
     if "monitor" not in detail:
         return entry
@@ -68,7 +64,7 @@ def without_contents(entry: LogEntry) -> LogEntry:
 
 
 def without_binding(text: str, detail: Mapping[str, Any]) -> str:
-    """Return a monitor's text about a verdict without the values of parameters, which come from messages."""
+    """Remove the values of parameters, which come from messages."""
     found = _BOUND.search(text)
     if found is None:
         return text
@@ -77,7 +73,6 @@ def without_binding(text: str, detail: Mapping[str, Any]) -> str:
 
 
 def as_object(entry: LogEntry) -> dict[str, Any]:
-    """Return the documented JSON object of a record; `decision` is absent if nothing was decided."""
     record = entry.record
     fields = {name: getattr(record, name) for name in _OF_THE_RECORD}
     if record.decision is None:
@@ -92,7 +87,7 @@ def as_object(entry: LogEntry) -> dict[str, Any]:
 
 
 def entry_of(fields: Any) -> LogEntry:
-    """Parse the documented JSON object. Raises `ValueError`, `KeyError` and `TypeError`."""
+    """Raises `ValueError`, `KeyError` and `TypeError`."""
     if not isinstance(fields, dict):
         raise TypeError("not an object")
     own = {name: value for name, value in fields.items() if name not in _NOT_THE_RECORDS}
@@ -102,12 +97,10 @@ def entry_of(fields: Any) -> LogEntry:
 
 
 def as_json(entry: LogEntry) -> str:
-    """Return one line of NDJSON, without the newline; ASCII only."""
     return json.dumps(as_object(entry), separators=(",", ":"))
 
 
 def fields_of(entry: LogEntry) -> dict[str, str | None]:
-    """Return the fields that identify a record, as text; missing fields are None."""
     record = entry.record
     return {
         "sequence": str(entry.sequence),
@@ -125,7 +118,6 @@ def fields_of(entry: LogEntry) -> dict[str, str | None]:
 
 
 def requested(record: AuditRecord) -> str | None:
-    """Return the word for a request: its category, or the call that gives the resource up (unregisterPublisher)."""
     call = record.detail.get("call")
     if record.category != "command" and isinstance(call, str) and call.startswith(_GIVES_UP):
         return call

@@ -1,7 +1,6 @@
-"""Remove old records step by step. If the log has a signer, the signer must sign each step first.
+"""Remove old records step by step. A refused removal is tried again later.
 
-Every removal is recorded in the same transaction. Records of a signed log are removed only with the signer's signature
-over exactly these records. A refused removal is tried again later (`unremoved` gives the reason).
+Records of a signed log are removed only with the signer's signature over exactly these records.
 """
 
 import re
@@ -24,18 +23,13 @@ _LIMIT = re.compile(rb"\nlimit ([0-9][0-9.e+-]{0,31}+ (?:days|bytes))\n\Z")
 
 
 class _Wanted(NamedTuple):
-    """A step that waits for the signer."""
-
     gone: RemovedRange
     reason: str
     by_size: bool
 
 
 class Remover:
-    """Applies a log's retention, in its turns; `approve` requests a signature, `report` makes the record.
-
-    `now` returns the time of the present turn.
-    """
+    """Applies a log's retention; `approve` requests a signature, and `now` returns the time of the turn."""
 
     def __init__(
         self,
@@ -59,7 +53,6 @@ class Remover:
         self.unremoved: str | None = None
 
     def step(self, writer: ChainWriter) -> bool:
-        """Remove one step of records, or request the signature for it; return whether records were removed."""
         now = self._now()
         self.due = now + _LOOK_SECONDS
         if now < self._refused or (self._wanted is not None and now - self._asked < _ANSWER_SECONDS):
@@ -80,7 +73,7 @@ class Remover:
         return False
 
     def ask_again(self) -> None:
-        """Forget earlier requests, which may be lost, because the signer is in service (again)."""
+        """Forget earlier requests, which a new signer may have lost."""
         self._wanted, self._aged, self._refused, self.due = None, 0.0, 0.0, 0.0
 
     def sealed(self) -> None:
@@ -88,7 +81,6 @@ class Remover:
         self._aged = self.due = 0.0
 
     def approved(self, writer: ChainWriter, number: int, text: bytes, signature: bytes, key: bytes) -> bool:
-        """Remove the records if the signer signed exactly the requested removal; return whether they were removed."""
         wanted, self._wanted = self._wanted, None
         if wanted is None or wanted.gone.last_checkpoint != number:
             return False
@@ -103,7 +95,7 @@ class Remover:
         return True
 
     def refused(self, number: int, reason: str, *, early: bool = False) -> None:
-        """Try again later. `early`: by the signer's clock, the records are not old enough yet, which is normal."""
+        """`early`: by the signer's clock, the records are not old enough yet, which is normal."""
         wanted = self._wanted
         if wanted is not None and wanted.gone.last_checkpoint == number:
             self._wanted = None

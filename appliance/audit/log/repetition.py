@@ -1,12 +1,8 @@
 """Define the kinds of folded records: the key that repetitions share, and the summary of a kind.
 
-Texts from peers cannot create an unlimited number of kinds:
-
-1. The key of a named host's kind has event, decision, rule, request, and reason. The reason of a decision is our own
-   text. From a peer's error only the plain words are used, because the peer chooses numbers, names and quotations.
-2. The key of an unknown host's kind has address, event, decision, call, and the plain words of the reason.
-3. Above the quota there is one kind per host, and one for all unknown hosts. These count the first few reasons, callers
-   and resources by name, and the rest together.
+Texts from peers cannot create an unlimited number of kinds. The peer chooses numbers, names and quotations in an
+error, so only its plain words are part of a key. The key of an unknown host's kind has no resource and no caller.
+Above the quota there is one kind per host, and one for all unknown hosts.
 """
 
 from typing import Any
@@ -88,7 +84,6 @@ def new_state(record: AuditRecord, scope: str) -> FoldState:
 
 
 def subject(record: AuditRecord) -> Key:
-    """Return the key of a request; a contrary decision with the same key ends a kind."""
     about = map(str, map(record.detail.get, ABOUT))
     return (record.host, record.caller_id, record.category, record.resource, *about)
 

@@ -1,11 +1,8 @@
 """Choose which old records to remove, and which of these to write again. No I/O.
 
-The oldest records are removed first, in short steps, each up to a (signed) checkpoint. Every step is recorded as
-`records removed`, with the hash after which the chain continues.
-
-An age limit removes all older records. A size limit keeps denials and alarms longer: they are written again at the end
-of the log, with their id and time. At most half of a step is kept. Hosts take turns, so a flood from one host cannot
-displace the records of another.
+An age limit removes all older records. A size limit keeps denials and alarms longer: they are written again at
+the end of the log, with their id and time, at most half of a step. Hosts take turns, so a flood from one host
+cannot displace the records of another.
 """
 
 from collections import OrderedDict
@@ -27,10 +24,7 @@ _Hash = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]
 
 @dataclass(frozen=True)
 class Retention:
-    """The limits of a log: `days` for which records are kept (None: always), and `size` in bytes (None: any).
-
-    By age, only records up to the sequence `collected()` are removed.
-    """
+    """The limits of a log; by age, only records up to the sequence `collected()` are removed."""
 
     days: float | None = None
     size: int | None = None
@@ -45,15 +39,12 @@ class Retention:
         return f"the log was larger than {self.size} bytes" if too_large else None
 
     def oldest_kept(self, now: int) -> int:
-        """Return the age limit in nanoseconds since the epoch; 0 without one."""
+        """Return nanoseconds since the epoch; 0 without a limit."""
         return 0 if self.days is None else now - int(self.days * _DAY)
 
 
 class RemovedRange(msgspec.Struct, frozen=True, omit_defaults=True):
-    """The records that retention removes, and the hashes after which chain and checkpoints continue.
-
-    `limit` and `signature` are those of the signer's statement; empty without one.
-    """
+    """The records that retention removes, and the hashes after which chain and checkpoints continue."""
 
     first_sequence: _Count
     last_sequence: _Count
@@ -71,7 +62,6 @@ class RemovedRange(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 def as_kept(columns: StoredColumns, digest: bytes) -> AuditRecord:
-    """Return a record to write again, with its original sequence and hash in `detail.kept`."""
     record = from_columns(columns)
     if "kept" in record.detail:
         return record
@@ -80,11 +70,7 @@ def as_kept(columns: StoredColumns, digest: bytes) -> AuditRecord:
 
 
 def worth_keeping(evidence: Sequence[AuditRecord], removed: int) -> list[AuditRecord]:
-    """Return the records of `evidence` to write again, in order, when `removed` records are removed.
-
-    Hosts take turns; all unknown hosts together count as one. For each host, alarms are chosen first, then denials,
-    then summaries, each oldest first.
-    """
+    """All unknown hosts together take one turn. The alarms of a host are first, then denials, then summaries."""
     waiting: OrderedDict[str, list[AuditRecord]] = OrderedDict()
     for record in sorted(evidence, key=_rank):
         # Version 0.1.0 wrote `stranger`.

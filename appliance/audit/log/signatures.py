@@ -1,10 +1,8 @@
 """Request signatures of checkpoints, and store the valid ones.
 
-1. A signature is stored only if it is valid for the checkpoint's text and made with the pinned key.
-2. The key of the first valid signature is pinned in `<log>.pub` (PEM); the program never replaces it.
-3. While the signer is not in service, checkpoints stay unsigned. Their signatures are requested later (`ask`), oldest
-   first, a limited number at a time. Once the signer has signed a checkpoint, it refuses
-   all earlier ones. So each request says whether it is the oldest, and a new signer gets the oldest first.
+The key of the first valid signature is pinned in `<log>.pub` (PEM); the program never replaces it. A signer
+refuses all checkpoints before the last that it signed, so each request says whether it is the oldest, and a new
+signer gets the oldest first.
 """
 
 from collections.abc import Callable
@@ -27,7 +25,7 @@ class CheckpointSigner(Protocol):
     """Requests signatures of checkpoints; the log calls it on its own thread."""
 
     def __call__(self, number: int, text: bytes, *, oldest: bool) -> None:
-        """Request the signature of a checkpoint; it is the `oldest` if all earlier ones are signed."""
+        """`oldest`: all earlier checkpoints are signed."""
 
 
 class KeyUnreadableError(Exception):
@@ -39,7 +37,7 @@ def pinned_key_path(log: Path) -> Path:
 
 
 def read_public_key(path: Path) -> bytes:
-    """Return the raw Ed25519 public key (32 bytes) in a PEM file. Raises `KeyUnreadableError`."""
+    """Return the raw key (32 bytes). Raises `KeyUnreadableError`."""
     try:
         key = load_pem_public_key(read_given(path))
     except OSError as error:
@@ -52,7 +50,6 @@ def read_public_key(path: Path) -> bytes:
 
 
 def signature_is_valid(public_key: bytes, signature: bytes, text: bytes) -> bool:
-    """Return whether the private key of `public_key` signed `text`."""
     try:
         Ed25519PublicKey.from_public_bytes(public_key).verify(signature, text)
     except (InvalidSignature, ValueError):
@@ -61,7 +58,7 @@ def signature_is_valid(public_key: bytes, signature: bytes, text: bytes) -> bool
 
 
 class Signatures:
-    """The signatures of a log: requests to the signer, and its valid answers."""
+    """The requests to the signer, and its valid answers."""
 
     def __init__(self, log: Path, signer: CheckpointSigner | None) -> None:
         self._pin = pinned_key_path(log)
@@ -78,14 +75,12 @@ class Signatures:
         return self._pin.exists()
 
     def sealed(self, number: int, text: bytes) -> None:
-        """Request the signature of a new checkpoint, unless others must be requested first."""
         # The signer signs in order: once a checkpoint waits, all later ones wait until `ask`.
         self._waiting = self._waiting or len(self._asked) >= ASKED_AT_ONCE
         if not self._waiting:
             self._ask(number, text)
 
     def ask(self, writer: ChainWriter) -> None:
-        """Request the oldest missing signatures again: the signer is in service, or an answer may be lost."""
         self._asked.clear()
         self._waiting = False
         if self._signer is not None:
@@ -102,7 +97,7 @@ class Signatures:
         self._signer(number, text, oldest=oldest)
 
     def keep(self, writer: ChainWriter, number: int, signature: bytes, public_key: bytes) -> str | None:
-        """Store a valid signature and pin the first key; return the reason if the signature is invalid."""
+        """Pin the first key; return the reason if the signature is invalid."""
         self._asked.discard(number)
         text = writer.checkpoint_text(number)
         if text is None:
@@ -118,7 +113,6 @@ class Signatures:
         return None
 
     def wrong(self, what: str, text: bytes, signature: bytes, public_key: bytes) -> str | None:
-        """Return why a signature is invalid or not made with the pinned key, or None."""
         if not signature_is_valid(public_key, signature, text):
             return f"the signature of {what} is wrong"
         if not self._pin.exists():
@@ -133,7 +127,7 @@ class Signatures:
 
 
 def write_public_key(path: Path, public_key: bytes) -> None:
-    """Write a raw Ed25519 public key to a PEM file, replacing an existing one. Raises `OSError`."""
+    """Raises `OSError`."""
     key = Ed25519PublicKey.from_public_bytes(public_key)
     text = key.public_bytes(Encoding.PEM, PublicFormat.SubjectPublicKeyInfo)
     write_whole(path, text, 0o644)

@@ -1,8 +1,6 @@
 """Export records with their proofs: their position in the chain, up to a signed checkpoint.
 
-Each exported record contains the previous hash and its own hash. `then` lists the content hashes of the following
-records that the filter omits. It ends at the next exported record, or at the signed checkpoint that seals the record
-(`checkpoint`). `appliance/formats/bundle_verifier.py` verifies this with the public key alone.
+`appliance/formats/bundle_verifier.py` verifies them with the public key alone.
 """
 
 import json
@@ -28,7 +26,7 @@ _Hash = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]
 class ChainProof(msgspec.Struct, frozen=True, kw_only=True):
     """The position of a record in the chain; hashes are in hexadecimal.
 
-    `then` is None if version 0.1.0 wrote the following records, whose hashes cannot be computed without their content.
+    `then` is None if version 0.1.0 wrote the following records, whose hashes need their content.
     """
 
     previous: _Hash
@@ -38,10 +36,7 @@ class ChainProof(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def evidence(path: Path, wanted: Filter, page: int = 1000) -> Iterator[tuple[LogEntry, ChainProof]]:
-    """Yield the records that match `wanted` with their proofs, oldest first; one page is in memory at a time.
-
-    Raises `LogUnreadableError` and `FilterError`.
-    """
+    """One page is in memory at a time. Raises `LogUnreadableError` and `FilterError`."""
     cursor: str | None = "0"
     waiting: LogEntry | None = None
     while cursor is not None:
@@ -54,19 +49,17 @@ def evidence(path: Path, wanted: Filter, page: int = 1000) -> Iterator[tuple[Log
 
 
 def evidence_line(entry: LogEntry, chain: ChainProof, robot: str = "") -> str:
-    """Return one line of NDJSON without the newline: the record, the name of the `robot` if it has one, and `chain`."""
     name = f'"robot":{json.dumps(robot)},' if robot else ""
     return f'{as_json(entry)[:-1]},{name}"chain":{msgspec.json.encode(chain).decode("ascii")}}}'
 
 
 def stored_line(columns: StoredColumns, chain: ChainProof) -> bytes:
-    """Return a record as it is stored, with its position in the chain, as a line of NDJSON."""
     stored = columns._asdict() | {"detail": columns.detail.decode("utf-8", "surrogateescape")}
     return json.dumps({**stored, "chain": msgspec.to_builtins(chain)}, separators=(",", ":")).encode() + b"\n"
 
 
 def _placed(path: Path, entries: list[LogEntry], *, whole: bool) -> Iterator[tuple[LogEntry, ChainProof]]:
-    """Yield records with their proofs. Omit the last record, unless these are the `whole` rest of the export."""
+    """Omit the last record, unless these are the `whole` rest of the export."""
     following = [entry.sequence for entry in entries[1:]] + ([0] if whole else [])
     with reading(path) as connection:
         connection.execute("BEGIN")
@@ -84,7 +77,7 @@ def _placed(path: Path, entries: list[LogEntry], *, whole: bool) -> Iterator[tup
 
 
 class ChainReader:
-    """A reader of the proofs of records, in ascending order, from one snapshot of a log."""
+    """Reads proofs, in ascending order, from one snapshot of a log."""
 
     def __init__(self, connection: sqlite3.Connection) -> None:
         self._connection = connection
@@ -94,7 +87,7 @@ class ChainReader:
         self._before: tuple[int, str] = (-1, "")
 
     def place(self, sequence: int, following: int) -> ChainProof | None:
-        """Return a record's proof up to the next exported record (`following`; 0: none); None for a removed record."""
+        """Return the proof up to the record `following` (0: none); None for a removed record."""
         query = "SELECT hash FROM record WHERE sequence = ?"
         row = self._connection.execute(query, (sequence,)).fetchone()
         if row is None:
@@ -134,7 +127,6 @@ class ChainReader:
         return self._sealing
 
     def _contents(self, digest: bytes, after: int, upto: int) -> list[str] | None:
-        """Return the content hashes of the records from `after` + 1 to `upto`; None if they do not form the chain."""
         rows = self._connection.execute(
             f"SELECT {COLUMNS}, hash FROM record WHERE sequence > ? AND sequence <= ? ORDER BY sequence",  # noqa: S608  fixed names
             (after, upto),

@@ -1,9 +1,8 @@
 """Verify the checkpoints of a log, using the log's chain, the key, and the signer's memory.
 
-A checkpoint is valid if its text is well formed and belongs to this log, it follows the previous checkpoint, and it has
-the chain's hash at its sequence. A checkpoint is proven if the expected key signed it. A signature that the signer
-remembers may be missing because it is pending, but only for the last `ASKED_AT_ONCE` checkpoints. Otherwise the
-signature was removed.
+A checkpoint is valid if it follows the previous one and has the chain's hash, and proven if the expected key
+signed it. A signature that the signer remembers may be missing only for the last `ASKED_AT_ONCE` checkpoints,
+whose answers may be pending; an older one was removed.
 """
 
 import sqlite3
@@ -24,9 +23,8 @@ _TYPES = (int, int, bytes, bytes | None, bytes | None)
 
 
 class SignerMemory(msgspec.Struct, frozen=True):
-    """The signer's memory of a log: the hashes of the checkpoints that it signed, from number `first` on.
-
-    `removed` is the last record whose removal it approved; None if it never approved one.
+    """The hashes of the checkpoints that the signer signed, from number `first` on, and the last removal that it
+    approved.
     """
 
     first: int
@@ -43,7 +41,6 @@ class SignerMemory(msgspec.Struct, frozen=True):
 
 
 def read_signer_memory(directory: Path, log: str) -> SignerMemory | None:
-    """Return the signer's memory of a log from `directory`, or None if the signer never signed a checkpoint of it."""
     path = directory / f"{log}.signed"
     if not path.exists():
         return None
@@ -64,7 +61,7 @@ class StoredCheckpoint(NamedTuple):
 
 
 def last_removal(connection: sqlite3.Connection) -> RemovedRange | None:
-    """Return what retention removed from the log's beginning. Raises the errors of `msgspec` for a damaged record."""
+    """Raises the errors of `msgspec` for a damaged record."""
     query = "SELECT detail FROM record WHERE event = 'records removed' ORDER BY sequence DESC LIMIT 1"
     row = connection.execute(query).fetchone()
     return None if row is None else msgspec.json.decode(row[0], type=RemovedRange)
@@ -87,7 +84,7 @@ class CheckpointVerifier:
         self._on_their_way: list[int] = []
 
     def read(self, connection: sqlite3.Connection) -> None:
-        """Read `rows`, the table `checkpoint`, in order. Raises `sqlite3.DatabaseError` after the readable ones."""
+        """Raises `sqlite3.DatabaseError` after the readable rows."""
         query = "SELECT number, sequence, text, signature, public_key FROM checkpoint ORDER BY number"
         for row in connection.execute(query):
             if not all(map(isinstance, row, _TYPES)):
@@ -95,7 +92,7 @@ class CheckpointVerifier:
             self.rows.append(StoredCheckpoint(*row))
 
     def check(self, before: tuple[int, str], chain: dict[int, bytes], last: int) -> Iterator[LogFinding]:
-        """Yield the findings; `before` is the last checkpoint that retention removed: number and hash, or zeros."""
+        """`before` is the last checkpoint that retention removed: number and hash, or zeros."""
         number, previous = before
         self.last_number = number
         for row in self.rows:

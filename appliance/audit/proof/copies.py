@@ -1,14 +1,8 @@
 """Export signed checkpoints to another machine, and compare the log with these copies.
 
-Root on the appliance has the signer's key and memory, and can rewrite the whole history with valid signatures.
-Therefore copies are kept on another machine:
-
-1. A copy contains the complete signed text and the signature, so it can be verified anywhere.
-2. A log agrees with a copy if its chain has the copy's hash at the copy's sequence.
-3. A copy with an invalid signature is a finding. Copies from other logs are listed. If all copies are from other logs,
-   this log replaced another one, which is a finding.
-4. If all copies seal records that were removed since, this is a finding: they prove nothing about the remaining
-   records.
+Root on the appliance can rewrite the whole history with valid signatures; only copies on another machine reveal
+this. It is a finding if a copy has an invalid signature, if all copies are from other logs (this log replaced
+another one), or if all seal removed records (they prove nothing about the rest).
 """
 
 import json
@@ -37,11 +31,7 @@ class CopiesUnreadableError(Exception):
 
 
 class KnownLog(NamedTuple):
-    """A log that checkpoints are compared with, and the key that must have signed them (None: their own).
-
-    `hash_at` has the hashes of records from sequence `first` to `last`, and `text_of` the log's own checkpoints by
-    number; None for missing ones.
-    """
+    """A log that checkpoints are compared with, and the key that must have signed them (None: their own)."""
 
     id: str
     key: str | None
@@ -70,7 +60,7 @@ class SignedCheckpoint(msgspec.Struct, frozen=True, omit_defaults=True):
 
     @classmethod
     def of(cls, text: bytes, signature: bytes, key: bytes) -> "SignedCheckpoint":
-        """Parse the text of a checkpoint. Raises `ValueError`."""
+        """Raises `ValueError`."""
         return cls(**parse_checkpoint(text)._asdict(), signature=signature.hex(), key=key.hex())
 
     @property
@@ -83,7 +73,6 @@ class SignedCheckpoint(msgspec.Struct, frozen=True, omit_defaults=True):
         return self.checkpoint.text()
 
     def fault(self, expected: str | None = None) -> ProofFault | None:
-        """Return why the key `expected` (default: the checkpoint's) did not sign it, or None."""
         try:
             parse_checkpoint(self.text())
         except ValueError:
@@ -92,7 +81,6 @@ class SignedCheckpoint(msgspec.Struct, frozen=True, omit_defaults=True):
         return signature_fault(self.text(), self.signature, self.key, key, signature_is_valid)
 
     def fault_in(self, log: KnownLog) -> ProofFault | None:
-        """Return why it is not a checkpoint of this log, or None."""
         if self.log != log.id:
             return ProofFault.LOG
         fault = self.fault(log.key)
@@ -107,22 +95,19 @@ class SignedCheckpoint(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 def select_signed(connection: sqlite3.Connection, where: str, *values: int) -> list[SignedCheckpoint]:
-    """Return the signed checkpoints that meet a condition in SQL. Raises `ValueError` for a damaged one."""
+    """`where` is a condition in SQL. Raises `ValueError` for a damaged checkpoint."""
     query = "SELECT text, signature, public_key FROM checkpoint WHERE signature IS NOT NULL AND public_key IS NOT NULL"
     found = connection.execute(f"{query} AND {where}", values)
     return [SignedCheckpoint.of(*row) for row in found]
 
 
 def signed_checkpoints(log: Path, after: int = 0, limit: int = 1000) -> list[SignedCheckpoint]:
-    """Return at most `limit` signed checkpoints of the log with numbers above `after`, in order.
-
-    Raises `LogUnreadableError`.
-    """
+    """Raises `LogUnreadableError`."""
     return _read(log, "number > ? ORDER BY number LIMIT ?", after, limit)
 
 
 def newest_checkpoint(log: Path) -> SignedCheckpoint | None:
-    """Return the last signed checkpoint of the log, or None. Raises `LogUnreadableError`."""
+    """Raises `LogUnreadableError`."""
     return next(iter(_read(log, "true ORDER BY number DESC LIMIT 1")), None)
 
 
@@ -135,9 +120,9 @@ def _read(log: Path, where: str, *values: int) -> list[SignedCheckpoint]:
 
 
 def read_copies(file: Path) -> list[SignedCheckpoint]:
-    """Return the checkpoints in a file: NDJSON (`rosrv audit checkpoints`), or the output of a syslog receiver.
+    """Accepts NDJSON (`rosrv audit checkpoints`), or the output of a syslog receiver; other lines are skipped.
 
-    Other lines are skipped. Raises `CopiesUnreadableError` if there is no checkpoint.
+    Raises `CopiesUnreadableError` if there is no checkpoint.
     """
     found = []
     try:
@@ -185,7 +170,7 @@ _WORDS = {
 
 
 class CopiesVerifier:
-    """Verifies copies against the chain of the log with the id `log`; `key` must have signed the copies."""
+    """Verifies copies against the log with the id `log`; `key` must have signed them."""
 
     def __init__(self, log: str, key: bytes | None, copies: Iterable[SignedCheckpoint]) -> None:
         copies = list(copies)
@@ -210,10 +195,6 @@ class CopiesVerifier:
     def check(
         self, chain: dict[int, bytes], removed: int, last: int, texts: dict[int, bytes]
     ) -> list[LogFinding]:
-        """Return the findings. `chain` has the hashes at `sequences`; `texts` the log's own checkpoints by number.
-
-        `removed` and `last` are the sequences of the last removed record and of the last record.
-        """
         key = None if self._key is None else self._key.hex()
         log = KnownLog(self._log, key, removed, last, chain.get, texts.get)
         found = list(self._compare(log))

@@ -1,12 +1,8 @@
 """Verify that a log is complete and unchanged, or report which records are missing or changed, and how.
 
-The verifier walks the chain once, from the first record to the last. If a record does not follow from the previous
-one, the verifier tries the next records in other positions, to distinguish a change, a removal, an insertion and a
-reordering.
-
-The log alone cannot show whether records after the last signed checkpoint were cut off or rewritten;
-`unsealed` is the number of records present there. Root can rewrite both the log and the signer's memory. Only
-checkpoints on another machine reveal this.
+If a record does not follow from the previous one, the verifier tries the next records in other positions, to
+distinguish a change, a removal, an insertion and a reordering. The log alone cannot show whether records after
+the last signed checkpoint were cut off or rewritten.
 """
 
 import re
@@ -59,11 +55,10 @@ def verify(
     copies: Sequence[SignedCheckpoint] | None = None,
     progress: Callable[[int], None] = lambda _sequence: None,
 ) -> Verification:
-    """Verify the log at `path` from end to end. Raises `LogUnreadableError` and `KeyUnreadableError`.
+    """Raises `LogUnreadableError` and `KeyUnreadableError`.
 
-    `public_key` (raw, 32 bytes) must have signed the checkpoints; default: the key pinned beside the log. `signer` is
-    the directory with the signer's memory. `copies` are checkpoints from another machine. `progress` is called with
-    the sequence from time to time.
+    `public_key` (raw) must have signed the checkpoints, by default the key beside the log. `signer` is the
+    directory with the signer's memory. `copies` are from another machine.
     """
     with reading(path, advice="") as connection:
         connection.text_factory = lambda text: text.decode("utf-8", "surrogateescape")
@@ -108,8 +103,6 @@ def _log_id(connection: sqlite3.Connection) -> str:
 
 
 class _Verifier:
-    """The verification of one log in one walk."""
-
     def __init__(
         self,
         connection: sqlite3.Connection,
@@ -177,8 +170,8 @@ class _Verifier:
     def _check_removal(self, removed: RemovedRange | None) -> str:
         """Return "signed", "unsigned", or "" without a removal.
 
-        A removal without a signature is unfounded, unless it was made by a version that did not sign removals. In that
-        case, no signed statement has a smaller `removed`.
+        Only versions that did not sign removals made unsigned ones; then no signed statement has a smaller
+        `removed`.
         """
         if removed is None:
             return ""
@@ -266,7 +259,6 @@ class _Verifier:
         return row.hash
 
     def _note(self, row: _Row, place: int) -> None:
-        """Store the hash of a sealed record, and the number in a `checkpoint` record."""
         if place in self._sealed:
             self._sealed[place] = row.hash
         if row.columns[_EVENT] == "checkpoint":
@@ -284,10 +276,9 @@ class _Verifier:
         return map(_row, rows)
 
     def _explain(self, row: _Row, previous: bytes) -> bytes:
-        """Find out why a record does not follow the previous one; return the hash to continue from.
+        """Return the hash to continue from.
 
-        Each search takes milliseconds. After `_MOST_FINDINGS`, no search is made, so that a forged log cannot take
-        hours.
+        After `_MOST_FINDINGS`, no search is made, so that a forged log cannot take hours.
         """
         if len(self._findings) >= _MOST_FINDINGS:
             return self._changed(row, row.sequence - self._shift)
@@ -347,11 +338,6 @@ class _Verifier:
 
 
 def _original_order(rows: list[_Row], previous: bytes, place: int) -> list[_Row]:
-    """Return the records of `rows` in their original order from sequence `place` on.
-
-    The result ends when the ordered records fill the same positions as before (a reordering), or when no next record is
-    found.
-    """
     order: list[_Row] = []
     left = list(rows)
     while left:

@@ -1,14 +1,10 @@
 """Summarise the denials of a log by host: number, first and last time, most frequent reasons, callers.
 
-Invariants:
-
-1. A summary of repetitions counts as their number.
-2. A summary of repetitions that covers many hosts counts for the hosts that it names; the rest is `OTHERS`.
-3. Memory and time are bounded. The newest `MOST_RECORDS` records are read. The oldest hosts beyond `_MOST_HOSTS`, and
-   the reasons and callers of a host beyond `_MOST_NAMES`, are counted together as `OTHERS`. Decisions about calls have
-   their own limit, so the noise of a port scan does not hide them.
-4. No reason has contents of messages. Reasons that differ only in numbers are counted together, under the newest text.
-5. Rights that a new policy or a block revoked are not counted, because the host attempted nothing.
+1. Memory and time are bounded: hosts, reasons and callers beyond the limits are counted together as `OTHERS`.
+   Decisions about calls have their own limit, so the noise of a port scan does not hide them.
+2. No reason has contents of messages. Reasons that differ only in numbers are counted together, under the newest
+   text.
+3. Rights that a new policy or a block revoked are not counted, because the host attempted nothing.
 """
 
 import functools
@@ -103,7 +99,7 @@ class _HostCounts:
 
 
 def summary_of_log(path: Path, wanted: Filter, limit: int) -> DenialSummary:
-    """Return the summary of a log's denials that match `wanted`. Raises `LogUnreadableError` and `FilterError`."""
+    """Raises `LogUnreadableError` and `FilterError`."""
     return summarised(_newest_first(path, msgspec.structs.replace(wanted, decision=("deny",))), limit)
 
 

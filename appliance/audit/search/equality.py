@@ -1,12 +1,11 @@
-"""Equal records, and their rows: a flood of one cause is one row for a person. Pure.
+"""Show equal records as one row: a flood of one cause is one row for a person. Pure.
 
-Invariants:
 1. Records are equal if they differ only in time, ids, contents of messages and the numbers in the reason.
-2. A record that stands for several (`12 more in the same second`, a summary of repetitions) equals the record that it
-   continues, and counts that many times. If it does not repeat the reason, it equals each record with its other fields.
-3. Equal records are one row if they are consecutive. Between a monitor's records may be other monitors' records of at
-   most `_BETWEEN` rows, because one message causes several records: a verdict, a log line, a drop. Any other record
-   ends all rows, so the order of decisions and changes is as recorded.
+2. A record that stands for several (`12 more in the same second`) equals the record that it continues, and counts
+   that many times. If it does not repeat the reason, it equals each record with its other fields.
+3. Equal records are one row if they are consecutive. At most `_BETWEEN` rows of other monitors may separate a
+   monitor's records, because one message causes several. Any other record ends all rows, so the order of
+   decisions and changes is as recorded.
 4. Each record is in exactly one row, so the rows' counts add up.
 """
 
@@ -41,10 +40,7 @@ class EqualKey(NamedTuple):
 
 @dataclass(slots=True)
 class EqualRecords:
-    """A row of equal records: the oldest and the newest, how many records, and how often the event happened.
-
-    `value` is the reason of the newest record that has one, without the words about repetitions.
-    """
+    """A row of equal records: how many they are, and how often the event happened."""
 
     first: LogEntry
     last: LogEntry
@@ -65,7 +61,7 @@ def equal_key(record: AuditRecord) -> EqualKey:
 
 
 def plain_reason(record: AuditRecord) -> str:
-    """Return the reason without the words about repetitions; empty if there is nothing else."""
+    """Remove the words about repetitions."""
     if "monitor" not in record.detail:
         return record.reason
     found = _MORE.match(record.reason)
@@ -76,7 +72,7 @@ def plain_reason(record: AuditRecord) -> str:
 
 
 def time_span(record: AuditRecord) -> tuple[int, int]:
-    """Return the times of the first and last event of a record, which is made some time after its events."""
+    """A record is made some time after its events."""
     first, last = record.detail.get("first_time"), record.detail.get("last_time")
     return (first, last) if type(first) is int and type(last) is int else (record.time, record.time)
 
@@ -90,7 +86,6 @@ def times_of(event: str, detail: dict[str, Any]) -> int:
 
 
 def grouped(entries: Iterable[LogEntry]) -> list[EqualRecords]:
-    """Return the rows of records in either order; each row is at the place of its record that came first."""
     rows: list[EqualRecords] = []
     open_rows: list[tuple[EqualKey, EqualRecords]] = []
     for entry in entries:
@@ -110,11 +105,10 @@ def grouped(entries: Iterable[LogEntry]) -> list[EqualRecords]:
 
 
 def equality_of(record: AuditRecord) -> dict[str, Any]:
-    """Return all that a client needs to make the rows of `grouped` itself, from pages and streams.
+    """Return all that a client needs to make the rows of `grouped` itself.
 
-    Two records are equal if their `key` is equal, and their `reason` too unless one is empty. A record joins one of the
-    last `reach` rows, and `times` and `value` are its part of the row's count and value, `began` and `ended`
-    the times of its first and last event.
+    Equal records have equal keys, and equal reasons unless one is empty. A record joins one of the last `reach`
+    rows.
     """
     key = equal_key(record)
     value = plain_reason(record)

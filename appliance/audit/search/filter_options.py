@@ -57,7 +57,7 @@ def filter_given(
         typer.Option("--who", help="Author: the name of a token, operator, or disk; a glob"),
     ] = None,
 ) -> Filter:
-    """Return the filter of these words. Raises `TimestampError`."""
+    """Raises `TimestampError`."""
     wanted = {"deny": deny, "allow": allow, "would deny": would_deny}
     begin, end = times_given(since, until)
     return Filter(
@@ -77,7 +77,7 @@ def filter_given(
 
 
 def times_given(since: str | None, until: str | None) -> tuple[int | None, int | None]:
-    """Return the times of --since and --until. Raises `TimestampError`."""
+    """Raises `TimestampError`."""
     now = clock.wall_ns()
     begin = None if since is None else parse_timestamp(since, now)
     end = None if until is None else parse_timestamp(until, now)

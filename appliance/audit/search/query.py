@@ -1,8 +1,4 @@
-"""Translate filters to SQL. No I/O.
-
-Each condition names the index that can answer it; `search` uses the most selective index. Values are always bound as
-parameters, never part of the statement.
-"""
+"""Translate filters to SQL. No I/O. Values are always bound as parameters, never part of the statement."""
 
 from typing import NamedTuple
 
@@ -19,17 +15,15 @@ _TRIGRAM = 3
 
 
 class FilterError(ValueError):
-    """A filter is invalid; the message has the part and the reason."""
+    """A filter is invalid."""
 
 
 class Filter(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The properties of the records to find; None or empty: any.
 
-    `since` (inclusive) and `until` (exclusive) are nanoseconds since the epoch; `severity` is the minimum. `host`,
-    `caller_id`, `resource`, `category` and `event` are exact, or globs if they contain `*`, `?` or `[`; `rule` is a
-    glob for the rule's section or key. `text` is searched in names, reason and details, ignoring case. `who` is a glob
-    for the name of the token (or `operator`) that made the request. `without_looks` omits allowed REST calls that only
-    read (GET, HEAD). `hosts` are networks, one of which contains the host: the meaning of a host's name.
+    `since` (inclusive) and `until` (exclusive) are nanoseconds since the epoch; `severity` is the minimum.
+    Names may be globs. `without_looks` omits allowed REST calls that only read. `hosts` are networks: the meaning
+    of a host's name.
     """
 
     decision: tuple[str, ...] = ()
@@ -65,7 +59,7 @@ class Condition(NamedTuple):
 
 
 def conditions(wanted: Filter) -> list[Condition]:
-    """Return the conditions of a filter without its text. Raises `FilterError`."""
+    """Leave out the filter's text. Raises `FilterError`."""
     found: list[Condition] = []
     if wanted.decision:
         marks = ", ".join("?" * len(wanted.decision))
@@ -103,7 +97,7 @@ def conditions(wanted: Filter) -> list[Condition]:
 
 
 def _within(networks: tuple[str, ...]) -> Condition:
-    """Return the condition that the host is in one of the networks; only hosts' addresses have an index."""
+    """Only hosts' addresses have an index."""
     if all(network.endswith(("/32", "/128")) for network in networks):
         addresses = tuple(network.rpartition("/")[0] for network in networks)
         marks = ", ".join("?" * len(addresses))
@@ -119,7 +113,7 @@ def _match(column: str, value: str) -> Condition:
 
 
 def checked_pattern(name: str, value: str) -> str:
-    """Return a pattern that is short, simple and valid Unicode. Raises `FilterError`."""
+    """Raise `FilterError` unless the pattern is short, simple and valid Unicode."""
     if len(value) > _LONGEST_PATTERN:
         raise FilterError(f"{name}: longer than {_LONGEST_PATTERN} characters")
     if value.count("*") > _MOST_STARS:
@@ -137,7 +131,7 @@ def text_condition(text: str) -> Condition:
 
 
 def text_match(text: str) -> str | None:
-    """Return the full-text expression that finds candidates for a text; None if it is too short for the index."""
+    """Return None if the text is too short for the index, which only finds candidates."""
     if len(text) < _TRIGRAM or "\0" in text:
         return None
     trigrams = {text[start : start + _TRIGRAM] for start in range(len(text) - _TRIGRAM + 1)}

@@ -1,7 +1,6 @@
 """Read the log: search with paging, show a record with its neighbours, follow, export.
 
-Reading works whether or not the appliance runs, and never blocks the writer. Texts are searched in the full-text index,
-and in the records that are not indexed yet.
+Reading never blocks the writer. Texts are also searched in the records that are not indexed yet.
 """
 
 import functools
@@ -34,14 +33,14 @@ _Found = TypeVar("_Found")
 
 
 class SearchPage(NamedTuple):
-    """The found records, and the cursor of the next page; None at the end."""
+    """`cursor` begins the next page; None at the end."""
 
     entries: list[LogEntry]
     cursor: str | None
 
 
 class RecordInContext(NamedTuple):
-    """A record, and the records of the same host or caller before and after it, in order."""
+    """A record, and the records of the same host or caller before and after it."""
 
     entry: LogEntry
     before: list[LogEntry]
@@ -51,10 +50,7 @@ class RecordInContext(NamedTuple):
 def search(
     path: Path, wanted: Filter, cursor: str | None = None, limit: int = 100, *, newest_first: bool = True
 ) -> SearchPage:
-    """Return a page of at most `limit` records that match `wanted`.
-
-    `cursor` is from the previous page. Raises `LogUnreadableError` and `FilterError`.
-    """
+    """Raises `LogUnreadableError` and `FilterError`."""
     if not 1 <= limit <= LARGEST_PAGE:
         raise FilterError(f"limit: not within 1 and {LARGEST_PAGE}")
     walk = _Walk(_sequence(cursor), newest_first)
@@ -62,7 +58,7 @@ def search(
 
 
 def show(path: Path, record_id: str, neighbours: int = 5) -> RecordInContext | None:
-    """Return the record with this id (or sequence) and its neighbours, or None."""
+    """`record_id` may also be a sequence."""
 
     def find(connection: sqlite3.Connection) -> RecordInContext | None:
         column = "id" if len(record_id) == ID_LENGTH else "sequence"
@@ -82,7 +78,6 @@ def show(path: Path, record_id: str, neighbours: int = 5) -> RecordInContext | N
 
 
 def export(path: Path, wanted: Filter, page: int = 1000) -> Iterator[LogEntry]:
-    """Yield all records that match `wanted`, oldest first; one page is in memory at a time."""
     cursor: str | None = "0"
     while cursor is not None:
         entries, cursor = search(path, wanted, cursor, page, newest_first=False)
@@ -94,10 +89,7 @@ def last_sequence(path: Path) -> int:
 
 
 def recorded_in_full(path: Path, entry: LogEntry) -> LogEntry | None:
-    """Return the full record that a record of repetitions continues; None if the log does not have it.
-
-    Raises `LogUnreadableError`.
-    """
+    """Return the first of the records that this one counts, if the log has it. Raises `LogUnreadableError`."""
     record = entry.record
     if record.event in FOLDED:
         shown = show(path, str(record.detail.get("recorded_id", "")), 0)
@@ -112,10 +104,10 @@ def recorded_in_full(path: Path, entry: LogEntry) -> LogEntry | None:
 
 
 class Follower:
-    """A follower of the log: each `poll` returns the records since the previous one, oldest first."""
+    """Each `poll` returns the records since the previous one, oldest first."""
 
     def __init__(self, path: Path, wanted: Filter, after: int | None = None) -> None:
-        """Begin after the sequence `after`, or at the end of the log. Raises `FilterError`."""
+        """Begin at the end of the log without `after`. Raises `FilterError`."""
         conditions(wanted)  # an invalid filter is refused now, not at the first record
         if wanted.text:
             text_condition(wanted.text)
@@ -210,7 +202,7 @@ def _networks_of(text: str) -> tuple[ipaddress.IPv4Network | ipaddress.IPv6Netwo
 
 
 def _most_selective(connection: sqlite3.Connection, found: list[Condition]) -> str | None:
-    """Return the index with the fewest candidates; None if each has `_SELECTIVE` or more, as a scan is then quick."""
+    """Return None if each index has `_SELECTIVE` candidates or more, as a scan is then quick."""
     best, fewest = None, _SELECTIVE
     for condition in found:
         if condition.answered_by is not None:

@@ -17,10 +17,7 @@ _TALLIES = ("reasons", "hosts", "callers", "resources", "calls")
 def lines_of(
     record: AuditRecord, in_full: LogEntry | None = None, host_in_words: Callable[[str], str] = str
 ) -> Iterator[str]:
-    """Yield the lines of the explanation; the caller must escape untrusted text in them.
-
-    `in_full`: the record of the first event, if this record counts repetitions.
-    """
+    """The caller must escape untrusted text. `in_full` is the first event, if this record counts repetitions."""
     yield from _own_lines(record, host_in_words)
     yield from _counted(record.detail, host_in_words)
     if in_full is not None:
@@ -93,7 +90,6 @@ def _own_lines(record: AuditRecord, host_in_words: Callable[[str], str]) -> Iter
 
 
 def _recorded(record: AuditRecord) -> Iterator[str]:
-    """Yield whether the flight recorder recorded the messages around a record that may trigger a recording."""
     detail = record.detail
     if "not_recorded" in detail:
         yield f"not recorded: {detail['not_recorded']}"
