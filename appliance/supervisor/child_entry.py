@@ -1,8 +1,6 @@
 """Start a child process: `python -m appliance.supervisor.child_entry ROLE PLAN`.
 
-The child drops the privileges that the role must not have, and checks that the role's user can reach the needed files.
-It then calls the role's entry point or executes its external program. A failure is reported to the supervisor over the
-lifeline as `Failed`, with a text for operators.
+The child drops its privileges first. It reports a failure over the lifeline as `Failed`.
 """
 
 import contextlib
@@ -57,7 +55,6 @@ class LaunchPlan(msgspec.Struct, frozen=True):
 
 
 def title_of(role: str, index: int | None) -> str:
-    """Return the title of a process; a number follows the role unless the process is its first."""
     return role if not index else f"{role}-{index + 1}"
 
 
@@ -110,11 +107,7 @@ def _leave_network_if_allowed() -> None:
 
 
 def _enter_sandbox(plan: LaunchPlan) -> None:
-    """Limit the process, and report limits that this kernel lacks to the supervisor.
-
-    The process runs without them. Raises `SeccompError` only for a role without network, because such a role
-    must not be able to make a socket.
-    """
+    """A role without network must be limited, or it could make a socket."""
     lacks = []
     abi = 0
     try:

@@ -4,4 +4,4 @@ from appliance.base.user_errors import UserError
 
 
 class StartError(UserError):
-    """The appliance cannot start; the message has the cause, the place and the remedy."""
+    """The appliance cannot start."""

@@ -1,8 +1,6 @@
-"""Keep listening sockets open while control restarts.
+"""Keep listening sockets open while control restarts, so that connections wait in the kernel's queue.
 
-Control sends each socket to the supervisor under a name. When control dies, connections wait in the kernel's queue,
-and the next control process gets all sockets back. This module accepts no connection and reads no data. Names are
-checked and counted, so a faulty control cannot fill the memory.
+Names are checked and counted, so a faulty control cannot fill the memory.
 """
 
 import os
@@ -14,11 +12,11 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.:/\[\]-]{0,199}")
 
 
 class ListenerRejectedError(ValueError):
-    """A socket is not kept; the message has the reason."""
+    """A socket is not kept."""
 
 
 class InheritedListeners:
-    """The kept sockets, whose descriptors this object owns."""
+    """The kept sockets; this object owns their descriptors."""
 
     def __init__(self, *, limit: int = 10_000) -> None:
         self._limit = limit
@@ -31,11 +29,7 @@ class InheritedListeners:
         return iter(list(self._sockets.items()))
 
     def keep(self, name: str, descriptor: int) -> None:
-        """Keep a socket, and close the name's earlier one. Close `descriptor` if it is rejected.
-
-        Raises `ListenerRejectedError` for an invalid name, a socket that does not listen, or too many
-        sockets.
-        """
+        """Raise `ListenerRejectedError` after closing `descriptor`. The name's earlier socket is closed."""
         try:
             self._check(name, descriptor)
         except ListenerRejectedError:

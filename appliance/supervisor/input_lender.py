@@ -1,11 +1,6 @@
-"""Open the operator's files for a role whose user may not reach them.
+"""Open the operator's files for a role whose user may not reach them, such as a policy in a home of mode 0700.
 
-The policy may be in a home of mode 0700, and an operator expects `rosrv up` to read it there as `rosrv policy check`
-does. The role gets open files, so no file is copied, and a reload reads the present text.
-
-1. Only a path that the role's row lists is opened: a file of it with its signature and test cases, or a folder with
-   everything below it. A compromised role gets nothing else.
-2. A thread answers, because a file system may block; it ends with the role.
+Only a path that the role's row lists is opened. A thread answers, because a file system may block.
 """
 
 import contextlib
@@ -34,9 +29,8 @@ class Borrower:
         self._is_owed = False  # the answer to an earlier request
 
     def open(self, path: Path) -> int | None:
-        """Return an open file, or None if the path is not an input of the role.
-
-        Raises `OSError`, which is `TimeoutError` while the supervisor does not answer.
+        """Return None for any other path. Raises `OSError`, which is `TimeoutError` while the supervisor does not
+        answer.
         """
         with self._asking:
             if self._is_owed:
@@ -66,7 +60,7 @@ class Borrower:
 
 
 def lend_inputs(inputs: Collection[Path]) -> socket.socket | None:
-    """Open inputs for a role in a thread; return its socket, or None if the role has the supervisor's rights anyway."""
+    """Return the role's socket, or None if the role has the supervisor's rights anyway."""
     if not inputs or os.geteuid() != 0:
         return None
     here, there = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -92,7 +86,7 @@ def _serve(link: socket.socket, inputs: tuple[Path, ...]) -> None:
 
 
 def open_input(path: Path, inputs: Collection[Path]) -> int | None:
-    """Open an input, a file beside it, or a file below it; return None for others. Raises `OSError`."""
+    """Return None unless the path is an input, a file beside it, or a file below it. Raises `OSError`."""
     for given in inputs:
         if any(path == given.with_name(given.name + suffix) for suffix in _BESIDE):
             return open_as_owner(path)

@@ -1,13 +1,11 @@
 """Build, check and remove the isolation of the processes: their network namespace and the firewall.
 
-The isolation is built before the first process starts and removed after the last process has ended. All calls block
-(tens of milliseconds, the probe some seconds), so a running supervisor makes them in a thread, one at a time.
+All calls block, the probe for seconds, so a running supervisor makes them in a thread, one at a time.
 
 1. No process starts before the firewall is in force.
-2. A hidden port counts as open if another local user can reach it, or if it cannot be probed; `probe` returns the
-   reason.
-3. Missing rules are installed again and logged, including rules that the kernel rejected before.
-4. After `remove`, no rule is installed again: `remove` waits for a running call, and later calls fail.
+2. A hidden port counts as open if another local user can reach it, or if it cannot be probed.
+3. Missing rules are installed again and logged.
+4. After `remove`, no rule is installed again: it waits for a running call, and later calls fail.
 """
 
 import contextlib
@@ -84,7 +82,7 @@ class NoIsolation:
         yield
 
     def build(self) -> None:
-        """Build the isolation. Raises `StartError` after removing everything that was built."""
+        """Raises `StartError` after removing everything that was built."""
 
     def remove(self) -> None: ...
 
@@ -92,20 +90,14 @@ class NoIsolation:
         """Close both ports to other users. Raises `NetworkError`."""
 
     def open_tunnels(self, pool: str, address: str) -> Esp:  # noqa: ARG002  the same everywhere
-        """Accept addresses of `pool` through IPsec only.
-
-        Raises `NetworkError` if clear text cannot be blocked, or ESP cannot run.
-        """
+        """Accept addresses of `pool` through IPsec only. Raises `NetworkError`."""
         raise NetworkError(
             f"isolation {self.kind} has no firewall that would keep tunnelled addresses from being forged:"
             " use isolation netns or container"
         )
 
     def open_own_network(self, network: str, ports: list[int]) -> None:  # noqa: ARG002  the same everywhere
-        """Let only the appliance's processes use the addresses of a network, and open these TCP ports.
-
-        Raises `NetworkError`.
-        """
+        """Let only the appliance use these addresses, and open these TCP ports. Raises `NetworkError`."""
         raise NetworkError(
             f"isolation {self.kind} has no namespace of its own, so any program of this machine could use the address"
             " of a door: use isolation netns or container"
@@ -115,18 +107,16 @@ class NoIsolation:
         """Remove the IPsec states and policies of an ended charon. Raises `NetworkError`, `LeftoversError`."""
 
     def route_to(self, host: str) -> str | None:  # noqa: ARG002  the same everywhere
-        """Return the address at which `host` reaches the appliance, or None if the address that it used is right."""
         return None
 
     def endpoint(self) -> PublicAddress:
-        """Return the address for hosts of other networks. Raises `NetworkError` if it is unknown."""
+        """Raises `NetworkError` if the address is unknown."""
         raise NetworkError(f"isolation {self.kind} has no tunnels: use isolation netns or container")
 
     def report(self) -> FirewallState:
         return FirewallState()
 
     def probe(self) -> str | None:
-        """Return why a hidden port may be reachable by other users, or None."""
         return None
 
 
@@ -156,7 +146,6 @@ class ContainerIsolation(NoIsolation):
 
     @contextlib.contextmanager
     def _standing(self) -> Iterator[None]:
-        """Run the block while the rules are in force. Raises `NetworkError` after they are removed."""
         with self._changing:
             self._require_standing()
             yield
@@ -167,7 +156,6 @@ class ContainerIsolation(NoIsolation):
 
     @contextlib.contextmanager
     def _taking_away(self) -> Iterator[None]:
-        """Run the block after a running call, or once that has hung for `_PATIENCE_SECONDS`."""
         self._ending = True
         held = self._changing.acquire(timeout=_PATIENCE_SECONDS)
         if not held:
@@ -179,7 +167,6 @@ class ContainerIsolation(NoIsolation):
                 self._changing.release()
 
     def build(self) -> None:
-        """Install the firewall. Raises `StartError`."""
         self._ending = False
         if self._namespace == Namespace.own():
             _require_own_network()
@@ -210,7 +197,6 @@ class ContainerIsolation(NoIsolation):
                 log.error("firewall rules may remain", error=str(error))
 
     def _end_tunnels(self, own: str) -> None:
-        """Close the tunnels, and remove the IPsec states and policies that a killed charon left in the kernel."""
         try:
             self._namespace.run(lambda: clear_leftovers(own.partition("/")[0]))
             interfaces.delete_address(self._namespace, "lo", own)
@@ -290,7 +276,6 @@ class ContainerIsolation(NoIsolation):
         return found
 
     def report(self) -> FirewallState:
-        """Return the state, after installing missing rules again."""
         with self._standing():
             if self.firewall is None:
                 return FirewallState()
@@ -305,7 +290,6 @@ class ContainerIsolation(NoIsolation):
         return FirewallState(report.backend, list(report.not_used), list(report.rules))
 
     def probe(self) -> str | None:
-        """Try to reach the hidden ports as another local user; return the reason of a success."""
         ports = {
             "ROSMaster": self._ports.rosmaster,
             "the master-side proxy endpoint": self._ports.inner,
@@ -406,14 +390,12 @@ class NetnsIsolation(ContainerIsolation):
             yield
 
     def open_tunnels(self, pool: str, address: str) -> Esp:
-        """Open the tunnels, and forward the host's IKE and ESP packets to the namespace."""
         with self._standing():
             esp = super().open_tunnels(pool, address)
             self._isolation.forward_tunnels()
             return esp
 
     def open_own_network(self, network: str, ports: list[int]) -> None:
-        """Open the network, and forward connections to these ports of the host to the namespace."""
         with self._standing():
             self._isolation.require_free(ports)
             super().open_own_network(network, ports)
@@ -442,7 +424,6 @@ class NetnsIsolation(ContainerIsolation):
         return tuple(ends.host for ends in self._isolation.ends.values())
 
     def route_to(self, host: str) -> str | None:
-        """Return the address at which a host reaches the appliance; None for a host in a tunnel."""
         # `host` comes from control, which is not trusted: accept only an address.
         address = ipaddress.ip_address(host)
         if self._tunnels is not None and address in ipaddress.ip_network(self._tunnels[0]):
@@ -450,11 +431,9 @@ class NetnsIsolation(ContainerIsolation):
         return self._isolation.host_address_for(host)
 
     def endpoint(self) -> PublicAddress:
-        """Return the address towards the default route, or the only address if there is no route."""
         return self._isolation.endpoint()
 
     def report(self) -> FirewallState:
-        """Install missing rules on the host again."""
         with self._standing():
             rules = self._isolation.rules()
             gone = [rule.purpose for rule in rules if not rule.in_force]
@@ -466,7 +445,7 @@ class NetnsIsolation(ContainerIsolation):
             return msgspec.structs.replace(super().report(), forwarding=list(rules), **self._look_at_others())
 
     def _look_at_others(self) -> dict[str, list[str]]:
-        """Log changes of other programs' rules for forwarded packets, such as Docker's; return these rules."""
+        """Log changes of other programs' rules for forwarded packets, such as Docker's."""
         try:
             found = {
                 "translations": list(self._isolation.translations()),
@@ -495,7 +474,7 @@ def isolation_for(
 
 
 def _require_own_network() -> None:
-    """Raise `StartError` in a container with the machine's network: the firewall would affect the whole machine."""
+    """The firewall would affect the whole machine of a container with the machine's network."""
     shared = lives_on_the_machines_network()
     if is_contained() and (shared or bridges()):
         raise StartError(

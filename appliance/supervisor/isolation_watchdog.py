@@ -1,10 +1,7 @@
 """Check the isolation while the appliance runs, and report to control.
 
-Calls of the isolation take time, so each runs in a daemon thread. Calls run one after the other; only a few route
-queries run at once. A thread that hangs does not keep the appliance from ending.
-
-Every exception (a missing file or process, no memory, an unreadable answer) becomes a finding with its reason. So the
-checks never stop, and an outdated good finding never hides a failure from control.
+Each call runs in a daemon thread, so a call that hangs does not keep the appliance from ending. Every exception
+becomes a finding, so an outdated good finding never hides a failure.
 """
 
 import asyncio
@@ -66,7 +63,6 @@ class IsolationWatchdog:
             self._tell(message)
 
     async def control_ready(self, inner_port: int, own_port: int) -> str | None:
-        """Close control's inner ports to other users, and verify that; return the reason of a failure."""
         try:
             async with self._one_at_a_time:
                 await in_thread(lambda: self.isolation.control_ready(inner_port, own_port))
@@ -77,7 +73,6 @@ class IsolationWatchdog:
         return await self.look()
 
     async def open_tunnels(self, pool: str, address: str) -> messages.TunnelsEnclosed:
-        """Block clear text for a pool; return where ESP runs, or why no tunnels are possible."""
         try:
             async with self._one_at_a_time:
                 esp = await in_thread(lambda: self.isolation.open_tunnels(pool, address))
@@ -90,7 +85,7 @@ class IsolationWatchdog:
         return messages.TunnelsEnclosed(esp)
 
     async def open_own_network(self, network: str, ports: list[int]) -> str:
-        """Open the own network; return the reason of a failure, or an empty text."""
+        """Return the reason of a failure."""
         try:
             async with self._one_at_a_time:
                 await in_thread(lambda: self.isolation.open_own_network(network, ports))
@@ -102,7 +97,6 @@ class IsolationWatchdog:
         return ""
 
     async def clear_tunnels(self, passive: Callable[[], bool]) -> None:
-        """Remove what a charon left, while this appliance is passive and runs no other charon."""
         try:
             async with self._one_at_a_time:
                 if passive():

@@ -1,8 +1,6 @@
 """Answer operators while control is stopped, and while it starts again without the right to serve.
 
-Requests on the admin socket would otherwise wait for ten seconds and more. The supervisor reads each request up to its
-line end without parsing it, and gives every request the same answer. Most pauses are shorter than `_PATIENCE_SECONDS`:
-control itself answers after these.
+Every request gets the same answer, unparsed. Pauses shorter than `_PATIENCE_SECONDS` need none: control answers.
 """
 
 import asyncio
@@ -19,7 +17,7 @@ _LONGEST_REQUEST = 16 << 20  # bytes, as in `control/admin_socket.py`
 
 
 async def answer_for_control(listener: Callable[[], socket.socket], reason: str) -> None:
-    """Answer with the reason from `_PATIENCE_SECONDS` on; `listener()` copies the admin socket."""
+    """`listener()` copies the admin socket."""
     await asyncio.sleep(_PATIENCE_SECONDS)
     async with await asyncio.start_unix_server(
         partial(_answer, reason), sock=listener(), limit=_LONGEST_REQUEST

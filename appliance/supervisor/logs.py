@@ -1,7 +1,4 @@
-"""Configure the logs of all processes: on standard error, readable on a terminal, otherwise JSON.
-
-Messages from the standard library's `logging` have the same format.
-"""
+"""Configure the logs of all processes: on standard error, readable on a terminal, otherwise JSON."""
 
 import logging
 import sys
@@ -20,7 +17,6 @@ _transform = structlog.tracebacks.ExceptionDictTransformer(show_locals=False)
 
 
 def configure_logs(process: str) -> None:
-    """Configure the logs of a process; every line has its name."""
     human = sys.stderr.isatty()
     shared: list[structlog.typing.Processor] = [
         structlog.contextvars.merge_contextvars,
@@ -49,7 +45,7 @@ def configure_logs(process: str) -> None:
 
 
 def write_line(text: str, stream: TextIO) -> None:
-    """Write a line for operators in the form of the logs: text with a terminal, otherwise JSON. Raises `OSError`."""
+    """Raises `OSError`."""
     if stream.isatty() or sys.stderr.isatty():
         stream.write(f"{text}\n")
         stream.flush()

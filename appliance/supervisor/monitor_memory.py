@@ -1,12 +1,8 @@
 """Provide the files in which relays keep the state of their monitors (`relay/monitors/state_memory.py`).
 
-Each run of the appliance has a folder with one file per relay. The kernel keeps the files' content when all processes
-die. This module reads only whether a file has content. Every relay may read the files of earlier runs, because a
-monitor may have moved to another relay. Earlier folders are removed only when each relay of a later run has written its
-file. So an appliance that is killed during its start loses no state.
-
-An orderly end writes all state to disk, and then a file with the time. After a reboot, the state is used only if this
-file exists.
+The kernel keeps the files when all processes die. Files of earlier runs are removed only when each relay of a
+later run has written its own, so an appliance that is killed during its start loses no state. After a reboot, the
+state is used only if an orderly end wrote it to disk.
 """
 
 import os
@@ -80,7 +76,6 @@ class MonitorMemory:
         yield StateGiven(True, self._boot, self._offset, ended.boot, ended.at), self._own[index]
 
     def close(self) -> None:
-        """Write the state to disk, after all relays have ended."""
         try:
             for descriptor in self._own:
                 os.fsync(descriptor)

@@ -18,7 +18,7 @@ def free_port() -> int:
 
 
 def first_free(ports: range) -> int:
-    """Return the first loopback port with neither a listener nor an old connection. Raises `OSError`."""
+    """Skip also ports with an old connection. Raises `OSError`."""
     for port in ports:
         with socket.socket() as sock:
             try:
@@ -30,7 +30,7 @@ def first_free(ports: range) -> int:
 
 
 def spare_ports(count: int, taken: Sequence[range], within: range) -> range:
-    """Return the highest adjacent ports that do not overlap `taken`. Raises `StartError`."""
+    """Return adjacent ports that do not overlap `taken`. Raises `StartError`."""
     stop = within.stop
     while stop - count >= within.start:
         wanted = range(stop - count, stop)

@@ -1,10 +1,8 @@
 """Drop privileges of a child before its own code runs.
 
-After `drop_privileges`:
-
 1. The child dies with the supervisor (`PR_SET_PDEATHSIG`), even if the supervisor died before the call.
-2. The child has no supplementary groups and only the role's capabilities. They are ambient, so its own children inherit
-   them. It cannot gain further privileges (`no_new_privs`).
+2. The child has only the role's capabilities; they are ambient, so its own children inherit them. It cannot gain
+   further privileges (`no_new_privs`).
 3. Only the child's user can read the files that the child makes (`umask 077`).
 
 Without root, only 1, 3 and `no_new_privs` apply.
@@ -36,10 +34,7 @@ _SCHED_SETATTR = {"x86_64": 314, "aarch64": 274}
 
 
 def die_with_parent(parent: int) -> None:
-    """Make the kernel kill this process when `parent` dies; exit if it is already dead.
-
-    Call this after the change of user: a change clears the setting.
-    """
+    """Call this after the change of user, which clears the setting."""
     prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:
         os._exit(1)
@@ -60,10 +55,9 @@ def raise_file_limit(wanted: int) -> int:
 
 
 def raise_oom_score(score: int) -> None:
-    """Let the kernel kill this process earlier if memory is short. The score is never lowered.
+    """Let the kernel kill this process earlier if memory is short.
 
-    Call this before the change of user: the role's user may not write the file. With a read-only /proc,
-    nothing changes.
+    Call this before the change of user: the role's user may not write the file.
     """
     with contextlib.suppress(OSError), open("/proc/self/oom_score_adj", "r+") as file:  # noqa: PTH123  as below
         if score > int(file.read()):
@@ -71,7 +65,6 @@ def raise_oom_score(score: int) -> None:
 
 
 def raise_priority(by: int) -> int:
-    """Raise the priority of this process; return `by`, or 0 if this is not permitted."""
     try:
         os.setpriority(os.PRIO_PROCESS, 0, os.getpriority(os.PRIO_PROCESS, 0) - by)
     except PermissionError:
@@ -80,12 +73,9 @@ def raise_priority(by: int) -> int:
 
 
 def add_niceness(by: int) -> None:
-    """Add to the niceness of this process, if permitted.
-
-    Where the kernel shares the processor among sessions (autogroups), the niceness of a process has an effect
-    only inside its session. So a session with a process of higher priority gets its niceness: call this in a
-    session of this process alone. A session of lower priority keeps its share, or a busy machine would lock
-    operators out.
+    """With autogroups, niceness has an effect only inside a session, so a session with a process of higher
+    priority also gets it: call this in a session of this process alone. A session of lower priority keeps its
+    share, or a busy machine would lock operators out.
     """
     with contextlib.suppress(PermissionError):
         os.nice(by)
@@ -96,11 +86,7 @@ def add_niceness(by: int) -> None:
 
 
 def shorten_slice(nanoseconds: int) -> None:
-    """Ask the scheduler for short turns, so that this process runs soon after it wakes; its share stays the
-    same.
-
-    Linux before 6.12 ignores the request. If a container forbids it, nothing changes.
-    """
+    """Let this process run soon after it wakes; its share stays the same. Linux before 6.12 ignores the request."""
     call = _SCHED_SETATTR.get(os.uname().machine)
     if call is None:
         return
@@ -113,7 +99,7 @@ def shorten_slice(nanoseconds: int) -> None:
 
 
 def leave_network() -> None:
-    """Move this process into an empty network namespace. Raises `OSError`."""
+    """Raises `OSError`."""
     libc_call("unshare(CLONE_NEWNET)", _CLONE_NEWNET)
 
 
@@ -180,7 +166,6 @@ def _empty_bounding_set(*, but: int = 0) -> None:
 
 
 def _reduce_capabilities(kept: int) -> None:
-    """Keep only the capabilities of this bit set, which executed programs inherit."""
     prctl(_PR_CAP_AMBIENT, _PR_CAP_AMBIENT_CLEAR_ALL)
     header = (ctypes.c_uint32 * 2)(_CAPABILITY_VERSION_3, 0)
     low, high = kept & 0xFFFFFFFF, kept >> 32
@@ -191,12 +176,11 @@ def _reduce_capabilities(kept: int) -> None:
 
 
 def prctl(option: int, first: int, second: int = 0) -> None:
-    """Call `prctl(2)`. Raises `OSError`."""
+    """Raises `OSError`."""
     libc_call(f"prctl({option})", ctypes.c_int(option), *map(ctypes.c_ulong, (first, second, 0, 0)))
 
 
 def libc_call(what: str, *arguments: Any) -> None:
-    """Call a function of libc, whose name begins `what`. Raises `OSError`."""
     function = ctypes.CDLL(None, use_errno=True)[what.partition("(")[0]]
     if function(*arguments) != 0:
         number = ctypes.get_errno()

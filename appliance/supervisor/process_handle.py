@@ -1,7 +1,6 @@
 """Run one process from its start to its death, with the supervisor's end of its lifeline.
 
-Callbacks report events to the supervisor, which decides about restarts. The kernel reports a death on a pid descriptor,
-so a reused process id causes no confusion.
+The kernel reports a death on a pid descriptor, so a reused process id causes no confusion.
 """
 
 import asyncio
@@ -32,7 +31,7 @@ _log = structlog.get_logger()
 
 
 class ProgramOutput:
-    """The output of a program, read until the program and all that it started have ended."""
+    """The output of a program, read until it and all that it started have ended."""
 
     def __init__(self, role: str, output: IO[bytes], loop: asyncio.AbstractEventLoop) -> None:
         self._role = role
@@ -77,10 +76,7 @@ class ProcessCallbacks:
 
 
 def is_hanging(silent: float, *, starting: bool, still: float) -> bool:
-    """Whether a process hangs: `silent` seconds without an answer, `still` seconds without progress.
-
-    During a start, `silent` counts from the start; a start that progresses may take long.
-    """
+    """During a start, `silent` seconds count from the start, and a start that progresses (`still`) may take long."""
     if starting:
         return silent > LONGEST_START_SECONDS or (silent > FIRST_ANSWER_SECONDS and still > ANSWER_SECONDS)
     return silent > ANSWER_SECONDS
@@ -92,7 +88,7 @@ class ProcessHandle:
     def __init__(
         self, role: str, index: int, plan: LaunchPlan, lifeline: socket.socket, reports: ProcessCallbacks
     ) -> None:
-        """`lifeline` is the supervisor's open end, and `plan.lifeline` is the child's."""
+        """`lifeline` is the supervisor's end."""
         self.role = role
         self.index = index
         self.ready = False
@@ -157,7 +153,7 @@ class ProcessHandle:
         ]
 
     def send(self, message: Message, descriptors: tuple[int, ...] = ()) -> None:
-        """Send a message; do nothing if the process is dead, because its death is reported separately."""
+        """Ignore a dead process, because its death is reported separately."""
         if self._channel is None:
             return
         try:
@@ -175,7 +171,7 @@ class ProcessHandle:
         self.answered = clock.now()
 
     def discount_pause(self, seconds: float) -> None:
-        """Accept the answer this much later, because the supervisor did not run (a suspended machine)."""
+        """Accept a later answer, because the supervisor did not run (a suspended machine)."""
         self.started += seconds
         if self.answered is not None:
             self.answered += seconds
@@ -247,7 +243,7 @@ def _environment(home: str) -> dict[str, str]:
 
 
 def program_environment(home: str, extra: dict[str, str]) -> dict[str, str]:
-    """Return the environment of a program, which inherits only language and time zone."""
+    """Inherit only language and time zone."""
     environment = _environment(home)
     del environment["PYTHONPATH"], environment["PYDANTIC_DISABLE_PLUGINS"]
     return {**environment, **extra}

@@ -41,7 +41,6 @@ class ProcessSlot:
 
     @property
     def is_starting(self) -> bool:
-        """Whether the appliance does not serve yet because this process is not ready."""
         if self.role.on_demand or self.role.dispensable:
             return False
         return self.process is None or not (self.process.ready or self.process.is_program)
@@ -53,7 +52,6 @@ class ProcessSlot:
 
     @property
     def is_late(self) -> bool:
-        """Whether nodes cannot connect because this process is not ready."""
         role = self.role
         waited_for = (
             role.program is None and role.after is None and not role.on_demand and not role.dispensable
@@ -68,7 +66,6 @@ class ProcessSlot:
         return lived
 
     def recovers(self) -> bool:
-        """Reset the failures if the process has run long enough; return whether this call did so."""
         lasts = self.process is not None and clock.now() - self.process.started >= STABLE_SECONDS
         if not (lasts and self.is_failing):
             return False
@@ -76,13 +73,11 @@ class ProcessSlot:
         return True
 
     def delay(self) -> float:
-        """Return the delay in seconds: 0 after a long run, more after each short run."""
         if self.is_failing and self.role.dispensable:
             return min(2.0 ** (self.short_runs - FAILING_AFTER + 1), _LONGEST_DELAY)
         return _BACKOFF[min(max(self.short_runs - 1, 0), len(_BACKOFF) - 1)]
 
     def plan(self, facts: Facts, lifeline: int, lender: int | None) -> LaunchPlan:
-        """Return the plan of the next start; `lifeline` and `lender` are the child's ends."""
         role = self.role
         home = str(facts.part(role.part))
         plan = LaunchPlan(

@@ -17,5 +17,5 @@ def main(lifeline_fd: int, index: int, config: Path) -> None:
 
 
 def limits_of(config: Path) -> RelayLimits:
-    """Return the limits in a configuration. Raises `OSError`, `msgspec.ValidationError`."""
+    """Raises `OSError`, `msgspec.ValidationError`."""
     return msgspec.json.decode(config.read_bytes(), type=_Section).relay

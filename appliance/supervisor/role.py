@@ -63,35 +63,19 @@ class ExternalProgram:
 
 @dataclass(frozen=True)
 class Role:
-    """One row of the table.
+    """One row of the table of processes.
 
-    Start: `path` returns the last argument of `entry`. `indexed` roles get their number; they have `most`
-    processes (None: one for each relay). `after` is the role that must be ready first. `outlives_takeover`:
-    the role continues when this appliance becomes passive. `stands_by`: a role with `after` also runs while
-    this appliance is passive. `listens`: each process of the role gets the listening socket that the
-    supervisor keeps for it. `on_demand`: the role starts when control requests it, and does not restart after
-    exit status 0.
+    `most` processes may run (None: one for each relay). `after` is the role that must be ready first; with
+    `stands_by`, a role also runs while this appliance is passive. `listens`: the supervisor keeps the listening
+    sockets. `on_demand`: control requests the start, and exit status 0 is not followed by a restart. `asks`: the
+    supervisor checks a program without a lifeline over HTTP. `dispensable`: the other roles continue when this
+    role cannot serve. `outlives_control` roles are stopped last.
 
-    Watching: `asks`: the supervisor checks over HTTP whether the role is alive (for a program without a
-    lifeline). `dispensable`: the other roles continue when this role cannot serve. `outlives_control` roles
-    are stopped last.
-
-    Permissions: `part` is the role's folder in the state directory. `links` are the roles it talks to.
-    `files` is the limit on open files. `readable_by` is the user whose group may enter `part` and read its
-    group-readable files. `group` is the user whose group replaces the role's own, so the role can read files
-    that are `readable_by` that user. `capabilities` lists the `privileges.SUPERVISOR_CAPABILITIES` that the
-    role keeps. `secret` is a file that the role's user may not read; it is opened before the privileges are
-    dropped, and the last argument of `entry` is its descriptor or None. `inputs` are files and folders of the
-    operator, which the supervisor opens for the role if the role's user may not reach them. `sandbox` has the
-    permitted system calls, and the files and ports besides the role's part and the system. `ended_early` is
-    the role's `oom_score_adj` (0 to 1000): the kernel kills a higher one earlier if memory is short. `nice`
-    is its niceness: a higher one yields the processor, so that no console delays a stop. A negative one has
-    effect if the supervisor may give it (CAP_SYS_NICE). `slice_ns` is the length of its turns at the
-    processor (0: the kernel's): a process with short turns waits less for each. `receiver` is the only other
-    machine that the firewall lets the user reach.
-
-    A feature's role runs if the settings of features let it (`configured`), and a `paired` one only on one of
-    two appliances.
+    The group of the user `readable_by` may read files of `part`; a role that reads them has this user as `group`.
+    `secret` is a file that the role's user may not read: the last argument of `entry` is its descriptor or None.
+    `inputs` are files of the operator, which the supervisor opens. `ended_early` is the `oom_score_adj`. A higher
+    `nice` yields the processor, so that no console delays a stop. `slice_ns` is the length of its turns (0: the
+    kernel's). `receiver` is the only other machine that the firewall lets the user reach.
     """
 
     name: str
@@ -128,5 +112,4 @@ class Role:
 
     @property
     def serves_robot(self) -> bool:
-        """Whether the role may run only while this appliance is active; a pause stops it."""
         return not (self.outlives_takeover or self.stands_by)

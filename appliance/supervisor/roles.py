@@ -1,8 +1,4 @@
-"""The table of processes, with the user, the permissions and the start of each process.
-
-To add a process, add its row. A role is either a part of the appliance (`entry`: a function that gets the lifeline)
-or an external program (`program`: the command and its environment).
-"""
+"""The table of processes, with the user, the permissions and the start of each process."""
 
 import shutil
 from collections.abc import Mapping
@@ -29,7 +25,7 @@ ROS_PROGRAMS = {ROSMASTER: "python3-rosmaster", ROSOUT: "rosout"}
 
 
 def _of_ros(facts: Facts, part: str, master: str) -> dict[str, str]:
-    """Return the environment of a ROS program; ROS_IP makes rosmaster listen on loopback only."""
+    """ROS_IP makes rosmaster listen on loopback only."""
     return {
         "ROS_IP": "127.0.0.1",
         "ROS_MASTER_URI": master,
@@ -41,10 +37,7 @@ def _of_ros(facts: Facts, part: str, master: str) -> dict[str, str]:
 
 
 def _messages_at(ports: range | None) -> tuple[str, ...]:
-    """Return the argument that makes roscpp serve messages at the first free port.
-
-    Connections of an earlier run may occupy a port for a minute.
-    """
+    """roscpp uses the first free port of the range: connections of an earlier run may occupy one for a minute."""
     return () if ports is None else (f"__tcpros_server_port:={first_free(ports)}",)
 
 
@@ -130,7 +123,7 @@ def roles_of(
     api: bool = True,
     paired: bool = False,
 ) -> tuple[Role, ...]:
-    """Return the rows to start. Raises `StartError` if a ROS program is missing."""
+    """Raises `StartError` if a ROS program is missing."""
     require_programs(ROS_PROGRAMS)
     wanted = {"api": api}
     return tuple(

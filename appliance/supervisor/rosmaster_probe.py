@@ -1,6 +1,6 @@
 """Check that `rosmaster`, which has no lifeline, is alive: call its `getPid`.
 
-Any answer counts. The firewall accepts only sockets of control's user, so the socket is made as this user.
+The firewall accepts only sockets of control's user, so the socket is made as this user.
 """
 
 import asyncio
@@ -21,10 +21,6 @@ _REQUEST = (
 
 
 async def answers(port: int, account: Account, inside: AbstractContextManager[None], seconds: float) -> bool:
-    """Whether `rosmaster` answers on this loopback port.
-
-    `inside` enters rosmaster's network namespace while the socket is made.
-    """
     loop = asyncio.get_running_loop()
     # The firewall matches a socket's owner by fsuid.
     with inside, acting_as(account.uid):

@@ -51,12 +51,8 @@ def run_appliance(
     pairing: Pairing | None = None,
     waits: Callable[[], None] = lambda: None,
 ) -> None:
-    """Run the appliance. Raises `StartError` if it cannot start or continue.
-
-    `ready` is called once, when nodes may connect; it gets control's message and the settings with all ports
-    chosen. With `pairing` the appliance is one of two, and `waits` is called once when it could serve.
-    `node_ports` is the policy's `[Ports] range`: the firewall limits connections to it, and `netns` forwards
-    it.
+    """Raises `StartError`. `ready` is called once, with the settings after all ports are chosen, and `waits` once
+    when an appliance with `pairing` could serve.
     """
     if settings.isolation == "none":
         log.warning(
@@ -84,7 +80,6 @@ def run_appliance(
 
 
 def _weigh(pairing: Pairing) -> int:
-    """Return the priority for the gate of one of two appliances, which no load may delay."""
     raised = raise_priority(-pairing.nice)
     if not raised:
         log.warning(
@@ -151,7 +146,6 @@ def _run(
 
 
 def _ports_of_rosout(settings: Settings, node_ports: range) -> range:
-    """Return ports for rosout that are outside of the kernel's local port range."""
     chosen = local_port_range()
     taken = [settings.listen_address[1], settings.rosmaster_port]
     taken += [settings.api_address[1]] if settings.api_address else []
@@ -173,7 +167,6 @@ def _with_ports(settings: Settings) -> Settings:
 
 
 def _api_with_port(settings: Settings) -> str:
-    """Return the address of REST; if the default port is in use, warn and choose a free one."""
     if settings.api_address is None:
         return settings.api
     host, port = settings.api_address

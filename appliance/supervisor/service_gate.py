@@ -7,10 +7,7 @@ from typing import Any
 
 @dataclass(frozen=True)
 class RoleChanges:
-    """The changes of the role; `activate(epoch)` and `passivate()` begin and end the service.
-
-    `suspend()` stops it, with all state kept, until `resume()`; it returns False if that is not possible now.
-    """
+    """`suspend()` keeps all state until `resume()`; it returns False if that is not possible now."""
 
     activate: Callable[[int], None]
     passivate: Callable[[], None]
@@ -21,8 +18,8 @@ class RoleChanges:
 class ServiceGate:
     """The gate of a single appliance, which may always serve, in epoch 0.
 
-    `accepts` has the messages of roles by which the gate decides. Operators get `paused` as the answer while
-    the service is suspended, and `ended` while this appliance stops serving.
+    `accepts` has the messages of roles by which the gate decides; operators get `paused` or `ended` as the
+    answer.
     """
 
     accepts: Mapping[str, tuple[type, ...]] = {}
@@ -47,10 +44,8 @@ class ServiceGate:
 class Pairing:
     """One of two appliances, before it starts.
 
-    `robot` is an address of the robot. Only `other` may send to `port`. `files` are written for the
-    processes: names, users, contents. The supervisor gets the priority `nice`. `fixed_authority` is why the
-    authority of hosts cannot be replaced. `event` and `text` are printed when this appliance could serve,
-    with the state `ready` for systemd.
+    `robot` is an address of the robot. Only `other` may send to `port`. `files` have names, users and contents.
+    `fixed_authority` is why the authority of hosts cannot be replaced.
     """
 
     robot: str

@@ -1,8 +1,5 @@
-"""Notify systemd of the state of the appliance (`Type=notify`, `WatchdogSec`).
+"""Notify systemd of the state of the appliance (sd_notify(3)).
 
-During the start, the supervisor requests more time from systemd, and itself ends a start without progress.
-
-The protocol is sd_notify(3): datagrams of `KEY=value` lines to the socket in `NOTIFY_SOCKET`, if the variable is set.
 systemd's watchdog covers the supervisor's loop; that loop watches the other processes.
 """
 
@@ -26,14 +23,14 @@ class ServiceManager:
 
     @classmethod
     def of(cls, environment: MutableMapping[str, str]) -> "ServiceManager":
-        """Return the manager, and remove the socket and the watchdog from the environment, which children inherit."""
+        """Remove the socket and the watchdog from the environment, which children inherit."""
         said = {
             name: environment.pop(name, None) for name in ("NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID")
         }
         return cls(said["NOTIFY_SOCKET"], _seconds(said))
 
     def starting(self, status: str) -> None:
-        """Request more time; `status` is the present step."""
+        """Request more time."""
         self._say(f"{_MORE}STATUS={status}")
 
     def ready(self, status: str) -> None:
@@ -45,7 +42,6 @@ class ServiceManager:
 
     @asynccontextmanager
     async def watched(self) -> AsyncIterator[None]:
-        """Notify the watchdog twice per interval during the block."""
         task = asyncio.create_task(self._live())
         try:
             yield

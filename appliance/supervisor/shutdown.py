@@ -18,10 +18,7 @@ log = structlog.get_logger()
 
 
 async def end_all(slots: Sequence[ProcessSlot], process_died: asyncio.Event) -> None:
-    """End all processes; those that outlive control come last.
-
-    `process_died` is set after each death, when its slot is free. No process may start during the shutdown.
-    """
+    """No process may start during the shutdown. `process_died` is set after each death, when its slot is free."""
     for slot in slots:
         if slot.due is not None:
             slot.due.cancel()

@@ -1,8 +1,7 @@
 """Block ending signals while the isolation is built or removed, so that nothing is left on the machine.
 
-1. Signals during the build are delivered when the supervisor's loop runs; the loop then ends in order.
-2. Signals during the removal are ignored, because the end is already in progress.
-3. Other threads also block these signals (`block`); otherwise the kernel would deliver the signals to them.
+Signals during the build are delivered when the supervisor's loop runs, and signals during the removal are
+ignored. Other threads must also block them (`block`); otherwise the kernel would deliver the signals to them.
 """
 
 import signal
@@ -35,5 +34,4 @@ def heard() -> Iterator[None]:
 
 
 def block() -> set[int]:
-    """Block the signals in this thread and its children; return the previously blocked signals."""
     return {int(number) for number in signal.pthread_sigmask(signal.SIG_BLOCK, _ENDING)}

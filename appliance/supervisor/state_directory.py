@@ -1,15 +1,15 @@
-"""Prepare the state directory: set owners and modes of its parts, and lock it, so that only one appliance uses it.
+"""Prepare the state directory: set owners and modes of its parts, and lock it, so that only one appliance uses
+it.
 
-An existing directory is used, and closed to other users, only if it is empty or already an appliance's state.
-Otherwise `--state /tmp` would close /tmp to all users.
+A foreign directory is refused, because `--state /tmp` would close /tmp to all users.
 
 state/            0711  root: others may pass through, not list
-state/lock        0600  locked while an appliance runs; contains its process id
+state/lock        0600  locked while an appliance runs
 state/admin.sock  0600  for the other verbs of `rosrv`
 state/monitors/   0700  root: the state of monitors (`monitor_memory.py`)
 state/run/        0755  the resolved configuration for the children
 state/relay/      0700  rosrv-relay    and so on, one folder per role, for its user only
-state/control/    2710  rosrv:rosrv-api  (as root) new files get this group, which may read some of them (audit log)
+state/control/    2710  rosrv:rosrv-api  (as root) new files get this group, which may read the audit log
 """
 
 import contextlib
@@ -34,10 +34,7 @@ _SHOWN = 3
 
 
 def foreign(path: Path) -> str | None:
-    """Return why a directory is not an appliance's state; an empty or missing one may become one.
-
-    Raises `OSError`.
-    """
+    """An empty or missing directory may become an appliance's state. Raises `OSError`."""
     if not path.is_dir():
         return None
     found = sorted(entry.name for entry in path.iterdir() if entry.name != _OF_THE_DISK)
@@ -49,7 +46,7 @@ def foreign(path: Path) -> str | None:
 
 
 def _has_lock(path: Path) -> bool:
-    """Whether the folder's owner made a lock file: in a shared folder, any user may create one."""
+    """In a shared folder, any user may create a lock file; only that of the folder's owner counts."""
     try:
         lock = (path / _LOCK).lstat()
     except FileNotFoundError:
@@ -61,7 +58,7 @@ class StateDirectory:
     """The directory, whose lock is held until `close`."""
 
     def __init__(self, path: Path) -> None:
-        """Create the directory if needed. Raises `StartError`."""
+        """Raises `StartError`."""
         self.path = path.absolute()
         self._written: list[str] = []  # for the children, beside the configuration
         try:
@@ -82,10 +79,7 @@ class StateDirectory:
         return self.path / "run" / "config.json"
 
     def prepare(self, roles: Collection[Role]) -> None:
-        """Create the parts, and remove unfinished files of killed writers.
-
-        Raises `StartError` if a part belongs to another user, or its owner cannot be changed.
-        """
+        """Remove also the unfinished files of killed writers. Raises `StartError`."""
         try:
             self._give_parts(roles)
         except PermissionError as error:
@@ -117,10 +111,6 @@ class StateDirectory:
         write_whole(self.config, text.encode(), 0o644)
 
     def write_files(self, files: Iterable[tuple[str, str, bytes]]) -> None:
-        """Write files (name, user, contents) that only their users can read.
-
-        Remove those of an earlier start, which may have been killed.
-        """
         for path in self.config.parent.iterdir():
             if path != self.config and not path.is_dir():
                 path.unlink()

@@ -1,18 +1,16 @@
 """Start, watch and restart the processes of the appliance.
 
 1. The supervisor parses no data from a node or a browser. A child that sends a message outside `_FROM_ANY` and
-   `_FROM_CONTROL` is killed and restarted.
-2. A dead process is restarted within a second. A process that does not answer for five seconds is killed.
-3. Once nodes may connect, only a request of the control process ends the appliance; no other message and no death of a
-   process does. A process that cannot serve (a full disk) is restarted after at most a second, a dispensable process
-   after at most a minute.
-4. If one end of a link is new, both ends get a new link. A new control first gets every kept socket, then its links,
-   then the list of processes.
-5. One of two appliances is passive until its gate (`service_gate.py`) lets it serve. When the gate suspends the
-   service, all processes that serve the robot are stopped (SIGSTOP), and operators learn that the appliance is paused.
-   They go on if the gate resumes the service in the same epoch. Otherwise they are killed and start again, passive: no
-   state in memory is older than the next epoch.
-6. Stopping the appliance takes less than five seconds, even if children hang, and leaves no process behind.
+   `_FROM_CONTROL` is killed.
+2. A dead process is restarted within a second; a dispensable process that cannot serve, within a minute. A process
+   that does not answer for five seconds is killed.
+3. Once nodes may connect, only a request of the control process ends the appliance, and no death of a process.
+4. If one end of a link is new, both ends get a new link. A new control first gets every kept socket, then its
+   links, then the list of processes.
+5. When the gate suspends the service, all processes that serve the robot are stopped (SIGSTOP). They go on if it
+   resumes the service in the same epoch; otherwise they are killed, so no state in memory is older than the next
+   epoch.
+6. Stopping the appliance takes less than five seconds, even if children hang.
 """
 
 import asyncio
@@ -115,11 +113,9 @@ class Supervisor:
         stands_by: Callable[[], None] = lambda: None,
         gate: Callable[[RoleChanges], ServiceGate] = ServiceGate,
     ) -> None:
-        """Make the supervisor; `ready` is called once when nodes may connect, and may raise `StartError`.
+        """`ready` and `stands_by` are called at most once; `ready` may raise `StartError`.
 
-        `stands_by` is called once when the appliance only waits for its `gate`. `listeners` stay open while a
-        process restarts, so connections wait. Without `memory`, the state of monitors is lost when relays
-        die.
+        Without `memory`, the state of monitors is lost when relays die.
         """
         self._facts = facts
         self.slots = [
@@ -152,10 +148,7 @@ class Supervisor:
         self._since = clock.utc_now().isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
     async def run(self) -> None:
-        """Run until SIGTERM or SIGINT; SIGHUP reloads the policy.
-
-        Raises `StartError` if the appliance cannot start or continue; all processes are then stopped.
-        """
+        """Run until SIGTERM or SIGINT; SIGHUP reloads the policy. Raises `StartError`."""
         loop = asyncio.get_running_loop()
         loop.set_exception_handler(_log_fault)
         for number in (signal.SIGTERM, signal.SIGINT):
@@ -183,7 +176,6 @@ class Supervisor:
                 self._memory.close()
 
     def stop(self, failure: str | None = None) -> None:
-        """End the run, in order unless there is a `failure`."""
         if not self.stopping.is_set():
             self.failure = failure
             self.stopping.set()
@@ -214,7 +206,6 @@ class Supervisor:
         self.stop(f"rosmaster does not answer on 127.0.0.1:{self._facts.rosmaster_port}; check the log")
 
     async def until_ready(self) -> None:
-        """Wait until the appliance serves; give up when processes make no progress."""
         began = clock.now()
         while not self.is_ready and not self.stopping.is_set():
             with suppress(TimeoutError):
@@ -233,7 +224,6 @@ class Supervisor:
                 log.info("still starting", waits_for=words, seconds=waited)
 
     def _gets_on(self, began: float, slots: list[ProcessSlot]) -> bool:
-        """Whether a start may continue: for some minutes, then up to a limit while processes make progress."""
         waited = clock.now() - began
         if waited < _START_SECONDS:
             return True
@@ -324,7 +314,7 @@ class Supervisor:
                 self.control_said(process, message, descriptors)
 
     def _sandboxed(self, process: ProcessHandle, sandbox: messages.Walled) -> None:
-        """Note the limits of a process, which are accepted only as its first message."""
+        """Accept the limits of a process only as its first message."""
         if process.sandbox is not None:
             self._violated(process, "reported its sandbox twice")
             return
@@ -336,10 +326,7 @@ class Supervisor:
         self._tell_processes()
 
     def _cannot_serve(self, process: ProcessHandle, reason: str, output: Sequence[str]) -> None:
-        """End the appliance if it is still starting; otherwise only kill the process, whose next start may succeed.
-
-        A dispensable process never ends the appliance.
-        """
+        """End the appliance only if it is still starting: the next start of the process may succeed."""
         slot = next(slot for slot in self.slots if slot.process is process)
         process.reason = reason
         process.output = tuple(_printable(line)[:_LONGEST_LINE] for line in output[-OUTPUT_LINES:])
@@ -379,7 +366,7 @@ class Supervisor:
     def _free_log(self, processes: list[int]) -> None:
         """Kill the readers that hold a writer's lock of the audit log; a correct reader never holds one.
 
-        If the holder is unknown to the kernel (-1) or not a child, kill all readers.
+        If the holder is unknown (-1), kill all readers.
         """
         ours = {slot.process.pid for slot in self.slots if slot.process is not None}
         for slot in self.slots:
@@ -451,10 +438,9 @@ class Supervisor:
                 slot.process.kill()
 
     def _suspend(self) -> bool:
-        """Suspend the service; return False if a process is only starting.
+        """Return False if a process is only starting.
 
-        A control that stood by does not count as starting, so a lapse soon after the activation does not end
-        the appliance.
+        A control that stood by does not count, so a lapse soon after the activation does not end the appliance.
         """
         serving = [(slot, slot.process) for slot in self.slots if slot.role.serves_robot]
         if any(slot.is_starting for slot, process in serving if process is not None):
@@ -490,7 +476,6 @@ class Supervisor:
     # --- readiness ----------------------------------------------------------------------------------------
 
     async def control_ready(self, process: ProcessHandle, said: ControlReady) -> None:
-        """Close control's inner ports to other users, then announce that the appliance serves."""
         reason = await self._watchdog.control_ready(said.inner_port, said.own_port)
         while self._gate.suspended and process.alive:
             await asyncio.sleep(_SUSPENDED_SECONDS)
@@ -511,7 +496,6 @@ class Supervisor:
             process.send(messages.Announced())
 
     def _answer(self, process: ProcessHandle, work: Coroutine[Any, Any, None]) -> None:
-        """Do work for a process; too many requests at once count as a violation."""
         if self._unanswered >= _MOST_UNANSWERED:
             work.close()
             self._violated(process, f"sent more than {_MOST_UNANSWERED} requests at once")
@@ -645,7 +629,6 @@ class Supervisor:
         self._start_later(slot)
 
     def _ended(self, slot: ProcessSlot) -> None:
-        """Note the end of a process; the end of a role on demand does not count as a restart."""
         log.info("process ended", role=slot.role.name)
         slot.starts -= 1
         slot.short_runs = 0

@@ -1,8 +1,7 @@
 """Choose the users of the children.
 
-If the appliance is started as root, each role has its own user: the user with the role's name in the user database, or
-else a reserved numeric id, so that a container without these users also works. If it is not started as root, all
-processes run as the caller.
+As root, each role has its own user: that with its name, or a reserved numeric id, so that a container without
+these users also works.
 """
 
 import os
@@ -38,10 +37,7 @@ class Account:
 
 
 def account_of(user: str, group: str | None = None) -> Account:
-    """Return the account of a role's user; `group` names the user whose group replaces the role's own.
-
-    Raises `KeyError` for a user without a role.
-    """
+    """`group` names the user whose group replaces the role's own. Raises `KeyError`."""
     if group is not None:
         return replace(account_of(user), gid=account_of(group).gid)
     numeric = NUMERIC_IDS[user]

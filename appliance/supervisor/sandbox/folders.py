@@ -13,7 +13,6 @@ _LOADERS = (("/lib", "ld-linux-*"), ("/lib64", "ld-linux-*"))
 
 
 def with_system_files(sandbox: SandboxPlan, home: str, run: str) -> SandboxPlan:
-    """Permit reading the system, Python, our code and `run` (the resolved configuration), and writing `home`."""
     # The paths by which `process_handle` starts the process; a private view has no other.
     code = {
         str(Path(sys.prefix).resolve()),
@@ -33,7 +32,7 @@ def executables_of(program: Path) -> tuple[str, ...]:
 
 
 def folders_of(*files: Path | None) -> tuple[str, ...]:
-    """Return the folders of files and of their link targets, because editors often replace a file when they save it."""
+    """Return folders, because editors often replace a file when they save it."""
     given = [file for file in files if file is not None]
     found = [str(place.parent) for file in given for place in (file.absolute(), file.resolve())]
     return tuple(dict.fromkeys(found))

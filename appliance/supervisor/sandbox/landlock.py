@@ -1,7 +1,7 @@
 """Limit files and TCP ports of a process with Landlock, which needs no privilege and which children inherit.
 
-Landlock limits files from ABI version 1 (Linux 5.13), TCP ports from version 4 (6.7), and signals and abstract sockets
-from version 6 (6.12). Limits that the kernel lacks are reported.
+Limits that the kernel lacks are reported: files need Linux 5.13, TCP ports 6.7, signals and abstract sockets
+6.12.
 """
 
 import contextlib
@@ -45,10 +45,7 @@ def lacking(abi: int) -> list[str]:
 
 
 def restrict(sandbox: SandboxPlan) -> int:
-    """Limit this process and its children; return the ABI, 0 for none.
-
-    Raises `LandlockError`.
-    """
+    """Return the ABI, 0 for none. Raises `LandlockError`."""
     abi = version()
     if abi == 0:
         return 0

@@ -1,11 +1,10 @@
 """Show a process the program where its user may not reach it, such as a checkout in a home of mode 0700.
 
-1. The view is a mount namespace of the process: no other process sees a difference, and no file is copied or changed.
-2. An empty, read-only folder covers each closed folder. It contains the program and the state, and nothing else, so the
-   process can reach less of a home than with permission to pass through it.
-3. The program is mounted read-only. Where umask 077 at the clone closed its files, its owner is mapped to the process's
-   user; files of other owners keep their permissions.
-4. The state keeps its owners and permissions.
+1. The view is a mount namespace of the process: no other process sees a difference, and no file is changed.
+2. An empty, read-only folder with only the program and the state covers each closed folder, so the process can
+   reach less of a home than with permission to pass through it.
+3. The program is mounted read-only. Where umask 077 at the clone closed its files, its owner is mapped to the
+   process's user.
 """
 
 import contextlib
@@ -44,15 +43,12 @@ _REMEDY = (
 
 
 class ViewError(Exception):
-    """A view cannot be made; the message has the cause and the remedy."""
+    """A view cannot be made."""
 
 
 @dataclass(frozen=True)
 class PrivateView:
-    """A view: covered folders, and the shown folders of the program and the state directory.
-
-    `owned` are the folders of the program with files that only their owner may read.
-    """
+    """`owned` are the folders of the program with files that only their owner may read."""
 
     covered: tuple[str, ...]
     program: tuple[str, ...]
@@ -61,17 +57,13 @@ class PrivateView:
 
 
 def program_folders() -> tuple[Path, ...]:
-    """Return the folders of the Python environment, and of the packages unless they are in it."""
     top, environment = Path(appliance.__file__).resolve().parent.parent, Path(sys.prefix).resolve()
     packages = () if top.is_relative_to(environment) else tuple(top / name for name in _PACKAGES)
     return (environment, *packages)
 
 
 def view_of(program: Sequence[Path], state: Path) -> PrivateView | None:
-    """Return the view that other users need.
-
-    None if they reach everything, or if the processes have this user (not root).
-    """
+    """Return None if other users reach everything, or the processes are not root."""
     if os.geteuid() != 0:
         return None
     owned = [folder for folder in program if not _is_open(folder)]
@@ -89,7 +81,7 @@ def view_of(program: Sequence[Path], state: Path) -> PrivateView | None:
 
 
 def require_view(view: PrivateView | None, *, may_mount: bool) -> PrivateView | None:
-    """Return the view. Raises `StartError` if the program needs it and this process may not mount it."""
+    """Raise `StartError` if the program needs a view that this process may not mount."""
     if view is None or may_mount:
         return view
     if view.program:
@@ -101,7 +93,7 @@ def require_view(view: PrivateView | None, *, may_mount: bool) -> PrivateView | 
 
 
 def enter(view: PrivateView, account: Account) -> None:
-    """Enter the view, in a process with one thread that is not `account` yet. Raises `ViewError`."""
+    """Call this in a process with one thread, before the change of user. Raises `ViewError`."""
     try:
         _enter(view, account)
     except OSError as error:
@@ -134,7 +126,7 @@ def _closed_above(path: Path) -> Path | None:
 
 
 def _is_open(folder: Path) -> bool:
-    """Whether other users can read every file of our packages below a folder: a pull may have another umask."""
+    """Check every file: a pull may have another umask."""
     if folder.name not in _PACKAGES:
         return _permits(folder, _ENTER | _READ)
     return all(
@@ -152,7 +144,6 @@ def _permits(path: Path, wanted: int) -> bool:
 
 
 def _tree(folder: str, account: Account | None) -> int:
-    """Return a read-only tree of mounts; the user `account` appears as its owner."""
     tree = _clone(folder)
     if account is None:
         _set_attributes(tree, _ATTR_READ_ONLY, 0, folder)
@@ -175,7 +166,7 @@ def _set_attributes(tree: int, attributes: int, namespace: int, folder: str) -> 
 
 @contextlib.contextmanager
 def _user_namespace(owner: os.stat_result, account: Account) -> Iterator[int]:
-    """Map the owner to the account; only mounts use the namespace. Raises `OSError`."""
+    """Only mounts use the namespace."""
     here, there = socket.socketpair()
     child = os.fork()
     if child == 0:

@@ -12,11 +12,9 @@ ROUTES = (*NETWORK, int(socket.AF_NETLINK))  # name lookups read the kernel's ro
 class SandboxPlan:
     """The permissions of a process.
 
-    `allowlist`: permit only listed system calls; otherwise, deny only those that no process of the appliance makes.
-    `families`: address families of the sockets that the process may make. `programs`: files that it may execute, and
-    the libraries they load. `reads`, `writes`: folders and files; paths in `writes` may also be read. A missing path
-    grants nothing. `binds`, `connects`: TCP ports to listen on and to connect to; None: any port. With an allowlist and
-    without ports, the system calls `bind` and `connect` fail for every family.
+    Without `allowlist`, only calls that no process of the appliance makes are denied. Paths in `writes` may also
+    be read, and a missing path grants nothing. `binds`, `connects`: None permits any TCP port; with an allowlist
+    and without ports, the calls fail for every family.
     """
 
     allowlist: bool = False

@@ -1,11 +1,10 @@
 """Filter the system calls of a process with libseccomp, which knows their numbers on every architecture.
 
-A denied call fails with EPERM. A call outside the allowlist, or a call that hides its arguments (`clone3`), fails with
-ENOSYS, so that libraries try an older call instead. Only calls of another architecture (32 bits) kill a process,
-because no program of the appliance makes them. All other calls fail without a kill: a library may try calls of a newer
-kernel, and a killed relay stops its topics.
+A call outside the allowlist, or a call that hides its arguments (`clone3`), fails with ENOSYS, so that libraries
+try an older call instead. Only calls of another architecture (32 bits) kill a process: a killed relay stops its
+topics.
 
-Memory is never writable and executable at once. A written page may become executable later (`mprotect`), because
+Memory is never writable and executable at once, but a written page may become executable (`mprotect`), because
 compiled code needs this.
 """
 
@@ -97,11 +96,11 @@ class _Filter:
         self._otherwise = otherwise
 
     def set(self, attribute: int, value: int) -> None:
-        """Set an attribute, unless libseccomp or the kernel lacks it; the same calls are denied without it."""
+        """The same calls are denied without an attribute that libseccomp or the kernel lacks."""
         self._library.seccomp_attr_set(self._context, ctypes.c_int(attribute), ctypes.c_uint32(value))
 
     def add(self, action: int, names: Iterable[str], *comparisons: Comparison) -> None:
-        """Add a rule that applies if all comparisons hold. Calls that this architecture lacks are skipped."""
+        """Skip calls that this architecture lacks."""
         if action == self._otherwise:
             return
         compared = (_Comparison * len(comparisons))(*(_Comparison(*comparison) for comparison in comparisons))

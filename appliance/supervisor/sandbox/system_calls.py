@@ -4,7 +4,6 @@ import ctypes
 
 
 def system_call(number: int, *arguments: int | bytes | None) -> tuple[int, int]:
-    """Return the result, negative for a failure, and the error number."""
     libc = ctypes.CDLL(None, use_errno=True)
     given = [ctypes.c_long(argument) if isinstance(argument, int) else argument for argument in arguments]
     result: int = libc.syscall(ctypes.c_long(number), *given)
