@@ -1,16 +1,9 @@
 """Close the ROS ports of the machine that the nodes run on, with an nftables file.
 
-A ROS node listens on ports of the local port range, which a port scanner finds. The file closes the range to all but
-loopback and the appliance:
-
-1. A TCP connection is refused at its SYN, without the connection tracker. Older connections, and connections that the
-   machine itself opens, continue.
-2. A UDP packet is dropped if it is new to the connection tracker. Answers to this machine (DNS, NTP, DHCP) pass.
-3. This machine may forward a connection to the appliance, for a container, a virtual machine or a hotspot client. If
-   such a connection has an address of this machine after all translation, it is dropped: the policy would treat it as
-   the machine's own. The rule needs Linux 5.7; with older kernels it never matches.
-4. All rules are in one table, `inet rosrv_protect`, replaced in one transaction. Rules of other programs stay, and
-   traffic that they block stays blocked.
+1. A TCP connection is refused at its SYN, without the connection tracker, so connections that the machine itself
+   opens continue. A UDP packet is dropped if it is new to the tracker, so answers pass.
+2. A connection that this machine forwards to the appliance is dropped if it then has an address of this machine:
+   the policy would treat it as the machine's own. With kernels before Linux 5.7 the rule never matches.
 """
 
 import ipaddress
@@ -46,7 +39,7 @@ class OpenService:
 
 
 def parse_services(texts: Sequence[str]) -> tuple[OpenService, ...]:
-    """Parse services such as `tcp/22,udp/123,tcp/8000-8010`. Raises `ValueError` with the invalid one."""
+    """Raises `ValueError` with the invalid one."""
     return tuple(_service(part.strip()) for text in texts for part in text.split(","))
 
 
@@ -58,7 +51,7 @@ def parse_ports(text: str) -> PortRange:
 
 
 def parse_address(text: str) -> str:
-    """Parse an address; networks and names are rejected."""
+    """Reject networks and names."""
     try:
         address = ipaddress.ip_address(text)
     except ValueError:
@@ -71,7 +64,6 @@ def parse_address(text: str) -> str:
 
 
 def local_port_range() -> PortRange:
-    """Return the kernel's local port range, the same for IPv4 and IPv6."""
     try:
         first, last = RANGE_FILE.read_text(encoding="ascii").split()
     except (OSError, ValueError) as error:
@@ -82,11 +74,7 @@ def local_port_range() -> PortRange:
 def protection(
     appliances: Sequence[str], ports: PortRange, services: Sequence[OpenService], *, tunnelled: bool = False
 ) -> str:
-    """Return the nftables file.
-
-    `tunnelled`: the appliances' addresses are accepted only through IPsec, where they cannot be forged. The file then
-    has a rule for ESP in the kernel and one for ESP in user space; only one of them ever matches.
-    """
+    """`tunnelled`: the appliances' addresses are accepted only through IPsec, where they cannot be forged."""
     if not appliances:
         raise ValueError("give the address of at least one appliance")
     rules, leaving = ['iifname "lo" accept'], []

@@ -1,8 +1,7 @@
 """Delete entries of the connection tracker.
 
-Address translation applies only to the first packet of a connection. A host that keeps sending UDP (IKE, ESP in UDP)
-keeps its old entry alive, so changed rules would not redirect its packets. Therefore the entries of forwarded ports are
-deleted whenever the rules change.
+Address translation applies only to the first packet of a connection. A host that keeps sending UDP (IKE, ESP in
+UDP) keeps its old entry alive, so changed rules would not redirect its packets.
 """
 
 import errno
@@ -20,10 +19,7 @@ _FAMILIES = (socket.AF_INET, socket.AF_INET6)
 
 
 def forget(namespace: Namespace, ports: Iterable[int]) -> int:
-    """Delete the entries of these UDP ports of the namespace's own addresses; return their number.
-
-    Entries of forwarded packets stay. Raises `NetworkError`.
-    """
+    """Delete only entries of the namespace's own addresses; return their number. Raises `NetworkError`."""
     own = {address.partition("/")[0] for address in interfaces.addresses(namespace)}
     try:
         return namespace.run(

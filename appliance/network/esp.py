@@ -19,7 +19,7 @@ _STATE = ("src", "192.0.2.1", "dst", "192.0.2.2", "proto", "esp", "spi")
 
 
 def choose_esp(namespace: Namespace) -> Esp:
-    """Return where ESP can run. Raises `NetworkError` with the remedy."""
+    """Raises `NetworkError` with the remedy."""
     refusal = _try_kernel(namespace)
     if refusal is None:
         return "kernel"
@@ -32,10 +32,7 @@ def choose_esp(namespace: Namespace) -> Esp:
 
 
 def lend_tun(uid: int, gid: int, tun: Path | None = None) -> None:
-    """Give a user access to the TUN device, by an entry in its access control list if needed.
-
-    Raises `NetworkError` with the remedy.
-    """
+    """Add an entry to the device's access control list if needed. Raises `NetworkError`."""
     device, shown = tun or TUN, ""
     try:
         about = device.stat()
@@ -67,7 +64,7 @@ def _entries_of(device: Path, mode: int) -> list[tuple[int, int, int]]:
 
 
 def _with_user(entries: list[tuple[int, int, int]], uid: int) -> bytes:
-    """Return the list with an entry for the user; the mask permits the rights of all entries."""
+    """The mask permits the rights of all entries."""
     kept = [row for row in entries if row[0] != _MASK and row[::2] != (_USER, uid)]
     mask = _READ_WRITE
     for tag, rights, _id in kept:
@@ -77,7 +74,6 @@ def _with_user(entries: list[tuple[int, int, int]], uid: int) -> bytes:
 
 
 def _try_kernel(namespace: Namespace) -> str | None:
-    """Return why the kernel rejects an IPsec state with the tunnels' cipher, or None."""
     spi = f"0x{secrets.randbelow(0x7FFFFFFF) + 0x1000:x}"
     key = "0x" + secrets.token_hex(36)  # 256 bits and the salt
     cipher = ("reqid", "1", "mode", "tunnel", "aead", "rfc4106(gcm(aes))", key, "128")

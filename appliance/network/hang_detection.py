@@ -1,7 +1,6 @@
 """Wait for a program while it progresses, and end it if it hangs.
 
-A time limit alone is not enough: under emulation or load, `nft` may need a minute instead of ten milliseconds. A
-program hangs if it uses no processor time and waits for neither a processor nor a disk.
+Under emulation or load, `nft` may need a minute. A program hangs if it waits for neither a processor nor a disk.
 """
 
 import logging
@@ -33,7 +32,7 @@ class ProcessActivity:
         self._since = clock.now()
 
     def stalled_seconds(self) -> float:
-        """Return the seconds since the process progressed or waited for processor or disk; call this every second."""
+        """Call this every second."""
         now = clock.now()
         try:
             fields = self._stat.read_text(encoding="utf-8", errors="replace").rpartition(")")[2].split()
@@ -46,10 +45,7 @@ class ProcessActivity:
 
 
 def run_program(program: Start, text: str, what: str) -> tuple[int, str, str]:
-    """Run a program; return exit status, standard output and standard error.
-
-    `program` gets the pipes as arguments of `subprocess.Popen`. Raises `TimeoutError`, `OSError`.
-    """
+    """Return exit status, standard output and standard error. Raises `TimeoutError`, `OSError`."""
     pipe = subprocess.PIPE
     with program(stdin=pipe, stdout=pipe, stderr=pipe, text=True) as process:
         said, complained = communicate(process, text, what)
@@ -57,10 +53,7 @@ def run_program(program: Start, text: str, what: str) -> tuple[int, str, str]:
 
 
 def communicate(process: "subprocess.Popen[str]", text: str, what: str) -> tuple[str, str]:
-    """Return standard output and error. Log long waits for `what`.
-
-    Raises `TimeoutError` if it hangs, after it is killed.
-    """
+    """Raises `TimeoutError` after a hanging process is killed; logs long waits for `what`."""
     began, progress, said = clock.now(), ProcessActivity(process.pid), _SAY_SECONDS
     # Send the input here: a second call of `Popen.communicate` would not continue it.
     with ThreadPoolExecutor(1, "communicate") as pool:

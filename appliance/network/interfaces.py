@@ -1,7 +1,7 @@
 """Change interfaces, addresses and routes in a namespace, over netlink.
 
-Every function waits until the kernel is done. Addresses have the form `10.77.0.10/24` or `fd77::10/64`. IPv6
-addresses are usable at once: duplicate address detection is skipped, because the networks have no other hosts.
+Addresses have the form `10.77.0.10/24` or `fd77::10/64`. Duplicate address detection is skipped, because the
+networks have no other hosts.
 """
 
 import ipaddress
@@ -23,7 +23,7 @@ T = TypeVar("T")
 
 
 def create_veth(near: Namespace, near_name: str, far: Namespace, far_name: str) -> None:
-    """Create a veth pair with one end in each namespace, and set both up."""
+    """Set both ends up."""
     for name in (near_name, far_name):
         if not 0 < len(name) <= IFNAMSIZ:
             raise ValueError(f"interface name {name!r} must have 1 to {IFNAMSIZ} characters")
@@ -43,7 +43,6 @@ def create_veth(near: Namespace, near_name: str, far: Namespace, far_name: str) 
 
 
 def create_bridge(namespace: Namespace, name: str) -> None:
-    """Create a bridge without spanning tree, and set it up."""
     _netlink(
         namespace,
         f"creating the bridge {name}",
@@ -69,8 +68,6 @@ def set_link(namespace: Namespace, name: str, *, up: bool) -> None:
 
 
 def delete_link(namespace: Namespace, name: str) -> None:
-    """Delete an interface, with the other end of a veth pair."""
-
     def delete(route: Any) -> None:
         for index in route.link_lookup(ifname=name):
             route.link("del", index=index)
@@ -107,7 +104,7 @@ def delete_address(namespace: Namespace, name: str, address: str) -> None:
 
 
 def add_route(namespace: Namespace, destination: str, via: str) -> None:
-    """Add a route; `destination` is a network, or "default"."""
+    """`destination` is a network, or "default"."""
     family = _family(via)
     everywhere = "::/0" if family == socket.AF_INET6 else "0.0.0.0/0"
     where = everywhere if destination == "default" else destination
@@ -119,7 +116,6 @@ def add_route(namespace: Namespace, destination: str, via: str) -> None:
 
 
 def add_near_route(namespace: Namespace, name: str, destination: str, *, source: str, hop_limit: int) -> None:
-    """Add a route whose packets leave with `source` and this TTL."""
     length = 128 if _family(destination) == socket.AF_INET6 else 32
     _netlink(
         namespace,
@@ -137,7 +133,6 @@ def add_near_route(namespace: Namespace, name: str, destination: str, *, source:
 
 
 def add_local_route(namespace: Namespace, network: str) -> None:
-    """Make a network's addresses local, without an interface for each."""
     _netlink(
         namespace,
         f"adding the own network {network}",
@@ -163,13 +158,10 @@ def links(namespace: Namespace) -> list[str]:
 
 
 def addresses(namespace: Namespace) -> list[str]:
-    """Return the addresses with prefix lengths, including link-local ones."""
     return _netlink(namespace, "listing addresses", _held)
 
 
 def addresses_by_interface(namespace: Namespace) -> dict[str, list[str]]:
-    """Return the addresses with prefix lengths by interface."""
-
     def read(route: Any) -> dict[str, list[str]]:
         names = _names(route)
         held: dict[str, list[str]] = {name: [] for name in names.values()}
@@ -192,8 +184,6 @@ class DefaultRoute:
 
 
 def default_route(namespace: Namespace, version: int) -> DefaultRoute | None:
-    """Return the route with the lowest metric in the main table; `version` is 4 or 6."""
-
     def read(route: Any) -> DefaultRoute | None:
         family = socket.AF_INET if version == 4 else socket.AF_INET6
         names = _names(route)
@@ -214,7 +204,7 @@ def default_route(namespace: Namespace, version: int) -> DefaultRoute | None:
 
 
 def networks(namespace: Namespace) -> list[str]:
-    """Return the networks of every route and address, without default routes."""
+    """Leave out default routes."""
 
     def read(route: Any) -> list[str]:
         routes = [
@@ -228,7 +218,7 @@ def networks(namespace: Namespace) -> list[str]:
 
 
 def source_address_for(namespace: Namespace, peer: str) -> str:
-    """Return the source address by the routing table. Raises `NetworkError` without a route."""
+    """Raises `NetworkError` without a route."""
     family = _family(peer)
 
     def look_up(route: Any) -> str:

@@ -1,26 +1,13 @@
-"""Isolation `netns`: run the appliance in a separate namespace on a bare host.
+"""Isolation `netns`: run the appliance in a separate namespace on a bare host (docs/reference/network.md).
 
-```
- hosts of the network                host                              namespace `rosrv`
-        |            +-------------------------------+         +---------------------------+
-        +---- eth0 --| ROSRV-NAT: 11311, node ports  |--veth---| eth0 10.111.0.2           |
-                     | on every address of the host  |         | RVMaster, relay, rosmaster|
-                     +-------------------------------+         +---------------------------+
-```
-
-1. Packets to a forwarded port at any address of the host go to the namespace and keep their source address. The host's
-   own processes reach the port by any address of the host and by 127.0.0.1; ::1 stays refused, because it cannot leave
-   a host. On the network, the appliance's own connections have the host's address.
-2. A connection arrives with the address of the machine that made it. Other programs translate addresses (for
-   containers, virtual machines, hotspot clients), but not on the appliance's link. The first translation of a
-   connection wins, and the chain ROSRV-KEEP, which keeps the source, comes first. If a forwarded packet still has an
-   address of this machine, the chain ROSRV-POST drops it. If these rules are flushed, the appliance detects such
-   packets by their TTL: the host's own packets have 255 on the link, and a router decreases the TTL.
-3. Other ports in the namespace cannot be reached through the host, and the host does not become a router: forwarding is
-   enabled, but the chain ROSRV-FWD passes only the appliance's packets.
-4. Every change is recorded before it is made, so that `down`, or `up` after a crash, undoes it. A namespace or an
+1. A connection arrives with the address of the machine that made it: the first translation wins, and the chain
+   ROSRV-KEEP, which keeps the source, comes before those of other programs. If a forwarded packet still has an
+   address of this machine, ROSRV-POST drops it. If these rules are flushed, the TTL reveals such packets: the
+   host's own have 255 on the link.
+2. The host does not become a router: forwarding is enabled, but ROSRV-FWD passes only the appliance's packets.
+3. Every change is recorded before it is made, so that `down`, or `up` after a crash, undoes it. A namespace or an
    interface of the same name without a record is an error.
-5. Only one appliance runs on a host. Its lock ends with its process, so a record without a lock is left from a crash.
+4. The lock of the appliance ends with its process, so a record without a lock is left from a crash.
 """
 
 import contextlib
@@ -83,7 +70,7 @@ class IsolationSettings:
 
 @dataclass(frozen=True)
 class LinkAddresses:
-    """The addresses of the link's ends, without a prefix length."""
+    """The addresses of the link's ends."""
 
     network: str
     host: str
@@ -95,10 +82,8 @@ class LinkAddresses:
 
 
 class _IpForwarding:
-    """The forwarding settings of one host.
-
-    The kernel copies the global setting to every interface, so the value of each interface is also recorded. A host
-    gets its IPv6 routes from router advertisements; if it forwards, it ignores them unless `accept_ra` is 2.
+    """The kernel copies the global setting to every interface, so each is also recorded. A host that forwards
+    ignores IPv6 router advertisements unless `accept_ra` is 2.
     """
 
     def __init__(self, host: Namespace) -> None:
@@ -110,7 +95,6 @@ class _IpForwarding:
         return self._host.sysctl("net/ipv6/conf/all/disable_ipv6") == "0"
 
     def before(self, family: Family) -> bool:
-        """Return the value before `enable` changes it."""
         return self._host.sysctl(_GLOBAL[family]) != "0"
 
     def record(self) -> dict[str, str]:
@@ -154,9 +138,9 @@ class Isolation:
         self._lock: int | None = None
 
     def up(self) -> None:
-        """Isolate the appliance, after removing leftovers of a crash.
+        """Remove leftovers of a crash first.
 
-        Raises `PrivilegeError`, or `NetworkError` with the obstacle; the host is then left unchanged.
+        Raises `PrivilegeError`, or `NetworkError`; the host is then left unchanged.
         """
         require_privileges("isolation netns")
         self._take_lock()
@@ -188,13 +172,12 @@ class Isolation:
         return interfaces.source_address_for(self._host, peer)
 
     def endpoint(self) -> PublicAddress:
-        """Return the address for hosts of other networks. Raises `NetworkError` if it is unknown."""
+        """Raises `NetworkError` if the address is unknown."""
         return outward_address(self._host, without=("lo", self.settings.link))
 
     def obstacles(self) -> tuple[str, ...]:
-        """Return chains of other programs on the host that drop forwarded packets by default.
-
-        Our rules cannot override them; the owner of such a chain must accept the appliance's link.
+        """Return chains of other programs that drop forwarded packets: their owner must accept the appliance's
+        link.
         """
         link = self.settings.link
         return tuple(
@@ -203,14 +186,10 @@ class Isolation:
         )
 
     def translations(self) -> tuple[str, ...]:
-        """Return chains of other programs on the host that translate addresses of machines or containers.
-
-        These translations do not apply to connections to the appliance.
-        """
         return (*self._backend.foreign_translations(), *iptables.foreign_translations(self._host))
 
     def forward_tunnels(self) -> None:
-        """Forward UDP 500 and 4500. Raises `NetworkError` if the host uses these ports."""
+        """Raises `NetworkError` if the host uses UDP 500 or 4500."""
         if self._udp == _TUNNELS:
             return
         used = self._host.run(udp_ports_in_use) & {port.first for port in _TUNNELS}
@@ -224,7 +203,7 @@ class Isolation:
         self._install(self._wanted())
 
     def require_free(self, ports: Iterable[int]) -> None:
-        """Raise `NetworkError` if a program of the host listens on a TCP port that is not forwarded."""
+        """Raise `NetworkError` if a program of the host listens on a port that is not forwarded."""
         used = self._host.run(listening_ports) & ({*ports} - {one.first for one in self._tcp})
         if used:
             raise NetworkError(
@@ -366,10 +345,6 @@ def isolation_rules(
     tcp: tuple[PortRange, ...] = (),
     udp: tuple[PortRange, ...] = (),
 ) -> tuple[PacketRule, ...]:
-    """Return the host's rules; `routers` are the families for which the host was already a router.
-
-    `tcp` and `udp` ports are forwarded besides those of the settings.
-    """
     inward, outward = Interface(settings.link), Interface(settings.link, other=True)
     forwarded = partial(PacketRule, chain=Chain.FORWARD)
     leaving = partial(PacketRule, chain=Chain.LEAVING, leaves_on=inward)
@@ -424,7 +399,7 @@ def _true_sources(family: Family, end: LinkAddresses, inward: Interface) -> tupl
 
 
 def _loopback(family: Family, inward: Interface) -> PacketRule:
-    """Return the rule that gives 127.0.0.1 the veth's address; ::1 cannot leave a host, so it stays refused."""
+    """::1 cannot leave a host, so it stays refused."""
     if family == 4:
         local = partial(PacketRule, chain=Chain.KEPT_SOURCE, source="127.0.0.0/8", leaves_on=inward)
         return local("from the host's own loopback", PacketVerdict.MASQUERADE)

@@ -1,15 +1,8 @@
 """Make network namespaces, run code and programs in them, and delete them.
 
-A namespace is a name under `/run/netns`, as with `ip netns`. A *thread*, not a process, is in a namespace, so each
-call gets its own thread, which moves into the namespace and ends there:
-
-1. No thread has to return from the namespace, which could fail.
-2. A program started with `popen` is inside the namespace before its first instruction. Only `subprocess` runs between
-   fork and exec, so `popen` is safe in a process with threads.
-3. The netlink library works whether or not the calling thread runs an asyncio loop.
-
-A program with `PR_SET_PDEATHSIG` would be killed when `popen` returns, because its parent *thread* then ends. Use
-`entered()` for such a program.
+Each call gets its own thread, which ends in the namespace, because a return could fail. A program with
+`PR_SET_PDEATHSIG` would be killed when `popen` returns, because its parent thread then ends; use `entered()` for
+it.
 """
 
 import contextlib
@@ -46,7 +39,7 @@ T = TypeVar("T")
 
 
 class NetworkError(UserError):
-    """The network cannot be changed; the message has the cause, the place and the remedy."""
+    """The network cannot be changed."""
 
 
 class PrivilegeError(NetworkError):
@@ -54,12 +47,11 @@ class PrivilegeError(NetworkError):
 
 
 def has_privileges() -> bool:
-    """Whether this process can make namespaces, for which it needs CAP_SYS_ADMIN and CAP_NET_ADMIN."""
     return _has_capabilities(1 << _CAP_NET_ADMIN | 1 << _CAP_SYS_ADMIN)
 
 
 def require_network_admin(what: str) -> None:
-    """Raise `PrivilegeError` for `what` unless this process may change its own network."""
+    """Raise `PrivilegeError` unless this process may change its own network."""
     if not _has_capabilities(1 << _CAP_NET_ADMIN):
         raise PrivilegeError(
             f"{what} needs CAP_NET_ADMIN: run it as root, give it to the container (cap_add: [NET_ADMIN]), "
@@ -74,7 +66,7 @@ def _has_capabilities(wanted: int) -> bool:
 
 
 def require_privileges(what: str) -> None:
-    """Raise `PrivilegeError` for `what` unless this process can make namespaces."""
+    """Raise `PrivilegeError` unless this process can make namespaces."""
     if not has_privileges():
         raise PrivilegeError(
             f"{what} needs root (CAP_SYS_ADMIN and CAP_NET_ADMIN): run it with sudo, "
@@ -83,7 +75,7 @@ def require_privileges(what: str) -> None:
 
 
 class Namespace:
-    """A namespace by its name; the object does not create it."""
+    """A namespace by its name, which may not exist."""
 
     def __init__(self, name: str) -> None:
         if not _VALID_NAME.fullmatch(name):
@@ -107,7 +99,7 @@ class Namespace:
         return hash(self.path)
 
     def exists(self) -> bool:
-        """Whether the namespace exists; a bare file from a crash does not count."""
+        """A bare file from a crash does not count."""
         try:
             here, above = self.path.stat(), self.path.parent.stat()
         except OSError:
@@ -115,10 +107,7 @@ class Namespace:
         return here.st_dev != above.st_dev
 
     def create(self) -> "Namespace":
-        """Create the namespace, which has only `lo`, which is down.
-
-        Raises `PrivilegeError`, or `NetworkError` if the name exists.
-        """
+        """The namespace has only `lo`, which is down. Raises `PrivilegeError`, `NetworkError`."""
         require_privileges(f"creating the network namespace {self.name}")
         with _directory_lock():
             if self.exists():
@@ -147,10 +136,7 @@ class Namespace:
 
     @contextlib.contextmanager
     def entered(self) -> Iterator[None]:
-        """Move the calling thread into the namespace for the block.
-
-        For short synchronous work (open a socket, start a program); do not await in the block.
-        """
+        """Move the calling thread into the namespace for the block, which must not await."""
         home = os.open(_HERE, os.O_RDONLY | os.O_CLOEXEC)
         try:
             self._enter()
@@ -170,14 +156,11 @@ class Namespace:
         return _in_thread(inside)
 
     def popen(self, args: Sequence[str | os.PathLike[str]], **options: Any) -> "subprocess.Popen[Any]":
-        """Start a program in the namespace; `options` are those of `subprocess.Popen`."""
+        """`options` are those of `subprocess.Popen`."""
         return self.run(lambda: subprocess.Popen(args, **options))
 
     def sysctl(self, key: str, value: str | None = None) -> str:
-        """Return the value, after setting it to `value` if given.
-
-        `key` has the form `net.ipv4.ip_forward`; use slashes instead of dots if it has an interface name with a dot.
-        """
+        """`key` has slashes instead of dots if it has an interface name with a dot."""
         path = Path("/proc/sys", *key.split("/" if "/" in key else "."))
 
         def access() -> str:
@@ -191,14 +174,13 @@ class Namespace:
             raise NetworkError(f"sysctl {key} in {self.name}: {error.strerror}") from error
 
     def lacks_syn_cookies(self) -> bool:
-        """Whether forged first packets could fill a listener's queue of half-open connections."""
         try:
             return self.sysctl("net.ipv4.tcp_syncookies") == "0"
         except NetworkError:  # the kernel was built without SYN cookies
             return True
 
     def processes(self) -> list[int]:
-        """Return the processes in the namespace, without this one."""
+        """Leave out this process."""
         if not self.exists():
             return []
         mark = self.path.stat()
@@ -212,7 +194,7 @@ class Namespace:
         return sorted(found)
 
     def open(self) -> int:
-        """Open the namespace for netlink; the caller closes the descriptor."""
+        """The caller closes the descriptor."""
         try:
             return os.open(self.path, os.O_RDONLY | os.O_CLOEXEC)
         except OSError as error:
@@ -237,7 +219,7 @@ class _OwnNamespace(Namespace):
         return True
 
     def _enter(self) -> None:
-        """Move this thread into the namespace; do nothing if it is there, because containers may not call setns."""
+        """Do nothing if the thread is there, because containers may not call setns."""
         if not os.path.samestat(_HERE.stat(), self.path.stat()):
             super()._enter()
 
@@ -249,7 +231,7 @@ class _OwnNamespace(Namespace):
 
 
 def namespaces(prefix: str = "") -> list[Namespace]:
-    """Return the namespaces by name, including names whose namespace no longer exists."""
+    """Return also names whose namespace no longer exists."""
     if not DIRECTORY.is_dir():
         return []
     names = sorted(entry.name for entry in DIRECTORY.iterdir())
@@ -286,7 +268,7 @@ def _directory_lock() -> Iterator[None]:
 
 
 def _is_mount_point(path: Path) -> bool:
-    """Whether a path is a mount point, even of a bind mount onto itself, which `os.path.ismount` misses."""
+    """Find also a bind mount onto itself, which `os.path.ismount` misses."""
     with Path("/proc/thread-self/mountinfo").open(encoding="utf-8", errors="replace") as lines:
         return any(line.split(" ", 5)[4] == str(path) for line in lines)
 
@@ -316,7 +298,6 @@ def lives_on_the_machines_network(proc: Path = Path("/proc")) -> bool:
 
 
 def is_contained(root: Path = Path("/")) -> bool:
-    """Whether this is a container, with its own network or not."""
     if any((root / mark).exists() for mark in _CONTAINER_MARKS):
         return True
     try:
@@ -326,15 +307,12 @@ def is_contained(root: Path = Path("/")) -> bool:
 
 
 def bridges(classes: Path = Path("/sys/class/net")) -> list[str]:
-    """Return the bridges; a container has none, a machine that runs containers at least one."""
+    """A machine that runs containers has at least one, a container none."""
     return sorted(link.name for link in classes.glob("*") if (link / "bridge").is_dir())
 
 
 def end_processes(pids: Sequence[int]) -> None:
-    """End processes by SIGTERM, and by SIGKILL after `_END_SECONDS`.
-
-    A descriptor refers to each process, so a reused id is never signalled.
-    """
+    """Send SIGTERM, then SIGKILL. A descriptor refers to each process, so a reused id is never signalled."""
     descriptors: dict[int, int] = {}
     for pid in pids:
         with contextlib.suppress(OSError):

@@ -1,8 +1,6 @@
 """Probe a hidden port: try to reach it as another local user.
 
-At the start and every minute, a child process becomes an unprivileged user inside the namespace. It connects to the
-port over loopback, IPv4 and IPv6. Without a listener, a refusal proves nothing. So the addresses of the listening
-sockets are also read; they also show whether a socket listens outside loopback.
+Without a listener, a refusal proves nothing, so the addresses of the listening sockets are also read.
 """
 
 import ipaddress
@@ -70,7 +68,6 @@ class ProbeResult:
 
     @property
     def closed(self) -> bool:
-        """Whether every attempt has a clear outcome and none connected."""
         return not any(
             attempt.outcome in (ConnectOutcome.REACHED, ConnectOutcome.UNCLEAR) for attempt in self.attempts
         )
@@ -87,7 +84,7 @@ class ProbeResult:
 
 
 def probe_port(namespace: Namespace, port: int, uid: int = PROBE_UID) -> ProbeResult:
-    """Probe a port over loopback, not as root. Raises `NetworkError` if the probe cannot run."""
+    """Raises `NetworkError` if the probe cannot run."""
     if uid <= 0:
         raise ValueError("the probe must run as an unprivileged user, not as root")
     listening = namespace.run(lambda: listening_addresses(port))

@@ -1,7 +1,6 @@
 """Find the address by which hosts of other networks reach this machine.
 
-The machine cannot see address translation in front of it, such as a container's published ports. So each address comes
-with the reason for its choice; operators see the reason and can configure another address.
+Address translation in front of this machine is invisible, so operators see the reason of each choice.
 """
 
 import ipaddress
@@ -25,7 +24,7 @@ class PublicAddress:
 def outward_address(namespace: Namespace, *, without: Sequence[str]) -> PublicAddress:
     """Return the address towards the default route, or the only address if there is no route.
 
-    Interfaces in `without` do not count. Raises `NetworkError` if there is no such address or more than one.
+    Raises `NetworkError` if there is not exactly one, without the interfaces `without`.
     """
     for version in _VERSIONS:
         route = interfaces.default_route(namespace, version)
@@ -38,10 +37,7 @@ def outward_address(namespace: Namespace, *, without: Sequence[str]) -> PublicAd
 
 
 def only_address(namespace: Namespace, *, without: Sequence[str]) -> PublicAddress:
-    """Return the only address, of IPv4 if possible. Interfaces in `without` do not count.
-
-    Raises `NetworkError` if there is no such address or more than one.
-    """
+    """Prefer IPv4. Raises as `outward_address` does."""
     held = interfaces.addresses_by_interface(namespace)
     own = [text.partition("/")[0] for name, texts in held.items() if name not in without for text in texts]
     found = sorted(
@@ -58,7 +54,7 @@ def only_address(namespace: Namespace, *, without: Sequence[str]) -> PublicAddre
 
 
 def _first(namespace: Namespace, route: interfaces.DefaultRoute, version: int) -> str | None:
-    """Return the source address of packets to the gateway; without a gateway (a modem), the interface's first one."""
+    """Without a gateway (a modem), return the interface's first address."""
     if route.gateway is not None:
         return interfaces.source_address_for(namespace, route.gateway)
     held = interfaces.addresses_by_interface(namespace).get(route.interface, [])

@@ -1,10 +1,7 @@
 """Find the TCP ports of a machine that accept a connection from here.
 
-Many connections are tried at once, each with its own time limit, so the scan takes at most `len(ports) / AT_ONCE *
-seconds`. A connection that opens is reset at once without data.
-
 If a connection fails before a packet leaves (no route, a rule of this machine), it is unknown whether the port is
-open. Only the result of `connect` shows this; the socket reports no error later.
+open; only the result of `connect` shows this.
 """
 
 import errno
@@ -43,7 +40,7 @@ class ScanResult:
 
 
 def addresses_of(host: str) -> tuple[str, ...]:
-    """Return the addresses of a host. Raises `NetworkError` for an unknown name or an own address."""
+    """Raises `NetworkError` for an unknown name or an own address."""
     try:
         found = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)
     except socket.gaierror as error:
@@ -59,7 +56,7 @@ def addresses_of(host: str) -> tuple[str, ...]:
 
 
 def scan(address: str, ports: Iterable[int], seconds: float) -> ScanResult:
-    """Scan ports for at most `seconds` each. Raises `NetworkError` for an unusable address."""
+    """Raises `NetworkError` for an unusable address."""
     wanted = list(ports)
     opened: list[int] = []
     refused = silent = untried = 0
@@ -87,7 +84,6 @@ def scan(address: str, ports: Iterable[int], seconds: float) -> ScanResult:
 
 
 def longest(ports: int, seconds: float) -> float:
-    """Return the seconds that a scan of this number of ports takes if none answers."""
     return math.ceil(ports / _at_once()) * seconds
 
 
@@ -97,7 +93,6 @@ def _at_once() -> int:
 
 
 def _try(address: str, port: int, seconds: float) -> tuple[bool, int]:
-    """Return whether a packet left, and the error number (0: open). Raises `OSError`."""
     family = socket.AF_INET6 if ":" in address else socket.AF_INET
     with socket.socket(family, socket.SOCK_STREAM | socket.SOCK_NONBLOCK) as client:
         client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
@@ -112,7 +107,7 @@ def _try(address: str, port: int, seconds: float) -> tuple[bool, int]:
 
 
 def _is_own(address: str) -> bool:
-    """Whether this machine has the address, so that packets to it would also have it as source."""
+    """Packets to an own address would also have it as source."""
     family = socket.AF_INET6 if ":" in address else socket.AF_INET
     try:
         with socket.socket(family, socket.SOCK_DGRAM) as probe:

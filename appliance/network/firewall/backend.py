@@ -1,4 +1,4 @@
-"""Define the interface of the firewall's back ends: install rules in a namespace, remove them, count their packets."""
+"""Define the interface of the firewall's back ends."""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -37,12 +37,9 @@ class Backend(Protocol):
         """The families that the kernel supports."""
 
     def install(self, rules: tuple[PacketRule, ...]) -> None:
-        """Install the rules; rules of other programs stay.
-
-        Raises `BackendMissingError`, `FirewallError`; the old rules are then still in force.
-        """
+        """Raises `BackendMissingError`, `FirewallError`; the old rules are then still in force."""
 
     def remove(self) -> None: ...
 
     def counters(self) -> tuple[RuleCounter, ...]:
-        """Return the counters of rules that are in force and hooked in."""
+        """Return rules that are in force and hooked in."""

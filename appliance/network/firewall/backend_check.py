@@ -1,8 +1,7 @@
 """Test on a loopback port of our own that a back end works on this machine.
 
-A kernel may accept rules that it never applies (a match extension is a stub, or a container engine filters the
-calls). So a back end is used only after three tests on IPv4 and IPv6: the port must be reached without a rule,
-refused with a rule for another user, and reached with a rule for this user.
+A kernel may accept rules that it never applies: a match extension is a stub, or a container engine filters the
+calls.
 """
 
 import errno
@@ -18,7 +17,7 @@ _LOOPBACK = ((socket.AF_INET, "127.0.0.1"), (socket.AF_INET6, "::1"))
 
 
 def prove(backend: Backend, namespace: Namespace) -> None:
-    """Test a back end. Raises `FirewallError` if it does not work."""
+    """Raises `FirewallError`."""
     own, other = os.geteuid(), os.geteuid() + 1
     try:
         for family, address in _LOOPBACK:
@@ -47,7 +46,7 @@ def _listen(family: socket.AddressFamily, address: str) -> socket.socket | None:
 
 
 def _expect(namespace: Namespace, server: socket.socket, when: str, *, reached: bool) -> None:
-    """Connect to the port. Raises `FirewallError` unless the outcome is as `reached` demands."""
+    """Raise `FirewallError` unless the outcome is as `reached` demands."""
     address = server.getsockname()[:2]
 
     def connect() -> str | None:

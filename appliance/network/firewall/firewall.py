@@ -1,8 +1,4 @@
-"""Run the firewall of the appliance's namespace: choose a back end that works, install the rules, report them.
-
-Call `install` before `rosmaster` starts, `update` when a port becomes known or a host is enrolled, and `remove` at the
-end. `install` also replaces rules of an earlier run, whichever back end installed them.
-"""
+"""Run the firewall of the appliance's namespace with a back end that works."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -32,7 +28,7 @@ class FirewallReport:
 
 
 class Firewall:
-    """The firewall with the given back end, or with the first one that works (nft, then iptables)."""
+    """The firewall with the given back end, or with the first that works (nft, then iptables)."""
 
     def __init__(self, namespace: Namespace, backend: BackendChoice = "auto") -> None:
         self._namespace = namespace
@@ -42,9 +38,8 @@ class Firewall:
         self._not_used: list[str] = []
 
     def install(self, settings: FirewallSettings) -> str:
-        """Remove old rules first; return the back end's name.
-
-        Raises `PrivilegeError`, or `FirewallError` with the reason of each back end.
+        """Remove rules of an earlier run first, whichever back end installed them. Raises `PrivilegeError`,
+        `FirewallError`.
         """
         require_network_admin("the firewall")
         if self._backend is None:
@@ -55,7 +50,7 @@ class Firewall:
         return self._backend.name
 
     def update(self, settings: FirewallSettings) -> None:
-        """Replace the rules. Raises `FirewallError`; the old rules then stay in force."""
+        """Raises `FirewallError`; the old rules then stay in force."""
         if self._backend is None:
             raise FirewallError("the firewall is not installed yet: call install first")
         rules = appliance_rules(settings)
@@ -101,7 +96,6 @@ class Firewall:
         )
 
     def _clear(self, backend: Backend) -> None:
-        """Remove the rules of a back end. If this machine lacks the back end, do nothing."""
         try:
             backend.remove()
         except FirewallError as error:
@@ -113,11 +107,7 @@ class Firewall:
 def statuses(
     rules: tuple[PacketRule, ...], counters: tuple[RuleCounter, ...], families: tuple[Family, ...] = (4, 6)
 ) -> tuple[FirewallRule, ...]:
-    """Return the state of each rule, with counters summed over both address families.
-
-    A rule is in force if the kernel has it once for each of its families, or once for both. Only `families`
-    count.
-    """
+    """A rule is in force if the kernel has it once for each of `families`, or once for both."""
     of_rule: dict[tuple[str, str], list[RuleCounter]] = {}
     for counter in counters:
         of_rule.setdefault((counter.chain, counter.purpose), []).append(counter)

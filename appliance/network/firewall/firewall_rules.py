@@ -1,10 +1,10 @@
 """Define the rules of the firewall as data. No I/O.
 
-1. The rules only refuse, or RETURN to the rules of other programs, so they open no port that another firewall closed.
-2. A connection is refused at its first packet, a SYN without ACK, without the connection tracker. So a `NOTRACK` rule
-   cannot open the port. Packets of closed sockets pass, because rejecting them would delay the end of a connection.
-3. Permitted users are listed; all other users, and packets without a known owner, are refused.
-4. A limit per host counts connections after the handshake, because the address of a first packet can be forged.
+1. The rules only refuse, or RETURN to the rules of other programs, so they open no port that another firewall
+   closed.
+2. A connection is refused at its SYN, without the connection tracker, so a `NOTRACK` rule cannot open the port.
+   Packets of closed sockets pass, because rejecting them would delay the end of a connection.
+3. Packets without a known owner are refused.
 """
 
 import ipaddress
@@ -169,7 +169,6 @@ class PacketRule:
         return self.tcp_ports is not None or self.from_ports is not None or self.opening or self.accepting
 
     def families(self) -> tuple[Family, ...]:
-        """Return the own family, otherwise that of the addresses, otherwise both."""
         given = self.source or self.destination or self.to
         if given is not None:
             return (family_of(given),)
@@ -208,7 +207,7 @@ class PacketRule:
 
 @dataclass(frozen=True)
 class ForwarderAccess:
-    """The access of a user to one receiver only, such as that of the audit log."""
+    """The access of a user to one receiver only."""
 
     uid: int
     address: str
@@ -225,7 +224,7 @@ class ForwarderAccess:
 
 @dataclass(frozen=True)
 class PeerAccess:
-    """The access of two appliances to each other; `port` is that of both (TCP and UDP)."""
+    """The access of two appliances to each other, both at `port`."""
 
     other: str
     port: int
@@ -237,11 +236,9 @@ class PeerAccess:
 
 @dataclass(frozen=True, kw_only=True)
 class OwnNodeAccess:
-    """Access to and from the appliance's own node (rosout).
+    """The appliance's own node (rosout), which listens on every address.
 
-    The node listens on every address: for its node API on a port that the kernel chooses, and for messages on one of
-    `ports`. Only control may call the API, at the loopback address `address`; only the relay may connect to `ports`.
-    `master_port` is the port of the node's master (None: not known yet).
+    Only control may call its node API, at `address`; only the relay may connect to `ports`.
     """
 
     uid: int
@@ -260,13 +257,10 @@ class OwnNodeAccess:
 class FirewallSettings:
     """The values for the rules of the appliance's namespace.
 
-    `rosmaster_port` and `inner_port` may be unknown (None) until their processes run. Hosts in `tunnel_only`
-    are accepted through IPsec only: by the kernel's policy, or on `tunnel_interface` if ESP runs in user
-    space. `api_networks` and loopback may reach the REST port. `neighbours` are addresses of the machine at
-    the other end of the link (isolation netns): `own_network` has addresses of the appliance's own doors, and
-    `own_ports` the ports of doors. Only packets from that machine itself, which arrive with a full TTL, may
-    have these addresses. `client_ports` is the kernel's local port range; there the own node (rosout) listens
-    on every address, even with ROS_IP.
+    Hosts in `tunnel_only` are accepted through IPsec only: on `tunnel_interface` if ESP runs in user space.
+    `own_network` has addresses of the appliance's own doors. `neighbours` are addresses of the machine at the
+    other end of the link (isolation netns); only packets with a full TTL may have them. In `client_ports`, rosout
+    listens on every address, even with ROS_IP.
     """
 
     control_uid: int
@@ -343,7 +337,7 @@ def appliance_rules(settings: FirewallSettings) -> tuple[PacketRule, ...]:
 
 
 def family_of(address: str) -> Family:
-    """Return the family of an address. Raises `ValueError`."""
+    """Raises `ValueError`."""
     try:
         return 6 if ipaddress.ip_network(address).version == 6 else 4
     except ValueError as error:
@@ -352,7 +346,6 @@ def family_of(address: str) -> Family:
 
 
 def inner_port(name: str, port: int | None, user: str, uid: int) -> tuple[PacketRule, ...]:
-    """Return rules by which only one local user may connect, over loopback; none without a port."""
     return () if port is None else _inner_ports(name, PortRange.one(port), user, uid)
 
 
@@ -365,7 +358,6 @@ def _inner_ports(name: str, ports: PortRange, user: str, uid: int) -> tuple[Pack
 
 
 def _rosmaster(settings: FirewallSettings) -> tuple[PacketRule, ...]:
-    """Return rules by which rosmaster connects only to the master-side endpoint, once it exists."""
     if settings.inner_port is None:
         return ()
     uid = settings.rosmaster_uid
@@ -376,9 +368,7 @@ def _rosmaster(settings: FirewallSettings) -> tuple[PacketRule, ...]:
 
 
 def _own_node(settings: FirewallSettings) -> tuple[PacketRule, ...]:
-    """Return rules by which only control calls the own node, which reaches its master, proxy endpoints and relays
-    only.
-    """
+    """Only control calls the own node."""
     node = settings.own_node
     if node is None:
         return ()
@@ -398,10 +388,7 @@ def _own_node(settings: FirewallSettings) -> tuple[PacketRule, ...]:
 
 
 def _ports_of_others(uid: int, settings: FirewallSettings) -> Iterator[PacketRule]:
-    """Block RVMaster's port, REST, low ports, and the kernel's local port range.
-
-    The rules list blocked instead of permitted ports, because a new policy may change the permitted ones.
-    """
+    """Blocked instead of permitted ports are listed, because a new policy may change the permitted ones."""
     chosen, faces = settings.client_ports, settings.node_ports
     if faces is not None and chosen is not None and faces.overlaps(chosen):
         yield _connecting("own node: faces and relays", PacketVerdict.RETURN, tcp_ports=faces, uid=uid)
@@ -421,7 +408,6 @@ def _sends_nothing_out(name: str, uid: int) -> PacketRule:
 
 
 def _tunnel_only(network: str, interface: str | None) -> tuple[PacketRule, ...]:
-    """Return rules by which only the tunnel carries packets of the network."""
     outside = Interface(interface, other=True) if interface else None
     refused = partial(PacketRule, verdict=PacketVerdict.DROP, clear_text=interface is None)
     return (
@@ -431,7 +417,6 @@ def _tunnel_only(network: str, interface: str | None) -> tuple[PacketRule, ...]:
 
 
 def _own_network(network: str | None) -> tuple[PacketRule, ...]:
-    """Return rules that drop packets from other machines with an address of the own network."""
     if network is None:
         return ()
     outside = partial(PacketRule, verdict=PacketVerdict.DROP, chain=Chain.IN, arrives_on=OUTSIDE)
@@ -495,9 +480,7 @@ def _rate_limits(settings: FirewallSettings) -> tuple[PacketRule, ...]:
 
 
 def _chosen_by_the_kernel(settings: FirewallSettings) -> Iterator[PacketRule]:
-    """Yield rules that close the local port range to other machines, except for configured ports, because the
-    own node listens there.
-    """
+    """Except for configured ports, other machines reach none: the own node listens there."""
     if settings.client_ports is None:
         return
     chosen = {
@@ -515,11 +498,8 @@ def _chosen_by_the_kernel(settings: FirewallSettings) -> Iterator[PacketRule]:
 
 
 def _rate_limit(limit: RateLimit | None, name: str, ports: PortRange) -> tuple[PacketRule, ...]:
-    """Return rules that drop packets above the limit, which the host's kernel sends again.
-
-    The first packet after the handshake counts: its sender received our SYN-ACK, so its address is not
-    forged. Against forged first packets, the kernel limits half-open connections; above that limit it answers
-    with SYN cookies, which need no memory.
+    """The first packet after the handshake counts: its sender received our SYN-ACK, so its address is not forged.
+    Against forged first packets, the kernel answers with SYN cookies, which need no memory.
     """
     if limit is None:
         return ()

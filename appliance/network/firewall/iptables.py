@@ -1,11 +1,8 @@
 """The iptables back end: legacy xtables through python-iptables (libiptc), IPv4 and IPv6.
 
-The chains are in the table `filter`. Address translation needs nft, because the library cannot build the NAT targets of
-current xtables. The rules of a family change in one commit.
-
-The library caches each table, with the namespace in which it was opened, for the whole process. So each call opens its
-tables in a thread inside the namespace, one call at a time (`_ONE_AT_A_TIME`), under the lock of the `iptables`
-programs. `Chain.append_rule` is not used: to check a rule, it redirects the standard output of the whole process.
+Address translation needs nft, because the library cannot build the NAT targets of current xtables. The library
+caches each table, with the namespace in which it was opened, for the whole process. So each call opens its tables
+in a thread inside the namespace, one call at a time, under the lock of the `iptables` programs.
 """
 
 import contextlib
@@ -83,7 +80,7 @@ class IptablesBackend:
         self._in_tables(lambda table: table.replace(rendered))
 
     def remove(self) -> None:
-        """Remove the rules without creating unused tables."""
+        """Create no unused table."""
         _in_used_tables(self._namespace, "filter", lambda table: table.replace([]))
 
     def counters(self) -> tuple[RuleCounter, ...]:
@@ -102,36 +99,28 @@ class IptablesBackend:
 
 
 def load_modules() -> None:
-    """Load the modules of legacy xtables, which the kernel does not load automatically.
-
-    Call this while the process may still load modules. A failure appears only later, as an error of
-    `install`.
-    """
+    """Call this while the process may still load modules. A failure appears only as an error of `install`."""
     command = ["modprobe", "--quiet", "--all", "ip_tables", "ip6_tables"]
     with contextlib.suppress(OSError, subprocess.TimeoutExpired):  # a container has no modprobe
         subprocess.run(command, capture_output=True, timeout=_MODPROBE_SECONDS, check=False)
 
 
 def foreign_translations(namespace: Namespace) -> tuple[str, ...]:
-    """Return the chains of legacy xtables that translate addresses."""
     return _foreign(namespace, "nat", lambda table: table.translating())
 
 
 def foreign_forward_drops(namespace: Namespace) -> tuple[str, ...]:
-    """Return the chains of legacy xtables that drop forwarded packets."""
+    """Return chains that drop forwarded packets."""
     return _foreign(namespace, "filter", lambda table: table.dropping("FORWARD"))
 
 
 def _foreign(namespace: Namespace, name: str, look: "Callable[[_Table], list[str]]") -> tuple[str, ...]:
-    """Return the result of `look` for the families that use the table."""
     found: list[str] = []
     _in_used_tables(namespace, name, lambda table: found.extend(look(table)))
     return tuple(found)
 
 
 def _in_used_tables(namespace: Namespace, name: str, work: "Callable[[_Table], None]") -> None:
-    """Call `work` with the table; the library is loaded only if a family uses the table."""
-
     def inside() -> None:
         used = [family for family in _families() if name in _tables_in_use(family)]
         if used:
@@ -217,7 +206,6 @@ def _tracked(rule: PacketRule) -> list[Extension]:
 
 
 def _hashlimit(per_second: int, burst: int) -> tuple[tuple[str, str], ...]:
-    """Return a match with one bucket per source address, shared by rules with the same limit."""
     return (
         ("hashlimit-above", f"{per_second}/sec"),
         ("hashlimit-burst", str(burst)),
@@ -310,7 +298,6 @@ class _Table:
                 self._table.delete_entry(hook.place, jump.rule, jump.mask)
 
     def _hooks(self, chain: Chain, hook: str) -> int:
-        """Return the position of the chain's rule in a hook; only the targets of foreign rules are read."""
         count, entry = 0, self._table.first_rule(hook)
         while entry:
             count += self._table.get_target(entry) == chain.value.encode()
@@ -347,7 +334,7 @@ class _Table:
 
 
 def _comment(rule: Any) -> str:
-    """Return the comment of a rule; the library's own function would redirect our standard output."""
+    """The library's own function would redirect our standard output."""
     for match in rule.matches:
         if match.name == "comment":
             content = bytes(match.match_buf)[_MATCH_HEADER:]

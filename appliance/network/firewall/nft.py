@@ -1,12 +1,8 @@
 """The nftables back end: libnftables' JSON through `nft -j -f -`, in one transaction.
 
-The appliance has its own table, `inet rosrv`, for IPv4 and IPv6. For each hook, a base chain jumps to the chain with
-the rules, so the chains have the same names and structure as with iptables. Other tables can only refuse more
-packets.
-
-A limit per host uses a set of limited size with one bucket for each host. A rule that adds to a full set does not
-match, so a second rule gives all hosts without a bucket one shared bucket. (iptables drops packets if its table is
-full.)
+Other tables than the appliance's `inet rosrv` can only refuse more packets. A limit per host uses a set of
+limited size with one bucket for each host. A rule that adds to a full set does not match, so a second rule gives
+all hosts without a bucket one shared bucket.
 """
 
 import json
@@ -67,7 +63,6 @@ class NftBackend:
         return _counters([rule for rule in rules if rule["chain"] in hooked])
 
     def foreign_forward_drops(self) -> tuple[str, ...]:
-        """Return chains of other tables that drop forwarded packets by default."""
         return tuple(
             f"nftables chain {chain['family']} {chain['table']} {chain['name']}"
             for chain in self._list("chain", "list", "chains")
@@ -75,7 +70,6 @@ class NftBackend:
         )
 
     def foreign_translations(self) -> tuple[str, ...]:
-        """Return chains of other tables that translate the source of forwarded connections."""
         rules = self._list("rule", "list", "ruleset")
         found = (
             f"nftables chain {rule['family']} {rule['table']} {rule['chain']}"
@@ -124,7 +118,6 @@ def render(rules: tuple[PacketRule, ...]) -> list[Json]:
 
 
 def render_rule(rule: PacketRule) -> list[Json]:
-    """Return one rule, or one for each family, in libnftables' format."""
     same = rule.above is None and not rule.distant and rule.verdict not in _OF_A_FAMILY
     if same and len(rule.families()) == 2:
         return [_body(rule, [], None)]
@@ -225,7 +218,6 @@ def _over_limit(rule: PacketRule, protocol: str) -> Json:
 
 
 def _shared(rule: PacketRule, own: Json, family: Family) -> Json:
-    """Return the rule after `own` that limits hosts without a bucket."""
     assert rule.above is not None  # noqa: S101 - the caller asked
     address = _payload("ip6" if family == 6 else "ip", "saddr")
     expressions: list[Json] = []
@@ -266,7 +258,7 @@ def _hook(chain: Chain, hook: Hook) -> list[Json]:
 
 
 def _delete_table() -> list[Json]:
-    """Return commands that delete the table; adding an existing table first is not an error."""
+    """Adding an existing table first is not an error."""
     return [_table("add"), _table("delete")]
 
 
@@ -308,7 +300,6 @@ def _ports(ports: PortRange) -> object:
 
 
 def _translates_source(rule: Json) -> bool:
-    """Whether a rule has `masquerade` or `snat`, in the form of nft or of iptables-nft."""
     return any(
         "masquerade" in part or "snat" in part or part.get("xt", {}).get("name") in SOURCE_TRANSLATIONS
         for part in rule["expr"]
@@ -317,7 +308,6 @@ def _translates_source(rule: Json) -> bool:
 
 
 def _counters(rules: list[Json]) -> tuple[RuleCounter, ...]:
-    """Return the counters; the two rules of a limit count as one, and only if both exist."""
     shared = {_key(counter): counter for counter in map(_counter, rules) if counter.purpose.endswith(_SHARED)}
     found = []
     for rule in rules:
