@@ -1,15 +1,12 @@
 """Assign topics, services and files of specifications to relay processes.
 
-Files whose specifications share topics, services or variables, or publish on each other's topics, form a *group*. A
-group and everything that it uses are on one relay, so every message meets all its monitors there. A topic or service
-without a specification is assigned by a hash of its name.
-
-Invariants:
+Files whose specifications share topics, services or variables, or publish on each other's topics, form a *group*,
+which is on one relay with everything that it uses, so every message meets all its monitors there.
 
 1. At any time, exactly one relay carries a topic or service, for all its publishers.
-2. A plan moves as few running monitors as possible, then as few carried topics and services, and then balances loads.
-3. In a plan, no relay both loses and gains monitored topics. A relay gets monitors before it carries their topics, and
-   keeps the monitors until it no longer carries these topics.
+2. A plan moves as few running monitors as possible, then as few topics and services, and then balances loads.
+3. In a plan, no relay both loses and gains monitored topics. A relay has the monitors before and after it carries
+   their topics.
 4. The allocation survives the death of control, as do connections in the relays.
 """
 
@@ -23,14 +20,12 @@ from appliance.specifications.specification_files import CheckedSpecifications
 
 TOPIC, SERVICE = "topic", "service"
 Resource = tuple[str, str]
-"""A topic or service: `TOPIC` or `SERVICE`, and a name."""
+"""`TOPIC` or `SERVICE`, and a name."""
 
 
 @dataclass(frozen=True, slots=True)
 class FileGroup:
-    """A group of files; `files` has the number of specifications in each, `resources` are the topics and
-    services that they use.
-    """
+    """`files` has the number of specifications in each, `resources` the topics and services that they use."""
 
     files: Mapping[str, int]
     resources: frozenset[Resource]
@@ -78,11 +73,9 @@ class Allocation:
 
     @property
     def resources(self) -> set[Resource]:
-        """Return the assigned resources; all others are placed by their names."""
         return set(self._plan.resources)
 
     def restore(self, text: str) -> bool:
-        """Use a stored allocation; return False if the text is unreadable or has another number of relays."""
         try:
             kept = json.loads(text)
             plan = AllocationPlan(
@@ -97,7 +90,6 @@ class Allocation:
         return True
 
     def plan(self, checked: CheckedSpecifications, carried: Collection[Resource] = ()) -> AllocationPlan:
-        """Return the plan for specifications; `carried` are the topics and services that relays carry."""
         carried = set(carried)
         groups = groups_of(checked)
         homes = self._homes(groups, carried)
@@ -122,7 +114,7 @@ class Allocation:
     def _one_way(
         self, groups: Sequence[FileGroup], homes: Sequence[int], carried: Collection[Resource]
     ) -> list[int]:
-        """Return homes by which all groups that move are on one relay, so that no group has to leave it."""
+        """Move all groups that move to one relay, so that no group has to leave it."""
         moving = [
             self._cost(group, home, carried) != (0, 0) for group, home in zip(groups, homes, strict=True)
         ]
@@ -186,7 +178,7 @@ class Allocation:
 
 
 def groups_of(checked: CheckedSpecifications) -> list[FileGroup]:
-    """Return the groups, the largest first, and equal ones in the order of their files' names."""
+    """Return the largest group first."""
     touched: dict[str, set[Resource]] = {file: set() for file in checked.monitors.values()}
     for name, file in checked.monitors.items():
         touched[file] |= {(TOPIC, topic) for topic in checked.topics[name]}

@@ -39,10 +39,9 @@ def contents(
     unbuilt: Mapping[str, str] = {},
     given_topics: Topics = NO_TOPICS,
 ) -> Contents:
-    """Return the contents of a whole set. Raises `SpecificationsRefusedError` with all errors.
+    """Raises `SpecificationsRefusedError` with all errors.
 
-    With `load`, the module of the whole set is also built and loaded. The monitors of the files in `unbuilt`
-    do nothing, for the reason given. `given_topics` replace topics given in the texts.
+    `load`: also build and load the module. The monitors of the files in `unbuilt` do nothing.
     """
     try:
         definitions = _standard().extended(Definitions.from_files(texts))
@@ -113,10 +112,7 @@ def _givens(monitors: MonitorSet, name: str) -> Iterator[GivenDeclared]:
 def contents_at_start(
     files: Mapping[str, str], texts: Mapping[str, str], given_topics: Topics = NO_TOPICS
 ) -> Contents:
-    """Return the contents for a start: monitors of files with errors do nothing (`unbuilt`, `left_out`).
-
-    Raises `SpecificationsRefusedError` if the files exceed a limit.
-    """
+    """Monitors of files with errors do nothing. Raises `SpecificationsRefusedError` if the files exceed a limit."""
     try:
         return contents(files, texts, load=True, given_topics=given_topics)
     except SpecificationsRefusedError as error:
@@ -139,10 +135,7 @@ def contents_beside(
     broken: Collection[str],
     given_topics: Topics = NO_TOPICS,
 ) -> Contents:
-    """Like `contents_at_start`, for a change while files that had errors before, `broken`, are in force.
-
-    Raises `SpecificationsRefusedError` if another file has an error.
-    """
+    """Files that had errors before, `broken`, may still have them."""
     found = contents_at_start(files, texts, given_topics)
     errors = found.left_out | {found.monitors[name]: error for name, error in found.unbuilt.items()}
     fresh = [error for file, error in errors.items() if file not in broken]
@@ -154,10 +147,7 @@ def contents_beside(
 def check(
     sources: Sources, site_keys: Sequence[str], *, compiler: Callable[..., Contents] = contents
 ) -> CheckedSpecifications:
-    """Compile in the caller's process. Raises `SpecificationsRefusedError` with all errors.
-
-    With `site_keys`, each text must be signed with one of these keys.
-    """
+    """Compile in the caller's process. With `site_keys`, each text must be signed."""
     if not sources.files:
         return CheckedSpecifications()
     require_bounded(sources)
@@ -177,7 +167,6 @@ def _topics_known(text: str, file: str, texts: Mapping[str, str]) -> bool:
 def _good(
     files: Mapping[str, str], texts: Mapping[str, str], topics: Topics
 ) -> tuple[set[str], dict[str, str]]:
-    """Return the files that compile together, and the last error of each file that has had one."""
     errors: dict[str, str] = {}
 
     def grown(good: set[str], more: Sequence[str]) -> set[str]:
@@ -210,7 +199,7 @@ def _places(monitors: MonitorSet) -> dict[str, str]:
 
 
 def parts(compiled: bytes, wanted: Sequence[PartNames]) -> list[bytes]:
-    """Return the parts that relays run. Raises `SpecificationsRefusedError`."""
+    """Raises `SpecificationsRefusedError`."""
     try:
         return [*map(_bounded, parts_of(compiled, [(names.monitors, names.shadows) for names in wanted]))]
     except SpecificationError as error:

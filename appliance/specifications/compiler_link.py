@@ -1,13 +1,8 @@
 """Control's link to the compiler process, which parses specifications for it.
 
-The process is started on demand and ends when it is idle. Specifications that exceed its limits are refused and end
-the process; the specifications in force stay in force.
-
-Orders take precedence over dry runs. A dry run begins only while no order is compiled and no other dry run is under
-way; a new order ends it.
-
-The last answer for a start is kept, and the last parts. So a standby that has checked its start compiles nothing when
-it takes over, while the robot waits.
+Specifications that exceed the compiler's limits end it, and are refused. A new order ends a dry run. The last
+answer for a start is kept, so a standby that has checked its start compiles nothing when it takes over, while the
+robot waits.
 """
 
 import asyncio
@@ -36,7 +31,7 @@ _TRIES = 2  # an idle compiler may end just when a question is sent
 
 
 class SpecificationCompiler:
-    """`wanted()` requests the start of the compiler process."""
+    """Compilations raise `SpecificationsRefusedError`, also without an answer. `wanted()` requests the start."""
 
     def __init__(self, wanted: Callable[[], None]) -> None:
         self._wanted = wanted
@@ -53,7 +48,7 @@ class SpecificationCompiler:
         ] = {}  # the last question of each kind, and its answer
 
     def call(self) -> None:
-        """Start the compiler early, because a compilation will soon be requested."""
+        """Start the compiler early."""
         if self._link.channel is None and not self._called:
             self._there.clear()
             self._called = True
@@ -67,18 +62,10 @@ class SpecificationCompiler:
     async def check(
         self, sources: Sources, site_keys: Sequence[str], broken: Sequence[str] = ()
     ) -> CheckedSpecifications:
-        """For an order. Files in `broken` may have errors, as after a start.
-
-        Raises `SpecificationsRefusedError`, also if the compiler does not answer.
-        """
         return await self._checked(sources, site_keys, broken, at_start=False)
 
     async def check_at_start(self, sources: Sources, site_keys: Sequence[str]) -> CheckedSpecifications:
-        """Compile for a start: files with errors do not keep the others from coming into force
-        (`Contents.unbuilt`).
-
-        Raises the errors of `check`.
-        """
+        """Compile for a start: files with errors do not keep the others from coming into force."""
         return await self._checked(sources, site_keys, (), at_start=True)
 
     async def _checked(
@@ -94,7 +81,6 @@ class SpecificationCompiler:
     async def try_out(
         self, sources: Sources, site_keys: Sequence[str], broken: Sequence[str] = ()
     ) -> CheckedSpecifications:
-        """For a dry run. Raises the errors of `check`, also if an order ended the dry run."""
         if not sources.files:
             return CheckedSpecifications()
         require_bounded(sources)
@@ -111,15 +97,11 @@ class SpecificationCompiler:
         return checked(answer.contents, sources, site_keys)
 
     async def parts(self, compiled: bytes, wanted: list[messages.PartNames]) -> list[bytes]:
-        """Return the parts that relays run. Raises `SpecificationsRefusedError`, also without an answer."""
         answer = await self._asked_once(lambda number: messages.PartsWanted(number, compiled, wanted))
         parts: list[bytes] = answer.parts
         return parts
 
     async def _asked_once(self, question: Callable[[int], messages.Message]) -> Any:
-        """Return the answer to a question, or the last answer if the question is the same. Raises as `_asked`
-        does.
-        """
         wanted = question(0)
         last, answer = self._kept.get(type(wanted), (None, None))
         if last != wanted:
@@ -128,13 +110,11 @@ class SpecificationCompiler:
         return answer
 
     async def _ordered(self, question: Callable[[int], messages.Message]) -> Any:
-        """Return the answer for an order. Raises as `_asked` does."""
         with self._order():
             return await self._asked(question)
 
     @contextlib.contextmanager
     def _order(self) -> Iterator[None]:
-        """End a dry run in progress, and let none begin in the block."""
         self._orders += 1
         self._no_order.clear()
         if self._dry_run:
@@ -149,10 +129,7 @@ class SpecificationCompiler:
     async def _asked(
         self, question: Callable[[int], messages.Message], *, goes_on: Callable[[], bool] = lambda: True
     ) -> Any:
-        """Return the compiler's answer, or its successor's if it has just ended.
-
-        Raises `SpecificationsRefusedError`, also if `goes_on()` returns False.
-        """
+        """Ask the successor of a compiler that has just ended, while `goes_on()`."""
         for _ in range(_TRIES):
             try:
                 self.call()
@@ -176,7 +153,6 @@ class SpecificationCompiler:
         raise SpecificationsRefusedError([_ENDED])
 
     async def _answer(self, question: Callable[[int], messages.Message]) -> Any:
-        """Return the answer; end the compiler if the order is withdrawn before. Raises the errors of `Link.ask`."""
         asking = asyncio.ensure_future(self._link.ask(question, _WORK_SECONDS))
         try:
             while not (await asyncio.wait((asking,), timeout=_LOOK_SECONDS))[0]:

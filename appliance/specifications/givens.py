@@ -1,7 +1,6 @@
 """Check and keep the values that operators gave to monitors: constants while they run, topics at a load. No I/O.
 
-A value stays until its monitor is removed, or until a new text no longer declares it with a range that includes it.
-Then the default of the text applies again.
+A value stays until its monitor is removed, or until a new text no longer declares it or its range.
 """
 
 import math
@@ -20,7 +19,7 @@ _TOPIC = "topic"
 
 
 class Givens:
-    """The values that operators gave; `said` has them by monitor and name. Topics belong to a revision's sources."""
+    """`said` has the values by monitor and name. Topics belong to a revision's sources."""
 
     def __init__(self) -> None:
         self.said: dict[str, dict[str, GivenValue]] = {}
@@ -36,7 +35,6 @@ class Givens:
         return {monitor: values for monitor, values in found.items() if values}
 
     def dropped(self, checked: CheckedSpecifications) -> list[str]:
-        """Return a text for each value that these specifications do not allow."""
         kept = self.in_force(checked)
         return [
             f"{monitor}: {name}={_shown(value)} no longer applies, because the text does not allow it: the default of"
@@ -65,7 +63,7 @@ class Givens:
 def parsed(
     declared: tuple[GivenDeclared, ...], monitor: str, values: Mapping[str, GivenValue]
 ) -> dict[str, GivenValue]:
-    """Return the parsed values. Raises `SpecificationsRefusedError` with all errors."""
+    """Raises `SpecificationsRefusedError` with all errors."""
     known = {one.name: one for one in declared}
     found: dict[str, GivenValue] = {}
     findings = []

@@ -1,10 +1,7 @@
 """Compare specifications with the topics that are published now. No I/O.
 
-A monitor that begins again because its text has changed, or because it moves to another relay, may hold its topics: the
-robot then gets no command, not even a stop, until an operator resumes the monitor.
-
-If a specification has another type than the publisher, loading it would cut the topic, because the relay cannot read
-the messages. A topic that no node publishes may be misspelled. Both are checked before a change comes into force.
+A monitor that begins again may hold its topics: the robot then gets no command, not even a stop, until an
+operator resumes it.
 """
 
 from collections.abc import Collection, Iterable, Mapping
@@ -15,10 +12,7 @@ from appliance.specifications.specification_files import CheckedSpecifications
 
 
 class LiveType(NamedTuple):
-    """The type that a node registered, and the md5sum in its header (empty if no relay has seen it).
-
-    `moving`: it has published in the last minute, or this is not known.
-    """
+    """The type that a node registered, and the md5sum in its header (empty if no relay has seen it)."""
 
     name: str
     md5sum: str = ""
@@ -31,7 +25,7 @@ _ANY = "*"
 
 
 class TopicFindings(NamedTuple):
-    """Findings about topics; `conflicts` would be cut; all have the form `file:line:column: severity: text`."""
+    """Texts of the form `file:line:column: severity: text`; `conflicts` forbid the change."""
 
     conflicts: list[str]
     warnings: list[str]
@@ -48,8 +42,8 @@ def judge_topics(
 ) -> TopicFindings:
     """Compare topics that specifications add, or give another type, with those that nodes publish.
 
-    Monitors in `shadow` mode cut nothing: they just do not get messages that they cannot read. With `forced`,
-    conflicts are warnings. Monitors that are `promoted` from shadow mode are judged again.
+    Monitors in `shadow` mode cut nothing; those that are `promoted` from it are judged again. With `forced`,
+    conflicts are warnings.
     """
     found = TopicFindings([], [])
     acting = [name for name in coming.monitors if name not in shadow]
@@ -88,8 +82,7 @@ def judge_holds(
 ) -> TopicFindings:
     """Find the monitors that will lose their state and hold topics with a publisher.
 
-    Topics that carry messages are conflicts unless `hold` is set. Only monitors that are `acting` now and later hold
-    topics. The files `moved` go to another relay.
+    Only monitors that are `acting` now and later hold topics. The files `moved` go to another relay.
     """
     found = TopicFindings([], [])
     for name in (one for one in acting if one in present.states and coming.states[one].holds):
@@ -115,7 +108,7 @@ _UNREAD = "monitors in shadow mode do not see its messages"
 
 
 def _difference(theirs: LiveType, ours: LiveType) -> str:
-    """Return how the types differ, or an empty text; as in ROS, `*` fits any type, and the md5sum decides."""
+    """As in ROS, `*` fits any type, and the md5sum decides."""
     if theirs.name not in (_ANY, ours.name):
         return f"{theirs.name}, not as {ours.name}"
     if {theirs.md5sum, ours.md5sum} & {"", _ANY} or theirs.md5sum == ours.md5sum:

@@ -27,11 +27,9 @@ _LEVELS = {"WARN": Severity.WARNING, "ERROR": Severity.WARNING, "FATAL": Severit
 
 @dataclass(frozen=True, slots=True)
 class MonitorRecords:
-    """Makes the records and counts; `fields(topic, data)` parses a message.
+    """Makes the records and counts; each callback in `told` gets every event.
 
-    `counts` has the number of events by kind and monitor; a change by several monitors counts for each of
-    them. `at` has the number of dropped or changed messages by topic. Actions that monitors in shadow mode
-    would have taken are separate kinds. Each callback in `told` gets every event; a feature adds its own.
+    A change by several monitors counts for each in `counts`, and once for its topic in `at`.
     """
 
     trail: AuditTrail

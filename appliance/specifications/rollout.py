@@ -1,10 +1,9 @@
 """Roll out new specifications to all relays, each with its own files, or to none.
 
-First, relays that give nothing up get their new specifications. When all of these have taken them, moving topics are
-withdrawn from their old relay, and the allocation changes. The topics are then placed on the relay that has their
-monitors, so no message bypasses its monitors. Then the relays that gave something up get their specifications; the
-load is complete when they have answered (`all_taken`). A monitor whose file moves loses its state, which stays with
-the former relay. If the monitor's actions depend on its state, the monitor holds its topics.
+First, relays that give nothing up get their new specifications. Then moving topics are withdrawn, the allocation
+changes, and the topics are placed on the relay that has their monitors, so no message bypasses its monitors.
+Finally the other relays get their specifications (`all_taken`). A monitor whose file moves loses its state; if
+its actions depend on that, it holds its topics.
 """
 
 import asyncio
@@ -39,7 +38,7 @@ class Relays(Protocol):
     """The interface to the relays."""
 
     def send(self, message: Message, relay: int) -> bool:
-        """Send a message to a relay; return False if it is not connected."""
+        """Return False if the relay is not connected."""
 
     async def carried_out(self) -> None:
         """Wait until every relay has carried out its messages."""
@@ -47,10 +46,10 @@ class Relays(Protocol):
     def live_resources(self) -> set[Resource]: ...
 
     def withdraw(self, moves: Sequence[Move]) -> None:
-        """Withdraw resources from their old relays; called before the new allocation is adopted."""
+        """Called before the new allocation is adopted."""
 
     def place(self, moves: Sequence[Move]) -> None:
-        """Place resources on their new relays; called after the allocation was adopted."""
+        """Called after the new allocation was adopted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,10 +64,9 @@ class Revision:
 
 @dataclass(frozen=True, slots=True)
 class InheritedState:
-    """The states that the other appliance's relays `left`.
+    """The states that the other appliance's relays `left`, and why others are `lost`.
 
-    `at` is the time of its monitors then, if it is later than the time in the states. `lost` is why other
-    states are lost.
+    `at` is the time of its monitors then, if it is later than the time in the states.
     """
 
     lost: str = ""
@@ -77,16 +75,12 @@ class InheritedState:
 
 
 Parts = Callable[[bytes, list[messages.PartNames]], Awaitable[list[bytes]]]
-"""A function that returns the parts of relays. Raises `SpecificationsRefusedError`."""
+"""Returns the parts of relays. Raises `SpecificationsRefusedError`."""
 
 
 @dataclass(slots=True)
 class Rollout:
-    """The specifications on all relays; `states(checked)` returns each monitor's switch.
-
-    Each relay gets only its own part, which `parts` makes before the specifications are stated. `rows` are
-    the last reports.
-    """
+    """The specifications on all relays. Each gets only its own part, which `parts` makes."""
 
     allocation: Allocation
     trail: AuditTrail
@@ -129,14 +123,10 @@ class Rollout:
 
     @property
     def why_held(self) -> dict[str, str]:
-        """Return the held monitors with the reason, which is empty if no state was lost."""
         return {name: why for names in self._held.values() for name, why in names.items()}
 
     async def start(self, now: Revision, *, restarted: bool, kept: str) -> None:
-        """Begin with specifications; after a crash of control (`restarted`), relays keep theirs.
-
-        Raises `SpecificationsRefusedError`.
-        """
+        """After a crash of control (`restarted`), relays keep their specifications."""
         self._now = now
         if restarted:
             self._known = set(range(self.allocation.relays))
@@ -146,10 +136,7 @@ class Rollout:
         await self._make(now, self.allocation.of_file)
 
     async def leave(self, seconds: float) -> list[bytes]:
-        """Make all relays drop all messages, and return the states of their monitors.
-
-        Raises `ConnectionError` if a relay is away, and `TimeoutError` if one does not answer within `seconds`.
-        """
+        """Make all relays drop all messages. Raises `ConnectionError`, `TimeoutError`."""
         self._leaving = True
         return [answer.content or b"" for answer in await self._states(seconds, copy=False)]
 
@@ -177,12 +164,11 @@ class Rollout:
         return bool(self._now.checked.monitors) and not self._leaving and not self._heirs
 
     def inherit(self, state: InheritedState, taken: Callable[[], None]) -> None:
-        """Give relays inherited states; call `taken` once all relays have them."""
         self._inherited, self._heirs = state, set(range(self.allocation.relays))
         self._inheritance_taken = taken
 
     def statement(self, relay: int) -> messages.SpecificationsStated:
-        """Return the message for a relay; a restarted relay must hold topics as its monitors require."""
+        """A restarted relay must hold topics as its monitors require."""
         restarted = relay in self._known
         self._known.add(relay)
         (self._fresh.add if restarted else self._fresh.discard)(relay)
@@ -212,10 +198,8 @@ class Rollout:
         return [name for name in names if name in self._began]
 
     async def take(self, coming: Revision) -> list[str]:
-        """Bring specifications into force; return the monitors that began again because they moved.
-
-        A disconnected relay gets them when it returns. If this raises `SpecificationsRefusedError`, nothing
-        has changed.
+        """Return the monitors that began again because they moved. `SpecificationsRefusedError` means that
+        nothing has changed.
         """
         plan = self.allocation.plan(coming.checked, self.relays.live_resources())
         self._began = set()
@@ -230,11 +214,10 @@ class Rollout:
         raise SpecificationsRefusedError(["topics that must move changed during the rollout; try again"])
 
     def moved_files(self, coming: CheckedSpecifications) -> frozenset[str]:
-        """Return the files that would move to another relay, so that their monitors lose their state."""
         return self.allocation.plan(coming, self.relays.live_resources()).moved_files
 
     async def all_taken(self) -> None:
-        """Wait for relays that gave something up; refusals are in `refused`."""
+        """Refusals of relays that gave something up are in `refused`."""
         answers, self._answers = self._answers, {}
         if answers:
             await asyncio.wait(answers.values(), timeout=_RELAY_SECONDS)
@@ -286,10 +269,7 @@ class Rollout:
         return [finding for findings in said for finding in findings]
 
     def _settle(self, coming: Revision, plan: AllocationPlan) -> list[str]:
-        """Adopt a plan without `await`, so that no message of a relay is processed in between.
-
-        Relays that already have the revision confirm it again.
-        """
+        """Adopt a plan without `await`, so that no message of a relay is processed in between."""
         self._now = coming
         self.relays.withdraw(plan.moves)
         self.allocation.adopt(plan)
@@ -394,7 +374,7 @@ class Rollout:
                 self._merge_rows()
 
     def lost(self, relay: int) -> None:
-        """Note that a relay ended, perhaps because of specifications that it has not answered."""
+        """The relay may have ended because of specifications that it has not answered."""
         for at, statement in [entry for entry in self._waiting if entry[0] == relay]:
             self._answer(at, statement, ["a relay process exited during the load: try again"])
 
@@ -465,7 +445,7 @@ def _names(revision: Revision, relay: int, of_file: Callable[[str], int]) -> mes
 def parts_wanted(
     revision: Revision, relays: int, of_file: Callable[[str], int] | None = None
 ) -> list[messages.PartNames]:
-    """Return the parts for each relay; without `of_file`, those of a start on another appliance."""
+    """Without `of_file`, return the parts of a start on another appliance."""
     if of_file is None:
         of_file = _of(Allocation(relays).plan(revision.checked))
     names = dict.fromkeys(_names(revision, relay, of_file) for relay in range(relays))

@@ -1,4 +1,4 @@
-"""Files of specifications: the folder, their signatures, and their compiled contents."""
+"""Read files of specifications: the folder, their signatures, and their compiled contents."""
 
 import stat
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -23,7 +23,7 @@ _LONGEST = (
 
 
 class SpecificationsRefusedError(Exception):
-    """The specifications are rejected; `findings` has every reason, as `file:line:column: error: text`."""
+    """`findings` has every reason, as `file:line:column: error: text`."""
 
     def __init__(self, findings: list[str]) -> None:
         super().__init__("\n".join(findings))
@@ -31,11 +31,7 @@ class SpecificationsRefusedError(Exception):
 
 
 class Sources(msgspec.Struct, frozen=True):
-    """Specifications by file name, and definitions by `package/Type.msg` (or `.srv`).
-
-    `signatures` of the site have the same names. `topics` replace topics given in the texts, by monitor and
-    name.
-    """
+    """Specifications by file name, and definitions by `package/Type.msg` (or `.srv`)."""
 
     files: dict[str, str] = {}
     definitions: dict[str, str] = {}
@@ -61,7 +57,7 @@ class Sources(msgspec.Struct, frozen=True):
         )
 
     def without(self, files: set[str]) -> "Sources":
-        """Return the sources without some files; the message definitions stay."""
+        """The message definitions stay."""
         left, signatures = (
             {name: text for name, text in texts.items() if name not in files}
             for texts in (self.files, self.signatures)
@@ -69,17 +65,13 @@ class Sources(msgspec.Struct, frozen=True):
         return Sources(left, self.definitions, signatures, self.topics)
 
     def signers(self, site_keys: Sequence[str]) -> list[str]:
-        """Return the names of the keys that signed; none without site keys.
-
-        Raises `SpecificationsRefusedError` with every file and definition that no site key signed.
-        """
+        """Return the names of the keys that signed. Raises `SpecificationsRefusedError` with all unsigned files."""
         found, unsigned = self._signed(site_keys)
         if unsigned:
             raise SpecificationsRefusedError([*unsigned.values()])
         return sorted(found)
 
     def signed(self, site_keys: Sequence[str]) -> tuple["Sources", dict[str, str]]:
-        """Return the signed sources, and the errors of the others by their names below the folder."""
         _, errors = self._signed(site_keys)
         files, definitions = (
             {name: text for name, text in texts.items() if folder + name not in errors}
@@ -99,7 +91,7 @@ class Sources(msgspec.Struct, frozen=True):
         return found, unsigned
 
     def difference(self, before: "Sources") -> tuple[list[str], list[str], list[str]]:
-        """Return the added, changed and removed files; a definition is `msg/package/Type.msg`."""
+        """A definition is `msg/package/Type.msg`."""
         old, new = before.named(), self.named()
         return (
             [name for name in new if name not in old],
@@ -117,13 +109,11 @@ class CheckedSpecifications(messages.Contents, frozen=True):
     signed_by: list[str] = []  # noqa: RUF012  each struct gets one of its own
 
     def fields(self, topic: str, data: bytes) -> dict[str, Any] | None:
-        """Return the fields in the first bytes of a message, or None if the type is not known."""
         name = self.types.get(topic)
         definitions = _definitions(name, self.texts.get(name, "")) if name is not None else None
         return read_fields(definitions, name, data) if name is not None and definitions is not None else None
 
     def md5sum(self, topic: str) -> str:
-        """Return the md5sum of a topic's type; empty if the definition is not known."""
         name = self.types.get(topic, "")
         definitions = _definitions(name, self.texts.get(name, ""))
         return "" if definitions is None else definitions.md5sum(name)
@@ -144,12 +134,12 @@ def _definitions(name: str, text: str) -> Definitions | None:
 
 
 def checked(contents: messages.Contents, sources: Sources, site_keys: Sequence[str]) -> CheckedSpecifications:
-    """Return contents that may come into force. Raises `SpecificationsRefusedError`."""
+    """Raises `SpecificationsRefusedError`."""
     return CheckedSpecifications(**msgspec.structs.asdict(contents), signed_by=sources.signers(site_keys))
 
 
 def require_bounded(sources: Sources) -> None:
-    """Raise `SpecificationsRefusedError` for too many or too long sources."""
+    """Raises `SpecificationsRefusedError`."""
     if len(sources.files) > _MOST_FILES:
         raise SpecificationsRefusedError(
             [f"{len(sources.files)} specification files; the limit is {_MOST_FILES}"]
@@ -168,10 +158,7 @@ def _too_long(name: str) -> str:
 
 
 def read_folder(folder: Path) -> Sources:
-    """Return the sources in a folder, with the definitions in its `msg/` and the signatures.
-
-    Raises `SpecificationsRefusedError`.
-    """
+    """Read also definitions and signatures. Raises `SpecificationsRefusedError`."""
     sources, errors = _read_folder(folder)
     if errors:
         raise SpecificationsRefusedError([*errors.values()])
@@ -179,10 +166,9 @@ def read_folder(folder: Path) -> Sources:
 
 
 def read_usable(folder: Path, site_keys: Sequence[str]) -> tuple[Sources, dict[str, str]]:
-    """Return the sources in a folder, and by name the errors of files that may not come into force.
+    """Return the sources, and the errors of files that may not come into force.
 
-    These cannot be opened, are not UTF-8 text, are too long, or have no signature of a site key. Raises
-    `SpecificationsRefusedError` if the folder cannot be read.
+    Raises `SpecificationsRefusedError`.
     """
     found, errors = _read_folder(folder)
     sources, unsigned = found.signed(site_keys)
@@ -217,7 +203,6 @@ def _read_folder(folder: Path) -> tuple[Sources, dict[str, str]]:
 
 
 def _definitions_in(own: Path) -> dict[str, Path]:
-    """Return the files of definitions by `package/Type.msg`. Raises `SpecificationsRefusedError`."""
     found = {}
     try:
         for path in files_below(own) if _is(stat.S_ISDIR, own) else ():
@@ -238,7 +223,7 @@ def _unreadable(path: Path, error: OSError) -> SpecificationsRefusedError:
 
 
 def _is(kind: Callable[[int], bool], path: Path) -> bool:
-    """Whether a path is of this kind. Raises `OSError` if it is unknown whether the path exists."""
+    """Raise `OSError` if it is unknown whether the path exists."""
     try:
         return kind(stat_given(path).st_mode)
     except (FileNotFoundError, NotADirectoryError):
@@ -263,11 +248,7 @@ _Stamp = tuple[str, int, int, int, int]
 
 
 class SpecificationFolder:
-    """The folder of specifications, or an empty one.
-
-    Each status and list request compares the folder with the specifications in force. Therefore the files are
-    read only if one has changed.
-    """
+    """The folder of specifications, or an empty one; files are read only if one has changed."""
 
     def __init__(self, path: Path | None) -> None:
         self.path = path
@@ -275,15 +256,12 @@ class SpecificationFolder:
         self._found: Sources | None = None
 
     def read(self) -> Sources:
-        """Return the sources. Raises `SpecificationsRefusedError`."""
         return read_folder(self.path) if self.path is not None else Sources()
 
     def read_usable(self, site_keys: Sequence[str]) -> tuple[Sources, dict[str, str]]:
-        """Return the result of the function of this name. Raises `SpecificationsRefusedError`."""
         return read_usable(self.path, site_keys) if self.path is not None else (Sources(), {})
 
     def looked_at(self) -> Sources | None:
-        """Return the sources, or None if they are not valid. Unchanged files are not read again."""
         if self.path is None:
             return Sources()
         stamps = _stamps(self.path)
@@ -297,7 +275,6 @@ class SpecificationFolder:
 
 
 def _stamps(folder: Path) -> list[_Stamp] | None:
-    """Return values that change when a file changes; None if the folder cannot be read."""
     try:
         own = folder / "msg"
         found = [path for path, _is_folder in entries_of(folder) if path.match("*.rv*")]

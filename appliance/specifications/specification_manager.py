@@ -2,20 +2,13 @@
 
 This file is long because each of its short methods changes the same state, one change at a time.
 
-Invariants:
-
-1. The folder of specifications is the baseline, and the appliance never writes to it. Changes while the robot runs are
-   revisions in the store (`specification_revisions.py`). Revisions and switches (`switches.py`) survive a restart.
-2. The compiler process compiles new specifications before anything changes. If there are errors, nothing changes, and
-   all errors are returned. The relays get the compiled form, and may refuse it.
-3. A monitor that is loaded and shares variables with monitors in shadow mode is also in shadow mode. A load or switch
-   of other monitors never takes an existing monitor out of force.
-4. A reload loads the folder's files. Other files stay in force unless the reload prunes, so a missing file ends no
-   protection.
-5. Every change can have a time limit for confirmation (`store/revisions.py`). Each revision is stored with its last
-   switches, so a rollback restores its monitors as they were.
-6. A tag names the state that operators have seen. Each revision, switch and resumption changes the tag; tags never
-   repeat. A change that expects another tag is refused.
+1. The appliance never writes to the folder of specifications. Changes are revisions in the store; revisions and
+   switches survive a restart.
+2. If a text has errors, or a relay refuses its compiled form, nothing changes.
+3. A load or switch of other monitors never takes an existing monitor out of force.
+4. Files that are not in the folder stay in force unless a reload prunes, so a missing file ends no protection.
+5. Each revision is stored with its last switches, so a rollback restores its monitors as they were.
+6. Each change gets a new tag, which never repeats; a change that expects another tag is refused.
 """
 
 import asyncio
@@ -86,7 +79,7 @@ _WORDS: dict[Switch, str] = {True: "enabled", False: "disabled", SHADOW: "in sha
 
 
 class UnknownMonitorError(Exception):
-    """A monitor, file or revision does not exist; the text lists the valid names."""
+    """A monitor, file or revision does not exist."""
 
 
 class DryRunUnderWayError(Exception):
@@ -105,9 +98,7 @@ class MonitorsChangedError(Exception):
 
 
 class _Consent(NamedTuple):
-    """The consent to effects; `force`: topics may be cut whose publishers have another type. `hold`: topics
-    with traffic may be held.
-    """
+    """`force`: topics may be cut whose publishers have another type. `hold`: topics with traffic may be held."""
 
     force: bool = False
     hold: bool = False
@@ -118,10 +109,10 @@ _ALL = _Consent(force=True, hold=True)
 
 
 class SpecificationManager(Revisions[MonitorRevisionRow]):
-    """The specifications in force; changes are made one at a time.
+    """The specifications in force.
 
-    `published()` is called when monitors may publish other topics. Each callback in `told` gets every event
-    that a relay reports. With `site_keys`, everything in force is signed with one of these keys.
+    Changes are made one at a time; they raise `SpecificationsRefusedError` and `UnknownMonitorError`. `published()`
+    is called when monitors may publish other topics. With `site_keys`, everything in force is signed.
     """
 
     refusal = SpecificationsRefusedError
@@ -177,11 +168,9 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
     # --- start ---
 
     async def start(self, *, restarted: bool, taken_over: bool = False) -> None:
-        """Bring the specifications of a start into force. Raises `SpecificationsRefusedError`.
-
-        After a crash of control, these are the specifications that were in force. At the start of the
-        appliance, they are the folder's, unless an operator's own revision was in force when the appliance
-        stopped. One of two appliances (`taken_over`) uses those of the active one.
+        """After a crash of control, the specifications that were in force are used; `taken_over`, those of the
+        active appliance. At the start of the appliance, the folder's are used, unless an operator's own revision
+        was in force.
         """
         settings = self.store.settings()
         self.switches.restore(settings.get(SWITCHES, "{}"))
@@ -227,15 +216,13 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
 
     @property
     def differs_from_folder(self) -> bool:
-        """Whether the specifications in force differ from the folder's; False without a folder."""
         return self.folder is not None and not self._is_folder(self.sources)
 
     def names(self) -> list[str]:
-        """Return the monitors in the order in which they get messages."""
         return list(self.checked.monitors)
 
     def file_of(self, name: str) -> str:
-        """Return the file of a monitor, or the file of this name. Raises `UnknownMonitorError`."""
+        """`name` is a monitor or a file."""
         if name in self.sources.files:
             return name
         if name not in self.checked.monitors:
@@ -247,7 +234,6 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         return answers.MonitorRevisionList(msgspec.convert(rows, list[answers.MonitorRevision]))
 
     async def texts(self, request: admin.MonitorRevisionWanted) -> answers.RevisionTexts:
-        """Return a revision with its texts. Raises `UnknownMonitorError`."""
         row = await self._find(request.revision)
         if row is None:
             raise UnknownMonitorError(f"revision {request.revision} of the specifications does not exist")
@@ -260,11 +246,8 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
     # --- changing ---
 
     async def load(self, request: admin.MonitorLoad, who: str, *, enable: bool = False) -> Replacement:
-        """Load specifications, and replace files of the same names. Raises `SpecificationsRefusedError`.
-
-        With `enable`, monitors that would be disabled by the setting of this name are enabled. With
-        `confirm_within`, this change, like any other, is rolled back automatically after that many seconds
-        unless confirmed.
+        """With `enable`, monitors that the setting of this name would disable are enabled. With `confirm_within`,
+        this change, like any other, is rolled back after that many seconds unless confirmed.
         """
         async with self._changing(request.expected):
             topics, constants = split(request.given)
@@ -294,7 +277,6 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             )
 
     async def attempt(self, request: admin.MonitorTry, who: str) -> answers.Tried:
-        """Return the effects that a load would have. Raises the errors of `load`, and `DryRunUnderWayError`."""
         if who in self._attempting:
             raise DryRunUnderWayError(
                 "your previous dry run is still running: wait for its answer, then try again"
@@ -317,7 +299,6 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         return answers.Tried(revision, tag, *files, [*checked.warnings, *warnings], [*checked.monitors])
 
     async def replace(self, request: admin.MonitorReplace, who: str) -> Replacement:
-        """Replace the text of a monitor's file. Raises `UnknownMonitorError`, and the errors of `load`."""
         file = self.file_of(request.name)
         load = admin.MonitorLoad(
             {file: request.text},
@@ -333,10 +314,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         return await self.load(load, who)
 
     async def reload(self, request: admin.MonitorReload, who: str) -> Replacement:
-        """Load the folder; other files stay in force, unless `prune` is set.
-
-        Raises `SpecificationsRefusedError`, also without a folder.
-        """
+        """Files that are not in the folder stay in force, unless `prune` is set."""
         async with self._changing(request.expected):
             if self.folder is None:
                 raise SpecificationsRefusedError([_NO_FOLDER])
@@ -363,7 +341,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             )
 
     async def take_bundle(self, sources: Sources, who: str, note: str) -> Replacement:
-        """Bring exactly these sources into force. `SpecificationsRefusedError` means that nothing has changed."""
+        """Bring exactly these sources into force."""
         async with self._changing(None):
             sources = sources.with_topics(self.sources.topics)
             if self.in_force.who != DISK and sources == self.sources:
@@ -373,7 +351,6 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             )
 
     async def held_by_bundle(self, sources: Sources) -> list[str]:
-        """Return why these sources would hold topics with traffic. Raises `SpecificationsRefusedError`."""
         sources = sources.with_topics(self.sources.topics)
         if sources == self.sources:
             return []
@@ -381,11 +358,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         return self._held(checked, self._in_shadow(checked), hold=False).conflicts
 
     async def remove(self, request: admin.MonitorRemove, who: str) -> Replacement:
-        """Remove files, which are given by their names or those of their monitors.
-
-        Raises `UnknownMonitorError`. Raises `SpecificationsRefusedError` if other monitors use variables of
-        these files, or if a file has further monitors that are not named.
-        """
+        """Remove files, or the files of monitors, if no other monitor is in them or uses their variables."""
         async with self._changing(request.expected):
             names, owners = request.names, self.checked.monitors
             known = set(self.sources.files) | set(owners)
@@ -409,11 +382,10 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             return await self._change(sources, keeper, who, note, within, check=check, consent=_Consent())
 
     async def roll_back(self, request: admin.MonitorRollback, who: str) -> Replacement:
-        """Bring a kept revision into force; None is the previous revision, 0 no specifications.
+        """None is the previous revision, 0 no specifications.
 
-        A monitor that returns gets the switch that it had when it was removed. Raises `SpecificationsRefusedError`.
-
-        The rollback of an unconfirmed change must succeed: there a file with an error does nothing, as after a start.
+        The rollback of an unconfirmed change must succeed: there a file with an error does nothing, as after a
+        start.
         """
         check = self._as_at_start if who == UNCONFIRMED else self._strictly
         async with self._changing(request.expected):
@@ -449,10 +421,8 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             return answers.MonitorsConfirmed(waited, self.revision, self.tag)
 
     async def switch(self, request: admin.MonitorSwitch, who: str) -> Switched:
-        """Enable or disable monitors, permanently or for `for_seconds`; return those that changed.
-
-        Raises `UnknownMonitorError`. Raises `SpecificationsRefusedError` if a monitor to enable is in shadow
-        mode, or shares variables with a monitor in shadow mode.
+        """Return the monitors that changed. A monitor in shadow mode, or that shares variables with such a
+        monitor, is not enabled.
         """
         async with self._changing(request.expected):
             self._all_known(request.names)
@@ -468,12 +438,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             return self._switched(names, until=self.returns.until(names[0]) if names else None)
 
     async def shadow(self, request: admin.MonitorShadow, who: str) -> Switched:
-        """Put monitors into shadow mode or into force; return those that changed.
-
-        With `confirm_within`, monitors return to shadow mode after that many seconds unless confirmed. Raises
-        the errors of `switch`. Raises `SpecificationsRefusedError` also for a disabled monitor that should
-        come into force, and for a monitor that would cut a topic.
-        """
+        """Return the monitors that changed. With `confirm_within`, they return to shadow mode unless confirmed."""
         async with self._changing(request.expected):
             self.judge_shadow(request)
             names = await self._switch(
@@ -484,7 +449,6 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             )
 
     def judge_shadow(self, request: admin.MonitorShadow) -> list[str]:
-        """Return the warnings about a change of shadow mode, which is not made. Raises the errors of `shadow`."""
         self._all_known(request.names)
         disabled = [name for name in request.names if self.switches.states[name] is False]
         if disabled and not request.shadow:
@@ -513,7 +477,6 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             raise SpecificationsRefusedError([text])
 
     async def _come_back(self, back: Mapping[str, Switch]) -> None:
-        """Apply the switches of monitors whose time is over. Raises `SpecificationsRefusedError`."""
         async with self._one_change:
             for to in (True, SHADOW):
                 names = [name for name in self.switches.states if back.get(name) == to]
@@ -614,10 +577,9 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         )
 
     async def resume(self, request: admin.MonitorResume, who: str) -> Switched:
-        """Release held topics; return the monitors that held them.
+        """Return the monitors that held topics.
 
-        Raises `UnknownMonitorError`. Raises `SpecificationsRefusedError` for monitors whose relay process is
-        not running, because the next process will hold the topics again.
+        A relay that is not running is refused, because the next process will hold the topics again.
         """
         async with self._changing(request.expected):
             self._all_known(request.names)
@@ -645,10 +607,6 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             return self._switched(held)
 
     async def give(self, request: admin.MonitorGive, who: str) -> answers.GivenSet:
-        """Set given constants; return everything that is given to the monitor.
-
-        Raises `UnknownMonitorError`. Raises `SpecificationsRefusedError` for a value outside of its range.
-        """
         async with self._changing(request.expected):
             name = request.name
             self._all_known([name])
@@ -748,11 +706,8 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         topics: Mapping[str, Mapping[str, str]] = MappingProxyType({}),
         constants: Given = NO_VALUES,
     ) -> Replacement:
-        """`kept` are files that are not in the folder, `loaded` those that the operator named.
-
-        `switches`, and the values `given`, are for monitors that are not in force yet; monitors in the files
-        `shadow` start in shadow mode, and those in the files `enable` are not disabled. `topics` and
-        `constants` are new values of this change.
+        """`kept` are files that are not in the folder, `loaded` those that the operator named. `switches`,
+        `given`, `shadow` and `enable` are for monitors that are not in force yet.
         """
         before, previous, switched = self.revision, self.sources, self.switches.said
         said = self.givens.said
@@ -817,17 +772,13 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         return await self._check_at_start(sources, self.site_keys)
 
     def _broken(self) -> dict[str, str]:
-        """Return the files that do nothing since the start, with their errors."""
         unbuilt = {self.checked.monitors[name]: error for name, error in self.checked.unbuilt.items()}
         return self.checked.left_out | unbuilt
 
     async def _beside_broken(
         self, check: CheckBeside, sources: Sources, loaded: Collection[str] = ()
     ) -> CheckedSpecifications:
-        """Let files that have done nothing since the start, because of an error, do nothing still.
-
-        Raises `SpecificationsRefusedError` if a `loaded` or any other file has an error, or needs one of these files.
-        """
+        """Let files that have done nothing since the start, because of an error, do nothing still, unless `loaded`."""
         present, following = self.sources.named(), sources.named()
         errors = {
             file: error
@@ -847,7 +798,6 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
     def _check_given(
         self, topics: Mapping[str, Mapping[str, str]], constants: Given, checked: CheckedSpecifications
     ) -> dict[str, dict[str, messages.GivenValue]]:
-        """Return the given constants. Raises `SpecificationsRefusedError`."""
         require_topics(topics, checked)
         if topics and self.site_keys:
             text = "the site signs the topics of a text, so a load cannot replace them: sign a text with another topic"
@@ -871,7 +821,6 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         *,
         promoted: Collection[str] = (),
     ) -> list[str]:
-        """Return warnings. Raises `SpecificationsRefusedError` if a topic would be cut, or held."""
         cut = judge_topics(
             coming, self.checked, self._live(), shadow=shadow, forced=consent.force, promoted=promoted
         )

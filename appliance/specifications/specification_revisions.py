@@ -18,7 +18,7 @@ from appliance.specifications.specification_files import (
 from appliance.store.state_file import MonitorRevisionRow, StateStore
 
 Check = Callable[[Sources, Sequence[str]], Awaitable[CheckedSpecifications]]
-"""A function that compiles sources. Raises `SpecificationsRefusedError`."""
+"""Raises `SpecificationsRefusedError`."""
 
 CheckBeside = Callable[[Sources, Sequence[str], Sequence[str]], Awaitable[CheckedSpecifications]]
 """The files named last had errors before, and may still have them. Raises `SpecificationsRefusedError`."""
@@ -28,7 +28,7 @@ NOTHING = MonitorRevisionRow(0, "{}", 0.0, DISK, "")
 
 
 class StartingSpecifications(NamedTuple):
-    """The specifications of a start; `refused` has the folder's errors, if the last revision stays in force."""
+    """`refused` has the folder's errors, if the last revision stays in force."""
 
     sources: Sources
     checked: CheckedSpecifications
@@ -63,12 +63,9 @@ async def specifications_at_start(
     named: Collection[str],
     kept: MonitorRevisionRow | None = None,
 ) -> StartingSpecifications:
-    """Return the stored revision `last`, or the folder's sources.
+    """Return the stored revision `last`, the folder's sources, or `kept` if a reload would refuse the folder.
 
-    If a reload would refuse the folder, use `kept`, the revision that was in force.
-
-    Raises `SpecificationsRefusedError`, also if they are not of an operator and lack a monitor that is
-    `named` to be enabled, unless a file is left out.
+    Raises `SpecificationsRefusedError`, also if a monitor that is `named` to be enabled is missing.
     """
     refused: list[str] = []
     if last is None:
@@ -112,7 +109,7 @@ async def _folder_or_kept(
 def _without_unusable(
     checked: CheckedSpecifications, sources: Sources, folder: SpecificationFolder, site_keys: Sequence[str]
 ) -> CheckedSpecifications:
-    """Return specifications in which files of the folder without a usable text count as left out."""
+    """Files of the folder without a usable text count as left out."""
     try:
         _, errors = folder.read_usable(site_keys)
     except SpecificationsRefusedError:
@@ -130,7 +127,7 @@ def unknown_monitors(names: Sequence[str], checked: CheckedSpecifications) -> st
 async def _check_kept(
     check: Check, row: MonitorRevisionRow, site_keys: Sequence[str]
 ) -> CheckedSpecifications:
-    """Check a stored revision. If this version refuses it, the error names the command that discards it."""
+    """If this version refuses the revision, the error names the command that discards it."""
     try:
         return await check(sources_of(row), site_keys)
     except SpecificationsRefusedError as error:
@@ -142,11 +139,7 @@ async def _check_kept(
 
 
 def forget_revision(store: StateStore, now: float) -> int | None:
-    """Discard the revision, so that the next start uses the folder; return it, or None if the folder was in
-    use.
-
-    Call this only while the appliance is not running.
-    """
+    """Return the discarded revision. Call this only while the appliance is not running."""
     last = next(iter(store.monitor_revisions(1)), NOTHING)
     if last.who == DISK:
         return None

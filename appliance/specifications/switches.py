@@ -1,9 +1,7 @@
 """Track which monitors are enabled, disabled or in shadow mode (`SHADOW`). No I/O.
 
-`--enable` applies to monitors that no operator has switched: it enables `all`, `none` or the named monitors, or puts
-all into shadow mode (`shadow`). An operator's switch is dropped when its monitor is removed; a monitor that is loaded
-later under the same name starts without a switch. Monitors that share variables are in shadow mode together (except
-disabled ones).
+`--enable` applies to monitors that no operator has switched. Monitors that share variables are in shadow mode
+together.
 """
 
 import json
@@ -16,7 +14,7 @@ SWITCHES = "monitor switches"
 
 
 class Switches:
-    """The switches of all monitors; `said` has those of operators, `enable` is the start option."""
+    """`said` has the switches of operators, `enable` is the start option."""
 
     def __init__(self, enable: str) -> None:
         self.starts_in_shadow = enable == "shadow"
@@ -39,11 +37,9 @@ class Switches:
         return [name for name, state in self.states.items() if state == SHADOW]
 
     def switched_off(self) -> dict[str, Switch]:
-        """Return the monitors that an operator, not the configuration, disabled or put into shadow mode."""
         return {name: to for name, to in self.said.items() if to is not True and self.states.get(name) == to}
 
     def states_of(self, checked: CheckedSpecifications) -> dict[str, Switch]:
-        """Return each monitor's switch; shadow mode extends to monitors that share variables with one in it."""
         states = {name: self._own(name) for name in checked.monitors}
         if SHADOW in states.values():
             for group in checked.sharing:
@@ -58,7 +54,7 @@ class Switches:
         return self.said.get(name, self._all or name in self.named)
 
     def enforce(self, checked: CheckedSpecifications) -> list[str]:
-        """Keep the switches of these monitors; return those that are in shadow mode only because of others."""
+        """Return the monitors that are in shadow mode only because of others."""
         self.said = {name: to for name, to in self.said.items() if name in checked.monitors}
         self.states = self.states_of(checked)
         drawn_in = [name for name, to in self.states.items() if to == SHADOW and self._own(name) != SHADOW]

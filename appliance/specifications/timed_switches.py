@@ -1,12 +1,9 @@
 """Switch monitors for a limited time: disable them, or bring them from shadow mode into force until confirmed.
 
-Invariants:
-
-1. The time is stored before its monitor is switched, and survives restarts of control and of the appliance.
-2. A monitor is switched for at most the ordered time plus the time for which the appliance did not run, even if the
-   clock was set back.
-3. Switching back can be refused, because the monitor now shares variables with monitors of another switch. It is then
-   tried again until it succeeds or an operator switches the monitor.
+1. The time is stored before its monitor is switched, and survives restarts.
+2. A monitor is switched for at most the ordered time plus the time for which the appliance did not run, even if
+   the clock was set back.
+3. Switching back can be refused, because the monitor now shares variables with others. It is then tried again.
 """
 
 import asyncio
@@ -32,9 +29,7 @@ _log = structlog.get_logger()
 
 
 class _Return(msgspec.Struct, frozen=True):
-    """A time limit: the switch `of` ends at `until` (seconds since the epoch), after `seconds`; then `back`
-    applies.
-    """
+    """The switch `of` ends at `until` (seconds since the epoch), after `seconds`; then `back` applies."""
 
     until: float
     seconds: float
@@ -49,7 +44,7 @@ def returns_moved(store: StateStore, seconds: float) -> None:
 
 
 class TimedSwitches:
-    """The time limits; when one ends, `come_back(back)` is called, which calls `end` like every switch."""
+    """When a limit ends, `come_back(back)` is called, which calls `end` like every switch."""
 
     def __init__(
         self, store: StateStore, come_back: Callable[[Mapping[str, Switch]], Awaitable[None]]
@@ -65,11 +60,9 @@ class TimedSwitches:
         return name in self._kept
 
     def until(self, name: str) -> float | None:
-        """Return when a disabled monitor is enabled again, in seconds since the epoch, or None."""
         return self._end_of(name, False)
 
     def confirm_by(self, name: str) -> float | None:
-        """Return when a monitor returns to shadow mode unless confirmed, in seconds since the epoch, or None."""
         return self._end_of(name, True)
 
     def unconfirmed(self) -> list[str]:
@@ -80,7 +73,6 @@ class TimedSwitches:
         return found.until if found is not None and found.of == of else None
 
     def start(self, states: Mapping[str, Switch]) -> None:
-        """Continue the limits of monitors that still have the limited switch."""
         text = self._store.settings().get(_SETTING, "{}")
         kept = msgspec.json.decode(text, type=dict[str, _Return])
         now = clock.wall()
@@ -92,10 +84,7 @@ class TimedSwitches:
         self._save()
 
     def begin(self, back: Mapping[str, Switch], seconds: float, of: Switch = False) -> None:
-        """Apply the switches in `back` after `seconds`.
-
-        A monitor that already has a limit returns to the switch of that limit.
-        """
+        """A monitor that already has a limit returns to the switch of that limit."""
         until = clock.wall() + seconds
         self._kept |= {
             name: _Return(until, seconds, self._kept[name].back if name in self._kept else to, of)
