@@ -1,10 +1,7 @@
 """Make and verify the access tokens of REST. No I/O.
 
-A token is `rosrv_<id>_<secret>`: the id (48 bits) selects the row, and the secret (256 random bits) proves possession.
-Invariants:
-
-1. The secret is never stored, only its salted scrypt hash and the data to verify its keys (`request_signing.py`).
-2. The comparison takes constant time.
+A token is `rosrv_<id>_<secret>`; the secret has 256 random bits. Only its salted scrypt hash and the data to
+verify its keys are stored. The comparison takes constant time.
 """
 
 import hashlib
@@ -26,11 +23,11 @@ _COST, _BLOCK, _PARALLEL, _LENGTH = 1 << 14, 8, 1, 32
 
 
 class BadTokenNameError(ValueError):
-    """The name is not valid for a token; the text describes valid names."""
+    """The name is not valid for a token."""
 
 
 class TokenRow(NamedTuple):
-    """A stored token. Times are seconds since the epoch; `revoked` is None unless the token was revoked."""
+    """A stored token. Times are seconds since the epoch."""
 
     id: str
     name: str
@@ -43,15 +40,11 @@ class TokenRow(NamedTuple):
     keys: TokenKeys | None = None  # None: made by a version that derived no keys
 
     def usable(self, ends: Deadlines) -> bool:
-        """Return whether the token is valid now; `ends` has its end since it is known."""
         return self.revoked is None and not ends.passed(self.id, self.expires)
 
 
 def make_token(name: str, role: str, *, now: float, seconds: float) -> tuple[TokenRow, str]:
-    """Return a new token that expires after `seconds`: its row, and its text, which is stored nowhere.
-
-    Raises `BadTokenNameError`.
-    """
+    """Return the row and the text, which is stored nowhere. Raises `BadTokenNameError`."""
     if not _NAME.fullmatch(name) or name in _RESERVED:
         raise BadTokenNameError(
             f"{name[:80]!r} is not a valid token name: letters, digits and . _ @ -, beginning with a letter or digit, "
@@ -65,13 +58,12 @@ def make_token(name: str, role: str, *, now: float, seconds: float) -> tuple[Tok
 
 
 def parse_token(text: str) -> tuple[str, str] | None:
-    """Return the id and the secret of a token's text; None if it is not a token."""
+    """Return the id and the secret."""
     found = _FORM.fullmatch(text)
     return None if found is None else (found[1], found[2])
 
 
 def hash_secret(secret: str, salt: bytes) -> bytes:
-    """Return the hash of a secret; the hash is stored, the secret is not."""
     return hashlib.scrypt(
         secret.encode("ascii"), salt=salt, n=_COST, r=_BLOCK, p=_PARALLEL, dklen=_LENGTH, maxmem=64 << 20
     )

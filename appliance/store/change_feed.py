@@ -11,8 +11,8 @@ from appliance.store.changes import Encoded
 class ChangeFeed:
     """The changes after the number `before`, in order: at most `room` bytes, but always the last one.
 
-    When more arrive, the oldest are dropped, and a consumer that lacks them needs a copy of the whole state. `changed`
-    is called in the thread that made a change. Any thread may use this class.
+    A consumer that lacks older ones needs a copy of the whole state. `changed` is called in the thread that made
+    a change. Any thread may use this class.
     """
 
     def __init__(self, before: int, changed: Callable[[], None], room: int) -> None:
@@ -24,7 +24,7 @@ class ChangeFeed:
         self._lock = threading.Lock()
 
     def add(self, changes: Sequence[Encoded]) -> None:
-        """Append the next changes; the numbers have no gap."""
+        """The numbers have no gap."""
         with self._lock:
             self._changes += changes
             self._size += sum(len(change.body) for change in changes)
@@ -37,10 +37,7 @@ class ChangeFeed:
             self._shrink()
 
     def after(self, number: int, most: int) -> list[Encoded] | None:
-        """Return the changes after this number: at most `most` bytes, but at least one change if there is any.
-
-        Return None if the feed does not have all of them, or if there was never such a number.
-        """
+        """Return at most `most` bytes of changes, but at least one; None if the feed does not have all of them."""
         with self._lock:
             skipped = number - self._before
             if not 0 <= skipped <= len(self._changes):
@@ -54,7 +51,6 @@ class ChangeFeed:
             return found
 
     def release(self, number: int) -> None:
-        """Drop the changes up to this number, because the consumer has them."""
         with self._lock:
             while self._changes and self._before < number:
                 self._drop_oldest()

@@ -1,23 +1,13 @@
-"""The changes of the state file as typed rows, the SQL that carries them out, and the file that keeps them before.
+"""The changes of the state file as typed rows, the SQL that carries them out, and the file that keeps them
+before.
 
-No SQL text is stored or sent.
-`Tables` is the only place that makes SQL of changes. It checks each change against the schema, so a change from a file
-or from another appliance can only put or delete rows of known tables, with values of the columns' types.
+Only `Tables` makes SQL, and it checks each change against the schema. So a change from a file or from another
+appliance can only put or delete rows of known tables, with values of the columns' types.
 
-`WriteAhead` keeps changes in a file until the database has stored them, so that a killed process loses none. A change
-is appended before any answer that depends on it. The append is one small write to the page cache: it takes microseconds
-and does not wait for the disk. When the database has stored all changes, the file is emptied. After a crash, the
-database applies the changes in the file that it does not have.
-
-The alternative is to commit each change (`python -m benchmarks.state_writes` compares both). With this file, a
-registration blocks the thread that answers nodes for 20 µs instead of 45 µs. That thread never waits for SQLite's one
-writer, which needs a third of a second for a parameter tree of 16 MiB. With commits while a tree is written and both
-cores are busy, one registration in a hundred would wait 3 to 17 ms. With this file, the wait is 0.06 ms.
-
-The file survives the death of the process and, after `sync`, a power failure, as the database's own WAL does. A power
-failure before `sync` may leave any part of the file, so each change has a checksum and the number of the change before
-it. Reading ends at the first change that is torn, damaged, or follows a missing one. No caller has awaited such a
-change.
+`WriteAhead` keeps changes in a file until the database has stored them, so that a killed process loses none. A
+commit of each change instead would make the thread that answers nodes wait for SQLite's one writer (`python -m
+benchmarks.state_writes` compares both). A power failure before `sync` may leave any part of the file. Reading
+ends at the first change that is torn, damaged, or follows a missing one; no caller has awaited such a change.
 """
 
 import contextlib
@@ -56,18 +46,18 @@ _EARLIER_LENGTH = struct.Struct(">I")  # of a statement that version 0.2.0 left;
 
 
 class ChangeError(ValueError):
-    """A change does not fit the tables of the state; the text names the table and the column."""
+    """A change does not fit the tables of the state."""
 
 
 class Put(msgspec.Struct, frozen=True, array_like=True, tag="put"):
-    """Store these rows of a table; each replaces the row with the same key."""
+    """Store these rows; each replaces the row with the same key."""
 
     table: str
     rows: Sequence[Sequence[Any]]
 
 
 class Delete(msgspec.Struct, frozen=True, array_like=True, tag="delete"):
-    """Delete the rows of a table that meet all conditions."""
+    """Delete the rows that meet all conditions."""
 
     table: str
     conditions: Sequence[Condition]
@@ -81,7 +71,6 @@ class _Column(NamedTuple):
     nullable: bool
 
     def problem(self, value: Any) -> str:
-        """Return the reason why the column cannot have this value; empty if it can."""
         if value is None:
             return "" if self.nullable else "must have a value"
         if not isinstance(value, self.types):
@@ -109,7 +98,7 @@ class Tables:
         return iter(self._columns)
 
     def check(self, change: Change) -> None:
-        """Raise `ChangeError` unless the change fits the tables."""
+        """Raise `ChangeError` unless the change fits."""
         columns = self._columns.get(change.table)
         if columns is None:
             raise ChangeError(f"the state has no table {change.table[:80]!r}")
@@ -146,10 +135,7 @@ class Tables:
 
 
 def joined(changes: Sequence[tuple[Change, bool]]) -> Iterator[tuple[Change, bool]]:
-    """Yield the changes, joining consecutive rows of a table: each change delays the loop's thread.
-
-    The second value of each pair is kept; only rows with equal values are joined.
-    """
+    """Join consecutive rows of a table if their second values are equal: each change delays the loop's thread."""
     if len(changes) == 1:
         yield changes[0]
         return
@@ -186,10 +172,10 @@ class WriteAheadClosedError(OSError):
 
 
 class WriteAhead:
-    """The write-ahead file at `path`. Raises `OSError` if the file cannot be opened.
+    """The write-ahead file at `path`, for any thread. Raises `OSError`.
 
-    Any thread may use this class. The descriptor's number is read only under the lock. So `close` waits for a write in
-    progress, every later use raises `WriteAheadClosedError`, and no write goes to another file that reuses the number.
+    The descriptor's number is read only under the lock, so no write after `close` goes to another file that
+    reuses it.
     """
 
     def __init__(self, path: Path) -> None:
@@ -206,9 +192,8 @@ class WriteAhead:
             yield self._open_descriptor
 
     def left(self, stored: int) -> LeftBehind:
-        """Return what an earlier process did not write to the database, which has all changes up to `stored`.
-
-        Raises `ValueError` for an intact change that this release does not know.
+        """Leave out the changes up to `stored`. Raises `ValueError` for an intact change that this release does
+        not know.
         """
         with self._descriptor() as descriptor:
             data = os.pread(descriptor, os.fstat(descriptor).st_size, 0)
@@ -218,7 +203,7 @@ class WriteAhead:
         return LeftBehind([(number, decoder.decode(body)) for number, body in _after(stored, data)], [])
 
     def append(self, changes: Sequence[Encoded]) -> None:
-        """Append changes with one write. Raises `OSError` when the disk is full."""
+        """Raises `OSError` when the disk is full."""
         with self._descriptor() as descriptor:
             parts: list[bytes] = []
             last = self._last
@@ -235,18 +220,17 @@ class WriteAhead:
             self._last = last
 
     def stored(self, number: int) -> None:
-        """Note that the database has all changes up to this number; empty the file when it has no others."""
+        """The database has all changes up to this number: empty the file when it has no others."""
         with self._descriptor() as descriptor:
             if number >= self._last:
                 os.ftruncate(descriptor, 0)
 
     def clear(self) -> None:
-        """Empty the file: the database has everything."""
         with self._descriptor() as descriptor:
             os.ftruncate(descriptor, 0)
 
     def sync(self) -> None:
-        """Flush the file to the disk, while other threads may append. Raises `OSError`."""
+        """Other threads may append. Raises `OSError`."""
         with self._descriptor() as descriptor:
             own = os.dup(descriptor)
         try:
@@ -255,7 +239,7 @@ class WriteAhead:
             os.close(own)
 
     def close(self) -> None:
-        """Close the file after any use in progress; do nothing if it is already closed."""
+        """Wait for any use in progress; do nothing if the file is already closed."""
         with self._lock:
             if self._open_descriptor >= 0:
                 os.close(self._open_descriptor)
@@ -263,7 +247,6 @@ class WriteAhead:
 
 
 def _after(stored: int, data: bytes) -> Iterator[Encoded]:
-    """Yield the changes after the number `stored`, up to the first that is damaged or follows a missing one."""
     position = 0
     while position + _HEAD.size + _NUMBERS.size <= len(data):
         marked, checksum = _HEAD.unpack_from(data, position)

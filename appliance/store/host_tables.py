@@ -40,10 +40,7 @@ _LONGEST_SECONDS = 398 * 86_400.0  # the longest life of a certificate that the 
 
 
 class HostRow(NamedTuple):
-    """An enrolled host: its virtual address, and its certificate's serial number (hexadecimal) and expiry.
-
-    Times are seconds since the epoch; `revoked` is None while the host may connect. A name always keeps its address.
-    """
+    """An enrolled host. A name always keeps its virtual address; times are seconds since the epoch."""
 
     name: str
     address: str
@@ -71,7 +68,7 @@ class CertificateRow(NamedTuple):
 
 
 class PortsRow(NamedTuple):
-    """The check of a machine's ROS ports from outside; `name` is the name of a host, or an address."""
+    """The check of a machine's ROS ports from outside; `name` is a host or an address."""
 
     name: str
     state: str
@@ -95,7 +92,7 @@ class EnrolmentTokenRow(NamedTuple):
 
 
 class RevokedCertificateRow(NamedTuple):
-    """A revoked certificate: the times of its revocation (`moment`) and expiry. `name` is empty if not known."""
+    """A revoked certificate. `name` is empty if not known."""
 
     serial: str
     name: str
@@ -104,7 +101,7 @@ class RevokedCertificateRow(NamedTuple):
 
 
 class HostBlockRow(NamedTuple):
-    """A host that an operator blocks, since this time (seconds since the epoch).
+    """A host that an operator blocks.
 
     `ends` is the end by the age clock (`base/age_clock.py`), in nanoseconds; None: it ends by an order only.
     """
@@ -117,10 +114,7 @@ class HostBlockRow(NamedTuple):
 
 
 class AuthorityRow(NamedTuple):
-    """The certificate (PEM) of the hosts' authority, and its last list of revoked certificates (PEM).
-
-    `signed` is when the list was signed, in seconds since the epoch; 0 if there is no list yet.
-    """
+    """The certificate (PEM) of the hosts' authority, and its last list of revoked certificates (PEM)."""
 
     certificate: str
     revocations: str
@@ -128,10 +122,7 @@ class AuthorityRow(NamedTuple):
 
 
 class ApplianceRow(NamedTuple):
-    """One of two appliances: the fingerprint of its tunnel key, and the certificate (PEM) for it.
-
-    `endpoint` is the address at which hosts reach it, and `pin` the pin of its REST server.
-    """
+    """One of two appliances: the fingerprint of its tunnel key, and the certificate (PEM) for it."""
 
     key: str
     endpoint: str
@@ -185,7 +176,6 @@ class HostTables:
         self._database.put("revocation", *row)
 
     def forget_revoked(self, before: float) -> None:
-        """Remove certificates that expired before this time, and are therefore invalid even without a revocation."""
         self._database.delete("revocation", ("expires", "<", before))
         self._database.delete("revoked_certificate", ("moment", "<", before - _LONGEST_SECONDS))
 

@@ -23,7 +23,6 @@ LIMITS = ("confirm", "confirm monitors")
 
 
 def limit_moved(text: str, seconds: float) -> str:
-    """Return a stored time limit with another end."""
     if not text:
         return text
     back_to, deadline, *length = text.split()
@@ -31,7 +30,6 @@ def limit_moved(text: str, seconds: float) -> str:
 
 
 def reloaded_by(who: str) -> str:
-    """Return the note of a revision that was read again; `DISK`: by a signal to the appliance."""
     return "reloaded from disk" + (f" by {who}" if who != DISK else "")
 
 
@@ -40,11 +38,11 @@ class Row(Protocol):
 
     @property
     def revision(self) -> int:
-        """Return the revision's number; 0 before the first revision."""
+        """The revision's number; 0 before the first revision."""
 
     @property
     def who(self) -> str:
-        """Return the operator who brought the revision into force, or `DISK`."""
+        """The operator who brought the revision into force, or `DISK`."""
 
     def _asdict(self) -> dict[str, Any]: ...
 
@@ -55,9 +53,8 @@ R = TypeVar("R", bound=Row)
 class Revisions(ABC, Generic[R]):
     """The revisions of the policy or of the specifications; only one change is made at a time.
 
-    A change can have a time limit: unless confirmed, it is rolled back automatically, even if the control process or
-    the appliance restarts. A rollback that raises `refusal` or `StoreError` changes nothing, and is tried
-    again after `_AGAIN_SECONDS`, because the operators may be absent.
+    An unconfirmed change is rolled back even if the appliance restarts. A rollback that raises `refusal` or
+    `StoreError` changes nothing, and is tried again, because the operators may be absent.
     """
 
     refusal: ClassVar[type[Exception]]
@@ -73,11 +70,7 @@ class Revisions(ABC, Generic[R]):
         nothing: R,
         setting: str,
     ) -> None:
-        """`rows(limit)` returns revisions, newest first; `save` writes one.
-
-        The revision `nothing` is in force until the last stored revision is loaded. The store keeps the time limit
-        under the name `setting`.
-        """
+        """`rows(limit)` returns revisions, newest first; `nothing` is in force until the last one is loaded."""
         self.store = store
         self._rows = rows
         self._save = save
@@ -94,7 +87,6 @@ class Revisions(ABC, Generic[R]):
 
     @property
     def tag(self) -> int | str:
-        """Return the tag of the present state; a request repeats it as `expected`."""
         return self.revision
 
     @abstractmethod
@@ -104,10 +96,8 @@ class Revisions(ABC, Generic[R]):
     # --- start ---
 
     def _find_last(self, *, restarted: bool) -> bool:
-        """Put the last stored revision in force; return whether it takes precedence over the files on disk.
-
-        It takes precedence after a crash of the control process (`restarted`). When the appliance starts, only a
-        revision made by an operator (a rollback, REST) takes precedence.
+        """Return whether the last stored revision takes precedence over the files on disk: after a crash of
+        control (`restarted`), or if an operator made it.
         """
         self.in_force = next(iter(self._rows(1)), self.in_force)
         return self.revision > 0 and (restarted or self.in_force.who != DISK)
@@ -132,10 +122,7 @@ class Revisions(ABC, Generic[R]):
         return next((row for row in await self._kept() if row.revision == revision), None)
 
     async def _wanted(self, revision: int | None) -> R:
-        """Return the stored revision to roll back to (None: the one before the present revision).
-
-        Raises `refusal` if it does not exist, and `outdated` if another revision came into force during the read.
-        """
+        """None is the revision before the present one. Raises `refusal` and `outdated`."""
         before = self.revision
         known = {row.revision: row for row in await self._kept()}
         if self.revision != before:
@@ -152,7 +139,7 @@ class Revisions(ABC, Generic[R]):
 
     @contextlib.asynccontextmanager
     async def _changing(self, expected: int | str | None) -> AsyncIterator[None]:
-        """Hold the lock for one change. Raises `outdated` unless `expected` is None or the present tag."""
+        """Raises `outdated` unless `expected` is None or the present tag."""
         async with self._one_change:
             require_awaited()
             if expected not in (None, self.tag):
@@ -160,7 +147,6 @@ class Revisions(ABC, Generic[R]):
             yield
 
     def _put_in_force(self, row: R, within: float | None = None) -> None:
-        """Store a revision and put it in force; unless confirmed, roll it back after `within` seconds."""
         if within is not None:  # set the limit first, because control may die during the change
             back_to = self.revision if self.confirm_by is None else self._back_to
             self._limit(back_to, clock.wall() + within, within)

@@ -64,10 +64,7 @@ _EMPTY = msgspec.msgpack.encode({})
 
 
 class IncarnationRow(NamedTuple):
-    """A stored incarnation; `changed` is in monotonic seconds, and used only for the order.
-
-    `relay_port` is the incarnation's port on the first relay process, `more_relay_ports` are its ports on the others.
-    """
+    """`changed` is in monotonic seconds, for the order only. `relay_port` is the port on the first relay process."""
 
     key: str
     name: str
@@ -83,7 +80,7 @@ class IncarnationRow(NamedTuple):
 
 
 class RegistrationRow(NamedTuple):
-    """A stored registration; `ordinal` counts registrations in the order they were made."""
+    """`ordinal` counts registrations in the order they were made."""
 
     key: str
     kind: str
@@ -103,10 +100,7 @@ class PermissionRow(NamedTuple):
 
 
 class RevisionRow(NamedTuple):
-    """A policy that was in force; `loaded` is seconds since the epoch, `who` names its author.
-
-    `signature` is the signature of the site; empty if the policy is unsigned.
-    """
+    """A policy that was in force; `loaded` is seconds since the epoch, `who` names its author."""
 
     revision: int
     text: str
@@ -142,11 +136,11 @@ class StateStore:
         self._noted: dict[str, list[int]] = {}  # the changes of each key since the tree was stored, by number
 
     async def settled(self) -> None:
-        """Wait until everything saved so far is on the disk. Raises `StoreError` if it cannot be written."""
+        """Raises `StoreError` if the changes cannot be written to the disk."""
         await self.database.settled()
 
     def close(self, seconds: float | None = None) -> None:
-        """Write the queued changes within `seconds` (None: no limit), and close the file."""
+        """None: no limit."""
         self.database.close(seconds)
 
     # --- registry ---
@@ -196,7 +190,6 @@ class StateStore:
     # --- parameters ---
 
     def save_parameters(self, tree: dict[str, Any]) -> None:
-        """Store the whole parameter tree, and remove the single changes that it contains."""
         with self.database.together():  # a change that stays would undo a larger one below it
             self.database.put("parameters", 1, msgspec.msgpack.encode(tree), ahead=False)
             self.database.delete("parameter_change", ("number", "<=", self._parameter_changes), ahead=False)
@@ -209,14 +202,12 @@ class StateStore:
 
     @property
     def tree_is_due(self) -> bool:
-        """Whether the tree should be stored, for a large value or because many keys have changed."""
         return self._only_in_tree or len(self._noted) > _MOST_NOTED
 
     def note_parameter(self, key: str, value: Any) -> None:
-        """Store one change until the next tree is stored: the parameter has this value (None: it was deleted).
+        """Store one change until the next tree is stored; None: the parameter was deleted.
 
-        The change then survives the process. It replaces the earlier changes of its key, so the tree, which may be
-        large, is stored rarely. A value larger than `LARGEST_CHANGE` is stored only with the tree.
+        The tree, which may be large, is stored rarely, and a value larger than `LARGEST_CHANGE` only with it.
         """
         data = None if value is None else msgspec.msgpack.encode(value)
         if data is not None and len(data) > self._largest_change:
@@ -239,7 +230,6 @@ class StateStore:
         self._noted.setdefault(key, []).append(self._parameter_changes)
 
     def parameter_changes(self) -> list[tuple[str, Any]]:
-        """Return the changes since the tree was stored, in order; the value is None for a deleted parameter."""
         query = "SELECT number, key, value FROM parameter_change ORDER BY number"
         rows = self.database.query(query)
         self._parameter_changes = rows[-1][0] if rows else 0
@@ -271,7 +261,6 @@ class StateStore:
         self.database.put("policy_revision", *row[:-1])
 
     def revisions(self, limit: int = -1) -> list[RevisionRow]:
-        """Return the last `limit` revisions (-1: all), the newest first."""
         rows = self.database.query(
             "SELECT policy_revision.*, coalesce(signature, '') FROM policy_revision"
             " LEFT JOIN policy_signature USING (revision) ORDER BY revision DESC LIMIT ?",
@@ -283,14 +272,12 @@ class StateStore:
         self.database.put("monitor_revision", *row)
 
     def monitor_revisions(self, limit: int = -1) -> list[MonitorRevisionRow]:
-        """Return the last `limit` revisions of the specifications (-1: all), the newest first."""
         rows = self.database.query("SELECT * FROM monitor_revision ORDER BY revision DESC LIMIT ?", (limit,))
         return [MonitorRevisionRow(*row) for row in rows]
 
     # --- the state of monitors, between two appliances ---
 
     def save_monitor_state(self, relay: int, epoch: int, content: bytes) -> None:
-        """Store the state that a relay left when its appliance, active in this epoch, handed over."""
         self.database.put("monitor_state", relay, epoch, content)
 
     def clear_monitor_states(self) -> None:
@@ -303,7 +290,7 @@ class StateStore:
     # --- tokens ---
 
     def save_tokens(self, *rows: TokenRow) -> None:
-        """Store tokens, or their new ends. After a crash, either all of these rows are stored or none."""
+        """After a crash, either all of these rows are stored or none."""
         with self.database.together():
             for row in rows:
                 if row.keys is not None:
@@ -323,7 +310,6 @@ class StateStore:
         return dict(self.database.query("SELECT id, used FROM token_use"))
 
     def save_time_left(self, left: Mapping[str, float]) -> None:
-        """Store the seconds until the ends of tokens, by id."""
         with self.database.together():
             for token, seconds in left.items():
                 self.database.put("token_left", token, seconds)

@@ -20,7 +20,7 @@ class StoredDeadlines(Deadlines):
         self.limit(self._stored)
 
     def save(self) -> None:
-        """Store the remaining times that have changed. Raises `StoreError`."""
+        """Raises `StoreError`."""
         changed = {name: left for name, left in self.left().items() if self._stored.get(name) != left}
         if changed:
             self._store.database.require_room()
@@ -33,7 +33,6 @@ class StoredDeadlines(Deadlines):
             self._store.forget_time_left(name)
 
     async def watch(self) -> None:
-        """Store the remaining times every half a minute."""
         while True:
             await asyncio.sleep(_SAVE_SECONDS)
             with contextlib.suppress(StoreError):  # a full disk: the next save tries again

@@ -1,14 +1,10 @@
 """Write one SQLite file: changes are queued, written in groups by one thread, and can be awaited.
 
-Waiting changes are committed together (group commit). A killed process loses no change: a separate file holds
-queued changes until the database has them (`ahead`). A power failure loses no change that was awaited
-(`settled`). So a change that was reported to an operator as done stays done.
-
-Each change has a number, in the order of the queue. The table `journal` has the number of the last change in the
-database; the same transaction writes both. So after a crash the database neither repeats nor skips a change.
-
-Numbers identify changes within a *history* only. Each process that changes the file begins a new history, because an
-earlier process may have passed on changes that it then lost in a crash.
+A killed process loses no change: a separate file holds queued changes until the database has them (`ahead`). A
+power failure loses no change that was awaited (`settled`). The table `journal` has the number of the last change,
+so after a crash the database neither repeats nor skips a change. Numbers identify changes within a *history*
+only, which each process that changes the file begins, because an earlier process may have passed on changes that
+it then lost in a crash.
 """
 
 import asyncio
@@ -85,15 +81,14 @@ class _Gathered(NamedTuple):
 
 
 class StoreError(Exception):
-    """The state cannot be read or written; the text names the file and the reason."""
+    """The state cannot be read or written."""
 
 
 class Database:
-    """The state file at `path`, created with `schema` when it is new.
+    """The state file at `path`, created with `schema` when it is new. Raises `StoreError`.
 
-    Raises `StoreError` if the file is not a database or cannot be opened. `failed` is called once when writing fails (a
-    full disk). Nothing is dropped: the write is tried again until it succeeds or the database is closed. `drive` makes
-    the driver that calls the turns, in one thread.
+    `failed` is called once when writing fails (a full disk); the write is tried again until the database is
+    closed.
     """
 
     def __init__(
@@ -134,10 +129,8 @@ class Database:
         self._driver = drive("store", self.turn, _GATHER_SECONDS)
 
     def query(self, sql: str, parameters: Sequence[Value] = ()) -> list[tuple[Any, ...]]:
-        """Read rows, including those queued before; after start-up, call this in a thread, because it may wait.
-
-        The result lacks changes that are not written within `_CATCH_UP_SECONDS`. If writing fails (a full disk), the
-        call does not wait.
+        """Read also queued rows. Call this in a thread, because it may wait for `_CATCH_UP_SECONDS`, though not
+        while writing fails.
         """
         if not self._ended and not self._failing:
             written = threading.Event()
@@ -151,15 +144,12 @@ class Database:
             raise StoreError(f"{self._path}: {error}") from error
 
     def put(self, table: str, *row: Value, ahead: bool = True) -> None:
-        """Queue a row of a table; it replaces the row with the same key.
-
-        With `ahead`, it survives the process from then on (large values do without). Raises `ChangeError` for a row
-        that does not fit the table, and `StoreError` after `close`, as `delete` does.
+        """With `ahead`, the row survives the process from then on. Raises `ChangeError`, and `StoreError` after
+        `close`.
         """
         self._submit(Put(table, [row]), ahead=ahead)
 
     def delete(self, table: str, *conditions: Condition, ahead: bool = True, **equal: Value) -> None:
-        """Queue the removal of the rows that meet all conditions and have these values in these columns; see `put`."""
         equals: list[Condition] = [(column, "=", value) for column, value in equal.items()]
         self._submit(Delete(table, [*conditions, *equals]), ahead=ahead)
 
@@ -207,7 +197,6 @@ class Database:
         self._driver.wake()
 
     def follow(self, changed: Callable[[], None], room: int) -> ChangeFeed:
-        """Return a feed of all changes from now on; `changed` is called after each, in its thread."""
         with self._order:
             feed = ChangeFeed(self._number, changed, room)
             self._feeds = (*self._feeds, feed)
@@ -222,9 +211,9 @@ class Database:
         return self._number
 
     def copy(self) -> sqlite3.Connection:
-        """Return a copy of the database, in a file that no longer has a name; call this in a thread.
+        """Return a copy in a file that no longer has a name; call this in a thread.
 
-        The copy is one step: with fewer pages at a time, each commit would start it again. Changes are still written.
+        The copy is one step: with fewer pages at a time, each commit would start it again.
         """
         path = self._path.with_suffix(".new")
         path.unlink(missing_ok=True)  # a killed process may have left a part
@@ -257,7 +246,7 @@ class Database:
             raise StoreError(f"{why}; nothing was changed: free space and try again")
 
     async def settled(self) -> None:
-        """Wait until all changes queued so far are on the disk. Raises `StoreError` if they cannot be written."""
+        """Raises `StoreError` if the changes queued so far cannot be written."""
         loop = asyncio.get_running_loop()
         done: asyncio.Future[str] = loop.create_future()
 
@@ -280,9 +269,8 @@ class Database:
             raise StoreError(f"{problem}; a power failure may undo recent changes: check the disk")
 
     def close(self, seconds: float | None = None) -> None:
-        """Write the queue within `seconds` (None: no limit), and close the file.
-
-        Changes made after this call begins raise `StoreError`.
+        """Write the queue within `seconds` (None: no limit). Changes made after this call begins raise
+        `StoreError`.
         """
         with self._order:
             self._closed = True
@@ -293,7 +281,6 @@ class Database:
         self._ahead.close()
 
     def turn(self, now: float) -> float | None:
-        """Write a group of the queue; return the time of the next turn, None at the end."""
         if self._ended:
             return None
         if now < self._retry_at and not self._closed:
@@ -354,7 +341,7 @@ class Database:
         return True
 
     def _sync(self) -> str:
-        """Flush to the disk; return why it failed. The kernel may have dropped what it could not write."""
+        """Return why the flush failed. The kernel may have dropped data that it could not write."""
         try:
             with self._path.with_name(f"{self._path.name}-wal").open("rb") as log:
                 os.fsync(log.fileno())
