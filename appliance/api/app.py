@@ -84,10 +84,7 @@ def build_app(services: Services) -> FastAPI:
 
 
 async def _only_known(request: Request) -> None:
-    """Raise `ProblemError` (422) for parameters that the contract lacks.
-
-    Pages outside the contract, such as the console, accept any query parameters.
-    """
+    """Raise `ProblemError` (422) for parameters that the contract lacks, but not for pages outside the contract."""
     given = request.query_params.keys()
     if not given:
         return

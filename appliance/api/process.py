@@ -1,8 +1,7 @@
 """Run the api process: its lifeline, its link to control, its certificate, and the listener.
 
-The process ends when the supervisor sends `Stop` or has ended. It outlives control. If control does not come back, or
-closed the link because of an invalid message, the api ends and the supervisor starts a new one. Routes and contract
-are made when the first request passes the gate, so an unused api needs little memory.
+It outlives control. Routes and contract are made when the first request passes the gate, so an unused api needs
+little memory.
 """
 
 import asyncio

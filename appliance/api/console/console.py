@@ -1,16 +1,10 @@
 """Serve the console: one page for operators, with all its files.
 
-Invariants:
-
-1. The files are part of the program, need no token and contain no secret. Only the site's notice, the robot's name, and
-   the time after which the page locks, are settings. The page requests its content from `/v1` with its reader's token.
-2. Only files that existed when the routes were made are served, by exact name: a request's path never reaches the file
-   system.
-3. The headers restrict the page to this origin, for loading and for connections, and to its own scripts. A string never
-   becomes markup (Trusted Types).
-4. The page names its files by addresses that contain a hash of their content, so browsers keep them without asking.
-   All modules are one script, all style sheets one, both made here: a missing file or name ends the start of the API.
-   A script that a feature loads with `import()` is a file of its own.
+1. The files are part of the program, need no token and contain no secret.
+2. Only files that existed when the routes were made are served, by exact name: a request's path never reaches the
+   file system.
+3. The headers restrict the page to this origin and to its own scripts. A string never becomes markup (Trusted
+   Types).
 """
 
 import gzip
@@ -64,7 +58,7 @@ class _File(NamedTuple):
 
 
 def routes(settings: Settings) -> APIRouter:
-    """Return the routes, which are not part of the contract. Raise `ModuleError` if the modules cannot be joined."""
+    """The routes are not part of the contract. Raise `ModuleError` if the modules cannot be joined."""
     router = APIRouter(include_in_schema=False)
     served = _collect((files(__package__) / name for name in _SERVED), "")
     for feature in FEATURES:
@@ -81,7 +75,6 @@ def routes(settings: Settings) -> APIRouter:
     }
 
     def named(found: re.Match[str]) -> str:
-        """Return the address, with a hash, of the file that the match names."""
         name = found[1]
         if name not in served:
             raise ModuleError(f"the console names {_PREFIX}{name}, which does not exist")

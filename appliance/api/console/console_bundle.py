@@ -1,20 +1,11 @@
 """Join the console's modules into one script, and its style sheets into one.
 
-The sources stay plain modules without a build tool, so they use a small part of the module syntax:
+The sources stay plain modules without a build tool. Imports have the form `import { a, b as c } from "./x.js";`,
+in a feature also from `"#console/x.js"`; an absolute address stays a separate file. Exports have the forms
+`export function`, `export async function`, `export class`, `export const NAME` and `export { a, b } from "…";`.
 
-- `import { a, b as c } from "./x.js";`, in a feature also from `"#console/x.js"`, a module of the console; from an
-  absolute address, which stays a separate file;
-- `export function`, `export async function`, `export class`, `export const NAME`;
-- `export { a, b } from "…";`
-
-Invariants:
-
-1. Every module becomes one function scope, so private names do not collide. It is included once, after all modules
-   that it imports.
-2. Everything else raises `ModuleError`, at the start of the API: other forms of import and export, `import()` of a
-   module that is joined, cycles, missing files, names that a module does not export, unclosed strings and brackets, and
-   a slash after a bracket that may begin a regular expression.
-3. Comments and needless spaces are removed, but not inside strings, templates and regular expressions.
+Every module becomes one function scope, so private names do not collide. Everything else raises `ModuleError`, at
+the start of the API.
 """
 
 import posixpath
@@ -57,19 +48,15 @@ class _Token(NamedTuple):
 
 
 def join_modules(sources: Mapping[str, str], entry: str) -> str:
-    """Return the script of `entry` and all its imports. `sources` maps paths, such as `js/main.js`, to texts.
-    Raise `ModuleError`.
-    """
+    """`sources` maps paths, such as `js/main.js`, to texts. Raise `ModuleError`."""
     joining = _Joining(sources)
     joining.include(entry)
     return joining.script()
 
 
 def join_late_modules(sources: Mapping[str, str], entry: str) -> str:
-    """Return the entry and all that it imports from its folder, with the exports of the entry.
-
-    A page loads it by `import()` at its address. Modules of other folders are in the page's script, with their state,
-    so the entry gets them as arguments. Raise `ModuleError`.
+    """Modules of other folders are in the page's script, with their state, so the entry gets them as arguments.
+    Raise `ModuleError`.
     """
     folder = f"{posixpath.dirname(entry)}/"
     joining = _Joining({name: text for name, text in sources.items() if name.startswith(folder)})
@@ -78,11 +65,7 @@ def join_late_modules(sources: Mapping[str, str], entry: str) -> str:
 
 
 def join_styles(sources: Mapping[str, str], entry: str, within: tuple[str, ...] = ()) -> str:
-    """Return one style sheet, without comments and indentation.
-
-    `within` are the files whose imports led to the entry. Raise `ModuleError` for a missing file, a cycle,
-    and an import of another form.
-    """
+    """`within` are the files whose imports led to the entry. Raise `ModuleError`."""
     if entry not in sources:
         raise ModuleError(f"there is no file {entry}")
     way = (*within, entry)
@@ -200,7 +183,6 @@ def _tightened(pieces: list[_Token]) -> str:
 
 
 def _apart(before: str, after: str) -> bool:
-    """Whether the tokens `before` and `after` stay two tokens without a space between them."""
     return before in _SEPARATING or after in _SEPARATING
 
 

@@ -1,13 +1,11 @@
 """Authenticate bearer tokens.
 
-Invariants:
-
-1. Only an unexpired token of control's list identifies its owner. Before the first list arrives, clients are asked to
-   try again, because "revoked" would end their sessions.
-2. The costly check (scrypt) runs in a thread, for one request at a time. A peer that keeps sending wrong tokens must
-   wait between checks, so guessing costs little.
-3. A valid token is remembered only as a hash under a random key of this process, never in clear text. A change of the
-   list of tokens clears this memory.
+1. Before control's first list of tokens arrives, clients are asked to try again, because "revoked" would end
+   their sessions.
+2. The costly check (scrypt) runs in a thread, for one request at a time. A peer that keeps sending wrong tokens
+   must wait between checks.
+3. A valid token is remembered only as a hash under a random key of this process, until the list of tokens
+   changes.
 4. The use of a token is reported at once, and then at most once in `USE_SECONDS`.
 """
 
@@ -75,7 +73,7 @@ class TokenAuthenticator:
         self._shown: OrderedDict[str, float] = OrderedDict()  # by peer: the time of its last valid token
 
     def quota_class(self, peer: str) -> QuotaClass:
-        """Return the class of the operator's machine, or of a peer with a recent valid token; otherwise unknown."""
+        """Peers with a recent valid token, and the operator's machine, are known."""
         shown = self._shown.get(peer)
         lately = shown is not None and clock.now() - shown < _KNOWN_SECONDS
         return QuotaClass.REGISTERED if lately or is_loopback(peer) else QuotaClass.UNKNOWN
@@ -96,7 +94,7 @@ class TokenAuthenticator:
         return kept is not None and not self._ends.passed(kept.id, kept.expires)
 
     async def recognise(self, authorization: str | None, host: str) -> Bearer:
-        """Return the bearer of an `Authorization` header. Raises `ProblemError` (401, 429, 503)."""
+        """Raises `ProblemError` (401, 429, 503)."""
         if authorization is None:
             raise self._refusal("no token: send it as `Authorization: Bearer TOKEN`")
         if not self._stated:

@@ -1,11 +1,7 @@
 """Make and keep the self-signed certificate of REST.
 
-Clients may trust exactly this certificate, so it is replaced only when it ends, or when the configuration
-gives the appliance another name. The name of the machine is in it, but a new one does not replace the
-certificate: by default, each recreated container has a new id as its name.
-
-The authority for hosts in tunnels does not sign the certificate, because REST also runs without tunnels.
-Clients get a copy of `certificate.pem`, or pin the key's fingerprint, as the kits of hosts do.
+Clients may trust exactly this certificate, so it is replaced only when it ends, or when the configuration gives
+the appliance another name. Each recreated container has a new name of the machine, which changes nothing.
 """
 
 import base64
@@ -35,10 +31,8 @@ _CONTAINER_ID = re.compile("[0-9a-f]{12}")
 
 
 def tls_context(home: Path, names: Iterable[str], now: datetime.datetime) -> ssl.SSLContext:
-    """Return the context; make a new certificate if none is stored, or if the stored one ends soon or lacks
-    one of `names`.
-
-    Raises `OSError`, `ValueError` and `ssl.SSLError` if the stored files cannot be used.
+    """Make a new certificate unless a valid one with all `names` is stored. Raises `OSError`, `ValueError` and
+    `ssl.SSLError`.
     """
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.minimum_version = ssl.TLSVersion.TLSv1_2
@@ -49,10 +43,7 @@ def tls_context(home: Path, names: Iterable[str], now: datetime.datetime) -> ssl
 
 
 def renew(context: ssl.SSLContext, home: Path, names: Iterable[str], now: datetime.datetime) -> bool:
-    """Replace a certificate that ends soon or was made with a wrong clock; return whether it was replaced.
-
-    Raises the same errors as `tls_context`.
-    """
+    """Return whether the certificate was replaced. Raises as `tls_context` does."""
     made = _make_if_needed(home, names, now)
     if made:
         context.load_cert_chain(home / CERTIFICATE, home / KEY)
@@ -110,7 +101,7 @@ def _make(certificate_path: Path, key_path: Path, names: Iterable[str], now: dat
 
 
 def pin_of(home: Path) -> str:
-    """Return the pin of the key in the format of curl's `--pinnedpubkey`."""
+    """Return the format of curl's `--pinnedpubkey`."""
     certificate = x509.load_pem_x509_certificate((home / CERTIFICATE).read_bytes())
     public = certificate.public_key().public_bytes(
         serialization.Encoding.DER, serialization.PublicFormat.SubjectPublicKeyInfo
@@ -119,7 +110,7 @@ def pin_of(home: Path) -> str:
 
 
 def fingerprint_of(home: Path) -> str:
-    """Return the SHA-256 of the certificate in hexadecimal."""
+    """Return the SHA-256 in hexadecimal."""
     certificate = x509.load_pem_x509_certificate((home / CERTIFICATE).read_bytes())
     return certificate.fingerprint(hashes.SHA256()).hex()
 

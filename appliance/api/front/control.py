@@ -1,11 +1,7 @@
 """Send the api's requests to control, and notices of REST calls without an answer.
 
-Invariants:
-
-1. At most `_MOST_OPEN` requests are open; further ones are rejected here.
-2. A request ends with its answer, with the end of the link, or after a time limit.
-3. A notice (`tell`) never waits. While the control process is away, the last `_MOST_KEPT` notices are kept for the
-   next control process; lost notices are counted and logged.
+At most `_MOST_OPEN` requests are open. A notice never waits: the last `_MOST_KEPT` are kept for the next control
+process.
 """
 
 import asyncio
@@ -48,9 +44,8 @@ _UNKNOWN = (
 
 
 class ControlAwayError(Exception):
-    """Control gave no answer; the text gives the client the reason.
-
-    `active` is the address of the active appliance, if this one is the standby.
+    """The text gives the client the reason; `active` is the address of the active appliance, if this one is the
+    standby.
     """
 
     def __init__(self, reason: str, active: str = "") -> None:
@@ -100,10 +95,9 @@ class ControlLink:
     async def ask(
         self, request: AdminRequest[A], bearer: Bearer | None, seconds: float | None = None
     ) -> AdminAnswer[A]:
-        """Return control's answer. Raises `ControlAwayError`.
+        """Raises `ControlAwayError`.
 
-        A request is withdrawn if the client disconnects, or if it has not taken effect after `seconds` (None:
-        the operation's own limit).
+        A request is withdrawn if the client disconnects, or if it has not taken effect after `seconds`.
         """
         if seconds is None:
             operation = operation_of(request)
@@ -133,7 +127,7 @@ class ControlLink:
     async def _asked(
         self, request: AdminRequest[Any], bearer: Bearer | None, until: float, longest: float
     ) -> bytes:
-        """Return the encoded answer. The request is withdrawn when its client disconnects. Raises as `Link.ask`."""
+        """Raises as `Link.ask` does."""
         number = 0
 
         def question(given: int) -> RequestMade:
@@ -157,7 +151,7 @@ class ControlLink:
         return answer
 
     async def hand_over(self, door: str, ticket: str, peer: str, descriptor: int) -> tuple[int, str]:
-        """Return the status, and the reason for refusing the WebSocket or an empty text. Raises `ControlAwayError`."""
+        """Return the status, and the reason for refusing the WebSocket. Raises `ControlAwayError`."""
         if self.paused:
             raise ControlAwayError(self.paused)
         try:
@@ -169,7 +163,7 @@ class ControlLink:
         return answer.status, answer.reason
 
     def token_used(self, token: str) -> None:
-        """Report the use of a token. While control is away the report is dropped, and a later use is reported."""
+        """While control is away the report is dropped, and a later use is reported."""
         with contextlib.suppress(ChannelFullError):
             self._link.send(TokenUsed(token))
 

@@ -15,8 +15,7 @@ def etag(tag: int | str) -> str:
 class ConditionalGet:
     """A JSON answer to GET that has no ETag gets the hash of its body.
 
-    A client that sends the hash in `If-None-Match` gets 304, without the body. An answer with its own ETag is always
-    sent completely: such an ETag names a revision, for `If-Match` of a change, and does not cover the whole body.
+    Any other ETag names a revision, for `If-Match` of a change, and does not cover the whole body.
     """
 
     def __init__(self, app: ASGIApp) -> None:

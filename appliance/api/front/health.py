@@ -1,8 +1,4 @@
-"""Answer `/healthz` (whether REST answers) and `/readyz` (whether nodes are served).
-
-The probes do not query control. They use the last sampled state, at most `history.IDLE_SECONDS` old; a bad state is
-sampled again, at a limited rate.
-"""
+"""Answer `/healthz` (whether REST answers) and `/readyz` (whether nodes are served) from the last sampled state."""
 
 from typing import Literal
 

@@ -1,7 +1,6 @@
 """Keep samples of the last hour: counters that only grow, from which clients compute rates.
 
-While a client follows, control is queried every `BUSY_SECONDS`; otherwise every `IDLE_SECONDS`. One query serves all
-clients, so more clients cost RVMaster nothing. The age and the number of samples are limited.
+One query of control serves all clients, so more clients cost RVMaster nothing.
 """
 
 import asyncio
@@ -42,10 +41,7 @@ class Sample(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class LastSample(NamedTuple):
-    """Control's last status, or the reason why it is unknown.
-
-    `active`: the address of the active appliance, if this one is the standby.
-    """
+    """Control's last status, or the reason why it is unknown; `active` as in `ControlAwayError`."""
 
     number: int
     status: Status | None
@@ -66,7 +62,6 @@ class SampleHistory:
         self.seen = LastSample(0, None, None, _AWAY)
 
     def samples(self, most: int) -> list[Sample]:
-        """Return at most `most` evenly spaced samples, the newest last."""
         kept = list(self._samples)
         step = -(-len(kept) // most)
         return kept[::-1][::step][::-1] if step > 1 else kept
@@ -86,9 +81,8 @@ class SampleHistory:
             return self.seen
 
     async def again(self, seconds: float) -> LastSample:
-        """Sample again; if that takes longer than `seconds`, return the last sample.
-
-        Control is queried at most once in `LEAST_SECONDS`.
+        """If sampling takes longer than `seconds`, return the last sample. Control is queried at most once in
+        `LEAST_SECONDS`.
         """
         self._sooner.set()
         with contextlib.suppress(TimeoutError):

@@ -1,8 +1,6 @@
 """Report all REST calls to control, which records them; equal reads and rejections are folded.
 
-The first call of a kind is reported at once; repetitions within `FOLD_SECONDS` are counted and reported as one call.
-Calls beyond `kinds` kinds are counted by status only. Changes (any call with a valid token except GET and HEAD) are
-never folded.
+Changes (any call with a valid token except GET and HEAD) are never folded.
 """
 
 from collections import Counter

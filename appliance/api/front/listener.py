@@ -1,14 +1,11 @@
 """Accept connections of REST with `rpc/front`, which RVMaster also uses; uvicorn serves them.
 
-Invariants besides those of `rpc/front`:
-
-1. A connection is entered in the connection table before anything (such as TLS) is set up for it. If the table is full,
-   the connection is closed at once.
-2. A peer is known if it recently sent a valid token or is on this machine. To admit a peer that has no connection
-   yet, a connection of another peer may be closed. A connection of an unknown peer may be closed at any time. A
-   connection of a known peer may be closed only for another known peer, and only after it has waited for a second.
-3. Connections are opened (with TLS: the handshake begins) in the order of the processor time that their peers have
-   used. All unknown peers count as one peer.
+1. A connection is entered in the connection table before anything (such as TLS) is set up for it. If the table is
+   full, it is closed at once.
+2. A peer is known if it recently sent a valid token or is on this machine. A connection of an unknown peer may be
+   closed at any time to admit another peer, that of a known peer only for another known peer, after a second.
+3. Connections are opened in the order of the processor time that their peers have used. All unknown peers count
+   as one.
 4. The deadline for the head of the next request starts with the first byte after an answer, so neither an empty
    line nor the rest of a body keeps a connection open.
 """
@@ -137,7 +134,7 @@ class _Connection(Front, asyncio.Protocol):
         self.connection_table.file(self, Stage.UNFINISHED if begun else Stage.IDLE)
 
     def reject(self, _status: bytes, what: str) -> None:
-        """Send the status, and discard what the peer still sends: closing with unread bytes would lose the answer."""
+        """Discard the bytes that the peer still sends: closing with unread bytes would lose the answer."""
         self.closing = True
         self.transport.pause_reading()
         said = f"The peer {what}.\n".encode()
@@ -151,7 +148,6 @@ class _Connection(Front, asyncio.Protocol):
 
 
 def _class_of(quota_class: Callable[[str], QuotaClass], host: Address) -> str:
-    """Return the key for processor time, which all unknown peers share."""
     peer = peer_key(str(host))
     return "" if quota_class(peer) is QuotaClass.UNKNOWN else peer
 
@@ -207,7 +203,6 @@ class Listener:
             self._begin(self._websockets.pass_on(passage, head))
 
     def protocol_of(self, connection: _Connection) -> asyncio.Protocol:
-        """Make the protocol in the way that uvicorn's server does."""
         make = cast(Callable[..., asyncio.Protocol], self._config.http_protocol_class)
         return make(config=self._config, server_state=self._state, app_state={_CONNECTION: connection})
 
@@ -231,7 +226,6 @@ class Listener:
         self._begin(self.connection_table.sweep())
 
     async def stop(self) -> None:
-        """Stop after open requests had a second to finish."""
         if self._acceptor is not None:
             self._acceptor.close()
         tasks = list(self._tasks)

@@ -1,7 +1,4 @@
-"""Write each time in JSON twice: as the number in the struct's field (`since`), then as RFC 3339 (`since_utc`).
-
-A field is marked as a time by its type (`Moment`, `NanoMoment`), so answers need no code for times.
-"""
+"""Write each time in JSON twice: as the number in the struct's field (`since`), then as RFC 3339 (`since_utc`)."""
 
 import functools
 from collections.abc import Mapping
@@ -20,7 +17,7 @@ _OF_A_SECOND = 1_000_000  # a float has no more digits
 
 
 def in_full(value: Any) -> Any:
-    """Return the value with the RFC 3339 text of each time, as msgspec can encode it."""
+    """msgspec can encode the result."""
     if isinstance(value, msgspec.Struct):
         units = _units(type(value))
         if units is None:
@@ -39,7 +36,6 @@ def in_full(value: Any) -> Any:
 
 
 def describe(schema: dict[str, Any]) -> None:
-    """Add an RFC 3339 field after each time of a schema."""
     fields: dict[str, Any] = {}
     for name, field in schema.get("properties", {}).items():
         fields[name] = field
@@ -53,7 +49,7 @@ def describe(schema: dict[str, Any]) -> None:
 
 
 def given(text: str) -> int:
-    """Parse a time of a request to nanoseconds since the epoch. Raises `ProblemError` (422)."""
+    """Raises `ProblemError` (422)."""
     try:
         return parse_timestamp(text, clock.wall_ns())
     except (OverflowError, ValueError) as error:
@@ -66,7 +62,6 @@ def _text(moment: float, unit: str) -> str:
 
 @functools.cache
 def _units(kind: type[msgspec.Struct]) -> dict[str, str] | None:
-    """Return None if neither the struct nor a struct within it has a time."""
     _, kinds = msgspec.json.schema_components([kind])
     found = {
         name: {field: unit for field, of in schema.get("properties", {}).items() if (unit := _unit(of))}

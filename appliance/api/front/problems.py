@@ -95,11 +95,10 @@ def too_many(kind: str, detail: str, seconds: float) -> ProblemError:
 
 
 def bad_input(wrong: list[BadInput], *, besides: str = "") -> ProblemError:
-    """Return a problem of status 422; `besides` is added to the detail."""
     detail = "; ".join(f"{problem.where}: {problem.text}" for problem in wrong[:5])
     return ProblemError(422, "bad-input", detail + besides, errors=wrong)
 
 
 def defect(error: Exception) -> ProblemError:
-    """Return a problem that has the kind of the error, and nothing about its cause."""
+    """Reveal nothing about the cause of the error."""
     return ProblemError(500, "defect", f"a defect of rosrv, please report it: {type(error).__name__}")

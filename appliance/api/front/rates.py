@@ -1,10 +1,7 @@
 """Limit the rate of each peer with token buckets. No I/O; the time is a parameter.
 
-Invariants:
-
-1. There are at most `peers` buckets. A further bucket replaces the least recently used one, so a flood from many
-   addresses gains at most one burst for each address.
-2. An IPv6 peer is identified by its /64 network, because one host can use all addresses of that network.
+A further bucket replaces the least recently used, so a flood from many addresses gains at most one burst for
+each. An IPv6 peer is its /64 network, because one host can use all addresses of that network.
 """
 
 import ipaddress
@@ -35,7 +32,6 @@ class Buckets:
         self._buckets: OrderedDict[str, tuple[float, float]] = OrderedDict()
 
     def take(self, host: str, now: float) -> float:
-        """Return 0, or the seconds until the next token."""
         left = self._left(host, now)
         if left < 1:
             self._keep(host, left, now)

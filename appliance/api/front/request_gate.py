@@ -1,15 +1,12 @@
 """Check every request before it reaches a route, and report its answer.
 
-Order: rate → Host → Origin → size of the body → token. Invariants:
+Order: rate → Host → Origin → size of the body → token.
 
 1. A request that fails a check costs no more than reading its headers.
-2. Only `PUBLIC` paths and the console's own files are served without a token. Without a token, an unknown path gets
-   the same answer as a known path.
-3. A page of another site cannot misuse the browser of a person who can reach the appliance: a foreign name as Host
-   (DNS rebinding) and a foreign Origin are rejected, and no CORS header is ever sent.
-4. Every answer is reported, with equal reads folded (see `Journal`), except answers of the health probes and the
-   console's own files.
-5. A client that does not read its answer is disconnected.
+2. Without a token, an unknown path gets the same answer as a known path.
+3. A page of another site cannot misuse the browser of a person who can reach the appliance: a foreign name as
+   Host (DNS rebinding) and a foreign Origin are rejected, and no CORS header is ever sent.
+4. A client that does not read its answer is disconnected.
 """
 
 import asyncio
@@ -118,7 +115,7 @@ class RequestGate:
                 gone.cancel()
 
     def admit_websocket(self, host: str, path: str) -> None:
-        """Check rate and network. Raises `ProblemError`."""
+        """Raises `ProblemError`."""
         wait = self._rate.take(host, clock.now())
         if wait:
             raise too_many("too-many-requests", "too many requests from this host", wait)
@@ -171,7 +168,7 @@ class RequestGate:
 
 
 def asked_of(scope: Scope, headers: Headers, body: bytes) -> ClientRequest:
-    """Return the request in the form in which control verifies its signature."""
+    """Control verifies the signature in this form."""
     query = scope["query_string"].decode("latin-1")
     return ClientRequest(
         host=scope["client"][0],

@@ -16,9 +16,9 @@ _SCHEME = HTTPBearer(auto_error=False, description="A token made by `rosrv token
 
 
 class _Requires:
-    """Return the bearer, who must have at least the role `least`.
+    """Returns the bearer, who must have at least the role `least`.
 
-    Each dependency here is asynchronous, because FastAPI calls others in a thread for every request.
+    Each dependency is asynchronous, because FastAPI calls others in a thread for every request.
     """
 
     def __init__(self, least: TokenRole) -> None:
@@ -73,12 +73,12 @@ _STANDBY_SECONDS = 2  # until a client may ask a standby again
 
 
 async def ask(control: ControlLink, request: AdminRequest[A], bearer: Bearer) -> A:
-    """Return control's answer. Raises `ProblemError` for a rejection, `ControlAwayError` without an answer."""
+    """Raises `ProblemError` for a rejection, `ControlAwayError` without an answer."""
     return answered(await control.ask(request, bearer))
 
 
 async def ask_optional(control: ControlLink, request: AdminRequest[A], bearer: Bearer) -> A | None:
-    """Return control's answer; None for a rejection, such as a standby's, or without an answer."""
+    """Return None for a rejection, such as a standby's, or without an answer."""
     try:
         return await ask(control, request, bearer)
     except (ControlAwayError, ProblemError):
@@ -86,7 +86,7 @@ async def ask_optional(control: ControlLink, request: AdminRequest[A], bearer: B
 
 
 def answered(answer: AdminAnswer[A]) -> A:
-    """Return the value of an answer. Raises `ProblemError` for a rejection."""
+    """Raises `ProblemError` for a rejection."""
     if answer.ok:
         return answer.given()
     if answer.trouble == "standby":

@@ -1,8 +1,4 @@
-"""Make routes whose handlers take and return structs (msgspec): parse, encode, and add schemas to the contract.
-
-A handler returns a struct, or `Tagged` with a struct and its ETag, whose schema is in the contract; for another
-answer it returns a `Response`. The handler declares a body as `Annotated[Kind, body(Kind)]`.
-"""
+"""Make routes whose handlers take and return structs (msgspec): parse, encode, and add schemas to the contract."""
 
 import enum
 import functools
@@ -77,7 +73,7 @@ class _Body:
         self.text = text
 
     async def __call__(self, request: Request) -> Any:
-        """Return the parsed body. Raises `ProblemError` (415, 422)."""
+        """Raises `ProblemError` (415, 422)."""
         content_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
         if content_type == "text/plain" and self.text is not None:
             return self._of_text(_text(await request.body()))
@@ -126,7 +122,7 @@ def _text(data: bytes) -> str:
 
 
 def _all_wrong(given: Any, kind: Any) -> list[BadInput]:
-    """Return all errors, because msgspec stops at the first one."""
+    """msgspec stops at the first error."""
     if not isinstance(given, dict):
         return []
     known = {field.encode_name: field for field in msgspec.structs.fields(kind)}
@@ -182,7 +178,6 @@ class Routes(APIRouter):
     """Routes whose handlers take and return structs."""
 
     def add_api_route(self, path: str, endpoint: Callable[..., Any], **options: Any) -> None:
-        """Add name, answer, ETag and body to the contract."""
         options["operation_id"] = options.get("operation_id") or options.get("name") or endpoint.__name__
         hints = typing.get_type_hints(endpoint, include_extras=True)
         for hint in hints.values():

@@ -17,11 +17,8 @@ _SEARCHES = 4
 
 @dataclass(frozen=True, slots=True)
 class Services:
-    """`stopping` is set when the process must end.
-
-    `judging` shares the compiling of texts for queries and dry runs among tokens. `ordering` limits the same
-    for orders, so that orders never wait for queries. `searches` and `exports` limit searches and exports of
-    the audit log.
+    """`judging` shares the compiling of texts for queries and dry runs among tokens, `ordering` that for orders,
+    so that orders never wait for queries.
     """
 
     settings: Settings

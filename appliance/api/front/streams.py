@@ -1,9 +1,4 @@
-"""Limit long answers, which are streams and exports, by quotas.
-
-A long answer counts for its token and for its peer. So neither a viewer's token with many connections nor a
-machine with many tokens can use up the answers of others. `Work` does the same for answers that need much
-time.
-"""
+"""Limit long answers, which are streams and exports, for each token and each peer."""
 
 import asyncio
 import contextlib
@@ -45,7 +40,7 @@ class Streams:
         )
 
     def take(self, bearer: Bearer, peer: str, what: str) -> Callable[[], None]:
-        """Begin a long answer; return the function that ends it. Raises `ProblemError` (503)."""
+        """Return the function that ends the long answer. Raises `ProblemError` (503)."""
         self.roles[bearer.id] = bearer.role
         busy = self._tokens.refusal(bearer.id) or self._peers.refusal(peer)
         if busy:
@@ -102,7 +97,7 @@ def _class_of(token: tuple[str, TokenRole]) -> QuotaClass:
 
 
 async def in_thread(pieces: Iterator[A]) -> AsyncIterator[A]:
-    """Yield the pieces that a thread makes, without empty ones."""
+    """Skip empty pieces."""
     while (piece := await asyncio.to_thread(next, pieces, None)) is not None:
         if piece:
             yield piece

@@ -1,8 +1,5 @@
 """Pass the WebSocket of a viewer on to a door, after TLS.
 
-A viewer shows a ticket in the URL. Control checks it, and gives the door's process one end of a socket pair; this
-process copies bytes between the pair and the client. Invariants:
-
 1. Only the name of the door follows the request further: neither the door nor a log gets the ticket.
 2. Neither side is read while the other one does not read, so a client that stalls costs two small buffers.
 3. A peer that shows wrong tickets must wait, as with wrong tokens.
@@ -52,12 +49,10 @@ class WebSocketPassage(asyncio.Protocol):
                 self.note()
 
     def client_left(self) -> None:
-        """Close the door's end after it got what the client sent."""
         if self._door is not None:
             self._door.close()
 
     def hold_door(self, *, held: bool) -> None:
-        """Stop or continue reading from the door, because the client does not read or reads again."""
         if self._door is not None and not self._door.is_closing():
             (self._door.pause_reading if held else self._door.resume_reading)()
 
@@ -108,7 +103,7 @@ class WebSocketHandover:
         self._gate = gate
 
     async def pass_on(self, passage: WebSocketPassage, head: bytes) -> None:
-        """Ask control to hand the WebSocket over; a refusal is answered with its reason."""
+        """Answer a refusal with its reason."""
         host = passage.peer
         try:
             self._gate.admit_websocket(host, PREFIX.decode())
@@ -139,7 +134,7 @@ class WebSocketHandover:
 
 
 def _entry_of(target: bytes) -> tuple[str, str]:
-    """Return the door and the ticket in a URL. Raises `ProblemError`."""
+    """Raises `ProblemError`."""
     try:
         parts = urlsplit(target.decode("ascii"))
         ticket = parse_qs(parts.query).get("ticket", [""])[0]

@@ -1,8 +1,4 @@
-"""`/v1/audit`: search, one record, follow live, verify, export. The api reads the log's file, but cannot write it.
-
-Costly work is limited: the numbers of searches, exports and followers have limits, and only one verification
-runs at a time.
-"""
+"""`/v1/audit`: search, one record, follow live, verify, export. The api reads the log's file, but cannot write it."""
 
 import asyncio
 import contextlib
@@ -148,18 +144,16 @@ class LogReader:
         self._searches = services.searches
 
     async def read(self, bearer: Bearer, function: Callable[..., _T], *arguments: Any, **named: Any) -> _T:
-        """Wait for a turn, and return the result of the function. Raises `ProblemError`."""
         async with self._searches.turn(bearer):
             return await self.in_thread(function, *arguments, **named)
 
     async def named(self, bearer: Bearer, wanted: Filter) -> Filter:
-        """Replace the name of the filter's host by its networks. Raises `ProblemError`."""
         if not has_name(wanted):
             return wanted
         return await self.in_thread(with_networks, wanted, await ask(self._control, PolicyWanted(), bearer))
 
     async def record(self, bearer: Bearer, record_id: str, neighbours: int) -> RecordInContext:
-        """Return the record and its neighbours. Raises `ProblemError`."""
+        """Raises `ProblemError`."""
         shown = await self.read(bearer, show, self.path, record_id, neighbours)
         if shown is None:
             raise ProblemError(404, "unknown", f"there is no record {record_id}")

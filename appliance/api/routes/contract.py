@@ -69,7 +69,7 @@ def _made(app: FastAPI) -> dict[str, Any]:
 
 
 def _plain(schema: Any) -> Any:
-    """Replace forms that client generators do not understand: for a tuple's length they need `maxItems`."""
+    """Client generators need `maxItems` for a tuple's length."""
     if isinstance(schema, list):
         return [_plain(part) for part in schema]
     if not isinstance(schema, dict):
@@ -78,7 +78,6 @@ def _plain(schema: Any) -> Any:
 
 
 def _described(kind: str, schema: dict[str, Any]) -> None:
-    """Describe each field that has no description by the kind that it refers to."""
     for name, field in schema.get("properties", {}).items():
         words = WORDS.get(f"{kind}.{name}", WORDS.get(name))
         if words is not None and "$ref" not in field and not is_described(field):

@@ -1,7 +1,4 @@
-"""The contract as a page for people: each call with its parameters, bodies, answers and examples. Pure.
-
-It is one HTML file without scripts; all texts come from the program, and are escaped.
-"""
+"""The contract as a page for people, without scripts. All texts are escaped. Pure."""
 
 import json
 from collections.abc import Iterator, Mapping

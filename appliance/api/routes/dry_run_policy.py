@@ -1,7 +1,7 @@
 """Compute the effects of a policy without RVMaster: errors, tests, live connections, explanations.
 
-Every function here is pure, takes texts, and runs in a thread, so a client's long text costs RVMaster nothing.
-`current` is control's answer to `PolicyWanted`; if `text` is None, the policy in force is used.
+Every function takes texts and runs in a thread, so a client's long text costs RVMaster nothing. `current` is
+control's answer to `PolicyWanted`; if `text` is None, the policy in force is used.
 """
 
 from collections.abc import Iterable
@@ -23,7 +23,7 @@ from appliance.policy.policy_findings import PolicyError
 
 
 def judge_change(order: PolicyLoad, current: PolicyKnown, registrations: Iterable[Registration]) -> Report:
-    """Return the report of a change. Raises `ProblemError` with every finding if the text is rejected."""
+    """Raises `ProblemError` with every finding if the text is rejected."""
     known = PolicyContext.of(msgspec.structs.asdict(current))
     before = compile_policy(current.text, file=current.file, hosts=known.hosts, robot=known.robot)
     try:

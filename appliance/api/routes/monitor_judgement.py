@@ -1,8 +1,4 @@
-"""Compile the specifications in force from their texts, and convert findings to structures.
-
-Every function here is pure, takes texts, and runs in a thread. The compiler is imported when it is first needed, so
-that an unused api starts without it.
-"""
+"""Compile the specifications in force from their texts. The compiler is imported when it is first needed."""
 
 from __future__ import annotations
 
@@ -20,7 +16,6 @@ _PLACE = re.compile(r"(?s)([^:]*+):([0-9]{1,9}+):([0-9]{1,9}+): (error|warning):
 
 
 def findings_of(texts: list[str]) -> list[Finding]:
-    """Parse findings of the form `file:line:column: error: text`; skip others."""
     return [
         Finding(file=file, line=int(line), column=int(column), severity=severity, text=text)
         for file, line, column, severity, text in (
@@ -30,7 +25,6 @@ def findings_of(texts: list[str]) -> list[Finding]:
 
 
 def refusal(error: str, findings: list[str]) -> ProblemError:
-    """Return a problem whose detail has each finding on a separate line."""
     return ProblemError(
         422,
         "specifications-refused",
@@ -40,7 +34,7 @@ def refusal(error: str, findings: list[str]) -> ProblemError:
 
 
 class Described(NamedTuple):
-    """A specification; `uses` are the monitors whose variables it uses, `hold` whether it is declared `hold`."""
+    """`uses` are the monitors whose variables the specification uses, `hold` whether it is declared `hold`."""
 
     events: list[EventShown]
     properties: list[PropertyShown]
@@ -60,7 +54,7 @@ class Compiler:
         return self._last[1]
 
     def described(self, loaded: Monitors, name: str) -> Described:
-        """Return the specification of a monitor. Raises `KeyError`."""
+        """Raises `KeyError`."""
         monitor = self._set(loaded).monitor(name)
         events = [
             EventShown(
@@ -86,11 +80,10 @@ class Compiler:
         return Described(events, properties, sorted(monitor.code.uses), monitor.code.hold)
 
     def picture(self, loaded: Monitors, name: str) -> str | None:
-        """Return the monitor's automata as SVG; None if no automaton is finite. Raises `KeyError`."""
+        """Return None if no automaton is finite. Raises `KeyError`."""
         return self._set(loaded).monitor(name).picture()
 
     def warnings(self, file: str) -> list[Finding]:
-        """Return the last compilation's warnings for a file."""
         assert self._last is not None  # noqa: S101  callers compile by `described` first
         return findings_of(
             [str(warning) for warning in self._last[1].warnings if warning.position.file == file]

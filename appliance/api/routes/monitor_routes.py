@@ -41,7 +41,7 @@ class _Looking:
         self.desk = LogReader(services)
 
     async def state(self, bearer: Bearer, name: str) -> tuple[Monitors, MonitorState]:
-        """Return the monitors, and the state of the named one. Raises `ProblemError` (404)."""
+        """Raises `ProblemError` (404)."""
         loaded = await ask(self._services.control, admin.MonitorsWanted(texts=True), bearer)
         row = next((monitor for monitor in loaded.monitors if monitor.name == name), None)
         if row is None:
@@ -116,7 +116,6 @@ def routes(services: Services) -> Routes:
 
 
 def records_of(path: FilePath, name: str, cursor: str | None, count: int) -> list[LogEntry]:
-    """Return the records of a monitor, without those that only contain its name."""
     found: list[LogEntry] = []
     more: str | None = cursor
     while len(found) < count:
@@ -129,7 +128,6 @@ def records_of(path: FilePath, name: str, cursor: str | None, count: int) -> lis
 
 
 def _of(entry: LogEntry, name: str) -> bool:
-    """Whether the record is about this monitor, not about a name that contains the monitor's name."""
     record = entry.record
     return record.detail.get("monitor") == name or (
         record.event.startswith("monitor ") and record.resource == name
@@ -190,13 +188,12 @@ async def _change(call: OperationCall[Any]) -> Tagged[Replaced]:
 
 
 async def _try(call: OperationCall[Any], order: admin.MonitorTry) -> Tagged[Replaced]:
-    """Answer a dry run; control and the compiler limit the number of dry runs."""
     done = await call.ask(order)
     return tagged(Replaced(**asdict(done) | {"warnings": findings_of(done.warnings)}, loaded=False))
 
 
 async def _file_of(call: OperationCall[admin.MonitorReplace]) -> str:
-    """Return the file that a request replaces. Raises `ProblemError` (404)."""
+    """Raises `ProblemError` (404)."""
     name, loaded = call.order.name, await call.ask(admin.MonitorsWanted(texts=True))
     files = {monitor.name: monitor.file for monitor in loaded.monitors}
     if name in (loaded.files or {}):

@@ -37,12 +37,11 @@ def labels_of(known: PolicyInForce) -> HostLabels:
 
 
 def host_in_words(known: PolicyInForce | None) -> HostInWords:
-    """Return the function that names addresses; without a known policy it returns the address."""
     return str if known is None else partial(in_words, labels=names_of(known).labels())
 
 
 def has_name(wanted: Filter) -> bool:
-    """Whether the filter names a host, so the policy must be known; addresses and globs need none."""
+    """Whether the policy must be known; addresses and globs need none."""
     if wanted.host is None or not _GLOB.isdisjoint(wanted.host):
         return False
     try:
@@ -56,7 +55,7 @@ def has_name(wanted: Filter) -> bool:
 
 
 def with_networks(wanted: Filter, known: PolicyInForce) -> Filter:
-    """Return the filter with the networks of its host. Raises `FilterError` for an unknown name."""
+    """Raises `FilterError` for an unknown name."""
     try:
         networks = names_of(known).networks(wanted.host or "")
     except UnknownHostNameError as error:

@@ -1,8 +1,4 @@
-"""Derive routes from the table of operations (`channel/admin.py`): parameters, role, ETag, answer, contract.
-
-A route reads its order with the function that control also uses (`channel/rest_meaning.py`). The answer is control's,
-unless the operation's module has an `Answer` for the request.
-"""
+"""Derive routes from the table of operations (`channel/admin.py`): parameters, role, ETag, answer, contract."""
 
 import inspect
 from collections.abc import Awaitable, Callable, Mapping
@@ -72,7 +68,7 @@ class OperationCall(Generic[Q]):
     dry_run: bool
 
     async def ask(self, request: AdminRequest[A]) -> A:
-        """Return control's answer. Raises `ProblemError` for a rejection, `ControlAwayError` without an answer."""
+        """Raises `ProblemError` for a rejection, `ControlAwayError` without an answer."""
         control = self.services.control
         return self._answered(await control.ask(request, self.bearer))
 
@@ -86,17 +82,13 @@ class OperationCall(Generic[Q]):
 
 @dataclass(frozen=True)
 class Answer:
-    """Replaces control's answer; the contract has the return type of `function`.
-
-    If the answer is not a struct, `success` describes it in the contract.
-    """
+    """Replaces control's answer. If it is not a struct, `success` describes it in the contract."""
 
     function: Callable[[OperationCall[Any]], Awaitable[Any]]
     success: Mapping[str, Any] | None = None
 
 
 def routes(services: Services, answers: Mapping[str, Answer]) -> Routes:
-    """Return the routes of all operations; `answers` maps names of operations to answers other than control's."""
     router = Routes()
     assert answers.keys() <= {one.name for one in OPERATIONS}  # noqa: S101  no name is misspelt
     for operation in sorted(OPERATIONS, key=lambda one: "{" in one.path):  # literal paths before parameters
@@ -166,7 +158,7 @@ def _check(
 
 
 def _order(asked: ClientRequest, *, dry_run: bool) -> AdminRequest[Any]:
-    """Return the order that the request makes. Raises `ProblemError`."""
+    """Raises `ProblemError`."""
     try:
         return meant(asked, dry_run=dry_run)
     except BadTagError as error:
@@ -185,7 +177,6 @@ def _answer_type(operation: Operation, own: Answer | None) -> Any:
 
 
 def _of_path(operation: Operation) -> Any:
-    """Return the type of the path's parameters; a list has one element in the path."""
     in_path = [(name, field) for name, field in operation.fields().items() if f"{{{name}}}" in operation.path]
     if not in_path:
         return Depends(_nothing)

@@ -64,7 +64,7 @@ def page_of(
     newest_first: bool,
     equality: bool = False,
 ) -> dict[str, Any]:
-    """Return a page of records; its cursor reveals nothing about hidden records."""
+    """The cursor reveals nothing about hidden records."""
     found: list[LogEntry] = []
     more: str | None = cursor
     count = limit + 1
@@ -82,7 +82,6 @@ def page_of(
 
 
 def streamed(entry: LogEntry, *, equality: bool) -> dict[str, Any]:
-    """Return a record of a stream; with `equality`, it has the fields that make equal records one row."""
     return as_object(entry) | ({"equality": equality_of(entry.record)} if equality else {})
 
 
