@@ -28,7 +28,6 @@ ConfirmWithin = Annotated[
 
 
 def seconds_within(text: str | None, noun: str) -> float | None:
-    """Return the seconds of --confirm-within. Exits with status 2 if it is not a duration."""
     return None if text is None else span_given("--confirm-within", text, "30s, 5m or 1h", f"rosrv {noun}")
 
 
@@ -45,12 +44,6 @@ def verbs_of(
     back: Callable[[int | None], AdminRequest[_Done]],
     say_done: Callable[[_Done], None],
 ) -> tuple[GroupedVerb, GroupedVerb, GroupedVerb]:
-    """Return `revisions`, `rollback` and `confirm` of `rosrv noun`.
-
-    `listed`, `confirmation` and `back(revision)` are their requests; `say_done` prints the result of a
-    rollback.
-    """
-
     def revisions(appliance: Appliance) -> None:
         for row in appliance.ask_or_exit(listed).revisions:
             _say_revision(row, as_json=appliance.as_json)

@@ -1,7 +1,4 @@
-"""Complete names in the shell by querying the running appliance over its admin socket.
-
-Completion never prints errors: without access to a running appliance, it offers no names.
-"""
+"""Complete names in the shell by querying the running appliance; without access, offer none and print no error."""
 
 from collections.abc import Callable, Iterable
 from pathlib import Path

@@ -9,7 +9,6 @@ _SPAN = re.compile(r"([0-9]{1,9}(?:\.[0-9]{1,9})?)([smhdw])")
 
 
 def seconds_of(text: str, units: str) -> float | None:
-    """Return the seconds; None unless the duration is longer than zero and its unit is in `units`."""
     found = _SPAN.fullmatch(text)
     if found is None or found[2] not in units or float(found[1]) <= 0:
         return None
@@ -17,10 +16,7 @@ def seconds_of(text: str, units: str) -> float | None:
 
 
 def span_given(option: str, text: str, spans: str, verb: str = "rosrv") -> float:
-    """Return the seconds of a duration; `spans` lists one example of each accepted unit.
-
-    Exits with status 2 for any other text.
-    """
+    """`spans` lists one example of each accepted unit. Exits with status 2 for any other text."""
     seconds = seconds_of(text, "".join(filter(str.isalpha, spans.replace(" or ", ""))))
     if seconds is None:
         raise usage_error(f"{option} {text!r} is not a time: write {spans}", verb)

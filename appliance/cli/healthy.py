@@ -1,9 +1,7 @@
 """The health check of a container, `python -m appliance.cli.healthy`: exit status 0 while nodes are served.
 
-A standby is healthy while it runs: its nodes are served by the active appliance.
-
-Problems that do not affect nodes, such as a certificate that expires soon, appear only in `rosrv status`: for them, a
-container engine would restart the appliance in vain. The check runs every few seconds, so it imports very little.
+A standby is healthy while it runs. Problems that do not affect nodes do not count: for them, a container engine
+would restart the appliance in vain. The check runs every few seconds, so it imports very little.
 """
 
 import os

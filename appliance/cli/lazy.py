@@ -1,7 +1,4 @@
-"""Make typer commands that import their modules only when they run.
-
-Importing all modules takes a second of processor time, so `rosrv status` must not import the compiler.
-"""
+"""Make typer commands that import their modules only when they run: all modules together take a second."""
 
 import functools
 import inspect
@@ -28,10 +25,7 @@ def application(
     callback: Callable[..., None] | None = None,
     **settings: Any,
 ) -> typer.Typer:
-    """Return a typer application; `callback` takes the options before the verb.
-
-    `further` returns more verbs; it is called for the help, for completion and for a name that `verbs` lacks.
-    """
+    """`further` returns more verbs, for the help, for completion and for a name that `verbs` lacks."""
     app = typer.Typer(
         cls=_group_of(verbs, further),
         no_args_is_help=True,
@@ -67,11 +61,9 @@ def _group_of(verbs: Verbs, further: Callable[[], Verbs]) -> type[TyperGroup]:
             return _without_type_of_flags(super().get_params(ctx))
 
         def get_command(self, ctx: Any, cmd_name: str) -> Any:
-            """Return a command; features are imported only for a command that the core lacks."""
             return self.own_commands.get(cmd_name) or super().get_command(ctx, cmd_name)
 
         def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-            """Find the command; for an unknown name without a close match, list all verbs."""
             name = args[0]
             if name in self.own_commands:
                 return super().resolve_command(ctx, args)
@@ -139,7 +131,6 @@ def loaded(verb: Verb, name: str) -> Any:
 
 
 def _without_type_of_flags(options: list[Any]) -> list[Any]:
-    """Remove `<bool>`, which typer prints for a flag, although a flag takes no value."""
     for option in options:
         if isinstance(option, TyperOption) and option.is_flag:
             option.metavar = ""

@@ -1,4 +1,6 @@
-"""Define the `rosrv` command: the table of the core's verbs, and the handling of errors that the verbs do not catch."""
+"""Define the `rosrv` command: the table of the core's verbs, and the handling of errors that the verbs do not
+catch.
+"""
 
 import errno
 import functools
@@ -156,7 +158,7 @@ def main() -> None:
 
 
 def _open_closed_streams() -> None:
-    """Open closed streams (`>&-`) on /dev/null, so that no other file gets their descriptors."""
+    """No other file may get the descriptors of closed streams (`>&-`)."""
     while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
         os.set_inheritable(descriptor, True)
     os.close(descriptor)
@@ -170,13 +172,11 @@ _OLD_FLAGS = {"-list": "list", "-rvstate": "rvstate", "-enable": "enable", "-dis
 
 
 def _without_old_flags(arguments: list[str]) -> list[str]:
-    """Convert flags of the original ROSRV: `rosrv -enable M…` becomes `rosrv monitor enable M…`."""
     verb = _OLD_FLAGS.get(arguments[0]) if arguments else None
     return arguments if verb is None else ["monitor", verb, *arguments[1:]]
 
 
 def _asking_for_help(arguments: list[str]) -> list[str]:
-    """Convert `help`: `rosrv help policy check` and `rosrv policy help check` become `rosrv policy check --help`."""
     if "help" not in arguments[:2]:
         return arguments
     return [*(word for word in arguments[:2] if word != "help"), *arguments[2:], "--help"]

@@ -7,7 +7,7 @@ from rosmop.tool.terminal import printable
 
 
 def lines_of(value: Any, depth: int) -> Iterator[str]:
-    """Yield one line for each field, without control characters."""
+    """Remove control characters."""
     indent = "  " * depth
     if isinstance(value, Mapping):
         for name, inner in value.items():

@@ -1,6 +1,6 @@
 """Print the output of all verbs: coloured on a terminal, plain in a pipe, JSON on request.
 
-Text from the network (names, log entries) is printed without control characters and never as markup.
+Text from the network is printed without control characters and never as markup.
 """
 
 import datetime
@@ -41,13 +41,12 @@ def loaded_by(who: str, seconds: float | None) -> str:
 
 
 def usage_error(text: str, verb: str = "rosrv") -> typer.Exit:
-    """Print the text and return an exit with status 2, which the caller raises."""
     typer.echo(f"{verb}: {printable(text)}", err=True)
     return typer.Exit(2)
 
 
 def write_told(path: Path, data: bytes | mmap) -> None:
-    """Write to the path that the operator named; warn if a power cut may lose the data. Raises `OSError`."""
+    """Warn if a power cut may lose the data. Raises `OSError`."""
     try:
         write_where_told(path, data)
     except NotLastingError as error:
@@ -59,13 +58,11 @@ def say_json(fields: msgspec.Struct | Mapping[str, Any] | tuple[Any, ...]) -> No
 
 
 def say_diff(lines: Iterable[str]) -> None:
-    """Print a diff: additions green, removals red, positions cyan."""
     for line in lines:
         terminal.say(line, {"+": "green", "-": "red", "@": "cyan"}.get(line[:1], ""))
 
 
 def by_host(rows: Iterable[_T], host: Callable[[_T], str]) -> list[tuple[str, list[_T]]]:
-    """Group rows by host; the host with the most rows comes first."""
     found: dict[str, list[_T]] = {}
     for row in rows:
         found.setdefault(host(row), []).append(row)
@@ -73,7 +70,6 @@ def by_host(rows: Iterable[_T], host: Callable[[_T], str]) -> list[tuple[str, li
 
 
 def say_row(parts: Iterable[str], style: str = "") -> None:
-    """Print a row: one line in a pipe; on a terminal, parts without room are on more, indented lines."""
     first, *rest = parts
     width = shutil.get_terminal_size().columns if sys.stdout.isatty() else None
     line = first

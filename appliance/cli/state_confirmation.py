@@ -14,10 +14,7 @@ Confirm = Annotated[
 
 
 def confirm_state(state: Path, given: str | None, consequence: str) -> None:
-    """Exit with status 1 unless the operator types the state directory, or has given it.
-
-    `consequence` is what the order does, as a sentence.
-    """
+    """Exit with status 1 unless the operator types the state directory, or has given it."""
     try:
         found = state.is_dir()
     except PermissionError as error:

@@ -84,7 +84,7 @@ def status(
 
 
 def _look(appliance: Appliance) -> StatusView:
-    """Return the status. Raises `NotRunningError` also for an appliance that cannot give its status now."""
+    """Raises `NotRunningError` also for an appliance that cannot give its status now."""
     answer = _answer(appliance)
     if not answer.ok:
         raise NotRunningError(answer.error)
@@ -92,7 +92,6 @@ def _look(appliance: Appliance) -> StatusView:
 
 
 def _answer(appliance: Appliance) -> AdminAnswer[StatusView]:
-    """Return the status, or a standby's view of both appliances. Raises `NotRunningError`."""
     answer = appliance.ask(StatusWanted())
     if answer.trouble == "standby":
         pair = pair_view()
@@ -116,12 +115,11 @@ def _view(body: Status, appliance: Appliance) -> StatusView:
 
 
 def _is_attention(alarm: Alarm, body: Status) -> bool:
-    """Whether an alarm affects the exit status; recent denials and drops, and silenced alarms, do not."""
+    """Recent denials and drops, and silenced alarms, do not affect the exit status."""
     return alarm in activity(body) or (alarm.severity == "notice" and alarm.handled != "")
 
 
 def troubles_of(body: Status) -> list[str]:
-    """Return alarms except notices, and audit-only sections, the most urgent first."""
     return [
         alarm.text
         for alarm in open_alarms(body)
@@ -223,7 +221,6 @@ def _tunnels(ipsec: IpsecState) -> str:
 
 
 def _ports(known: dict[str, PortsSeen], host_in_words: HostInWords) -> str:
-    """Summarize whether the machines with nodes have closed their ROS ports to all but the appliance."""
     by_state = {
         state: [name for name, ports in known.items() if ports.state == state] for state in _PORT_STATES
     }
@@ -240,7 +237,6 @@ def _ports(known: dict[str, PortsSeen], host_in_words: HostInWords) -> str:
 
 
 def _others_rules(firewall: FirewallState) -> Iterator[tuple[str, str]]:
-    """Yield the rules of other programs that affect isolation netns; --json lists the chains' names."""
     translating, dropping = firewall.translations or [], firewall.obstacles or []
     words = []
     if translating:
@@ -263,7 +259,6 @@ def _isolation(body: Status) -> str:
 
 
 def processes_table(rows: Sequence[ProcessInfo], width: int, now: float | None = None) -> Table:
-    """Return a table with as many columns as fit, read downwards; processes of one role are numbered from 0."""
     across = max(1, min(3, width // _COLUMN))
     high = -(-len(rows) // across)
     table = table_of(*["process", "pid", "for", "restarts"] * across)
@@ -283,7 +278,6 @@ def _cells(row: ProcessInfo, name: str, now: float | None) -> list[Text]:
 
 
 def missing_sandbox(rows: Sequence[ProcessInfo]) -> str | None:
-    """Return the missing sandbox limits, or None if this kernel supports all."""
     lacking = [f"{row.role}: {what}" for row in rows for what in row.lacks]
     if not lacking:
         return None
@@ -291,7 +285,6 @@ def missing_sandbox(rows: Sequence[ProcessInfo]) -> str | None:
 
 
 def doubted_clock(clock: ClockState) -> str | None:
-    """Return why the times of records are unreliable, or None."""
     if clock.before_program_seconds:
         days = clock.before_program_seconds / 86_400
         return f"wrong: {days:.0f} days before this program was built; set it before hosts get certificates"

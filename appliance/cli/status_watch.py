@@ -40,7 +40,7 @@ Look = Callable[[], StatusView]
 
 
 class _Looks:
-    """Queries the status; while the appliance does not answer, the view has the reason and the time since then."""
+    """While the appliance does not answer, the view has the reason and the time since then."""
 
     def __init__(self, look: Look) -> None:
         self._look = look
@@ -74,10 +74,7 @@ class _Looks:
 
 
 def watched(look: Look, seconds: float, *, as_json: bool) -> int:
-    """Show the status until it is interrupted; return the exit status of the last one.
-
-    `look` raises `NotRunningError` while the appliance does not answer. Raises `AccessDeniedError`.
-    """
+    """Return the exit status of the last status. Raises `AccessDeniedError`."""
     looks, console = _Looks(look), Console(highlight=False)
     try:
         if as_json or not console.is_terminal or console.is_dumb_terminal:
@@ -107,7 +104,6 @@ def _print_each(looks: _Looks, seconds: float, console: Console, *, as_json: boo
 
 
 def _redraw(looks: _Looks, seconds: float, console: Console) -> None:
-    """Redraw on the terminal's other screen; leave the last status on the normal one."""
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGWINCH})
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # else the terminal would keep the other screen
     view = None

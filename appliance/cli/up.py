@@ -130,7 +130,6 @@ def _announce_waiting(pairing: Pairing | None, *, as_json: bool) -> None:
 
 
 def _write(line: str, *, as_json: bool) -> None:
-    """Write a line to standard output as JSON or text. Raises `OSError`."""
     if as_json:
         sys.stdout.write(f"{line}\n")
         sys.stdout.flush()
@@ -139,9 +138,7 @@ def _write(line: str, *, as_json: bool) -> None:
 
 
 def _announce(said: ControlReady, settings: Settings, *, as_json: bool) -> None:
-    """Print that nodes may connect, with the first token. If it cannot be stored, print nothing and raise
-    `StartError`.
-    """
+    """If the first token cannot be stored, print nothing and raise `StartError`."""
     rest = _rest_url(settings)
     more: list[str] = []
     if as_json:
@@ -196,7 +193,7 @@ def _rest_url(settings: Settings) -> str | None:
 
 
 def _keep_token(state: Path, token: str) -> Path:
-    """Write the token to a file that only the owner can read. Raises `StartError`, and leaves no file, on an error."""
+    """Only the owner can read the file. Raises `StartError`, and leaves no file, on an error."""
     path = state / "first-token"
     try:
         path.unlink(missing_ok=True)

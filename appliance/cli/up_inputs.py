@@ -1,8 +1,6 @@
 """Validate the policy and the specifications before `rosrv up` starts anything.
 
-RVMaster reads both again and decides. A policy or monitor that an operator loaded survives a restart; RVMaster then
-does not read the file or the folder, which may be invalid. The file of the policy may also be invalid if the store
-has a revision, which then stays in force.
+RVMaster reads both again. If an operator loaded a policy or monitor, the file or the folder may be invalid.
 """
 
 import contextlib
@@ -34,11 +32,9 @@ _LAST_POLICY = """
 
 
 def read_inputs(settings: Settings, robot: str | None = None) -> range:
-    """Return the range of ports that the policy gives to nodes.
+    """Return the range of ports for nodes. Raises `StartError` with every error.
 
     One of two appliances, which knows the address of the `robot`, starts with the policy of the active one.
-
-    Raises `StartError` with every error of the policy or of the specifications.
     """
     state = settings.state / _STATE
     author = _last_author(state)
@@ -48,10 +44,7 @@ def read_inputs(settings: Settings, robot: str | None = None) -> range:
 
 
 def read_node_ports(settings: Settings, robot: str | None = None) -> range:
-    """Read the policy that RVMaster will bring into force.
-
-    Raises `StartError` with every error of the policy file, if there is no policy but this.
-    """
+    """Raises `StartError` with every error of the policy file, if there is no policy but this."""
     stored = _Stored(None, {}, complete=True)
     state = settings.state / _STATE
     try:
@@ -68,7 +61,7 @@ def read_node_ports(settings: Settings, robot: str | None = None) -> range:
 
 
 class _Stored(NamedTuple):
-    """The content of the store; if it is not `complete`, an earlier run left changes that are not in the database."""
+    """If the content is not `complete`, an earlier run left changes that are not in the database."""
 
     policy: KeptPolicy | None
     hosts: Mapping[str, Address]
@@ -92,7 +85,7 @@ def _stored_in(state: Path) -> _Stored:
 def _require_specifications(folder: Path, site_keys: Sequence[str], *, kept: bool) -> None:
     """Raise `StartError` unless a revision is kept, which then stays in force.
 
-    A child process compiles, because this process becomes the supervisor and would keep the compiler's memory.
+    A child process compiles, because the supervisor would keep the compiler's memory.
     """
     reader, writer = os.pipe()
     child = os.fork()
@@ -142,10 +135,7 @@ def _errors_in(folder: Path, site_keys: Sequence[str], *, kept: bool) -> str:
 
 
 def _last_author(state: Path) -> str:
-    """Return the author of the specifications in the store; `DISK` means that they were read from the folder.
-
-    A question mark means unknown: an earlier run may have left changes that are not in the database yet.
-    """
+    """`DISK` means the folder; a question mark, that changes may not be in the database yet."""
     try:
         if not state.exists():
             return ""

@@ -10,8 +10,7 @@ from pathlib import Path
 class Verb:
     """A row of the table; `place` is `module:function`, and in the help, `first` precedes its docstring.
 
-    `module` is relative to this folder; a feature gives its whole name. The help lists a feature's verb
-    `after` another one.
+    A feature's verb is listed `after` another one.
     """
 
     place: str
@@ -32,9 +31,8 @@ class Verb:
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """A command with its own verbs, such as `rosrv audit`; `after` as in `Verb`.
-
-    A feature adds verbs to a command of the core with a group of the same name, and leaves `help` empty.
+    """A command with its own verbs, such as `rosrv audit`. A feature adds verbs to a group of the core with the
+    same name.
     """
 
     help: str

@@ -81,7 +81,6 @@ def search(
 
 
 def _slash_missing(wanted: Filter) -> str:
-    """The records have resolved names of nodes, topics, services and parameters."""
     given = (("--topic", wanted.resource), ("--caller", wanted.caller_id))
     bare = [f"{option} /{name}" for option, name in given if name and name[0] not in "/*?["]
     return f"; names in ROS begin with a slash: {' '.join(bare)}" if bare else ""
@@ -260,7 +259,7 @@ def export(
 
 
 def _filter_of(appliance: Appliance) -> Filter:
-    """Return the filter of the options, with networks instead of a host's name. Raises `FilterError`."""
+    """Use networks instead of a host's name. Raises `FilterError`."""
     wanted = FILTER.value(appliance.params)
     for warning in unrecorded(wanted):
         note(printable(warning))
@@ -270,7 +269,7 @@ def _filter_of(appliance: Appliance) -> Filter:
 
 
 def _known(appliance: Appliance, wanted: Filter) -> PolicyKnown:
-    """Return the policy, which has the names of hosts. Raises `FilterError` if no appliance answers."""
+    """Raises `FilterError` if no appliance answers."""
     try:
         answer = appliance.ask(PolicyWanted())
     except NotRunningError:

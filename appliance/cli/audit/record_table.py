@@ -1,6 +1,5 @@
-"""Print audit records as text: a table on a terminal, lines in a pipe.
-
-Text from the network is escaped (`printable`) and printed as text, never as markup.
+"""Print audit records as text: a table on a terminal, lines in a pipe. Text from the network is escaped
+(`printable`).
 """
 
 import sys
@@ -29,10 +28,7 @@ _GAP = 2
 
 
 def print_entries(entries: list[LogEntry], host_in_words: HostInWords, *, each: bool = False) -> None:
-    """Print records; on a terminal, equal records are one row unless `each`.
-
-    If the terminal is too narrow, the reason of each row is below it.
-    """
+    """On a terminal, equal records are one row unless `each`."""
     if sys.stdout.isatty():
         rows = [row for entry in entries for row in grouped([entry])] if each else grouped(entries)
         cells = [
@@ -130,7 +126,7 @@ def _elsewhere(found: Elsewhere) -> Iterator[str]:
 
 
 def write(text: str) -> None:
-    """Write to standard output, and escape characters that its encoding lacks."""
+    """Escape characters that the encoding of standard output lacks."""
     encoding = sys.stdout.encoding or "ascii"
     sys.stdout.write(text.encode(encoding, "backslashreplace").decode(encoding) + "\n")
 
@@ -153,7 +149,6 @@ def _table(rows: list[tuple[Text, ...]]) -> Table:
 
 
 def _below(rows: list[tuple[Text, ...]]) -> Table:
-    """Return the table for a narrow terminal: record and event, then the reason, all beside the number."""
     grid = Table.grid(padding=(0, _GAP, 0, 0))
     grid.add_column(no_wrap=True, justify="right", style="bold")
     grid.add_column(overflow="fold")
@@ -212,7 +207,6 @@ def _joined(*parts: str | None) -> str:
 
 
 def _why(record: AuditRecord) -> str:
-    """Return the reason with the count of a folded record, and the rule unless the reason names it."""
     rule = record.rule
     named = rule is None or f"{Path(rule.file).name}:{rule.line}" in record.reason
     why = record.reason if named else f"{record.reason} ({rule_text(record.rule)})"

@@ -24,7 +24,7 @@ UNKNOWN = (
 
 
 class NotRunningError(Exception):
-    """No appliance answers, or it rejects this user or token; the text has the remedy."""
+    """No appliance answers, or it rejects this user or token."""
 
 
 class AccessDeniedError(NotRunningError):
@@ -32,9 +32,8 @@ class AccessDeniedError(NotRunningError):
 
 
 class AdminSocket:
-    """A client of the admin socket; each answer may take `seconds`.
-
-    After that time the request is withdrawn, and its outcome may take `grace` seconds.
+    """A client of the admin socket; after `seconds`, a request is withdrawn, and its outcome may take `grace`
+    seconds.
     """
 
     def __init__(self, state: Path, seconds: float = SECONDS, grace: float = _GRACE_SECONDS) -> None:
@@ -43,13 +42,11 @@ class AdminSocket:
         self._grace = grace
 
     def audit(self) -> "FileLog":
-        """Return the log, which can be read even while the appliance is stopped."""
         from appliance.cli.connection.audit_file import FileLog  # noqa: PLC0415  only for the verbs that read it
 
         return FileLog(self.state, self.robot_name)
 
     def robot_name(self) -> str:
-        """Return the robot's name; empty if it has none, or no appliance is in service."""
         try:
             answer = AdminSocket(self.state, QUICK_SECONDS, 0.1).ask(StatusWanted())
         except NotRunningError:
@@ -57,7 +54,7 @@ class AdminSocket:
         return answer.given().name if answer.ok else ""
 
     def ask(self, request: AdminRequest[A]) -> AdminAnswer[A]:
-        """Return the appliance's answer. Raises `NotRunningError`."""
+        """Raises `NotRunningError`."""
         line = encoded(request)
         path = self.state / ADMIN_SOCKET
         if not self.state.is_dir():
@@ -91,7 +88,6 @@ class AdminSocket:
             raise NotRunningError(f"{path}: an appliance of another version answers: {error}") from None
 
     def _read(self, sock: socket.socket) -> bytes:
-        """Read an answer; at the time limit, withdraw the request and wait for its outcome."""
         line = bytearray()
         try:
             _read_line(sock, line)
@@ -103,7 +99,7 @@ class AdminSocket:
 
 
 def encoded(request: AdminRequest[Any]) -> bytes:
-    """Return the request as a JSON line. Raises `NotRunningError` for text that is not valid UTF-8."""
+    """Raises `NotRunningError` for text that is not valid UTF-8."""
     try:
         return msgspec.json.encode(request)
     except UnicodeEncodeError as error:

@@ -30,7 +30,7 @@ Progress = Callable[[int], None]
 class FileLog:
     """Reads the log of a running or stopped appliance, or of a copy of its state directory.
 
-    All methods raise `LogUnreadableError`. `robot` returns the name of the robot, empty if it is not known.
+    All methods raise `LogUnreadableError`.
     """
 
     def __init__(self, state: Path, robot: Callable[[], str] = str) -> None:
@@ -62,7 +62,6 @@ class FileLog:
         return ((entry.sequence, evidence_line(entry, chain, robot)) for entry, chain in found)
 
     def follow(self, wanted: Filter, lines: int, *, on: bool) -> Iterator[list[LogEntry]]:
-        """Yield the last records, oldest first; then, if `on`, new ones without end."""
         path = self.path
         follower = Follower(path, wanted)
         if lines:
@@ -75,10 +74,6 @@ class FileLog:
     def verify(
         self, key: bytes | None, copies: Sequence[SignedCheckpoint] | None, progress: Progress
     ) -> Verification:
-        """Verify the log, and compare it with the signer's own records if they are readable.
-
-        `progress` is called with the sequence of the last verified record.
-        """
         path = self.path
         signer = path.parent.parent / "signer"
         may = os.access(signer, os.R_OK | os.X_OK)

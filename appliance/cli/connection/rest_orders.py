@@ -20,7 +20,7 @@ class RestWay:
     """Sends the requests of `AdminSocket` over REST, with the same answers."""
 
     def __init__(self, url: str, token: str | None, authority: Path | None) -> None:
-        """Prepare a client. Raises `ValueError` if a token must not be sent to this URL."""
+        """Raises `ValueError` if a token must not be sent to this URL."""
         self.client = RestClient(url, token, authority)
 
     def ask(self, request: AdminRequest[A]) -> AdminAnswer[A]:
@@ -40,7 +40,7 @@ class RestWay:
 
 
 def _carry_out(rest: RestClient, request: AdminRequest[A]) -> A:
-    """Send a request and return the body. Raises `NotRunningError` for a request that REST does not offer."""
+    """Raises `NotRunningError` for a request that REST does not offer."""
     asked: Any = request  # its kind is checked below
     if isinstance(asked, admin.RegistrationsWanted):
         return cast(A, _registrations(_carry_out(rest, admin.GraphWanted())))

@@ -1,11 +1,9 @@
 """Send requests to the running appliance over REST.
 
-Invariants:
-
 1. A credential leaves this machine only encrypted, to a server whose certificate is trusted (`--api-ca`, else the
    system's authorities). This check cannot be switched off. Clear text is used only for loopback addresses.
-2. The token comes from the environment, never from the command line, which every user of the machine can see. The token
-   does not leave the program: only its reading key is sent, and each order is signed (`request_signing.py`).
+2. The token comes from the environment, never from the command line, which every user of the machine can see.
+   Only its reading key is sent, and each order is signed (`request_signing.py`).
 3. Redirects, proxies and credentials from `.netrc` are not used.
 """
 
@@ -37,7 +35,6 @@ class RestProblemError(Exception):
     def __init__(
         self, status: int, kind: str, lines: list[str], findings: list[dict[str, Any]] | None = None
     ) -> None:
-        """`findings` are the errors in the sent text."""
         super().__init__(lines[0])
         self.findings = findings
         self.status = status
@@ -49,7 +46,7 @@ class RestClient:
     """A client of REST; the methods raise `NotRunningError` and `RestProblemError`."""
 
     def __init__(self, url: str, token: str | None, authority: Path | None) -> None:
-        """Prepare a client. Raises `ValueError` if a token must not be sent to this URL."""
+        """Raises `ValueError` if a token must not be sent to this URL."""
         self.url, secure = _place_of(url)
         self._token = _checked_token(token)
         if authority is not None and not secure:
@@ -77,9 +74,8 @@ class RestClient:
         match: bool = False,
         order: bool = True,
     ) -> dict[str, Any]:
-        """Send a request; return its JSON answer. `match`: accept any present revision (`If-Match: *`).
-
-        An `order` is signed unless it is a GET; a dry run is not an order.
+        """`match`: accept any present revision (`If-Match: *`). An `order` is signed unless it is a GET; a dry
+        run is not an order.
         """
         headers = {"If-Match": "*"} if match else {}
         with self.streamed(

@@ -1,8 +1,7 @@
 """Choose the running appliance for a verb: over the socket in its state directory, or over REST.
 
-A verb takes an `Appliance`, typer's context of the call, as its first parameter; the decorator `speaks` adds
-the options `--state`, `--api`, `--api-ca` and `--json`. The command line overrides the environment; within
-the environment, REST overrides the socket.
+A verb takes an `Appliance` as its first parameter, and the decorator `speaks` adds the options. The command line
+overrides the environment; within the environment, REST overrides the socket.
 """
 
 import ipaddress
@@ -84,8 +83,7 @@ class _Target:
 class Appliance(typer.Context):
     """A call of a verb, with the appliance that its options choose.
 
-    `said`: whether the command line or the environment names the appliance. `place`: the URL of REST; None over the
-    socket. `as_json`: whether to print answers as JSON.
+    `said`: whether the command line or the environment names the appliance.
     """
 
     @cached_property
@@ -94,7 +92,6 @@ class Appliance(typer.Context):
 
     @property
     def way(self) -> "AdminSocket | RestWay":
-        """Return the connection. Exits with status 2 for options that exclude each other."""
         return self._target.way
 
     @property
@@ -118,24 +115,20 @@ class Appliance(typer.Context):
         return self.way.ask(request)
 
     def audit(self) -> "FileLog | RestLog":
-        """Return the log; with a state directory, the appliance may be stopped."""
         return self.way.audit()
 
     @cached_property
     def host_in_words(self) -> "HostInWords":
-        """Return the function that names addresses; it returns the address if no appliance answers."""
-
         return named_by(self.way)
 
     def ask_or_exit(self, request: AdminRequest[A]) -> A:
-        """Return the answer. Exits with status 1 for a rejected request, and 2 if no appliance answers."""
+        """Exits with status 1 for a rejected request, and 2 if no appliance answers."""
         try:
             return self.body_or_exit(self.way.ask(request))
         except NotRunningError as error:
             raise usage_error(str(error)) from None
 
     def answer_or_exit(self, request: AdminRequest[A]) -> A:
-        """Like `ask_or_exit`; with --json, print the body and exit instead."""
         body = self.ask_or_exit(request)
         if self.as_json:
             say_json(body)  # type: ignore[arg-type]  # each answer is a struct
@@ -143,7 +136,6 @@ class Appliance(typer.Context):
         return body
 
     def body_or_exit(self, answer: AdminAnswer[A]) -> A:
-        """Return the body. For a rejection, print it with its findings and exit with status 1."""
         if answer.ok:
             return answer.given()
         if self.as_json:
@@ -186,8 +178,6 @@ def speaks_here(verb: Callable[Concatenate[Appliance, _P], None]) -> GroupedVerb
 def speaks_with(
     json_help: str, group: OptionGroup[Any] | None = None
 ) -> Callable[[Callable[Concatenate[Appliance, _P], None]], GroupedVerb]:
-    """Decorate a verb that prints JSON; the options of `group` are before the verb's own."""
-
     def command(*args: Any, **settings: Any) -> GroupedCommand:
         before = () if group is None else group.options
         return _ApplianceCommand(*args, before=before, json_help=json_help, **settings)
@@ -219,7 +209,7 @@ def _choose(
         ),
     ] = None,
 ) -> _Target:
-    """Return the appliance that the options choose. Exits with status 2 for options that exclude each other."""
+    """Exits with status 2 for options that exclude each other."""
     sources = {name: context.get_parameter_source(name) for name in ("state", "api", "api_ca")}
     said = {name: "" if source is None else source.name for name, source in sources.items()}
     typed = {name for name, source in said.items() if source == "COMMANDLINE"}

@@ -320,7 +320,6 @@ def _switch(appliance: Appliance, order: admin.AdminRequest[Switched], word: str
 
 
 def say_shadow_deadline(confirm_by: float | None) -> None:
-    """Print until when monitors must be confirmed; nothing if they stay in force."""
     if confirm_by is not None:
         say(f"back to shadow mode at {moment(confirm_by)} unless you run: rosrv monitor confirm", "yellow")
 
@@ -342,7 +341,6 @@ def _state(row: MonitorState) -> str:
 
 
 def say_replaced(body: Replacement, promote: str = "rosrv monitor promote") -> None:
-    """`promote` is the command that ends shadow mode."""
     for warning in body.warnings:
         say(warning, "yellow")
     parts = [

@@ -16,11 +16,7 @@ _STRING_CONSTANT = re.compile(r"\s*string\s+\w+\s*=")  # its value extends to th
 
 
 def read_to_send(files: Sequence[Path], folders: Sequence[Path]) -> Sources:
-    """Return the sources by file name.
-
-    Accepts and rejects the same files as `read_specifications` and `read_definitions`; the appliance
-    validates the contents of definitions. Raises `SpecificationError`.
-    """
+    """Accept the same files as `read_specifications` and `read_definitions`. Raises `SpecificationError`."""
     named: dict[str, Path] = {}
     for file in files:
         other = named.setdefault(file.name, file)
@@ -46,7 +42,7 @@ def read_to_send(files: Sequence[Path], folders: Sequence[Path]) -> Sources:
 
 
 def _sendable(text: str, place: str) -> str:
-    """Return text that can be sent: invalid UTF-8 is replaced in comments of definitions, and rejected elsewhere."""
+    """Invalid UTF-8 is replaced in comments of definitions, and rejected elsewhere."""
     lines = text.split("\n")
     for number, line in enumerate(lines):
         if line.isascii() or not _NOT_UTF_8.search(line):
