@@ -9,7 +9,7 @@ REPORT = "v1/bundles/report"
 
 
 class RobotReport(msgspec.Struct, frozen=True):
-    """The report of a robot to the collector: bundles by path (empty: none), its health, and polling problems."""
+    """Bundles by path (empty: none), the robot's health, and polling problems."""
 
     site: str
     group: str

@@ -3,17 +3,14 @@
 An archive is an uncompressed tar file (ustar) with these files, sorted by name:
 
 policy.ini                          the access policy
-policy.ini.sig                      optional: the site's signature
 policy.ini.tests.yaml               optional: the policy's test cases
 hosts.yaml                          the hosts to enrol
-monitors/NAME.rv                    any number of specifications
-monitors/msg/PACKAGE/NAME.msg|.srv  any number of message definitions
-monitors/….sig                      optional: the site's signature of each
+monitors/NAME.rv                    specifications
+monitors/msg/PACKAGE/NAME.msg|.srv  message definitions
+FILE.sig                            optional: the site's signature of a file, except hosts.yaml and the test cases
 
-Invariants:
-1. Equal contents have equal archives: owners, times and modes are constant. An archive is accepted only if packing its
-   contents gives the same bytes, so links, devices, trailing data and unusual headers are rejected.
-2. An archive has at most `LONGEST` bytes and `_MOST_FILES` files. Nothing is expanded.
+An archive is accepted only if packing its contents gives the same bytes, so links, devices, trailing data and
+unusual headers are rejected.
 """
 
 import io
@@ -36,10 +33,9 @@ _SIGNATURE = ".sig"
 
 
 class BundleContents(msgspec.Struct, frozen=True):
-    """The texts of a bundle. `cases` is None without test cases; missing signatures are empty.
+    """The texts of a bundle; missing signatures are empty.
 
-    `files` are the specifications by name, `definitions` the message definitions by `package/Type.msg` (or `.srv`), and
-    `signatures` the signatures of both by the same names.
+    `definitions` are by `package/Type.msg` (or `.srv`), and `signatures` by the names of both kinds of files.
     """
 
     policy: str
@@ -52,11 +48,10 @@ class BundleContents(msgspec.Struct, frozen=True):
 
 
 class BundleArchiveError(Exception):
-    """An archive or its contents are invalid; the text has the reason and what to do."""
+    """An archive or its contents are invalid."""
 
 
 def is_bundle_file(name: str) -> bool:
-    """Return whether a file of this name, relative to the bundle's folder, belongs to a bundle."""
     whole = name.removesuffix(_SIGNATURE)
     if whole in (POLICY, CASES, HOSTS):
         return whole in (name, POLICY)
@@ -64,13 +59,13 @@ def is_bundle_file(name: str) -> bool:
 
 
 def pack(files: Mapping[str, bytes]) -> bytes:
-    """Return the archive of these files by name. Raises `BundleArchiveError` if they are not a valid bundle."""
+    """Raises `BundleArchiveError` if the files are not a valid bundle."""
     contents_of(files)
     return _packed(files)
 
 
 def unpack(archive: bytes) -> BundleContents:
-    """Return the contents of an archive. Raises `BundleArchiveError`."""
+    """Raises `BundleArchiveError`."""
     if len(archive) > LONGEST:
         raise BundleArchiveError(f"the archive has {len(archive)} bytes; the limit is {LONGEST}")
     files: dict[str, bytes] = {}
@@ -92,7 +87,7 @@ def unpack(archive: bytes) -> BundleContents:
 
 
 def contents_of(files: Mapping[str, bytes]) -> BundleContents:
-    """Return the contents in these files by name. Raises `BundleArchiveError`."""
+    """Raises `BundleArchiveError`."""
     unknown = [name for name in files if not is_bundle_file(name)]
     if unknown:
         raise BundleArchiveError(f"{unknown[0][:200]!r} is not a file of a bundle: remove it")
@@ -127,7 +122,7 @@ def contents_of(files: Mapping[str, bytes]) -> BundleContents:
 
 
 def _text(name: str, data: bytes) -> str:
-    """Return a file's text as a local load reads it: UTF-8, LF line ends, without a BOM in specifications."""
+    """Read UTF-8 as a local load does, with LF line ends, and without a BOM in specifications."""
     try:
         text = data.decode("utf-8-sig" if name.startswith("monitors/") else "utf-8")
     except UnicodeDecodeError as error:

@@ -69,7 +69,7 @@ Opener = Callable[[str], Any]
 
 
 def printable(text: str) -> str:
-    """Escape characters that a terminal would interpret: a bundle may have any text in place of a number."""
+    """A bundle may have any text in place of a number."""
     return "".join(character if character.isprintable() else ascii(character)[1:-1] for character in text)
 
 
@@ -81,7 +81,6 @@ def unhexed(text: str) -> bytes:
 
 
 def packed(value: Any) -> bytes:
-    """Return a column of a record in MessagePack, as the appliance hashed it."""
     if value is None:
         return b"\xc0"
     if isinstance(value, int):
@@ -98,14 +97,14 @@ def packed(value: Any) -> bytes:
 
 
 def extra(*sizes: int) -> bytes:
-    """Return the extra field for sizes that do not fit into a header."""
     return struct.pack(f"<2H{len(sizes)}Q", 1, 8 * len(sizes), *sizes)
 
 
 def ends(file: Any, size: int, unpacked: int) -> bool:
-    """Whether the compressed data that begins here has `size` bytes, with zeros in the unused bits of the last byte.
+    """Whether the compressed data that begins here has `size` bytes, with zeros in the unused bits of the last
+    byte.
 
-    Reading stops when more than `unpacked` bytes were unpacked.
+    Reading stops after `unpacked` bytes.
     """
     unpacker = zlib.decompressobj(-15)
     while size > 1 and not unpacker.eof and unpacked >= 0:
@@ -170,7 +169,7 @@ def foreign(archive: zipfile.ZipFile) -> Iterator[str]:
 
 
 def regular(path: Path, follow: bool = True) -> Any:
-    """Open a regular file. Raise OSError for pipes and devices, which could block their reader forever."""
+    """Raise OSError for pipes and devices, which could block their reader forever."""
     flags = os.O_RDONLY | getattr(os, "O_BINARY", 0) | getattr(os, "O_NONBLOCK", 0)
     descriptor = os.open(path, flags | (0 if follow else getattr(os, "O_NOFOLLOW", 0)))
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
@@ -189,7 +188,6 @@ def require_bounded(archive: zipfile.ZipFile, size: int) -> None:
 
 
 def opened(place: Path) -> tuple[list[str], Opener, Iterator[str]]:
-    """Return the names in a ZIP file or a folder, a function that opens a member, and the bytes outside the members."""
     if not place.is_dir():
         with regular(place) as file:
             size = os.fstat(file.fileno()).st_size
@@ -203,7 +201,7 @@ def opened(place: Path) -> tuple[list[str], Opener, Iterator[str]]:
 
 
 class Runs:
-    """The runs of records in a bundle, in ascending order, each given by its first and last record."""
+    """The runs of records in a bundle, in ascending order."""
 
     def __init__(self, pairs: list[list[int]]) -> None:
         edges = [-1, *(edge for first, last in pairs for edge in (first, last))]
@@ -238,14 +236,12 @@ class Verifier:
         self.checkpoints = self.agreeing = 0
 
     def read_key(self, key: Path | None) -> str:
-        """Store the key, by default the bundle's own, for `openssl`. Return the raw key."""
         with regular(key) if key else self.open("audit.pub") as file:
             self.key.write_bytes(file.read(MOST))
         order = ["openssl", "pkey", "-pubin", "-outform", "DER", "-in", str(self.key)]
         return subprocess.run(order, check=True, capture_output=True).stdout[-32:].hex()
 
     def run(self) -> None:
-        """Check everything; a member that cannot be read is also a finding."""
         looks = {
             "the ZIP file": self.look_beside, "manifest.json": self.look_at_members, "proof.json": self.look_at_proof,
             "records.ndjson": self.look_at_records, "the hashes in the log": self.look_at_texts,
@@ -328,7 +324,6 @@ class Verifier:
             self.notes.append(f"record {last} as the last of this period: the log ended there")
 
     def note_hash(self, event: str, revision: int, detail: dict[str, Any]) -> None:
-        """Store the hash that a record contains for a policy, for specifications or for the recording."""
         if event == "policy loaded":
             self.loads[f"policies/{revision}.ini"] = detail.get("sha256")
         elif event == "specifications loaded":
@@ -358,7 +353,6 @@ class Verifier:
             self.notes.append("the specifications in force: the log has no record of a load")
 
     def records(self, name: str, runs: Runs | None = None) -> Iterator[dict[str, Any]]:
-        """Yield the records of a member, each after its check against the chain."""
         walk = Excerpt()
         with self.open(name) as lines:
             for line in iter(lambda: lines.readline(MOST), b""):
@@ -393,7 +387,6 @@ class Verifier:
             self.findings.append(f"{name}: no signed checkpoint seals the records from {walk.begin} on")
 
     def look_at_checkpoint(self, given: dict[str, Any], walk: Excerpt) -> None:
-        """Check that the key signed a checkpoint that seals these records and equals the copy kept elsewhere."""
         number = given["number"]
         place = self.manifest["log"], walk.sequence, walk.hash.hex()
         if (given["log"], given["sequence"], given["hash"]) != place:
@@ -421,7 +414,6 @@ class Verifier:
         return same and fault is None
 
     def has_signed(self, _key: bytes, signature: bytes, text: bytes) -> bool:
-        """Return whether the key of this verifier signed a text."""
         signed, stated = (self.key.with_name(name) for name in ("signature", "text"))
         signed.write_bytes(signature)
         stated.write_bytes(text)

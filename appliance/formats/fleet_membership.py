@@ -1,8 +1,6 @@
 """The membership of an appliance in a fleet: the collector's invitation, and the settings that a join keeps.
 
-`rosrv-fleet robot invite` writes the invitation, `rosrv fleet join` uses it. The folder `joined` of the state directory
-then has the settings (fleet.json) and the four files that they name. They apply unless `appliance.yaml` names a
-collector.
+The settings (`joined/fleet.json` in the state directory) apply unless `appliance.yaml` names a collector.
 """
 
 from pathlib import Path
@@ -24,11 +22,7 @@ _Token = Annotated[str, msgspec.Meta(pattern=r"^rosrv-join_[A-Za-z0-9_-]{43}\Z")
 
 
 class Invitation(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The means to join a collector: the robot's name, the collector, and a token for one use.
-
-    `authority` is the certificate that the robot trusts, `receipt_key` the public key of receipts (PEM). `group` is
-    SITE/GROUP, or empty. `expires` is in seconds since the epoch.
-    """
+    """The robot's name, the collector, and a token for one use until `expires` (seconds since the epoch)."""
 
     robot: _Name
     group: _Group = ""
@@ -40,7 +34,7 @@ class Invitation(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
 
 
 class JoinRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The request of a robot that joins: the token, the public key of its audit log and its certificate (PEM)."""
+    """The token, the public key of the robot's audit log and its certificate (PEM)."""
 
     token: _Token
     key: _Pem
@@ -48,7 +42,6 @@ class JoinRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 
 
 def settings_of(invitation: Invitation) -> dict[str, Any]:
-    """Return the section `fleet` for an invitation; its files are in the folder of the membership."""
     site, _, group = invitation.group.partition("/")
     section: dict[str, Any] = {
         "collector": invitation.collector, "robot": invitation.robot, "ca": AUTHORITY, "certificate": CERTIFICATE,
@@ -58,10 +51,7 @@ def settings_of(invitation: Invitation) -> dict[str, Any]:
 
 
 def joined_settings(state: Path) -> dict[str, Any]:
-    """Return the section `fleet` that a join left in a state directory; empty without one.
-
-    Raises `OSError`, and `ValueError` for a file that is not JSON.
-    """
+    """Raises `OSError`, and `ValueError` for a file that is not JSON."""
     folder = (state / FOLDER).absolute()
     try:
         section: dict[str, Any] = msgspec.json.decode((folder / SETTINGS).read_bytes(), type=dict[str, Any])

@@ -1,7 +1,4 @@
-"""Write and verify receipts: the collector's signed statement that it has a segment on its disk. No I/O.
-
-A receipt has exactly one valid text, like the other signed statements.
-"""
+"""Write and verify receipts: the collector's signed statement that it has a segment on its disk. No I/O."""
 
 import msgspec
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
@@ -10,10 +7,9 @@ from appliance.audit.log.signatures import signature_is_valid
 
 
 class SegmentReceipt(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A receipt; hash and signature are in hexadecimal.
+    """The collector has the records from sequence `first` to `last`, sealed by checkpoint `number`.
 
-    The collector has the segment `segment` of the log `log` of the robot `robot` (its name there): the records from
-    sequence `first` to `last`, sealed by checkpoint `number`. `time` is in nanoseconds since the epoch.
+    `time` is in nanoseconds since the epoch; hash and signature are in hexadecimal.
     """
 
     robot: str
@@ -35,7 +31,6 @@ class SegmentReceipt(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
         return msgspec.structs.replace(self, signature=key.sign(self.text()).hex())
 
     def is_signed(self, key: bytes) -> bool:
-        """Return whether the collector with the raw public key `key` signed this receipt."""
         try:
             return signature_is_valid(key, bytes.fromhex(self.signature), self.text())
         except ValueError:

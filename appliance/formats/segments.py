@@ -1,15 +1,11 @@
 """Write and verify segments: the records between two consecutive signed checkpoints, as they leave the appliance.
 
-A segment is NDJSON in ASCII; each line ends with a newline. The first line is the header: the checkpoint before the
-records (`begin`) and the checkpoint that seals them (`end`), both with their signatures. At the beginning of a log,
-`begin` is null. If retention removed the checkpoint before, `begin` is null and `after` has the last removed record.
-Each further line is a record, exactly as `rosrv audit export` writes it without a filter. A segment never changes: its
-name is the SHA-256 of its bytes.
+A segment is NDJSON in ASCII: the header (`SegmentHeader`), and the records as `rosrv audit export` writes them.
+Its name is the SHA-256 of its bytes. At the beginning of a log, `begin` is null; if retention removed the
+checkpoint before, `after` has the last removed record.
 
-Invariants:
-1. The records have consecutive sequences from the one after `begin` to that of `end`, and their chain leads from the
-   hash of `begin` to the hash of `end`. `end` follows `begin`. One key signed both. The hash in `after` is not signed,
-   but no other one leads to the signed hash of `end`.
+1. The chain of the records leads from the hash of `begin` to the hash of `end`, and one key signed both. The hash
+   in `after` is not signed, but no other one leads to the signed hash of `end`.
 2. Each segment has exactly one valid spelling, so equal records have equal names.
 3. Reading and writing need the memory of one record.
 """
@@ -35,7 +31,7 @@ _NOT_A_RECORD = (ValueError, KeyError, TypeError, RecursionError, OverflowError)
 
 
 class SegmentError(ValueError):
-    """A segment is invalid; the message has the line and the reason."""
+    """A segment is invalid."""
 
 
 class RecordPlace(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -57,7 +53,6 @@ class SegmentHeader(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
         return msgspec.json.encode(self) + b"\n"
 
     def follows(self, other: "SegmentHeader") -> bool:
-        """Return whether this segment continues `other`: the same log, and no record between them."""
         before = (other.end.sequence, bytes.fromhex(other.end.hash))
         return self.end.checkpoint.follows(other.end.checkpoint) and self.start == before
 
@@ -68,7 +63,7 @@ class SegmentHeader(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
 
 
 class SegmentSummary(NamedTuple):
-    """A segment: its name, its header, and the times of its earliest and latest record (nanoseconds; 0: no record)."""
+    """The times are those of the earliest and latest record (nanoseconds; 0: no record)."""
 
     name: str
     header: SegmentHeader
@@ -112,9 +107,9 @@ class _Bytes:
 
 
 def write_segment(log: Path, number: int, write: Callable[[bytes], object]) -> SegmentSummary | None:
-    """Write the segment that checkpoint `number` seals; None if it is not signed yet, or its records were removed.
+    """Return None if checkpoint `number` is not signed yet, or its records were removed.
 
-    Raises `LogUnreadableError`, also for records that do not lead to the checkpoint, and what `write` raises.
+    Raises `LogUnreadableError`, and the errors of `write`.
     """
     with reading(log) as connection:
         connection.execute("BEGIN")
@@ -146,10 +141,7 @@ def write_segment(log: Path, number: int, write: Callable[[bytes], object]) -> S
 
 
 def next_segment(log: Path, after: int) -> int | None:
-    """Return the number of the first checkpoint above `after`, signed or not; None: there is none yet.
-
-    Raises `LogUnreadableError`.
-    """
+    """Return the first checkpoint above `after`, signed or not. Raises `LogUnreadableError`."""
     with reading(log) as connection:
         return _number(
             connection.execute("SELECT min(number) FROM checkpoint WHERE number > ?", (after,)).fetchone()
@@ -180,14 +172,13 @@ def _line(columns: StoredColumns, previous: bytes, digest: bytes, end: SignedChe
 
 
 class SegmentReader:
-    """A reader that verifies a segment with one of the raw public keys `keys`, and yields its records; iterate once.
+    """Verifies a segment with one of the raw public keys `keys`, and yields its records; iterate once.
 
-    `most_bytes` is the largest segment. Iteration raises `SegmentError`, and what reading `file` raises. A record that
-    was yielded is proven only when the iteration has ended; `summary` is available then.
+    A record that was yielded is proven only when the iteration has ended. Iteration raises `SegmentError`.
     """
 
     def __init__(self, file: LineReader, keys: Collection[bytes], most_bytes: int) -> None:
-        """Read and verify the header. Raises `SegmentError`."""
+        """Raises `SegmentError`."""
         self._file = file
         self._left = most_bytes
         self._done = _Bytes()
@@ -247,7 +238,7 @@ class SegmentReader:
         return columns
 
     def summary(self) -> SegmentSummary:
-        """Read what is left, and return the summary of the proven segment. Raises `SegmentError`."""
+        """Read the rest, and return the summary of the proven segment. Raises `SegmentError`."""
         if not self._ended:
             for _columns in self:
                 pass
@@ -255,7 +246,6 @@ class SegmentReader:
 
 
 def _fault(header: SegmentHeader, keys: Collection[bytes]) -> str | None:
-    """Return why the checkpoints are not two consecutive ones of a log that one of `keys` signed, or None."""
     begin, end = header.begin, header.end
     if header.segment != 1:
         return f"version {header.segment} is not known; update the collector"

@@ -1,9 +1,7 @@
 """The signed terms of a bundle: its place, version and rings. No I/O, no clock.
 
-A bundle's name in TUF is `SITE/GROUP/VERSION.tar`. The custom field of its signed target has its terms: when it was
-signed, and its rings. A ring is a set of robots, by name or by percentage, that may not take the bundle earlier than
-`after` seconds after the signature. Robots compute their own ring, so no collector can give a bundle to a later ring
-early. A collector can only delay it further.
+A ring is a set of robots that may not take the bundle earlier than `after` seconds after the signature. Robots
+compute their own ring, so a collector can only delay a bundle further.
 """
 
 import hashlib
@@ -23,7 +21,7 @@ CUSTOM = "rosrv"
 
 
 class TermsError(ValueError):
-    """A name, path or term of a bundle is invalid; the text has the reason and a valid value."""
+    """A name, path or term of a bundle is invalid."""
 
 
 class BundlePath(NamedTuple):
@@ -42,7 +40,7 @@ class BundlePath(NamedTuple):
 
     @classmethod
     def parse(cls, text: str) -> Self:
-        """Return the path in a text. Raises `TermsError`."""
+        """Raises `TermsError`."""
         found = _PATH.fullmatch(text)
         if found is None:
             raise TermsError(f"{text[:200]!r} is not SITE/GROUP/VERSION.tar")
@@ -50,7 +48,7 @@ class BundlePath(NamedTuple):
 
 
 def role_of(site: str, group: str) -> str:
-    """Return the name of the TUF role for a site's group. Raises `TermsError` for an invalid name."""
+    """Raises `TermsError` for an invalid name."""
     for word in (site, group):
         if _WORD.fullmatch(word) is None:
             raise TermsError(
@@ -60,7 +58,7 @@ def role_of(site: str, group: str) -> str:
 
 
 class Ring(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unknown_fields=True):
-    """A ring: robots by name, or up to a percentage of all; `after` is in seconds after the signature."""
+    """Robots by name, or up to a percentage of all; `after` is in seconds after the signature."""
 
     name: str
     robots: list[str] = []
@@ -69,14 +67,13 @@ class Ring(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unknown_field
 
 
 class Terms(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The terms: the time of the signature (seconds since the epoch), the rings in order, and a note."""
+    """The time of the signature (seconds since the epoch), the rings in order, and a note."""
 
     signed: int
     rings: list[Ring]
     note: str = ""
 
     def ring_of(self, robot: str, path: BundlePath) -> int:
-        """Return the index of a robot's ring: the first that names it, or whose percentage it is in."""
         position = _position(robot, path)
         for index, ring in enumerate(self.rings):
             if robot in ring.robots or position < ring.percent:
@@ -84,17 +81,17 @@ class Terms(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         raise TermsError("the last ring does not have 100 percent")
 
     def earliest(self, robot: str, path: BundlePath) -> float:
-        """Return the time (seconds since the epoch) from which a robot may take the bundle."""
+        """Return seconds since the epoch."""
         return self.signed + self.rings[self.ring_of(robot, path)].after
 
 
 def _position(robot: str, path: BundlePath) -> int:
-    """Return a number from 0 to 99 that is fixed for a robot and a bundle, and even among robots."""
+    """The number from 0 to 99 is fixed for a robot and a bundle, and even among robots."""
     return int.from_bytes(hashlib.sha256(f"{path}\0{robot}".encode()).digest()[:8]) % 100
 
 
 def checked_terms(terms: Terms) -> Terms:
-    """Return the terms. Raises `TermsError` if the rings are not in order or do not cover all robots."""
+    """Raise `TermsError` if the rings are not in order or do not cover all robots."""
     rings = terms.rings
     if not 1 <= len(rings) <= _MOST_RINGS:
         raise TermsError(f"a bundle has 1 to {_MOST_RINGS} rings, not {len(rings)}")
@@ -120,7 +117,7 @@ def checked_terms(terms: Terms) -> Terms:
 
 
 def terms_of(custom: object) -> Terms:
-    """Return the terms in the custom field of a signed target. Raises `TermsError`."""
+    """Raises `TermsError`."""
     found = custom.get(CUSTOM) if isinstance(custom, dict) else None
     try:
         return checked_terms(msgspec.convert(found, Terms))
@@ -129,5 +126,5 @@ def terms_of(custom: object) -> Terms:
 
 
 def custom_of(terms: Terms) -> dict[str, object]:
-    """Return the custom field with these terms. Raises `TermsError`."""
+    """Raises `TermsError`."""
     return {CUSTOM: msgspec.to_builtins(checked_terms(terms))}
