@@ -10,5 +10,4 @@ ROBOT, APPLIANCE, UNKNOWN = "robot", "appliance", "unknown hosts"
 
 
 def actor(who: str) -> str:
-    """Return the name of an author; what no person did has the appliance as its author."""
     return f"the appliance ({who})" if who in (DISK, UNCONFIRMED) else who

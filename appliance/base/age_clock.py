@@ -1,15 +1,10 @@
 """A clock for the age of kept data, robust against wrong system time.
 
-After a start, the system clock may be wrong by years until a person or a time service corrects it.
-
-Invariants:
-
-1. While the process runs, the age clock follows the monotonic clock. It ignores changes of the system clock.
-2. Only the system clock shows how long the process was off. A gap of up to `_AT_ONCE` is added at once.
-3. A longer gap is added after the system clock has been ahead for `_STANDS` of running time. The smallest gap seen in
-   that time is added. A system clock that is behind adds nothing until someone corrects it.
-4. The age clock continues after a restart. It saves its state every `_SAVE`. Time since the last save counts as time
-   off.
+1. While the process runs, the age clock follows the monotonic clock, whatever the system clock does.
+2. Only the system clock shows how long the process was off. A gap of up to `_AT_ONCE` is added at once, a longer
+   one after the system clock has been ahead for `_STANDS` of running time: then the smallest gap seen in that
+   time. A system clock that is behind adds nothing until someone corrects it.
+3. The state is saved every `_SAVE`; time since the last save counts as time off.
 """
 
 from collections.abc import Callable
@@ -43,8 +38,7 @@ class _Kept(msgspec.Struct):
 class AgeClock:
     """Returns nanoseconds since the epoch, as if the system clock had never been wrong.
 
-    The state is in the file `path`. Without it, the clock starts at `begin()`, or at the system time. Raises
-    `OSError` if the file exists but cannot be opened.
+    Without the file `path`, the clock starts at `begin()`, or at the system time. Raises `OSError`.
     """
 
     def __init__(

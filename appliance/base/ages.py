@@ -4,7 +4,6 @@ from appliance.base import clock
 
 
 def age(since: float, now: float | None = None) -> str:
-    """Return the age as text with at most two units. `since` is seconds since the epoch."""
     seconds = max(0, int((clock.wall() if now is None else now) - since))
     days, rest = divmod(seconds, 86_400)
     hours, rest = divmod(rest, 3_600)

@@ -18,15 +18,11 @@ class NotLastingError(OSError):
 
 
 def name_to_make(path: Path) -> Path:
-    """Return a unique name, from which the finished file is renamed to `path`."""
     return path.with_name(f"{path.name}.{secrets.token_hex(4)}.new")
 
 
 def remove_unfinished(folder: str, place: int) -> None:
-    """Remove files of killed writers in `folder`, relative to the descriptor `place`, and below it.
-
-    No writer may be active. Files that cannot be removed stay; they do not block writers.
-    """
+    """No writer may be active. `place` is the descriptor to which `folder` is relative."""
     with contextlib.suppress(OSError):
         for _path, _folders, files, inside in os.fwalk(folder, follow_symlinks=False, dir_fd=place):
             for name in filter(_UNFINISHED.fullmatch, files):
@@ -35,11 +31,11 @@ def remove_unfinished(folder: str, place: int) -> None:
 
 
 def write_whole(path: Path, data: bytes | mmap, mode: int, owner: tuple[int, int] | None = None) -> None:
-    """Write a file atomically. Raises `OSError`, which leaves the old file unchanged.
+    """Raises `OSError`, which leaves the old file unchanged, and `NotLastingError` if the new file is perhaps not
+    on the disk.
 
-    `owner` (user and group; default: the writer) is set before the file gets its final name. With concurrent
-    writers, one complete file remains. Raises `NotLastingError` if the file is replaced but perhaps not on
-    the disk.
+    `owner` (user and group) is set before the file gets its final name. With concurrent writers, one complete
+    file remains.
     """
     making = name_to_make(path)
     try:
@@ -74,9 +70,9 @@ def write_whole(path: Path, data: bytes | mmap, mode: int, owner: tuple[int, int
 def write_where_told(path: Path, data: bytes | mmap) -> None:
     """Write to the path that a person named. Raises `OSError`.
 
-    A regular file is replaced atomically and keeps its mode and owner, even if `path` is a symbolic link. A
-    pipe, a device, or a file with an owner that this process cannot set is written in place. If `path` is the
-    process's own output (/dev/stdout), the data is appended to its earlier output.
+    A regular file is replaced atomically and keeps its mode and owner, also behind a symbolic link. A pipe, a
+    device, or a file with an owner that this process cannot set is written in place. The process's own output
+    (/dev/stdout) is appended to.
     """
     try:
         there = path.stat()

@@ -11,10 +11,10 @@ _log = structlog.get_logger()
 
 
 async def run_always(what: str, work: Callable[[], Awaitable[object]]) -> None:
-    """Run `work`, and start it again a second after each error, until it returns or is cancelled.
+    """Start `work` again a second after each error, until it returns or is cancelled.
 
-    An expected error is handled in `work`. Any other is a defect, which must not end other work of the
-    process: its traceback is logged as a fault in `what`.
+    Any such error is a defect, which must not end other work of the process: its traceback is logged as a fault
+    in `what`.
     """
     while True:
         try:

@@ -1,8 +1,7 @@
-"""The clocks of the machine: one that only advances, the system time, and the time since the boot.
+"""The clocks of the machine: a monotonic one, the system time, and the time since the boot.
 
-Every reading asks the source of the present context: the operating system, unless `using` replaces it. A task, a
-`call_later` and `asyncio.to_thread` keep the source of their creator; a `threading.Thread` begins with the operating
-system's.
+Every reading asks the source of the present context, which `using` replaces. Tasks and `asyncio.to_thread` keep
+the source of their creator; a `threading.Thread` begins with the operating system's.
 """
 
 import time
@@ -19,13 +18,13 @@ class ClockSource(Protocol):
     """A source of time; all readings are in nanoseconds."""
 
     def now_ns(self) -> int:
-        """Return the monotonic time, which may begin at any number."""
+        """The monotonic time, which may begin at any number."""
 
     def wall_ns(self) -> int:
-        """Return the time since the epoch, which people and time services set."""
+        """The time since the epoch, which people and time services set."""
 
     def since_boot_ns(self) -> int:
-        """Return the time since the boot, which includes suspensions of the machine."""
+        """The time since the boot, which includes suspensions of the machine."""
 
 
 class SystemClock:
@@ -45,7 +44,6 @@ _source: ContextVar[ClockSource] = ContextVar("clock", default=_SYSTEM)
 
 @contextmanager
 def using(source: ClockSource) -> Iterator[None]:
-    """Use the source in the block, and in tasks that the block creates."""
     before = _source.set(source)
     try:
         yield

@@ -7,11 +7,11 @@ from appliance.base import clock
 
 
 class Deadlines:
-    """Ends in seconds since the epoch. An end has passed once the system time *or* the time since the boot shows it.
+    """Ends in seconds since the epoch. An end has passed once the system time *or* the time since the boot shows
+    it.
 
-    An end is compared with the system time when it is first seen. From then on, a step back of the clock,
-    such as by a false time service, postpones nothing. After a restart `limit` has the same effect with the
-    seconds that were left.
+    An end is compared with the system time when it is first seen. From then on, a step back of the clock, such as
+    by a false time service, postpones nothing.
     """
 
     def __init__(self) -> None:
@@ -25,7 +25,7 @@ class Deadlines:
         return clock.wall() >= end or clock.since_boot() >= min(known[1], self._limits.get(name, math.inf))
 
     def limit(self, left: Mapping[str, float]) -> None:
-        """Limit the ends to the given numbers of seconds from now, whatever the system time is."""
+        """After a restart, limit the ends to the seconds that were left, whatever the system time is."""
         now = clock.since_boot()
         for name, seconds in left.items():
             self._limits[name] = min(now + seconds, self._limits.get(name, math.inf))
@@ -39,7 +39,6 @@ class Deadlines:
         self._limits.pop(name, None)
 
     def left(self) -> dict[str, float]:
-        """Return the seconds until each end that was seen, by the time since the boot; 0 if it has passed."""
         now = clock.since_boot()
         return {
             name: max(0.0, min(end, self._limits.get(name, math.inf)) - now)

@@ -1,7 +1,7 @@
 """Run an engine in a thread of its own, or in its caller's.
 
-An engine has no thread. Its `turn(now)` does the work that is due, and returns the time of the next turn, or None after
-the last one. A driver calls the turns, one at a time. All times are in monotonic seconds.
+The `turn(now)` of an engine does the work that is due, and returns the time of the next turn, or None after the
+last one. All times are in monotonic seconds.
 """
 
 import contextvars
@@ -28,7 +28,7 @@ class Driver(Protocol):
 
 
 Drive = Callable[[str, Turn, float], Driver]
-"""Start the engine with this name; return its driver after the first turn.
+"""Starts the engine with this name, and returns its driver after the first turn.
 
 After `wake`, the driver gathers work for the given number of seconds.
 """
@@ -49,7 +49,6 @@ class EngineThread:
         self._begun.wait()
 
     def wake(self) -> None:
-        """Run the engine after the time for gathering."""
         if not self._wake.is_set():  # `set` takes a lock
             self._wake.set()
 

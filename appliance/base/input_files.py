@@ -1,7 +1,6 @@
 """Read files that a person names: regular files only, with a size limit.
 
-A named pipe may block its reader forever, a device may be endless, and a file may not fit in memory. Each case raises
-an `OSError` that names the cause, so callers report it like a missing file.
+A named pipe may block its reader forever, a device may be endless, and a file may not fit in memory.
 """
 
 import contextlib
@@ -28,7 +27,7 @@ _KINDS = {
 
 
 def open_given(path: Path) -> io.BufferedReader:
-    """Open a regular file, or a pipe that a shell made for `<(command)` or `command |`. Raises `OSError`."""
+    """Open also a pipe that a shell made for `<(command)` or `command |`. Raises `OSError`."""
     descriptor = open_named(path)
     try:
         about = os.fstat(descriptor)
@@ -45,7 +44,7 @@ def open_given(path: Path) -> io.BufferedReader:
 
 
 def read_given(path: Path, longest: int = LONGEST) -> bytes:
-    """Return the content of a file of at most `longest` bytes. Raises `OSError`."""
+    """Raises `OSError`, also for more than `longest` bytes."""
     with open_given(path) as file:
         data = file.read(longest + 1)
     if len(data) > longest:
@@ -71,16 +70,13 @@ def path_for_library(path: Path) -> Iterator[Path]:
 
 
 def read_given_text(path: Path, encoding: str = "utf-8", errors: str = "strict") -> str:
-    """Return the text of a file, with LF as line ends. Raises `OSError` and `UnicodeDecodeError`."""
+    """Lines end with LF. Raises `OSError` and `UnicodeDecodeError`."""
     with io.TextIOWrapper(io.BytesIO(read_given(path)), encoding, errors) as text:
         return text.read()
 
 
 def files_below(folder: Path) -> list[Path]:
-    """Return the sorted files below a folder; a link is a file. Raises `OSError`.
-
-    `Path.glob` and `rglob` take a folder that may not be read for an empty one.
-    """
+    """A link is a file. `Path.glob` takes a folder that may not be read for an empty one; here it raises `OSError`."""
     found: list[Path] = []
     for path, is_folder in entries_of(folder):
         found += files_below(path) if is_folder else [path]
@@ -88,7 +84,7 @@ def files_below(folder: Path) -> list[Path]:
 
 
 def entries_of(folder: Path) -> list[tuple[Path, bool]]:
-    """Return the sorted entries, and whether each is a folder; a link is not. Raises `OSError`."""
+    """Return whether each entry is a folder; a link is not. Raises `OSError`."""
     descriptor = open_named(folder)
     try:
         with os.scandir(descriptor) as entries:
@@ -100,7 +96,7 @@ def entries_of(folder: Path) -> list[tuple[Path, bool]]:
 
 
 def stat_given(path: Path) -> os.stat_result:
-    """Return the status of a file; a link is followed. Raises `OSError`."""
+    """Follow a link. Raises `OSError`."""
     try:
         return path.stat()
     except (PermissionError, FileNotFoundError):  # as in `open_named`

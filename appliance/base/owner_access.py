@@ -1,12 +1,10 @@
 """Open a file that an operator names where only its owner may reach it.
 
 1. A process first uses its own rights.
-2. Root then acts as the owner of the folder, and after that as the owner of the file. In a container, root lacks
-   CAP_DAC_OVERRIDE, so permissions also stop root. The rights of the folder's owner also decide about symbolic links:
-   users cannot have root open another user's file by a link in their own folder. As the owner of the file, root
-   follows no link.
-3. A role of the appliance asks the supervisor, which opens only the files of the role's row in the table
-   (`supervisor/input_lender.py`).
+2. Root then acts as the owner of the folder, and after that as the owner of the file: in a container, root lacks
+   CAP_DAC_OVERRIDE. The rights of the folder's owner also decide about symbolic links, so users cannot have root
+   open another user's file by a link. As the owner of the file, root follows no link.
+3. A role of the appliance asks the supervisor (`supervisor/input_lender.py`).
 """
 
 import contextlib
@@ -37,12 +35,11 @@ class FileLender:
 
     @classmethod
     def install(cls, opened: Callable[[Path], int | None]) -> None:
-        """Use `opened` from now on if the process lacks a right."""
         cls.open = opened
 
 
 def open_named(path: Path) -> int:
-    """Return a descriptor of the file. Raises `OSError`."""
+    """Raises `OSError`."""
     try:
         return os.open(path, OPENING)
     except PermissionError:
@@ -56,7 +53,7 @@ def open_named(path: Path) -> int:
 
 
 def is_named_there(path: Path) -> bool:
-    """Whether the file exists, by the rights with which it would be opened: root's own may not suffice."""
+    """Use the rights with which the file would be opened: root's own may not suffice."""
     try:
         os.close(open_named(path))
     except (FileNotFoundError, NotADirectoryError):
@@ -67,12 +64,12 @@ def is_named_there(path: Path) -> bool:
 
 
 def open_as_owner(path: Path) -> int:
-    """Open the file with the rights of the folder's owner, or of the file's. Raises `OSError`."""
+    """Use the rights of the folder's owner, or of the file's. Raises `OSError`."""
     return _open_in(_folder(path.absolute().parent), path.name, path)
 
 
 def open_below(folder: Path, path: Path) -> int:
-    """Open a file below a folder; no folder between them may be a link. Raises `OSError`."""
+    """No folder between them may be a link. Raises `OSError`."""
     place = _folder(folder)
     for name in path.relative_to(folder).parent.parts:
         place = _next(place, name, os.O_NOFOLLOW)
@@ -81,7 +78,7 @@ def open_below(folder: Path, path: Path) -> int:
 
 @contextlib.contextmanager
 def acting_as(uid: int) -> Iterator[None]:
-    """Give this thread the user's rights in the block; without root, nothing changes."""
+    """Without root, nothing changes."""
     # seteuid would also take root from the other threads.
     if os.geteuid() != 0 or uid == 0:
         yield
@@ -97,7 +94,6 @@ def acting_as(uid: int) -> Iterator[None]:
 
 
 def _folder(path: Path) -> int:
-    """Open a folder for passing through, with the rights of the owners of the folders above."""
     try:
         return os.open(path, _PASSING)
     except PermissionError:

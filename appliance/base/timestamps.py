@@ -12,10 +12,10 @@ class TimestampError(ValueError):
 
 
 def parse_timestamp(text: str, now: int) -> int:
-    """Return nanoseconds since the epoch; `1h` means one hour before `now`, and a time without a zone is UTC.
+    """Return nanoseconds since the epoch; a time without a zone is UTC, and a time outside the log's range the
+    nearest end.
 
-    `10:32` is the most recent 10:32; `today` and `yesterday` begin at midnight. A time outside the log's range
-    becomes the nearest end of that range. Raises `TimestampError`.
+    Raises `TimestampError`.
     """
     ago = re.fullmatch(r"(\d{1,9}(?:\.\d{1,9})?)([smhdw])", text, re.ASCII)
     if ago is not None:
@@ -41,7 +41,7 @@ def _dated(text: str, now: int) -> str:
 
 
 def parse_date(text: str) -> int:
-    """Return nanoseconds since the epoch for a date or an RFC 3339 time. Raises `ValueError`."""
+    """Return nanoseconds since the epoch. Raises `ValueError`."""
     # datetime keeps only microseconds. The log prints nanoseconds, and every printed time must be valid input.
     fraction = re.search(r"\.(\d{1,9})", text)
     whole = text if fraction is None else text.replace(fraction[0], "", 1)

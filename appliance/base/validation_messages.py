@@ -1,7 +1,4 @@
-"""Describe an invalid value for users: what it must be, and the nearest known value.
-
-pydantic reads the configuration, the command line and REST parameters; msgspec reads REST bodies.
-"""
+"""Describe an invalid value for users: what it must be, and the nearest known value."""
 
 import difflib
 import re
@@ -66,7 +63,6 @@ _YAML = {
 
 
 def not_yaml(problem: object) -> str:
-    """Return `is not YAML: ` with the parser's message and advice."""
     said = " ".join(str(problem).split())
     return "; ".join(
         [f"is not YAML: {said}", *[do for what, do in _YAML.items() if re.search(what, said)][:1]]
@@ -74,7 +70,6 @@ def not_yaml(problem: object) -> str:
 
 
 def nearest(word: str, candidates: Collection[str]) -> str | None:
-    """Return the nearest candidate; None if none is similar or there are too many."""
     if len(candidates) > _MAXIMUM_CANDIDATES or len(word) > 100:
         return None
     folded = {candidate.casefold(): candidate for candidate in candidates}
@@ -83,13 +78,12 @@ def nearest(word: str, candidates: Collection[str]) -> str | None:
 
 
 def meant(word: str, candidates: Collection[str]) -> str:
-    """Return `; did you mean X?`, or an empty string."""
     found = nearest(word, candidates)
     return f"; did you mean {found}?" if found else ""
 
 
 def must_be(error: Mapping[str, Any]) -> str:
-    """Return what a value must be; `error` is one of pydantic's `errors()`."""
+    """`error` is one of pydantic's `errors()`."""
     kind, context = str(error["type"]), error.get("ctx") or {}
     wanted = _MUST_BE.get(kind) or _MUST_BE.get(kind.partition("_")[0]) or f"of another type ({kind})"
     shown = {name: _plain(value) for name, value in context.items()}
@@ -99,7 +93,7 @@ def must_be(error: Mapping[str, Any]) -> str:
 
 
 def refusal(error: Mapping[str, Any]) -> str:
-    """Return the message for the command line or a query; `error` is one of pydantic's `errors()`."""
+    """`error` is one of pydantic's `errors()`."""
     if error["type"] == "missing":
         return "must be given"
     if error["type"] == "value_error":  # raised by the appliance's own validator, with a complete message
@@ -108,10 +102,7 @@ def refusal(error: Mapping[str, Any]) -> str:
 
 
 def body_refusal(text: str, choices: Collection[str] = ()) -> str:
-    """Return the message for a REST body; `text` is msgspec's `ValidationError` without its path.
-
-    `choices` are the valid strings of an enumeration.
-    """
+    """`text` is msgspec's `ValidationError` without its path, `choices` are the valid strings of an enumeration."""
     no_choice = text.removeprefix("Invalid enum value ")
     if no_choice != text:
         return f"must be one of {', '.join(repr(str(one)) for one in choices)}, not {_cut(no_choice)}"
@@ -126,7 +117,6 @@ def _cut(text: str) -> str:
 
 
 def _shape(pattern: str) -> str:
-    """Describe the regular expression of a name in words; others are given as they are."""
     found = _NAME.fullmatch(pattern)
     if found is None:
         return f"a string that matches {pattern}"

@@ -1,7 +1,6 @@
 """Replace the numbers in a text, so that two reports of one cause with other measured values have the same words.
 
-Kept are digits that name something: in a word or ROS name (`joint_1`, `/arm/2`), an address or version (`10.0.0.66`,
-`2001:db8::42`), and the place in a file (`robot.ini:12`).
+Digits that name something are kept, as in `joint_1`, `10.0.0.66` and `robot.ini:12`.
 """
 
 import functools

@@ -1,15 +1,7 @@
 """Withdraw an order before it takes effect if its client no longer waits for the answer.
 
-Invariants:
-
-1. Every order calls `take_effect` before its first change. `take_effect` raises `WithdrawnError` if the client gave up
-   earlier (timeout, disconnection, kill). A withdrawn order changes nothing, now or later.
-2. After `take_effect`, the order runs to its end even if its client gives up.
-3. The audit log lists every order that started.
-4. Work outside an order (a start, a signal, an automatic rollback) is never withdrawn. Tasks that outlive their order
-   are not withdrawn either.
-
-The current order is a context variable, so all code that runs for one request sees the same order.
+Every order calls `take_effect` before its first change. A withdrawn order changes nothing, now or later; after
+`take_effect`, it runs to its end. Work outside an order, and tasks that outlive it, are never withdrawn.
 """
 
 import contextlib
@@ -41,7 +33,7 @@ _PRESENT: ContextVar[_Order | None] = ContextVar("order", default=None)
 
 @contextlib.contextmanager
 def awaited(given_up: Callable[[], bool]) -> Iterator[None]:
-    """Run the block as an order; `given_up()` returns whether its client stopped waiting."""
+    """`given_up()` returns whether the client of the order in the block stopped waiting."""
     order = _Order(given_up)
     before = _PRESENT.set(order)
     try:
@@ -59,7 +51,7 @@ def require_awaited() -> None:
 
 
 def take_effect() -> None:
-    """Mark the present order as begun. Raises `WithdrawnError` if the client gave up."""
+    """Raises `WithdrawnError`."""
     require_awaited()
     order = _PRESENT.get()
     if order is not None:
