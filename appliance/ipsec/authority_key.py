@@ -1,8 +1,4 @@
-"""Make, store and load the authority's private key, encrypted if there is a passphrase.
-
-When a passphrase is added, an unencrypted key is encrypted in place. An invalid key or passphrase raises an error with
-the remedy; the file is not replaced.
-"""
+"""Make, store and load the authority's private key, encrypted if there is a passphrase."""
 
 import os
 from pathlib import Path
@@ -59,7 +55,7 @@ def write_key(path: Path, key: Key, passphrase: bytes | None) -> None:
 
 
 def load_key(path: Path, certificate_file: str, kind: Kind, passphrase: bytes | None) -> Key:
-    """Return the key. Raises `OSError`, and `SignerKeyError` for an invalid key or one of another kind."""
+    """Raises `OSError`, and `SignerKeyError` for an invalid key or one of another kind."""
     if not path.exists():
         raise SignerKeyError(
             f"{path}: missing, but its certificate is there; restore it from a backup, or remove"

@@ -1,7 +1,6 @@
 """Use an authority that was brought from another machine, with a key that a passphrase encrypts.
 
-It is beside the signer's own authority, and is used instead once the signer has the passphrase. Until then, or with a
-wrong passphrase, the signer uses its own.
+Without the passphrase, the signer uses its own authority.
 """
 
 from pathlib import Path
@@ -14,9 +13,8 @@ FOLDER = "joined"  # of the signer's directory
 
 
 def open_authority(directory: Path, kind: Kind, passphrase: bytes | None) -> tuple[CertificateAuthority, str]:
-    """Return the authority; without the brought key, the appliance's own authority with the reason.
-
-    Raises `SignerKeyError` and `OSError` if the appliance's own authority cannot be used.
+    """Without the brought key, return the appliance's own authority with the reason. Raises `SignerKeyError` and
+    `OSError`.
     """
     own, folder = CertificateAuthority(directory, kind, passphrase), directory / FOLDER
     if not (folder / KEY_FILE).exists():

@@ -1,14 +1,11 @@
 """Run the certificate authority of an appliance: issue certificates of hosts, and sign the revocation list.
 
-1. The key (ECDSA on P-384, or Ed25519) is made at the first use and never leaves the process. Its file is in the
-   signer's own directory, mode 0600, encrypted if there is a passphrase. A key without its certificate, a certificate
-   of another key, or a key that others may read is an error; nothing is replaced.
-2. Only the public key of a request is used: this module sets the names, times and usages of a certificate. The request
-   must be signed by its own key, which must be ECDSA on P-384 or Ed25519.
-3. A certificate is valid for at most `LONGEST_DAYS`, and never longer than the authority's own.
-4. With a proof, the request must also be signed by the key of a valid certificate of this authority in the same name.
-5. A revocation list has all given serial numbers. charon ignores a list with a lower number, so the list's number
-   always grows, even after a restart or after the clock is set back.
+1. The key never leaves the process. A key without its certificate, a certificate of another key, or a key that
+   others may read is an error; nothing is replaced.
+2. Only the public key of a request is used: this module sets the names, times and usages of a certificate.
+3. A certificate is never valid for longer than the authority's own.
+4. charon ignores a revocation list with a lower number, so the list's number always grows, even after the clock
+   is set back.
 """
 
 import contextlib
@@ -47,7 +44,7 @@ _CLOCKS_DIFFER = datetime.timedelta(hours=1)
 
 @dataclass(frozen=True)
 class IssuedCertificate:
-    """A certificate in PEM, its serial number in hexadecimal, and its end in seconds since the epoch."""
+    """`serial` is in hexadecimal, the end in seconds since the epoch."""
 
     certificate: bytes
     serial: str
@@ -55,10 +52,7 @@ class IssuedCertificate:
 
 
 class CertificateAuthority:
-    """The authority in a folder, made with a key of this kind if missing.
-
-    Raises `SignerKeyError`, `OSError`.
-    """
+    """The authority in a folder, made with a key of this kind if missing. Raises `SignerKeyError`, `OSError`."""
 
     def __init__(self, directory: Path, kind: Kind = "ecdsa", passphrase: bytes | None = None) -> None:
         key_path, certificate_path = directory / KEY_FILE, directory / CERTIFICATE_FILE
@@ -88,10 +82,7 @@ class CertificateAuthority:
     def issue(
         self, request: bytes, name: str, days: float, *, proof: bytes = b"", former: bytes = b""
     ) -> IssuedCertificate:
-        """Issue a certificate for a request (PEM). Raises `RequestRefusedError`.
-
-        `proof` is the signature over the request by the key of the certificate `former` (PEM).
-        """
+        """`proof` is the signature over the request by the key of `former` (PEM). Raises `RequestRefusedError`."""
         if not _NAME.fullmatch(name):
             raise RequestRefusedError(
                 f"{name[:80]!r} is not a valid name for a certificate: letters, digits and . _ -, at most 63"
@@ -129,7 +120,7 @@ class CertificateAuthority:
         )
 
     def revocations(self, serials: Iterable[tuple[str, float]]) -> bytes:
-        """Return the list (PEM) of serial numbers (hexadecimal) and times (seconds since the epoch)."""
+        """Serial numbers are in hexadecimal, times in seconds since the epoch."""
         now = clock.utc_now()
         builder = (
             x509.CertificateRevocationListBuilder()
@@ -160,7 +151,7 @@ class CertificateAuthority:
 
 
 def _key_of(request: bytes) -> ec.EllipticCurvePublicKey | ed25519.Ed25519PublicKey:
-    """Return the key of a request. Raises `RequestRefusedError` unless its private key signed the request."""
+    """Raise `RequestRefusedError` unless the request's own private key signed it."""
     if len(request) > LONGEST_REQUEST:
         raise RequestRefusedError(f"the signing request is longer than {LONGEST_REQUEST} bytes")
     try:

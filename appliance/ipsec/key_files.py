@@ -5,7 +5,7 @@ from pathlib import Path
 
 
 class SignerKeyError(Exception):
-    """A key cannot be used; the message has the path, the reason and the remedy."""
+    """A key cannot be used."""
 
 
 def require_private(path: Path) -> None:

@@ -1,8 +1,7 @@
 """Remove IPsec states and policies, with their keys, that a killed charon left in the kernel.
 
-With them the kernel would accept packets even from a revoked host. So they are removed before charon starts again, and
-when the appliance ends. Only the appliance's own leftovers are removed: the states of ESP in UDP on port 4500, which
-only charon uses, and the policies from and to the appliance's tunnel address.
+With them the kernel would accept packets even from a revoked host. Only the appliance's own leftovers are
+removed: states of ESP in UDP on port 4500, and policies from and to its tunnel address.
 """
 
 import itertools
@@ -21,10 +20,10 @@ class LeftoversError(Exception):
 
 
 def clear_leftovers(own: str) -> int:
-    """Clear the calling thread's network namespace, where charon must not run; return the number of
-    leftovers.
+    """charon must not run in the calling thread's network namespace. `own` is the appliance's address in the
+    tunnels.
 
-    `own` is the appliance's address in the tunnels. Raises `LeftoversError`.
+    Raises `LeftoversError`.
     """
     orders = _orders(own)
     if orders:
@@ -36,7 +35,6 @@ def clear_leftovers(own: str) -> int:
 
 
 def state_orders(listed: str) -> list[str]:
-    """Return orders that delete charon's states in the output of `ip xfrm state list nokeys`."""
     starts = [*(found.start() for found in re.finditer(r"^src ", listed, re.MULTILINE)), len(listed)]
     orders = []
     for begin, end in itertools.pairwise(starts):
@@ -48,7 +46,6 @@ def state_orders(listed: str) -> list[str]:
 
 
 def policy_orders(listed: str, own: str) -> list[str]:
-    """Return orders that delete the policies from and to `own` in the output of `ip xfrm policy`."""
     return [
         f"xfrm policy delete src {source} dst {destination} dir {direction}"
         for source, destination, direction in _POLICY.findall(listed)

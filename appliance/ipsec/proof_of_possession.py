@@ -24,9 +24,8 @@ def require_proof(
     authority: x509.Certificate,
     now: datetime.datetime,
 ) -> None:
-    """Raise `RequestRefusedError` unless the key of `former` (PEM) signed the request.
-
-    `former` must be a valid certificate of the authority in this name. ECDSA signs with SHA-384.
+    """Raise `RequestRefusedError` unless the key of `former` (PEM), a valid certificate of the authority in this
+    name, signed the request.
     """
     try:
         certificate = x509.load_pem_x509_certificate(former)

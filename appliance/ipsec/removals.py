@@ -1,12 +1,10 @@
 """Approve removals of old audit records that follow from the settings and the signer's own memory.
 
-Without approval, a process that can write the log could remove recent records and call them old. So the signer uses its
-own settings and memory, and trusts neither the log nor control:
+Without approval, a process that can write the log could remove recent records and call them old.
 
 1. Records are removed up to a checkpoint that the signer signed.
-2. By age (`retention_days`): the signer signed that checkpoint long enough ago, by the age clock.
-3. By size (`retention_bytes`): the records sealed since that checkpoint would fill the size if each had
-   `LARGEST_RECORD` bytes.
+2. By age: the signer signed that checkpoint long enough ago, by the age clock.
+3. By size: the records sealed since that checkpoint would fill the size if each had `LARGEST_RECORD` bytes.
 """
 
 from collections.abc import Callable
@@ -31,7 +29,7 @@ class RemovalRefusedError(Exception):
 
 @dataclass(frozen=True)
 class RetentionLimits:
-    """The limits of retention: age in days, size in bytes."""
+    """Age in days, size in bytes."""
 
     days: float | None = None
     size: int | None = None
@@ -46,10 +44,9 @@ class RemovalApprover:
         self._clock = clock
 
     def approve(self, checkpoint: bytes, newest: bytes) -> bytes:
-        """Return the text to sign.
+        """Return the text to sign. `newest` is the last signed checkpoint.
 
-        `checkpoint` and `newest`, the last signed checkpoint, are checkpoint texts. Raises `RemovalRefusedError`,
-        `CheckpointRefusedError`, `OSError`.
+        Raises `RemovalRefusedError`, `CheckpointRefusedError`, `OSError`.
         """
         upto, last = read_checkpoint(checkpoint), read_checkpoint(newest)
         signed_at = self._signed.signed_at(upto)

@@ -16,13 +16,13 @@ from cryptography.x509.oid import NameOID
 
 
 def make_key() -> bytes:
-    """Return a private key for ECDSA on P-384, in PEM (PKCS #8)."""
+    """Use ECDSA on P-384; return PEM (PKCS #8)."""
     key = ec.generate_private_key(ec.SECP384R1())
     return key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
 
 
 def signing_request(key: bytes, name: str) -> bytes:
-    """Return a signing request (PKCS #10, PEM); `key` is from `make_key`."""
+    """Return PKCS #10 in PEM."""
     private = load_pem_private_key(key, password=None)
     if not isinstance(private, ec.EllipticCurvePrivateKey):
         raise ValueError("the key is not an ECDSA key: remove its file; a new one is created")
@@ -32,6 +32,5 @@ def signing_request(key: bytes, name: str) -> bytes:
 
 
 def fingerprint(key: bytes) -> str:
-    """Return the SHA-256 of the public key in hexadecimal; `key` is private (PEM)."""
     public = load_pem_private_key(key, password=None).public_key()
     return hashlib.sha256(public.public_bytes(Encoding.DER, PublicFormat.SubjectPublicKeyInfo)).hexdigest()

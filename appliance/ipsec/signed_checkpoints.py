@@ -1,12 +1,11 @@
 """Remember the audit checkpoints that the signer signed, so that it never signs a second history.
 
-1. For each log, `<log>.signed` lists the hashes of its signed checkpoints by number, and `<log>.times` lists the times
-   of signing by the age clock. Both files only grow.
-2. A checkpoint is approved if its number and hash follow the last one. A repeated checkpoint is approved if it equals
-   the one signed under its number (control lost the answer). An unknown log may begin with any number.
-3. A checkpoint contains the sequence number of the last removed record. The signer must have approved that removal
-   (`<log>.removed`, see `removals.py`). The first checkpoint with this field in a log from an older version is trusted;
-   every later checkpoint of the log needs the field.
+1. `<log>.signed` has the hashes of a log's signed checkpoints by number, and `<log>.times` the times of signing
+   by the age clock. Both files only grow.
+2. A checkpoint is approved if it follows the last one, or equals the one signed under its number (control lost
+   the answer). An unknown log may begin with any number.
+3. The signer must have approved the removal that a checkpoint contains (`<log>.removed`). The first checkpoint
+   with this field in a log from an older version is trusted.
 4. At most `MOST_LOGS` logs are remembered, so control cannot fill the signer's disk.
 """
 
@@ -24,11 +23,11 @@ _NUMBER = 8
 
 
 class CheckpointRefusedError(Exception):
-    """A checkpoint must not be signed; the message gives the reason."""
+    """A checkpoint must not be signed."""
 
 
 def read_checkpoint(text: bytes) -> Checkpoint:
-    """Parse the text of a checkpoint. Raises `CheckpointRefusedError`."""
+    """Raises `CheckpointRefusedError`."""
     try:
         return parse_checkpoint(text)
     except ValueError:
@@ -36,7 +35,7 @@ def read_checkpoint(text: bytes) -> Checkpoint:
 
 
 def newest_signing(directory: Path) -> int | None:
-    """Return the time of the last signature in nanoseconds since the epoch, or None."""
+    """Return nanoseconds since the epoch."""
     times = (path.read_bytes() for path in directory.glob("*.times"))
     return max(
         (int.from_bytes(kept[-_NUMBER:], "big") for kept in times if len(kept) > _NUMBER), default=None
@@ -51,7 +50,7 @@ class CheckpointMemory:
         self._clock = clock
 
     def approve(self, text: bytes) -> None:
-        """Remember a checkpoint that may be signed. Raises `CheckpointRefusedError`, `OSError`."""
+        """Raises `CheckpointRefusedError`, `OSError`."""
         wanted = read_checkpoint(text)
         path = self._path(wanted.log, "signed")
         if not path.exists():
@@ -73,7 +72,6 @@ class CheckpointMemory:
             os.close(descriptor)
 
     def signed_at(self, checkpoint: Checkpoint) -> int | None:
-        """Return when a checkpoint was signed, or the checkpoint's own time if that is not stored."""
         path = self._path(checkpoint.log, "signed")
         if not path.exists():
             return None
@@ -150,7 +148,7 @@ def _extent(descriptor: int) -> tuple[int, int]:
 
 
 def _is_known(descriptor: int, wanted: Checkpoint, first: int, count: int) -> bool:
-    """Whether a checkpoint was signed before. Raises `CheckpointRefusedError` if it does not follow the last one."""
+    """Raise `CheckpointRefusedError` if the checkpoint does not follow the last one."""
     index = wanted.number - first
     if index < 0 or index > count:
         raise CheckpointRefusedError(f"checkpoint {wanted.number} does not follow number {first + count - 1}")

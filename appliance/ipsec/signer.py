@@ -1,12 +1,10 @@
 """Run the signer: the process with the audit key and the authority's key. It has no network.
 
-1. The audit key is made at the first start in the signer's own directory (mode 0600) and never leaves the process. A
-   damaged key file, or one that others may read, is an error; it is never replaced.
-2. The signer parses only the messages of its lifeline and its link to control, and the signing requests in them. It
-   signs only audit checkpoints, removals of old records (`removals.py`), certificates and the revocation list.
-3. It remembers its signatures (`signed_checkpoints.py`) and never signs a second history. `rosrv audit verify` compares
-   the log with this memory, and so detects a truncated log or a removed signature.
-4. Every signing request is answered, even if parsing it raises an unexpected error, so later messages are served.
+1. The audit key never leaves the process. A damaged key file, or a file that others may read, is an error; it is
+   never replaced.
+2. The signer parses only the messages of its lifeline and its link to control, and the signing requests in them.
+   It never signs a second history.
+3. Every signing request is answered, even if parsing it raises an unexpected error, so later messages are served.
 """
 
 import asyncio
@@ -59,7 +57,7 @@ class _Settings(msgspec.Struct):
 
 
 def load_or_create_key(directory: Path) -> Ed25519PrivateKey:
-    """Return the audit key. Raises `SignerKeyError` or `OSError`."""
+    """Raises `SignerKeyError` or `OSError`."""
     path = directory / KEY_FILE
     if not path.exists():
         _create_key(directory)

@@ -1,11 +1,8 @@
 """Make charon's configuration: its file, and the tunnels of the enrolled hosts for vici. No I/O.
 
-1. The only proposals are AES-256-GCM and SHA-384 with Curve25519 or ECP-384. If charon has ML-KEM-768, it is added to
-   Curve25519.
-2. A host needs an unrevoked certificate of the appliance's own authority; without a valid revocation list, no host is
-   accepted. The name in the certificate determines the host's only address. The host reaches only the appliance's
+1. Without a valid revocation list, no host is accepted. The name in the certificate determines the host's only
    address, and no connection matches a host that is not enrolled.
-3. charon loads only the plugins listed here. None of them runs programs or requests lists from the network.
+2. charon loads only the plugins listed here. None of them runs programs or requests lists from the network.
 """
 
 from collections.abc import Iterable, Mapping
@@ -33,7 +30,7 @@ def plugins(esp: Esp) -> str:
 
 
 def configuration(directory: Path, esp: Esp) -> str:
-    """Return `strongswan.conf`, with the socket in `directory` and the log on stderr."""
+    """`directory` has the socket."""
     return f"""\
 charon-systemd {{
   load = {plugins(esp)}
@@ -70,13 +67,11 @@ class Proposals:
 
     @property
     def key_exchange(self) -> list[str]:
-        """Return the names in the status, such as `x25519+mlkem768`, `x25519` or `ecp384`."""
         words = [proposal.removeprefix("aes256gcm16-prfsha384-") for proposal in self.ike]
         return [word.replace("-ke1_", "+") for word in words]
 
 
 def proposals_of(key_exchanges: Iterable[str]) -> Proposals:
-    """Return the proposals for key exchanges by charon's names."""
     if _ML_KEM_ALGORITHM not in key_exchanges:
         return Proposals()
     return Proposals(
@@ -89,12 +84,10 @@ def connection_name(host: str) -> str:
 
 
 def host_of(connection: str) -> str | None:
-    """Return the host of a connection, or None, such as for a handshake before its host is known."""
     return connection.removeprefix(_PREFIX) if connection.startswith(_PREFIX) else None
 
 
 def pool(host: TunnelHost) -> dict[str, Any]:
-    """Return the message `load-pool` of vici, with the one address of a host."""
     return {connection_name(host.name): {"addrs": f"{host.address}-{host.address}"}}
 
 
