@@ -20,7 +20,6 @@ class Appliances:
 
     @property
     def other(self) -> ApplianceRow | None:
-        """Return the other appliance, or None if it has not introduced itself."""
         return None
 
     async def until_introduced(self) -> None:

@@ -13,7 +13,7 @@ M = TypeVar("M", messages.AuthorityStated, messages.CertificateMade, messages.Re
 
 
 class AuthorityError(Exception):
-    """The authority does not serve a request; `refused`: it rejected the request, otherwise it did not answer."""
+    """`refused`: the authority rejected the request, otherwise it did not answer."""
 
     def __init__(self, reason: str, *, refused: bool = False) -> None:
         super().__init__(reason)
@@ -32,11 +32,7 @@ class Authority:
     async def issue(
         self, request: bytes, name: str, days: float, *, proof: bytes = b"", former: bytes = b""
     ) -> messages.CertificateMade:
-        """Return the certificate for a signing request.
-
-        If `former` (a certificate in PEM) is given, `proof` must be a signature over the request by that
-        certificate's key.
-        """
+        """`proof` is a signature over the request by the key of `former` (PEM)."""
         return await self._ask(
             lambda number: messages.CertificateWanted(number, request, name, days, proof, former),
             messages.CertificateMade,

@@ -1,7 +1,7 @@
 """The table of hosts with a tunnel: names, addresses, certificates. It only keeps state.
 
-1. A name keeps its virtual address for good: no other host gets the address, even after a revocation. An address
-   promised with a token is also reserved. An address declared in hosts.yaml goes to another host only on request.
+1. No other host gets the virtual address of a name, even after a revocation. An address promised with a token is
+   also reserved, and an address declared in hosts.yaml goes to another host only on request.
 2. A replaced or revoked certificate is on the list of revoked certificates at once.
 3. `revision` grows with every change by an operator or a host, also across restarts.
 """
@@ -33,7 +33,7 @@ MOST_MACHINES = 1024
 
 
 class HostRefusedError(Exception):
-    """A request about hosts is refused, with the reason. `ours`: the appliance, not the request, is the cause."""
+    """The message has the reason. `ours`: the appliance, not the request, is the cause."""
 
     def __init__(self, reason: str, *, ours: bool = False) -> None:
         super().__init__(reason)
@@ -71,7 +71,7 @@ class HostTable:
         return str(self.pool.network_address + 1)
 
     def require(self, expected: int | None) -> None:
-        """Raise `HostsChangedError` for another revision."""
+        """Raises `HostsChangedError`."""
         if expected not in (None, self.revision):
             raise HostsChangedError(f"the table of hosts has revision {self.revision}, not {expected}")
 
@@ -88,11 +88,11 @@ class HostTable:
         return [row for row in self.enrolled() if self.declared.wants(row.name)]
 
     def addresses(self) -> dict[str, Address]:
-        """Return the addresses that `host:NAME` means in the policy while the tunnels are open."""
+        """The policy has these addresses for `host:NAME` while the tunnels are open."""
         return {row.name: ipaddress.ip_address(row.address) for row in self.admitted()}
 
     def enrolled_row(self, name: str) -> HostRow:
-        """Return the row of an enrolled host. Raises `UnknownHostError`."""
+        """Raises `UnknownHostError`."""
         row = self.rows.get(name)
         if row is None or row.revoked is not None:
             known = ", ".join(host.name for host in self.enrolled()[:20]) or "none"
@@ -106,7 +106,6 @@ class HostTable:
         return self.revoked.listed(self._enrolled_names())
 
     def missing_as_revoked(self) -> int:
-        """Return the number of enrolled hosts' revoked certificates that do not fit on the list."""
         return self.revoked.missing(self._enrolled_names())
 
     def require_room(self, name: str) -> None:
@@ -140,10 +139,7 @@ class HostTable:
             raise HostRefusedError(f"the table is full: {MOST_HOSTS} hosts, including revoked ones")
 
     def address_for(self, name: str, wanted: str | None, awaited: dict[str, str]) -> str:
-        """Return the address for a host; `awaited` maps addresses that tokens reserve to names.
-
-        Raises `HostRefusedError`.
-        """
+        """`awaited` maps addresses that tokens reserve to names. Raises `HostRefusedError`."""
         declared = self.declared.hosts.get(name)
         before = self.rows.get(name)
         kept = before.address if before else declared.address if declared else None
@@ -195,7 +191,6 @@ class HostTable:
         self.changed()
 
     def take_next(self, name: str) -> HostRow | None:
-        """Replace a certificate by its successor; None if no successor is stored."""
         row, certificate = self.rows[name], self.certificates.get(name)
         if certificate is None or certificate.next is None:
             return None
@@ -213,7 +208,7 @@ class HostTable:
         return self._set(row._replace(revoked=clock.wall()))
 
     def keep_ports(self, row: PortsRow) -> None:
-        """Store the result of a port check. Raises `HostRefusedError`."""
+        """Raises `HostRefusedError`."""
         if row.name not in self.ports and len(self.ports) >= MOST_MACHINES:
             raise HostRefusedError(f"the limit of {MOST_MACHINES} machines with known ports is reached")
         self.ports[row.name] = row

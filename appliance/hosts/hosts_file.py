@@ -1,14 +1,6 @@
-"""Read `ipsec/hosts.yaml`, which declares the hosts to enrol, at start and on reload. The file is never written.
+"""Read `ipsec/hosts.yaml` (docs/tunnels.md), which declares the hosts to enrol, at start and on reload.
 
-A bundle of the fleet has a text of its own, which replaces the file until the next reload.
-
-hosts:
-  - name: ocu-1
-    address: 10.113.11.20   # optional: reserved for it
-    groups: [operators]     # optional
-    tunnel: true            # false: enrolled or not, its tunnel stays closed
-
-An invalid file changes nothing, also at a start, and the status reports the error.
+The file is never written. An invalid file changes nothing, also at a start, and the status reports the error.
 """
 
 import contextlib
@@ -39,7 +31,7 @@ _GROUP = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,62}")
 
 
 class DeclaredHostsError(Exception):
-    """The file is invalid; the text has each location, its mistake, and a valid value."""
+    """The file is invalid."""
 
 
 @dataclass(frozen=True)
@@ -55,8 +47,7 @@ class DeclaredHost:
 class DeclaredHosts:
     """The declared hosts; `error` is the reason if the text is invalid now.
 
-    `bundled` is the text of a bundle, in place of the file. `text` is the file's last valid text. At a start
-    it is the stored one, which is used if the file is invalid now.
+    `bundled` is the text of a fleet's bundle, `text` the file's last valid text, at a start the stored one.
     """
 
     def __init__(self, path: Path, bundled: str = "", text: str = "") -> None:
@@ -76,11 +67,10 @@ class DeclaredHosts:
 
     @property
     def there(self) -> bool:
-        """Whether hosts are declared; otherwise none can diverge from the file."""
         return bool(self.hosts)
 
     def reload(self) -> None:
-        """Read the file again. Raises `DeclaredHostsError`, and then keeps the earlier content."""
+        """Raises `DeclaredHostsError`, and then keeps the earlier content."""
         try:
             self.text, self.hosts = _read(self.path)
         except DeclaredHostsError as error:
@@ -89,7 +79,7 @@ class DeclaredHosts:
         self.error = self.bundled = ""
 
     def take(self, text: str) -> None:
-        """Use the text of a bundle. Raises `DeclaredHostsError`, and then changes nothing."""
+        """Raises `DeclaredHostsError`, and then changes nothing."""
         self.hosts = parse_declared(text, IN_BUNDLE)
         self.error, self.bundled = "", text or "\n"
 
@@ -103,7 +93,7 @@ class DeclaredHosts:
 
 
 def read_declared(path: Path) -> dict[str, DeclaredHost]:
-    """Return the hosts in a file by name; none without a file. Raises `DeclaredHostsError`."""
+    """A missing file has no hosts. Raises `DeclaredHostsError`."""
     return _read(path)[1]
 
 
@@ -119,7 +109,6 @@ def _read(path: Path) -> tuple[str, dict[str, DeclaredHost]]:
 
 
 def parse_declared(text: str, path: str) -> dict[str, DeclaredHost]:
-    """Return the hosts in a text by name; `path` is its name in errors. Raises `DeclaredHostsError`."""
     if len(text) > _LARGEST:
         raise DeclaredHostsError(f"{path}: longer than {_LARGEST} characters")
     reading = _Reading()

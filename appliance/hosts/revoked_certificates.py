@@ -1,12 +1,10 @@
 """Keep revoked certificates until long after their end, and select those for the revocation list (CRL).
 
-Invariants:
-
-1. A revoked certificate stays on the list until a day after its expiry, and is deleted more than a year later. So the
-   certificate stays revoked even if the clock was ahead for a while and is then set back.
-2. The list fits into one value of vici (65,535 bytes in DER), because charon and swanctl reject a longer list. If the
-   list would be longer, certificates of hosts that are not enrolled are left out: charon has no connection that matches
-   them. Before certificates of enrolled hosts exceed the limit, `require_room` rejects further replacements.
+1. A revoked certificate stays on the list until a day after its expiry, and is deleted more than a year later, so
+   it stays revoked even if the clock was ahead for a while and is then set back.
+2. charon and swanctl reject a list that does not fit into one value of vici (65,535 bytes in DER). If it would
+   not, certificates of hosts that are not enrolled are left out: charon has no connection that matches them.
+   Before certificates of enrolled hosts exceed the limit, `require_room` rejects further replacements.
 """
 
 from collections.abc import Iterable, Set
@@ -22,7 +20,7 @@ _AT_ONCE_BYTES = 2 * (_ENTRY_BYTES + 20)  # two entries: a certificate and its s
 
 
 class RevokedCertificates:
-    """All revoked certificates; `enrolled` are the names whose certificates charon accepts."""
+    """`enrolled` are the names whose certificates charon accepts."""
 
     def __init__(self, kept: HostTables) -> None:
         self._kept = kept
@@ -57,7 +55,6 @@ class RevokedCertificates:
         return kept
 
     def missing(self, enrolled: Set[str]) -> int:
-        """Return the number of enrolled hosts' certificates that do not fit on the list."""
         rows = self._not_ended()
         if _bytes_of(rows) <= ENTRIES_BYTES:
             return 0

@@ -23,7 +23,7 @@ class StoredAuthority:
 
     @property
     def waits(self) -> str:
-        """Return what needs the authority's key, and until when tunnels open, as a text."""
+        """Return the work that needs the authority's key, and until when tunnels open."""
         return ""
 
     async def certificate(self) -> bytes:
@@ -40,7 +40,6 @@ class StoredAuthority:
         return kept.certificate == own.decode()
 
     async def obstacle(self) -> str:
-        """Return why this appliance cannot issue certificates, or an empty text."""
         await self.certificate()
         return ""
 

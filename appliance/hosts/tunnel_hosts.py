@@ -12,11 +12,10 @@ class TunnelHosts:
 
     @property
     def bundled(self) -> str:
-        """Return the bundle's text that is used instead of hosts.yaml, or an empty text."""
         return self._text
 
     async def take_bundle(self, text: str, who: str) -> object:
-        """Use a bundle's text; an empty one stands for the file. Raises `HostRefusedError`."""
+        """An empty text stands for the file. Raises `HostRefusedError`."""
         del who
         if text.strip():
             raise HostRefusedError("the bundle declares hosts, and this appliance has no tunnels")
@@ -24,7 +23,7 @@ class TunnelHosts:
         return None
 
     async def read_again(self, who: str) -> None:
-        """Read hosts.yaml. Raises `HostRefusedError` and `StoreError`."""
+        """Raises `HostRefusedError` and `StoreError`."""
 
     def status(self) -> IpsecState:
         return IpsecState(

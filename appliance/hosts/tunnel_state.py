@@ -1,11 +1,9 @@
 """Keep the state of the tunnels: firewall, configuration for charon, and charon's reports.
 
-Invariants:
-
-1. `open` makes the supervisor accept the pool's addresses through IPsec only. Until then, `enclosed` is False and
-   `addresses` is empty, because an address that also works in clear text does not identify a host.
+1. Until the supervisor accepts the pool's addresses through IPsec only, `addresses` is empty, because an address
+   that also works in clear text does not identify a host.
 2. Every update sends charon the complete wanted state; updates keep the order of the changes.
-3. Every tunnel that comes up, moves, goes down or is rejected is recorded; packets that charon dropped are counted.
+3. Every tunnel that comes up, moves, goes down or is rejected is recorded.
 4. A tunnel is closed when its certificate ends.
 """
 
@@ -46,7 +44,7 @@ class SignedRevocations:
         self._signed = b""
 
     async def signed(self) -> bytes:
-        """Return the list in PEM. Raises `AuthorityError`."""
+        """Raises `AuthorityError`."""
         async with self._one_at_a_time:
             state = (self._table.revision, int(clock.wall() // _SIGNED_SECONDS))
             if state != self._state:
@@ -103,7 +101,6 @@ class Tunnels:
 
     @property
     def esp(self) -> messages.Esp | None:
-        """Return how ESP runs, or None if no tunnels are open."""
         return None if self._enclosed is None else self._enclosed.esp
 
     @property
@@ -119,7 +116,7 @@ class Tunnels:
         return self._table.addresses() if self.enclosed else {}
 
     async def start(self) -> None:
-        """Open the tunnels before nodes are served; log a failure."""
+        """Log a failure, which does not keep nodes from being served."""
         if not self._table.admitted():
             return
         try:
@@ -132,7 +129,7 @@ class Tunnels:
         self._answered.set()
 
     async def open(self) -> None:
-        """Open the tunnels, for which the supervisor blocks clear text for the pool. Raises `HostRefusedError`."""
+        """Let the supervisor block clear text for the pool first. Raises `HostRefusedError`."""
         async with self._opening:
             if self.enclosed:
                 return
@@ -155,7 +152,6 @@ class Tunnels:
     # --- the process that runs charon ---
 
     def attach(self, link: Channel, needed: messages.CertificateNeeded | None = None) -> None:
-        """Serve a new process, which first requests its certificate unless it already `needed` it."""
         self._certificate = self.charon = None
         self._link.attach(link)
         if needed is not None:
@@ -184,15 +180,12 @@ class Tunnels:
                 asyncio.get_running_loop().call_later(self._again(), self._dirty.set)
 
     def _until_it_changes(self) -> float:
-        """Return the seconds to the next update, at most an hour; charon does not close a tunnel whose certificate
-        ends.
-        """
+        """charon does not close a tunnel whose certificate ends, so an update is due then."""
         now = clock.wall()
         ends = [row.expires - now for row in self._table.admitted() if row.expires > now]
         return min([_RESTATE_SECONDS, *(end + _JUST_AFTER_SECONDS for end in ends)])
 
     async def until_taken(self) -> bool:
-        """Wait until charon confirms the last `state_anew`; return False if it does not in time."""
         wanted = self._changes
         deadline = clock.now() + _TAKEN_SECONDS
         while self._taken_changes < wanted:
@@ -266,7 +259,7 @@ class Tunnels:
         return _AGAIN_SECONDS[min(self._failures, len(_AGAIN_SECONDS)) - 1]
 
     async def _own_certificate(self, needed: messages.CertificateNeeded) -> bytes:
-        """Return this appliance's certificate. Without the authority's key, the other appliance issued it."""
+        """Without the authority's key, the other appliance issued the certificate."""
         obstacle = await self._authority.obstacle()
         kept = self._appliances.certificate(needed.key) if obstacle else b""
         if kept:
