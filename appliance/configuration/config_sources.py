@@ -5,8 +5,8 @@
     3. the environment: `ROSRV_LISTEN`, and `ROSRV_LIMITS__BODY_BYTES` for the key `body_bytes` under `limits`
     4. flags
 
-With a file, its relative paths and relative defaults (`policies/default.ini`) are below the file's folder;
-all other paths, and without a file the defaults, are below the working directory.
+With a file, its relative paths and relative defaults are below the file's folder; all other paths are below the
+working directory.
 """
 
 import dataclasses
@@ -73,7 +73,7 @@ class Mistake:
 
 
 class ConfigError(UserError):
-    """The configuration has mistakes; the message lists all of them."""
+    """The configuration has mistakes."""
 
     def __init__(self, mistakes: list[Mistake]) -> None:
         self.mistakes = sorted(mistakes, key=_line_of)
@@ -90,7 +90,7 @@ def json_schema() -> dict[str, Any]:
 
 
 def read(values: Mapping[str, Any]) -> Settings:
-    """Return the settings with these values, checked. Raises `pydantic.ValidationError`."""
+    """Raises `pydantic.ValidationError`."""
     return _reader().validate_python(values)
 
 
@@ -105,7 +105,7 @@ def _reader() -> TypeAdapter[Settings]:
 
 
 def resolve(file: Path | None, environment: Mapping[str, str], flags: Mapping[str, Any]) -> Settings:
-    """Return the settings from all sources. A flag whose value is None was not given. Raises `ConfigError`."""
+    """A flag whose value is None was not given. Raises `ConfigError`."""
     gathered = _Gathered()
     chosen = _choose_file(file, environment)
     if chosen is not None:
@@ -181,7 +181,6 @@ class _Gathered:
                 self._set((key,), value, _FLAGS.get(key, "--" + key.replace("_", "-")))
 
     def add_stored(self) -> None:
-        """Add the values of features' sections that their verbs left in the state directory."""
         state = self._values.get("state", _DEFAULT_STATE)
         for kind in SECTIONS:
             given = self._values.get(kind.place, {})

@@ -28,7 +28,6 @@ _COMMON = re.compile(r"/usr/share/common-licenses/([A-Za-z0-9.-]*[A-Za-z0-9])")
 
 @functools.cache
 def inventory() -> Inventory:
-    """Return the versions of the program and its parts; the first call reads hundreds of files."""
     build, listed = SHIPPED / "build.json", SHIPPED / "sbom.cdx.json"
     return Inventory(
         version=appliance.__version__,
@@ -50,7 +49,7 @@ def debian_packages(status: str) -> Iterator[Message]:
 
 
 def debian_licences(text: str) -> list[str]:
-    """Return the licences in a package's copyright file, whether in Debian's machine-readable format or in prose."""
+    """Read Debian's machine-readable format and prose."""
     return sorted(set(_LICENCE.findall(text) if "Format:" in text else _COMMON.findall(text)))
 
 

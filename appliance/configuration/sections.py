@@ -14,7 +14,7 @@ S = TypeVar("S", bound="FeatureSection")
 
 
 def key(*, description: str = "", default: Any = dataclasses.MISSING, **rules: Any) -> Any:
-    """Define a key with a default (or `default_factory`), a description, and rules for pydantic's `Field`."""
+    """`rules` are those of pydantic's `Field`."""
     metadata = {"description": description or None, **rules}
     if isinstance(default, list):
         metadata["json_schema_extra"] = {"default": default}
@@ -68,7 +68,6 @@ def checked_receiver(text: str) -> str:
 
 
 def is_loopback(host: str) -> bool:
-    """Return whether a configured host is a loopback address, which only this machine reaches."""
     if host == "localhost":
         return True
     try:
@@ -78,7 +77,7 @@ def is_loopback(host: str) -> bool:
 
 
 class FeatureSection:
-    """The base of a feature's section; `place` is its key in `appliance.yaml`, such as `audit.syslog`.
+    """`place` is the section's key in `appliance.yaml`, such as `audit.syslog`.
 
     `stored_in` is a file in the state directory that also has values of the section; empty: none.
     """
@@ -88,19 +87,17 @@ class FeatureSection:
 
     @property
     def holds_records(self) -> str:
-        """Return the key that keeps old audit records until the feature has stored them elsewhere, or an empty text."""
         return ""
 
     @classmethod
     def with_stored(cls, _state: Path, given: dict[str, Any]) -> dict[str, Any]:
-        """Return the section as given, with the values of `stored_in`. Raises `OSError` and `ValueError`."""
+        """Add the values of `stored_in`. Raises `OSError` and `ValueError`."""
         return given
 
     def receivers(self) -> dict[str, tuple[str | None, str | None]]:
         return {}
 
     def services(self) -> tuple[str, ...]:
-        """Return the names of the services that nodes may call, without the appliance's own name."""
         return ()
 
 

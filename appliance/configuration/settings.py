@@ -47,8 +47,6 @@ SECTIONS = tuple(feature.settings for feature in FEATURES if feature.settings is
 
 
 def with_features(place: str) -> Callable[[type[T]], type[T]]:
-    """Add the sections of features that are below this key; empty: at the top."""
-
     def extended(cls: type[T]) -> type[T]:
         for kind in SECTIONS:
             above, _, name = kind.place.rpartition(".")
@@ -71,7 +69,7 @@ def _comma_separated(value: object) -> object:
 
 
 def _all_or_names(value: str) -> str:
-    """Return the value. Raises `ValueError` if it has `all`, `none` or `shadow` beside names."""
+    """Raise `ValueError` for `all`, `none` or `shadow` beside names."""
     names = [name.strip() for name in value.split(",")]
     words = sorted({"all", "none", "shadow"}.intersection(names))
     if words and len(names) > 1:
@@ -297,7 +295,6 @@ class ApiLimits:
 
 
 def relays_for_this_machine() -> int:
-    """Return the default number of relay processes: half of the cores, 1 to 4."""
     return max(1, min(4, (os.cpu_count() or 1) // 2))
 
 
@@ -483,5 +480,5 @@ class Settings:
 
 
 def load_resolved(path: Path) -> Settings:
-    """Load the supervisor's settings for its children. Raises `OSError`, `msgspec.ValidationError`."""
+    """Raises `OSError`, `msgspec.ValidationError`."""
     return msgspec.json.decode(path.read_bytes(), type=Settings, dec_hook=lambda kind, text: kind(text))
