@@ -16,7 +16,7 @@ NOT_RECORDED = "the audit log cannot be written; nothing is granted until it can
 
 
 class Asker(NamedTuple):
-    """A caller: its host, its claimed `caller_id`, the arrival time of its call (monotonic ns), and the target node."""
+    """A caller, with the arrival time of its call (monotonic ns) and the target node."""
 
     host: str
     caller_id: str
@@ -31,9 +31,8 @@ RecordDetails = Callable[[str, str | None, Severity, str | None, int], dict[str,
 class AuditTrail:
     """The writer of decisions and events under the running policy revision.
 
-    `strict`: an answer waits until its record is on disk. `deny_when_failed`: every request is denied while the log
-    cannot be written. Denials of unknown hosts have `detail.unknown_host`. While a host exceeds its log quota, its
-    events without a decision are only counted, not recorded one by one.
+    `strict`: an answer waits until its record is on disk. `deny_when_failed`: every request is denied while the
+    log cannot be written. While a host exceeds its log quota, its events without a decision are only counted.
     """
 
     def __init__(
@@ -49,7 +48,7 @@ class AuditTrail:
 
     @property
     def obstacle(self) -> str | None:
-        """Return why nothing can be granted now, or None; the text is safe to show to unknown hosts."""
+        """Return why nothing can be granted now; the text is safe to show to unknown hosts."""
         if self._deny_when_failed and self._log.failed is not None:
             return NOT_RECORDED
         return None
@@ -61,17 +60,17 @@ class AuditTrail:
         return self._log.budget.owing(host)
 
     async def still_owing(self, host: str) -> str:
-        """Return `owing`; if the host must wait, let the log catch up first and check again."""
         if self.owing(host):
             await self._log.wait_durable()
         return self.owing(host)
 
     def pause(self, host: str) -> float:
-        """Return the seconds that calls of this host wait before the next check; 0 for none."""
         return self._log.budget.pause(host)
 
     async def durable(self) -> str | None:
-        """Wait until all records so far are on disk. With `deny_when_failed`, return the reason if they cannot be."""
+        """Return None once all records so far are on disk, or, with `deny_when_failed`, the reason why they are
+        not.
+        """
         failure = await self._log.wait_durable()
         return failure if self._deny_when_failed else None
 
@@ -86,10 +85,9 @@ class AuditTrail:
         reads: bool = False,
         **asked_of: str,
     ) -> str:
-        """Record a decision and return the record's id. If the decision is only counted, no record has this id.
+        """Return the record's id. If the decision is only counted, no record has this id.
 
-        `asked_of` names the object of a command, such as a parameter or a node. `reads`: the call changes nothing, so
-        repetitions of an allowed call are only counted.
+        `asked_of` names the object of a command. `reads`: repetitions of an allowed call are only counted.
         """
         word = decision.word
         detail: dict[str, Any] = {"call": method, **asked_of}
@@ -141,11 +139,8 @@ class AuditTrail:
         whole: bool = False,
         **detail: Any,
     ) -> str:
-        """Record an event that is not a decision; return the record's id, as `decided` does. `more` adds details.
-
-        `severity` overrides the default severity of the event (`audit/log/events.py`).
-        `reads`: the event changed nothing, so repetitions are only counted. `whole`: every record is kept, even if the
-        host is beyond its quota.
+        """`reads`: repetitions are only counted. `whole`: every record is kept, even if the host is beyond its
+        quota.
         """
         now, severity = clock.wall_ns(), severity or SEVERITIES.get(event, Severity.INFO)
         detail = {**(more or {}), **detail, **self._details(event, decision, severity, host, now)}

@@ -1,9 +1,6 @@
-"""List every metric.
+"""List every metric; `python -m appliance.telemetry.metric_table` makes the table of docs/reference/metrics.md.
 
-`/metrics` and docs/reference/metrics.md are both generated from `METRICS`, the page by
-`python -m appliance.telemetry.metric_table`. Labels have few values. Calls, categories and roles are fixed sets. Only
-topics and services on a relay are labels; `control.operators.measurements` limits their number. The view of a feature
-defines the metrics of the feature.
+Labels have few values; `control.operators.measurements` limits the number of topics and services.
 """
 
 import sys

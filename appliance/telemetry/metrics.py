@@ -31,7 +31,7 @@ class LastMinute:
         self._seconds[-1][1][name] += number
 
     def counts(self) -> dict[str, int]:
-        """Return the number of events in the last minute for each name that had any."""
+        """Leave out names without an event."""
         oldest = int(self._clock()) - _SECONDS
         total: Counter[str] = Counter()
         for second, counts in self._seconds:
@@ -42,7 +42,7 @@ class LastMinute:
 
 @dataclass(slots=True)
 class Histogram:
-    """A histogram of durations by upper bound; the last entry of `counts` is for durations above all `BOUNDS`."""
+    """Durations by upper bound; the last entry of `counts` is for those above all `BOUNDS`."""
 
     counts: list[int] = field(default_factory=lambda: [0] * (len(BOUNDS) + 1))
     sum: float = 0.0
@@ -58,8 +58,7 @@ class Histogram:
 class Meter:
     """The counters of RVMaster's events since its start, and of the last minute.
 
-    `denied` has the denials by category, `denied_hosts` by host (unknown hosts together, as ""), `dropped` the messages
-    that monitors dropped by monitor.
+    `denied_hosts` has the unknown hosts together, as "".
     """
 
     def __init__(self) -> None:
@@ -71,7 +70,6 @@ class Meter:
         self.dropped = LastMinute()
 
     def decided(self, category: str, outcome: str, seconds: float, host: str) -> None:
-        """Count a decision about a host; unknown hosts are one, without a name."""
         self.decisions[category, outcome] += 1
         if outcome == "deny":
             self.denied.add(category)
@@ -79,7 +77,7 @@ class Meter:
         self.decision_seconds.observe(seconds)
 
     def called(self, call: str, seconds: float) -> None:
-        """Count an answered call; `call` is a name of the call table, never text from a client."""
+        """`call` is a name of the call table, never text from a client."""
         histogram = self.calls.get(call)
         if histogram is None:
             histogram = self.calls[call] = Histogram()
