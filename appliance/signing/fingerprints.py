@@ -1,7 +1,6 @@
 """Hash policies and specifications when they take effect, so that the audit log identifies them.
 
-The hash of several texts is the hash of the lines that `sha256sum` prints for their files, sorted by name. So anyone
-can compute this hash with `sha256sum` alone.
+The hash of several texts is that of the lines that `sha256sum` prints for their files, sorted by name.
 """
 
 import hashlib
@@ -10,17 +9,15 @@ from urllib.parse import quote
 
 
 def fingerprint(text: str | bytes) -> str:
-    """Return the SHA-256 of a text or bytes, in hexadecimal."""
     return hashlib.sha256(text.encode() if isinstance(text, str) else text).hexdigest()
 
 
 def fingerprint_of_all(texts: Mapping[str, str]) -> str:
-    """Return the SHA-256 of named texts; a changed name or text changes the hash."""
     lines = sorted((file_name(name), fingerprint(text)) for name, text in texts.items())
     return fingerprint("".join(f"{digest}  {name}\n" for name, digest in lines))
 
 
 def file_name(name: str) -> str:
-    """Convert a name to a relative file path, with unusual characters percent-encoded."""
+    """Encode unusual characters with percent signs."""
     parts = name.split("/")
     return "/".join(quote(part) if part.strip(".") else part.replace(".", "%2E") or "%" for part in parts)

@@ -1,15 +1,12 @@
 """Decide what the parts of an audit log prove: records, checkpoints, removals. Standard library only, no I/O.
 
-Every verifier of a log decides with this module, and words the fault itself: the command, segments, the collector, two
-appliances, the signer, and the bundle's verifier, whose program contains this text and must run on Python 3.8.
+Every verifier of a log decides with this module. The bundle's verifier contains this text, and must run on Python
+3.8.
 
-Invariants:
-1. The hash of a record covers the hash of its columns and the hash of the previous record (`link`). An excerpt can
-   therefore prove the chain without the records that it omits. Version 0.1.0 hashed the columns directly.
-2. A checkpoint contains the log's id, its own number, the sequence, the hash at that sequence, the time, and the hash
-   of the previous checkpoint. From version 2 on, it also contains the last removed record.
-3. A removal names the last checkpoint of the removed records, and the limit in the settings that required the removal.
-4. Each statement has exactly one valid text. Any other spelling, such as a leading zero, is invalid.
+1. The hash of a record covers the hash of its columns and the hash of the previous record (`link`), so an excerpt
+   can prove the chain without the records that it omits. Version 0.1.0 hashed the columns directly.
+2. A checkpoint contains the hash of the previous one, and from version 2 on the last removed record.
+3. Each statement has exactly one valid text. Any other spelling, such as a leading zero, is invalid.
 """
 
 from __future__ import annotations
@@ -21,7 +18,7 @@ from typing import Callable, NamedTuple
 
 NO_CHECKPOINT = "0" * 64  # the hash before the first checkpoint
 HasSigned = Callable[[bytes, bytes, bytes], bool]
-"""A function that returns whether a key signed: from its 32 raw bytes, the signature, and the text."""
+"""Returns whether a key signed: from its 32 raw bytes, the signature, and the text."""
 
 
 class ProofFault(enum.Enum):
@@ -47,28 +44,22 @@ def genesis(log_id: str) -> bytes:
 
 
 def link(previous: bytes, content: bytes) -> bytes:
-    """Return the hash of a record with the content hash `content` that follows the hash `previous`."""
     # The input has 65 bytes, so it cannot equal an input of version 0.1.0, which was always longer.
     return hashlib.sha256(previous + b"2" + content).digest()
 
 
 def follows(previous: bytes, packed: bytes, digest: bytes) -> bool:
-    """Return whether `digest` is the hash of a record after `previous`, as this version or 0.1.0 computes it.
-
-    `packed` are its columns as a MessagePack array, in which every value is stored with its type and length.
-    """
+    """Whether `digest` is the hash of a record after `previous`, as this version or 0.1.0 computes it."""
     return digest == link(previous, sha256(packed)) or digest == sha256(previous + packed)
 
 
 class Excerpt:
     """A walk along records in ascending order, up to the checkpoints that seal them.
 
-    `sequence` and `hash` are those of the last record. `begin` is the first record that no checkpoint seals yet, or 0;
-    only then may the next record leave a gap.
+    `begin` is the first record that no checkpoint seals yet, or 0; only then may the next record leave a gap.
     """
 
     def __init__(self, sequence: int = 0, digest: bytes = b"") -> None:
-        """Begin after a known record, or with the first one."""
         self.sequence, self.hash = sequence, digest
         self.begin = sequence + 1 if digest else 0
 
@@ -80,7 +71,6 @@ class Excerpt:
         return [ProofFault.CHANGED] * changed + [ProofFault.MOVED] * bool(moved)
 
     def skip(self, content: bytes) -> None:
-        """Go to the next record, of which only the content hash is known."""
         self.sequence, self.hash = self.sequence + 1, link(self.hash, content)
 
 
@@ -103,16 +93,15 @@ class Checkpoint(NamedTuple):
         ).encode()
 
     def follows(self, before: Checkpoint | None) -> bool:
-        """Return whether this is the checkpoint after `before`; None: the first one of its log."""
+        """None stands for the beginning of the log."""
         if before is None:
             return (self.number, self.previous) == (1, NO_CHECKPOINT)
         expected = (before.log, before.number + 1, checkpoint_hash(before.text()))
         return (self.log, self.number, self.previous) == expected and before.sequence <= self.sequence
 
     def contradiction(self, last: int, here: bytes | None) -> ProofFault | None:
-        """Return how a chain differs that ends with record `last` and has the hash `here` at this sequence.
-
-        None for `here`: the chain has no such record.
+        """Compare with a chain that ends with record `last` and has the hash `here` at this sequence (None: it
+        has no such record).
         """
         if self.sequence > last:
             return ProofFault.CUT_OFF
@@ -128,7 +117,7 @@ _CHECKPOINT = re.compile(
 
 
 def parse_checkpoint(text: bytes) -> Checkpoint:
-    """Parse the text of a checkpoint. Raises `ValueError` for any other text."""
+    """Raises `ValueError` for any other text."""
     match = _CHECKPOINT.fullmatch(text.decode("ascii", "replace"))
     if match is not None:
         log, number, sequence, digest, time, previous, last = match.groups()
@@ -146,7 +135,7 @@ def checkpoint_hash(text: bytes) -> str:
 def signature_fault(
     text: bytes, signature: str, key: str | None, expected: str, has_signed: HasSigned
 ) -> ProofFault | None:
-    """Return why a statement is not one that the key `expected` signed, or None. All but the text is in hexadecimal."""
+    """Return why the key `expected` did not sign the statement. All but the text is in hexadecimal."""
     if key != expected:
         return ProofFault.KEY
     try:
@@ -159,8 +148,8 @@ def signature_fault(
 class Removal(NamedTuple):
     """A removal of all records up to a checkpoint.
 
-    The fields are the checkpoint's number, its sequence, the record's hash there, and the checkpoint's own hash
-    (`sealed`). `limit` is the setting that required the removal, as the signer writes it.
+    `sealed` is the checkpoint's own hash. `limit` is the setting that required the removal, as the signer writes
+    it.
     """
 
     log: str

@@ -1,7 +1,4 @@
-"""Make a key and a certificate that is its own authority, for peers that trust exactly this certificate.
-
-`untimely` compares the times of a certificate with the clock: a wrong clock is the usual reason why TLS rejects one.
-"""
+"""Make a key and a certificate that is its own authority, for peers that trust exactly this certificate."""
 
 import datetime
 import ipaddress
@@ -18,7 +15,7 @@ _EARLIER = datetime.timedelta(days=1)  # the peer's clock may be behind
 
 
 def make_own_certificate(name: str, days: int, address: str | None = None) -> tuple[bytes, bytes]:
-    """Return a new key and its certificate (PEM), valid for `days`. A server's has its IP address.
+    """Return a new key and its certificate (PEM); a server's has its IP address.
 
     Raises `ValueError` for an invalid address.
     """
@@ -49,9 +46,9 @@ def make_own_certificate(name: str, days: int, address: str | None = None) -> tu
 
 
 def untimely(pem: bytes, whose_clock: str) -> str:
-    """Return when a certificate (PEM) is valid and what the clock shows, if it is not valid now; empty if it is.
+    """Return when the certificate is valid and the time of the clock, if it is not valid now.
 
-    Raises `ValueError` for anything else than a certificate.
+    Raises `ValueError` if it is not a certificate.
     """
     certificate, now = x509.load_pem_x509_certificate(pem), clock.utc_now()
     begins, ends = certificate.not_valid_before_utc, certificate.not_valid_after_utc

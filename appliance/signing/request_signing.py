@@ -1,19 +1,15 @@
 """Derive two keys from an access token, and sign orders with one of them. No I/O, no clock.
 
-A client need not send its token. It derives two keys from the token:
+The *reading key* replaces the token in `Authorization: Bearer`, and permits no changes. The *signing key*
+(Ed25519) never leaves the client. It signs each order: the HTTP request as sent, with a challenge from control,
+which accepts each challenge once.
 
-- The *reading key* replaces the token in `Authorization: Bearer`. It permits all reads that the token permits, and no
-  changes.
-- The *signing key* (Ed25519) never leaves the client. It signs each order: the HTTP request as sent, with a challenge
-  from control. Control accepts each challenge once.
-
-Invariants:
-
-1. The appliance stores the SHA-256 of the reading key and the public half of the signing key (`TokenKeys`). Neither key
-   can be derived from these values. Access to the state, a backup or the api's traffic is not enough to sign an order.
-2. The signed text has seven lines; each line is one part of the request. A part cannot contain control characters, so
+1. The appliance stores `TokenKeys`, from which neither key can be derived. Access to the state, a backup or the
+   api's traffic is not enough to sign an order.
+2. The signed text has seven lines, one for each part of the request. A part cannot contain control characters, so
    no two requests have the same text.
-3. Any change of this format needs a new version in the first line, in the derivations and in `docs/reference/rest.md`.
+3. Any change of this format needs a new version in the first line, in the derivations and in
+   `docs/reference/rest.md`.
 """
 
 import base64
@@ -33,42 +29,41 @@ _PROOF_FORM = re.compile(r"([!-~]{1,200}) ([A-Za-z0-9_-]{86})")
 
 
 class BadProofError(ValueError):
-    """A proof is invalid, or a request cannot be signed; the message gives the reason."""
+    """A proof is invalid, or a request cannot be signed."""
 
 
 class TokenKeys(NamedTuple):
-    """The verifiers of a token's keys: SHA-256 of the reading key, and the public signing key, 32 bytes each."""
+    """SHA-256 of the reading key, and the public signing key, 32 bytes each."""
 
     reading: bytes
     verifying: bytes
 
 
 def keys_of(token: str) -> TokenKeys:
-    """Return the verifiers of a token `rosrv_ID_SECRET`."""
+    """A token is `rosrv_ID_SECRET`."""
     return TokenKeys(reading_hash(reading_key(token)), _signing_key(token).public_key().public_bytes_raw())
 
 
 def reading_key(token: str) -> str:
-    """Return the reading key of a token: `rosrv-read_ID_KEY`."""
+    """Return `rosrv-read_ID_KEY`."""
     token_id = token.split("_")[1]
     return f"rosrv-read_{token_id}_{_text(hmac.digest(token.encode('ascii'), _READING, hashlib.sha256))}"
 
 
 def reading_id(shown: str) -> str | None:
-    """Return the id in a reading key, or None if the text is not a reading key."""
     found = _READING_FORM.fullmatch(shown)
     return None if found is None else found[1]
 
 
 def reading_hash(key: str) -> bytes:
-    """Return the stored hash of a reading key. The key has 256 random bits, so a fast hash is enough."""
+    """The key has 256 random bits, so a fast hash is enough."""
     return hashlib.sha256(key.encode("ascii")).digest()
 
 
 def statement(
     challenge: str, *, method: str, target: str, if_match: str, content_type: str, body: bytes
 ) -> bytes:
-    """Return the text to sign. `target` is the path and query as sent. Pass a missing header as an empty string.
+    """`target` is the path and query as sent; a missing header is an empty string.
 
     Raises `BadProofError` for a part with a control or non-ASCII character.
     """
@@ -80,12 +75,11 @@ def statement(
 
 
 def proof_of(token: str, challenge: str, stated: bytes) -> str:
-    """Sign a statement that contains this challenge; return the value of the `ROSRV-Proof` header."""
     return f"{challenge} {_text(_signing_key(token).sign(stated))}"
 
 
 def parse_proof(header: str) -> tuple[str, bytes]:
-    """Return the challenge and the signature from the header's value. Raises `BadProofError`."""
+    """Return the challenge and the signature. Raises `BadProofError`."""
     found = _PROOF_FORM.fullmatch(header)
     if found is None:
         raise BadProofError(f"{HEADER} is not `CHALLENGE SIGNATURE`")
@@ -93,7 +87,6 @@ def parse_proof(header: str) -> tuple[str, bytes]:
 
 
 def is_signed(verifying: bytes, stated: bytes, signature: bytes) -> bool:
-    """Return whether the holder of the token with this public key signed the statement."""
     try:
         Ed25519PublicKey.from_public_bytes(verifying).verify(signature, stated)
     except InvalidSignature:

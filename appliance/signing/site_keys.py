@@ -1,12 +1,8 @@
-"""Sign texts, and verify signatures with the keys in the site's configuration.
+"""Sign texts, and verify signatures with the keys in the site's configuration, in OpenSSH's format
+(PROTOCOL.sshsig).
 
-A signature is a separate file, FILE.sig, in OpenSSH's format (SSHSIG; see OpenSSH's PROTOCOL.sshsig), as
-`ssh-keygen -Y sign -n rosrv` writes it. A key is an `ssh-ed25519` line, as in the KEY.pub of `ssh-keygen -t ed25519`.
-
-Invariants:
-1. A signature is valid only for its own text, in the namespace `rosrv`, with a configured key. The public key inside
-   the signature file only selects one of the configured keys; it is not trusted.
-2. Without a configured key, no signature is required or checked.
+The public key inside the signature file only selects one of the configured keys; it is not trusted. Without a
+configured key, no signature is required or checked.
 """
 
 import base64
@@ -34,7 +30,7 @@ _HOW = "sign it (rosrv sign FILE --key KEY) and leave FILE.sig beside it, or sen
 
 
 class UnsignedError(Exception):
-    """A text has no valid signature of the site; the message gives the reason and the remedy."""
+    """A text has no valid signature of the site."""
 
 
 def checked_key(line: str) -> str:
@@ -44,14 +40,13 @@ def checked_key(line: str) -> str:
 
 
 def name_of(line: str) -> str:
-    """Return the name that records use for a key: its fingerprint, as `ssh-keygen -l` prints it, and its comment."""
+    """Return the fingerprint, as `ssh-keygen -l` prints it, and the comment."""
     digest = hashlib.sha256(_wire(_ED25519, _public(line))).digest()
     comment = " ".join(line.split()[2:])
     return f"SHA256:{base64.b64encode(digest).decode().rstrip('=')}" + (f" ({comment})" if comment else "")
 
 
 def read_signature(file: Path) -> str:
-    """Return the content of FILE.sig, or an empty string if it cannot be read."""
     try:
         with open_given(file.with_name(f"{file.name}.sig")) as opened:
             return opened.read(_LONGEST).decode("ascii", "replace")
@@ -60,7 +55,7 @@ def read_signature(file: Path) -> str:
 
 
 def signer(keys: Sequence[str], text: str, signature: str) -> str:
-    """Return the name of the key that signed this text; empty if no keys are configured. Raises `UnsignedError`."""
+    """Return the name of the key that signed; empty if no keys are configured. Raises `UnsignedError`."""
     if not keys:
         return ""
     from cryptography.exceptions import InvalidSignature  # noqa: PLC0415  only if a signature is checked
@@ -90,7 +85,7 @@ def signer(keys: Sequence[str], text: str, signature: str) -> str:
 
 
 def sign(text: str, key: "Ed25519PrivateKey") -> str:
-    """Return the signature of a text, byte for byte as `ssh-keygen -Y sign -n rosrv` makes it."""
+    """Return the bytes of `ssh-keygen -Y sign -n rosrv`."""
     raw = key.sign(_message(text, _HASHES[0]))
     public = _wire(_ED25519, key.public_key().public_bytes_raw())
     fields = _wire(public, _NAMESPACE, b"", _HASHES[0], _wire(_ED25519, raw))
@@ -100,7 +95,6 @@ def sign(text: str, key: "Ed25519PrivateKey") -> str:
 
 
 def public_line(key: "Ed25519PrivateKey") -> str:
-    """Return the public key as a line for `site_keys`, without a comment."""
     return f"ssh-ed25519 {base64.b64encode(_wire(_ED25519, key.public_key().public_bytes_raw())).decode()}"
 
 
@@ -146,7 +140,7 @@ def _wire(*strings: bytes) -> bytes:
 
 
 def _strings(data: bytes, count: int) -> list[bytes]:
-    """Split bytes into exactly `count` strings. Raises `ValueError` for any other content."""
+    """Raises `ValueError` unless there are exactly `count` strings."""
     found = []
     while data:
         length = int.from_bytes(data[:4])
