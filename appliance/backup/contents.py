@@ -1,7 +1,6 @@
 """Decide, by name and size, which files a backup contains; making and restoring a backup use the same rule.
 
-Each part of the state directory belongs to a process that may be compromised. Therefore file names with control
-characters and oversized files are errors, and are not backed up.
+Each part of the state belongs to a process that may be compromised, so unusual names and sizes are errors.
 """
 
 from pathlib import PurePosixPath
@@ -22,21 +21,18 @@ KEPT_PARTS = frozenset(role.part for role in ROLES) - _LEFT_OUT
 
 
 class BackupError(Exception):
-    """A backup cannot be made or restored; the message gives the reason and the remedy."""
+    """A backup cannot be made or restored."""
 
 
 def is_passing(name: str) -> bool:
-    """Return whether the file is not backed up because a start makes it again."""
     return name.endswith(_PASSING)
 
 
 def is_database(name: str) -> bool:
-    """Return whether the file is a database, which SQLite copies and whose size is not limited."""
     return name.startswith(_DATABASES) and name.endswith(".db")
 
 
 def trouble_with(name: str, size: int) -> str:
-    """Return why a file of this name and size (bytes) cannot be in a backup; empty if it can."""
     if not name.isprintable():
         return "has a name that is not valid UTF-8"
     if len(name.encode()) > _LONGEST_NAME:
@@ -47,7 +43,6 @@ def trouble_with(name: str, size: int) -> str:
 
 
 def belongs(name: str, parts: frozenset[str]) -> bool:
-    """Return whether a name in an archive is the name of a backed-up file below one of `parts`."""
     path = PurePosixPath(name)
     below = len(path.parts) > 1 and path.parts[0] in parts and ".." not in path.parts
     return below and str(path) == name and not is_passing(name)

@@ -1,14 +1,11 @@
 """Write the state directory of a running appliance to one file, for `restore.py`.
 
-Invariants:
-
 1. SQLite copies each database as a consistent snapshot.
 2. The log is copied first. Then the signer's memory is cut to the checkpoints in that copy, so that a restored log can
    be continued.
-3. `state.ahead` has changes that were acknowledged and are not in `state.db` yet. It is copied before `state.db`, so no
-   change is in neither; a start skips those that are in both.
-4. The file contains keys, so only its owner may read it. An existing file is not overwritten; an unfinished backup is
-   removed.
+3. `state.ahead` has acknowledged changes that `state.db` lacks. It is copied before `state.db`, so no change is in
+   neither; a start skips those that are in both.
+4. The file contains keys, so only its owner may read it.
 5. Root reads folders of users whose processes may be compromised. Therefore links are not followed with root's rights,
    and a file that belongs to another user is an error.
 """
@@ -48,10 +45,7 @@ _ADVICE = "run this as root with the capability DAC_OVERRIDE (in a container: do
 
 
 def back_up(state: Path, file: Path) -> list[str]:
-    """Write the state directory to `file` (a tar archive, mode 0600); return the names in it.
-
-    Raises `BackupError`.
-    """
+    """Return the names in the tar archive. Raises `BackupError`."""
     try:
         refuse_half_restored(state)
     except StartError as error:
@@ -118,10 +112,7 @@ def _write(state: Path, archive: tarfile.TarFile, beside: Path) -> list[str]:
 
 
 def _files(state: Path) -> Iterator[tuple[str, int]]:
-    """Yield the name and open descriptor of each file; the log first, because the signer's memory is cut to it.
-
-    The other files are listed after the log is copied, so the key for the log's signatures exists by then.
-    """
+    """List the other files after the log is copied, so the key for the log's signatures exists by then."""
     log = opened(state, AUDIT_LOG) if (state / AUDIT_LOG).exists() else None
     if log is not None:
         yield AUDIT_LOG, log
@@ -153,7 +144,7 @@ def _names(state: Path, part: str) -> Iterator[str]:
 
 
 def opened(state: Path, name: str) -> int | None:
-    """Open a file without following links; None if it is not a regular file. Raises `BackupError` for a wrong owner."""
+    """Follow no link; return None if it is not a regular file. Raises `BackupError` for a wrong owner."""
     part, *folders, last = PurePosixPath(name).parts
     here = os.open(state / part, _FOLDER)
     owner = os.fstat(here).st_uid
@@ -203,7 +194,6 @@ def _last_checkpoint(log: Path) -> dict[str, int]:
 
 
 def _as_far_as(memory: bytes, number: int | None) -> bytes:
-    """Return the signer's memory up to checkpoint `number`; all of it if `number` is None (another log)."""
     if number is None or len(memory) < _HEADER:
         return memory
     first = int.from_bytes(memory[:_HEADER], "big")
@@ -214,12 +204,10 @@ _BUSY_SECONDS = 30
 
 
 def copy_database(path: Path, owner: os.stat_result, copy: Path) -> None:
-    """Copy the database at `path` to the new file `copy`; `owner` is the file status of the database.
+    """`owner` is the file status of the database. Raises `BackupError`, `OSError`, `sqlite3.Error`.
 
-    SQLite opens the database and its write-ahead log by name. The folder's owner could replace either by a link, so
-    root reads them with only the owner's rights.
-
-    Raises `BackupError`, `OSError`, `sqlite3.Error`.
+    SQLite opens the database and its write-ahead log by name. The folder's owner could replace either by a link,
+    so root reads them with only the owner's rights.
     """
     with closing(sqlite3.connect(copy)) as target:
         target.execute("PRAGMA journal_mode = OFF")  # the owner cannot create a file beside the copy
