@@ -1,14 +1,11 @@
 """Run the compiler: lifeline, link to control, and a worker thread.
 
-Invariants:
-
-1. The process has no network and no files, only its lifeline and its link to control.
-2. Specifications that exceed the limits of memory or processor time end only this process.
-3. The process ends with exit status 0 after `_IDLE_SECONDS` without work.
-4. When the work's budget of processor time is used up, the compiler answers with a refusal, and the process ends
-   (status 0), because a thread cannot be stopped. The supervisor starts the next process on demand.
-5. The process ends in the same way when control closes the link, also while it starts or is idle: without a link
-   it gets no questions, and the supervisor starts no other compiler while it runs.
+1. The process has no network and no files. Specifications that exceed the limits of memory or processor time end
+   only this process.
+2. When the budget of processor time is used up, the compiler answers with a refusal, and the process ends (status
+   0), because a thread cannot be stopped.
+3. The process ends in the same way when control closes the link: without a link it gets no questions, and the
+   supervisor starts no other compiler while it runs.
 """
 
 import asyncio
@@ -35,7 +32,6 @@ _Question = messages.ContentsWanted | messages.PartsWanted
 
 
 def main(lifeline_fd: int) -> None:
-    """Compile specifications until control is done, or the supervisor ends the process."""
     resource.setrlimit(resource.RLIMIT_AS, (_MEMORY, _MEMORY))
     compiler = CompilerProcess(Channel(socket.socket(fileno=lifeline_fd), messages.Lifeline))
     asyncio.run(compiler.run())
@@ -52,7 +48,6 @@ class CompilerProcess:
         self._asked: asyncio.Queue[_Question] = asyncio.Queue()
 
     async def run(self) -> None:
-        """Answer questions until none comes for `_IDLE_SECONDS`, or the supervisor stops the process."""
         self._child.attach(messages.Ready())
         ended = asyncio.ensure_future(self._child.ended.wait())
         while not ended.done():
@@ -88,7 +83,6 @@ class CompilerProcess:
 
 
 def answer(wanted: _Question) -> messages.ContentsFound | messages.PartsMade | messages.CompilationRefused:
-    """Return the contents of these files, all their errors, or the parts that relays run."""
     ends = int(_used()) + _budget(wanted) + _SPARE_SECONDS
     resource.setrlimit(resource.RLIMIT_CPU, (ends, resource.RLIM_INFINITY))
     try:
