@@ -1,7 +1,6 @@
 """Run a forwarder of the audit log as a process: lifeline, link to control, and a thread that forwards.
 
-The process runs as a user that may read the audit log and write only the stored position. The firewall lets the process
-reach only the receiver. It outlives control and sends the records that control has committed.
+The process can read the audit log and write only the stored position, and reaches only the receiver.
 """
 
 import asyncio
@@ -34,7 +33,7 @@ class Forwarder(Protocol):
 
 
 class ForwardingProcess:
-    """The process: it connects the lifeline, the reports to control and the forwarding thread."""
+    """Connects the lifeline, the reports to control and the forwarding thread."""
 
     def __init__(self, forwarder: Forwarder, lifeline_fd: int) -> None:
         lifeline = Channel(socket.socket(fileno=lifeline_fd), messages.Lifeline)
@@ -74,10 +73,8 @@ class ForwardingProcess:
 
 
 class ProgressReports:
-    """The reporter of progress to control; `send` returns whether control was connected.
-
-    A new control process first gets the last report again. By comparing it with its predecessor's records, the new
-    process detects changes that were missed.
+    """A new control process first gets the last report again: by comparing it with its predecessor's records, it
+    detects changes that were missed.
     """
 
     def __init__(self, send: Callable[[messages.ForwardingReported], bool]) -> None:
@@ -89,6 +86,5 @@ class ProgressReports:
             self._told = progress
 
     def anew(self, progress: messages.ForwardingReported) -> None:
-        """Repeat the last report to a new control process, then report the current progress."""
         if self._send(self._told):
             self.tell(progress)
