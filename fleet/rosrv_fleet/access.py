@@ -34,7 +34,7 @@ def certificate_of(request: Request) -> bytes | None:
 
 
 def robot_of(robots: Robots) -> Callable[[Request], Awaitable[Robot]]:
-    """Return the dependency that identifies a robot; it answers 403 for any other caller."""
+    """Answer 403 to any other caller."""
 
     async def identify(request: Request) -> Robot:
         certificate = certificate_of(request)
@@ -55,7 +55,7 @@ def token_of(request: Request) -> str:
 
 
 def holder_of(tokens: OperatorTokens, role: FleetRole) -> Callable[[Request], Awaitable[OperatorToken]]:
-    """Return the dependency that requires a token with this role; it answers 401 or 403 otherwise."""
+    """Answer 401 or 403 without a token of this role."""
 
     async def identify(request: Request) -> OperatorToken:
         text = token_of(request)

@@ -1,9 +1,7 @@
-"""Record each change of robots, invitations, tokens and evidence with its author, in a file of the data folder.
+"""Record each change of robots, invitations, tokens and evidence with its author (docs/reference/fleet.md, Acts).
 
-Invariants:
-1. No change takes effect without a record on the disk: the act is recorded before, with the result `asked`.
-2. A second line has the result: `done`, or `failed: REASON`. An act without this line ended in between (a crash, a full
-   disk), and may have taken effect.
+No change takes effect without a record on the disk. An act without a second line ended in between, and may have
+taken effect.
 """
 
 import contextlib
@@ -23,10 +21,9 @@ FILE = "acts.ndjson"
 
 @contextmanager
 def recorded(data: Path, act: str, about: str, detail: str = "", who: str = "") -> Iterator[None]:
-    """Record an act of `who` (default: this command's user), run the block that carries it out, and record the result.
+    """Record an act of `who` (default: this command's user, or the user who called sudo) around the block.
 
-    With sudo, the user is the one who called sudo. Raises `OSError` if the act cannot be recorded; then the block does
-    not run.
+    Raises `OSError` if the act cannot be recorded; then the block does not run.
     """
     fields = {"who": who or _user(), "act": act, "about": about, "detail": detail}
     _append(data, fields | {"result": "asked"})

@@ -27,7 +27,6 @@ _log = structlog.get_logger()
 
 
 def bundle_router(collector: Collector) -> APIRouter:
-    """Return the routes of bundles and rollouts; none if the collector has no bundles."""
     router = APIRouter()
     if collector.bundles is not None:
         reader, changer = (
@@ -56,8 +55,6 @@ async def _damaged(_request: Request, error: Exception) -> Response:
 
 
 def make_app(collector: Collector) -> FastAPI:
-    """Return the application; its lifespan runs the indexer, the bundles and the database's connections."""
-
     @asynccontextmanager
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
         collector.store.remove_unfinished()

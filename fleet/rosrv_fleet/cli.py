@@ -59,7 +59,6 @@ _MOST_WAITING = 1000
 
 
 def main() -> None:
-    """Run the command. Errors are one line on standard error, with exit status 2."""
     os.umask(0o077)
     configure_log()
     try:
@@ -272,7 +271,6 @@ def reindex(config: Config = DEFAULT_CONFIG) -> None:
 
 
 def _index_all(collector: Collector) -> tuple[int, int]:
-    """Index all segments; return the number of indexed ones, and of robots and segments that cannot be indexed."""
     robots = collector.robots.known().values()
     indexed, damaged = 0, len(collector.robots.unreadable)
     for robot in robots:

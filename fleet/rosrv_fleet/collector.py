@@ -32,8 +32,7 @@ _BUNDLE_CONNECTIONS = 4
 class Collector:
     """The parts of a collector, which the routers use.
 
-    `searches` and each worker have separate connections. So searches and indexing never use up the connections of
-    rollouts and retention (`database`).
+    Searches and indexing have separate connections, so they never use up those of rollouts and retention.
     """
 
     config: FleetConfig
@@ -53,7 +52,7 @@ class Collector:
 
 
 def make_collector(config: FleetConfig) -> Collector:
-    """Return the parts of a collector. Raises `ReceiptKeyError` and `OSError`."""
+    """Raises `ReceiptKeyError` and `OSError`."""
     limits = config.limits
     key = read_receipt_key(config.data)
     robots = Robots(config.data / "robots")

@@ -1,6 +1,6 @@
 """Define the configuration of the collector: one YAML file, checked against these types.
 
-Each part of the collector has a section here. Relative paths are relative to the file.
+Relative paths are relative to the file.
 """
 
 import os
@@ -19,20 +19,16 @@ _Seconds = Annotated[float, msgspec.Meta(gt=0, le=86_400)]
 
 
 class FleetConfigError(Exception):
-    """The configuration is missing or invalid; the message has the file, the key and the remedy."""
+    """The configuration is missing or invalid."""
 
 
 class Limits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The limits of uploads and searches.
 
-    `segment_bytes` is the largest uncompressed segment, `upload_bytes` the largest compressed one; `upload_seconds` is
-    the longest upload, `check_seconds` the longest processor time of a segment's verification. `uploads` run at the
-    same time, one for each robot. `robot_bytes_per_day` and `robot_unpacked_bytes_per_day` limit the compressed and the
-    uncompressed bytes that one robot sends in 24 hours, stored or refused. `reserve_bytes` of the disk stay free.
-    `search_seconds` is the longest search; `searches` run at the same time, half of them with the same token.
-    `header_seconds` is the longest wait for a TLS handshake and for a request's headers. `connections` is the number of
-    open connections, `robot_connections` of one robot, `address_connections` of one address without a robot's
-    certificate.
+    `check_seconds` is processor time. `uploads` run at the same time, one for each robot. The bytes per day count
+    what a robot sends in 24 hours, stored or refused. `reserve_bytes` of the disk stay free. `searches` run at
+    the same time, half of them with the same token. `header_seconds` limits a TLS handshake and a request's
+    headers. `address_connections` are those of one address without a robot's certificate.
     """
 
     segment_bytes: _Positive = 512 << 20
@@ -54,8 +50,7 @@ class Limits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 class EvidenceConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The limits of evidence bundles, which operators add.
 
-    `bundle_bytes` is the largest bundle; `robot_bytes` limits the stored bundles of one robot. `upload_seconds` is the
-    longest upload, `check_seconds` the longest processor time of a verification.
+    `robot_bytes` limits the stored bundles of one robot; `check_seconds` is processor time.
     """
 
     bundle_bytes: _Positive = 1 << 30
@@ -78,19 +73,16 @@ class RetentionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
             raise ValueError(f"segment_days: {self.segment_days} needs index_days, of at most as many days")
 
     def oldest_day(self) -> date | None:
-        """Return the first day of arrival (UTC) that the index keeps; None: it keeps all."""
         return None if self.index_days is None else clock.utc_now().date() - timedelta(self.index_days)
 
     def keeps(self, day: date) -> bool:
-        """Return whether the index keeps a day of arrival (UTC) now."""
         oldest = self.oldest_day()
         return oldest is None or day >= oldest
 
 
 class BundlesConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The bundles that robots get. `folder` is the folder of `rosrv-fleet bundle publish`.
-
-    `timestamp_key` is the file `timestamp.pem` of the operator's repository.
+    """`folder` is the folder of `rosrv-fleet bundle publish`, `timestamp_key` the file of the operator's
+    repository.
     """
 
     folder: Path
@@ -100,10 +92,8 @@ class BundlesConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
 class FleetConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The configuration of a collector.
 
-    `data` is the folder with robots, tokens, keys and segments. `listen` is HOST:PORT. `certificate` and `key` are the
-    server's (PEM; by default server.pem and server.key in `data`, made by `rosrv-fleet init`). `database` is a libpq
-    connection string; libpq also reads PGPASSWORD and PGPASSFILE. A robot is silent if it was not heard for
-    `silent_seconds`. Without `retention`, nothing is removed. Without `bundles`, robots get none.
+    `database` is a libpq connection string; libpq also reads PGPASSWORD and PGPASSFILE. A robot is silent if it
+    was not heard for `silent_seconds`. Without `retention`, nothing is removed.
     """
 
     data: Path = _DATA
@@ -119,13 +109,13 @@ class FleetConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 
     @property
     def address(self) -> tuple[str, int]:
-        """Return `listen` as host and port. Raises `ValueError`."""
+        """Raises `ValueError`."""
         host, _, port = self.listen.rpartition(":")
         return host.strip("[]"), int(port)
 
 
 def load_config(path: Path) -> FleetConfig:
-    """Return the configuration in a YAML file. Raises `FleetConfigError`."""
+    """Raises `FleetConfigError`."""
     try:
         fields = yaml.safe_load(path.read_text(encoding="utf-8"))
         if isinstance(fields, dict) and not fields.keys() & {"certificate", "key"}:

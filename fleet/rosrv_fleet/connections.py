@@ -1,14 +1,11 @@
-"""Limit the open connections: of each robot, of each address without a robot's certificate, and of all
-together.
+"""Limit the open connections: of each robot, of each address without a robot's certificate, and of all together.
 
-A connection is counted from `accept` to `close`, with its TLS handshake. It counts for its address (IPv6: its
-/64 network) until a robot's certificate is known, then for the robot. A connection above a limit is closed
-immediately.
+A connection is counted from `accept` to `close`, for its address (IPv6: its /64 network) until a robot's
+certificate is known.
 
 An address is *proven* once a robot or an operator connected from it. All other addresses together get at most
-half of the connections. If they want more, or if the proven addresses and the robots want more, a connection
-of the unproven address with most is closed. Handshakes and requests without a robot or an operator also have
-a share: those of all other addresses together, in equal parts, and those of each proven address (`Shares`).
+half of the connections; if there are too few, a connection of the unproven address with most is closed.
+Handshakes and requests without a robot or an operator also have shares.
 """
 
 import asyncio
@@ -51,7 +48,7 @@ class Shares:
         self._all_others = (clock.now(), _ALL_OTHERS_AT_ONCE)
 
     def take(self, owner: str, *, proven: bool) -> bool:
-        """Take one from the share of an address; return False if nothing is left."""
+        """Return False if nothing is left."""
         now = clock.now()
         if now - self._looked >= 1.0:
             self._looked = now
@@ -102,7 +99,6 @@ class ClientConnections:
         self._logged = 0.0
 
     def accepted(self, connection: "CountedSocket", address: str) -> bool:
-        """Count a new connection; return False if there are too many."""
         owner = owner_of(address)
         proven = owner in self._proven
         if self._owners[owner] >= self._limits.address_connections:
@@ -127,7 +123,6 @@ class ClientConnections:
         return True
 
     def established(self, number: int, robot: str | None) -> bool:
-        """Note that the handshake of a descriptor is complete; return False if the robot has too many connections."""
         connection = self._open.get(number)
         if connection is None:  # it made room for another one
             return False
@@ -152,7 +147,6 @@ class ClientConnections:
         self._others_open -= len(self._others.pop(owner, ()))
 
     def may_ask(self, owner: str) -> bool:
-        """Take a request from the share of an address (`owner_of`); return False if nothing is left."""
         return self._requests.take(owner, proven=owner in self._proven)
 
     def is_proven(self, owner: str) -> bool:
@@ -214,7 +208,7 @@ class CountingListener(socket.socket):
     table: ClientConnections
 
     def accept(self) -> tuple[socket.socket, Any]:
-        """Return the next connection. Raises `ConnectionAbortedError` if it was above a limit and is closed."""
+        """Raises `ConnectionAbortedError` if the connection was above a limit and is closed."""
         number, address = self._accept()  # type: ignore[attr-defined]  # `socket.accept` also calls it
         connection = CountedSocket(self.family, self.type, self.proto, fileno=number)
         connection.table = self.table
@@ -225,7 +219,7 @@ class CountingListener(socket.socket):
 
 
 def listen(host: str, port: int, table: ClientConnections) -> CountingListener:
-    """Return a listening socket. Raises `OSError`."""
+    """Raises `OSError`."""
     (family, kind, protocol, _name, address), *_others = socket.getaddrinfo(
         host or None, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
     )
@@ -242,7 +236,6 @@ def listen(host: str, port: int, table: ClientConnections) -> CountingListener:
 
 
 def owner_of(address: str) -> str:
-    """Return the owner of connections from an address: an IPv4 address itself, the /64 network of an IPv6 address."""
     parsed = ipaddress.ip_address(address.partition("%")[0])
     if isinstance(parsed, ipaddress.IPv6Address) and parsed.ipv4_mapped is None:
         return str(ipaddress.ip_network((parsed, 64), strict=False))

@@ -1,7 +1,7 @@
 """Connect to PostgreSQL and apply the migrations.
 
-The rows are an index of the stored segments: `rosrv-fleet reindex` rebuilds them. A migration is a file
-`migrations/NNNN_name.sql`; each runs once, in order, in one transaction. Applied files never change.
+The rows are an index of the stored segments: `rosrv-fleet reindex` rebuilds them. Each migration
+`migrations/NNNN_name.sql` runs once, in order, in one transaction. Applied files never change.
 """
 
 from collections.abc import Iterator
@@ -25,10 +25,7 @@ class IndexDatabase:
     """A bounded pool of connections to the index. Thread-safe."""
 
     def __init__(self, conninfo: str, *, connections: int, statement_seconds: float) -> None:
-        """Prepare the pool; it connects in the background after `open`.
-
-        `connections` is the largest number of connections; `statement_seconds` the longest statement of `reading`.
-        """
+        """Connect in the background after `open`. `statement_seconds` limits the statements of `reading`."""
         self._statement_ms = int(statement_seconds * 1000)
         self._pool: ConnectionPool[Connection] = ConnectionPool(
             conninfo,
@@ -42,7 +39,7 @@ class IndexDatabase:
         )
 
     def open(self) -> None:
-        """Start the pool. A database that is down is not an error."""
+        """A database that is down is not an error."""
         self._pool.open(wait=False)
 
     def close(self) -> None:
@@ -64,7 +61,6 @@ class IndexDatabase:
 
 
 def migrate(connection: Connection, folder: Path = MIGRATIONS) -> list[str]:
-    """Apply the migrations that the database does not have; return their names. Raises `psycopg.Error`."""
     applied: list[str] = []
     with connection.transaction():
         connection.execute("SELECT pg_advisory_xact_lock(%s)", (_MIGRATION_LOCK,))

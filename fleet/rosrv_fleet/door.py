@@ -1,7 +1,7 @@
 """Answer requests of robots and operators, and of all other clients within the share of their address.
 
-The door comes before every route, so a login, a wrong token or the health check costs an address its own
-share only.
+The door comes before every route, so a login, a wrong token or the health check costs an address its own share
+only.
 """
 
 from starlette.requests import Request
@@ -20,7 +20,7 @@ class Door:
         self._app, self._table, self._tokens = app, table, tokens
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass a request on, or answer 429. An operator's token proves its address."""
+        """Answer 429 above the share. An operator's token proves its address."""
         if scope["type"] == "http" and not scope.get("state", {}).get(IS_ROBOT):
             request = Request(scope)
             owner = owner_of(request.client.host if request.client else "127.0.0.1")
@@ -39,7 +39,7 @@ class Door:
         await self._app(scope, receive, send)
 
     def _is_held(self, token: str) -> bool:
-        """Return whether an operator has the token. If the tokens are unreadable, the route answers with the error."""
+        """If the tokens are unreadable, the route answers with the error."""
         try:
             return self._tokens.holder(token) is not None
         except OSError:

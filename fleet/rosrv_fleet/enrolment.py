@@ -16,14 +16,14 @@ from appliance.formats.terms import TermsError, role_of
 from appliance.signing.own_certificate import untimely
 
 FIRST = "a"
-"""The name of a robot's first appliance; a robot without a standby has no other one."""
+"""The name of a robot's first appliance; a robot without a standby has no other."""
 _MOST_APPLIANCES = 2  # that may connect
 _MOST_KNOWN = 100  # with those that were removed
 _NAME = re.compile("[a-z0-9][a-z0-9._-]{0,62}")
 
 
 class EnrolmentError(Exception):
-    """A robot cannot be enrolled or changed; the message has the reason and the remedy."""
+    """A robot cannot be enrolled or changed."""
 
 
 class RobotGroup(NamedTuple):
@@ -37,7 +37,7 @@ class RobotGroup(NamedTuple):
 
     @classmethod
     def parse(cls, text: str) -> Self:
-        """Return the group in `SITE/GROUP`. Raises `EnrolmentError`."""
+        """Parse `SITE/GROUP`. Raises `EnrolmentError`."""
         site, _, group = text.partition("/")
         try:
             role_of(site, group)
@@ -49,7 +49,7 @@ class RobotGroup(NamedTuple):
 class RobotAppliance(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """An appliance of a robot: the raw public key of its log in hexadecimal, and its certificate (PEM).
 
-    `added` and `removed` are in nanoseconds since the epoch; one with `removed` may not connect.
+    An appliance with `removed` (nanoseconds since the epoch) may not connect.
     """
 
     key: str
@@ -73,9 +73,8 @@ class RobotAppliance(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
 class Robot(RobotAppliance, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """An enrolled robot: its name, its appliance, and with a standby the other one, by name, in `others`.
 
-    Each appliance has a log, a key and a certificate of its own; the name and the group are the robot's. A
-    removed appliance stays in `others`, because its segments are still verified. `group` is `SITE/GROUP`, or
-    empty: the robot gets no bundles. `removed` is when the robot was removed.
+    A removed appliance stays in `others`, because its segments are still verified. A robot without `group`
+    (`SITE/GROUP`) gets no bundles.
     """
 
     name: str
@@ -98,20 +97,19 @@ class Robot(RobotAppliance, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         return frozenset(one.public_key for one in self.appliances.values())
 
     def appliance_with(self, der: bytes) -> str:
-        """Return the name of the appliance with this certificate (DER); empty for none."""
         fingerprint = hashlib.sha256(der).hexdigest()
         return next((name for name, one in self.connecting.items() if one.fingerprint == fingerprint), "")
 
 
 def new_appliance(key: bytes, certificate: bytes) -> RobotAppliance:
-    """Return an appliance with PEM files. Raises `EnrolmentError`."""
+    """Raises `EnrolmentError`."""
     return RobotAppliance(
         key=_log_key(key), certificate=valid_certificate(certificate), added=clock.wall_ns()
     )
 
 
 def valid_certificate(pem: bytes) -> str:
-    """Return a certificate (PEM). Raises `EnrolmentError`, also if it is not valid now: no connection could use it."""
+    """Raises `EnrolmentError`, also if the certificate is not valid now: no connection could use it."""
     text = _certificate(pem)
     fault = untimely(text.encode(), "the collector")
     if fault:
@@ -120,7 +118,6 @@ def valid_certificate(pem: bytes) -> str:
 
 
 def new_robot(name: str, made: RobotAppliance, group: str, appliance: str) -> Robot:
-    """Return a new robot with one appliance. Raises `EnrolmentError`."""
     check_name(name)
     return Robot(
         name=name, key=made.key, certificate=made.certificate, added=made.added, appliance=appliance,
@@ -129,7 +126,6 @@ def new_robot(name: str, made: RobotAppliance, group: str, appliance: str) -> Ro
 
 
 def with_appliance(robot: Robot, appliance: str, made: RobotAppliance) -> Robot:
-    """Return a robot with a second appliance. Raises `EnrolmentError`."""
     if len(robot.connecting) >= _MOST_APPLIANCES or len(robot.appliances) >= _MOST_KNOWN:
         raise EnrolmentError(
             f"{robot.name} has the appliances {', '.join(robot.connecting)}; remove one before:"
@@ -139,10 +135,7 @@ def with_appliance(robot: Robot, appliance: str, made: RobotAppliance) -> Robot:
 
 
 def renewed(robot: Robot, appliance: str, certificate: str) -> Robot:
-    """Return a robot with another certificate of an appliance; a removed robot may connect again.
-
-    Raises `EnrolmentError`.
-    """
+    """A removed robot may connect again."""
     if appliance == robot.appliance:
         return msgspec.structs.replace(robot, certificate=certificate, removed=None)
     before = robot.others[appliance]
@@ -155,7 +148,6 @@ def renewed(robot: Robot, appliance: str, certificate: str) -> Robot:
 
 
 def without_appliance(robot: Robot, appliance: str) -> Robot:
-    """Return a robot without the right of one appliance to connect. Raises `EnrolmentError`."""
     left = {name: one for name, one in robot.connecting.items() if name != appliance}
     if len(left) != 1 or len(robot.connecting) != _MOST_APPLIANCES:
         raise EnrolmentError(
@@ -173,7 +165,6 @@ def without_appliance(robot: Robot, appliance: str) -> Robot:
 
 
 def moved(robot: Robot, group: str) -> Robot:
-    """Return a robot in another group. Raises `EnrolmentError`."""
     return msgspec.structs.replace(robot, group=str(RobotGroup.parse(group)))
 
 
@@ -209,9 +200,7 @@ def _log_key(pem: bytes) -> str:
 
 
 def _certificate(pem: bytes) -> str:
-    """Return a certificate (PEM) if all its parts that the collector uses can be read.
-
-    A certificate is parsed only where it is read, and TLS has another parser, so a certificate that passes
+    """A certificate is parsed only where it is read, and TLS has another parser, so a certificate that passes
     here must fail nowhere else.
     """
     try:
@@ -226,10 +215,7 @@ def _certificate(pem: bytes) -> str:
 
 
 def require_own_signature(pem: bytes) -> None:
-    """Require that a certificate (PEM) is signed with its own key, so that its sender has the key.
-
-    Raises `EnrolmentError`.
-    """
+    """Raise `EnrolmentError` unless the certificate is signed with its own key, so that its sender has the key."""
     certificate = x509.load_pem_x509_certificate(_certificate(pem).encode())
     try:
         certificate.verify_directly_issued_by(certificate)

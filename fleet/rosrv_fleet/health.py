@@ -13,13 +13,10 @@ _MOST_MARKS = 1000
 
 
 class RobotState(msgspec.Struct, frozen=True, kw_only=True):
-    """A robot: its newest segment (log, number, seconds since it arrived; None: none yet), and its problems.
+    """A robot: its newest segment (log, number, seconds since it arrived), and its problems.
 
-    `certificate_seconds` pass until the first certificate of its appliances ends. `heard_seconds` is the time since
-    each appliance pushed a segment, or stated that it has nothing to push; None: never. The robot is silent if one of
-    its appliances is.
-    `gaps` is the number of places where segments are missing; `forks` the number of segments with equal numbers; both
-    are counted up to 1,000.
+    `heard_seconds` is the time since each appliance was heard; the robot is silent if one of them is. `gaps` and
+    `forks` are counted up to 1,000.
     """
 
     name: str
@@ -34,10 +31,8 @@ class RobotState(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class FleetHealth(msgspec.Struct, frozen=True, kw_only=True):
-    """The state of the collector.
-
-    `waiting` is the number of stored segments that the index does not have yet, at most 10,000; `trouble` and `disk`
-    are the reasons why indexing or storing is impossible, or None.
+    """`waiting` segments are not in the index yet, counted up to 10,000; `trouble` and `disk` are reasons of
+    failures.
     """
 
     robots: list[RobotState]
@@ -47,7 +42,7 @@ class FleetHealth(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def health_of(collector: Collector) -> FleetHealth:
-    """Return the present state. Raises `OSError`."""
+    """Raises `OSError`."""
     store = collector.store
     marked = {
         kind: {robot: len(store.marked(kind, robot, _MOST_MARKS)) for robot in store.robots_with(kind)}

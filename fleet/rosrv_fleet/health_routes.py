@@ -89,7 +89,7 @@ class _Source(MetricSource):
 
 
 class _RolloutMetrics(MetricSource):
-    """The metrics of bundles and rollouts in one scrape: few labels, so that robots cannot fill Prometheus."""
+    """Few labels, so that robots cannot fill Prometheus."""
 
     def __init__(self, service: BundleService) -> None:
         self._service = service

@@ -16,7 +16,7 @@ _SECONDS = 5.0
 
 
 def check(config: FleetConfig) -> None:
-    """Query the collector on this machine. Raises `OSError` if it does not answer."""
+    """Raises `OSError` if the collector does not answer."""
     context = ssl.create_default_context(cafile=config.certificate)
     context.check_hostname = False  # it may name another address of this machine
     context.verify_flags |= ssl.VERIFY_X509_PARTIAL_CHAIN  # exactly this certificate
@@ -28,7 +28,6 @@ def check(config: FleetConfig) -> None:
 
 
 def main() -> None:
-    """Print why the collector does not answer and exit with 1; otherwise print nothing."""
     try:
         check(load_config(Path(os.environ.get("ROSRV_FLEET_CONFIG", _DEFAULT))))
     except (FleetConfigError, OSError) as error:

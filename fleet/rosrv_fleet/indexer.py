@@ -1,10 +1,7 @@
 """Copy stored segments to the index. The store works without it; the index catches up later.
 
-A segment and its records are written in one transaction, once. Its marker in the store is removed afterwards.
-
-Robots take turns, with one segment each. Large segments have separate turns (`LANES`), so smaller segments do not wait
-for them. A segment that cannot be indexed is set aside and reported; it does not delay other segments, and is tried
-again every hour.
+Robots take turns, with one segment each, and large segments have turns of their own (`LANES`). A segment that
+cannot be indexed is set aside, and tried again every hour.
 """
 
 import gzip
@@ -52,7 +49,7 @@ _log = structlog.get_logger()
 
 
 class Indexer:
-    """The indexer of a store: `run` a lane until `stop`; `index` one segment."""
+    """The indexer of a store."""
 
     def __init__(self, store: SegmentStore, robots: Robots, workers: Workers, config: FleetConfig) -> None:
         self._store = store
@@ -67,7 +64,6 @@ class Indexer:
 
     @property
     def trouble(self) -> str | None:
-        """Return the reason why segments are not indexed; None: all are indexed, or will be soon."""
         failures = [reason for reason in self._failures.values() if reason is not None]
         if failures:
             return failures[0]
@@ -85,7 +81,6 @@ class Indexer:
         self.wake()
 
     def run(self, lane: str) -> None:
-        """Index the waiting segments of a lane, until `stop`; a database that is down is tried again."""
         while not self._ending.is_set():
             self._wake[lane].clear()
             try:
@@ -102,10 +97,9 @@ class Indexer:
                 self._wake[lane].wait(_IDLE_SECONDS)
 
     def step(self, lane: str) -> bool:
-        """Index one segment of each robot that has waiting ones; return whether there were any.
+        """Index one segment of each robot; return whether there were any.
 
-        The segments of a robot whose file is unreadable wait. Raises `psycopg.Error`, `BrokenProcessPool` if a worker
-        was killed, and `OSError` of the store or if no worker can be started.
+        Raises `psycopg.Error`, `BrokenProcessPool` if a worker was killed, and `OSError`.
         """
         found = False
         killed: BrokenProcessPool | None = None
@@ -155,7 +149,7 @@ class Indexer:
             self._killed.pop(place, None)
 
     def _set_aside(self, place: SegmentPlace, stamp: FileStamp | None, reason: str) -> None:
-        """Report a segment, unless its robot has replaced the file since: then the segment waits for its next turn."""
+        """If the robot has replaced the file since, the segment waits for its next turn."""
         if self._store.set_aside(place, stamp):
             self._damage = f"{self._store.path(place)}: {reason}; run 'rosrv-fleet verify {place.robot}'"
             _log.error("a segment is stored, but cannot be indexed", reason=self._damage)
@@ -188,10 +182,9 @@ def index(
     keys: Collection[bytes],
     config: FleetConfig,
 ) -> bool:
-    """Write one segment and its records to the index, and return True, unless they are there.
+    """Return whether the segment was new and of a day that the index keeps.
 
-    A segment of a day that the index does not keep is not written. Raises `psycopg.Error`; for an unreadable
-    segment `OSError`, `EOFError`, `zlib.error` and `SegmentError`.
+    Raises `psycopg.Error`; for an unreadable segment `OSError`, `EOFError`, `zlib.error` and `SegmentError`.
     """
     received = store.received(place)
     day = datetime.fromtimestamp(received // _SECOND, UTC).date()
@@ -229,9 +222,8 @@ def index(
 
 
 def make_partition(database: IndexDatabase, day: date) -> None:
-    """Make the partition of a day unless it exists. Raises `psycopg.Error`.
-
-    It is attached after it was made, so neither it nor a search waits for the other.
+    """The partition is attached after it was made, so neither it nor a search waits for the other. Raises
+    `psycopg.Error`.
     """
     name = f"record_{day:%Y%m%d}"
     with database.writing() as connection:
@@ -249,10 +241,7 @@ def make_partition(database: IndexDatabase, day: date) -> None:
 
 
 def rows(records: Iterable[StoredColumns], day: str, place: SegmentPlace) -> Iterator[tuple[Any, ...]]:
-    """Yield the rows of records, as PostgreSQL can store them; the segment has the complete ones.
-
-    The index shows NUL as U+2400, and the beginning of names that are too long for it.
-    """
+    """The index shows NUL as U+2400, and the beginning of names that are too long for it."""
     for columns in records:
         detail = columns.detail.decode()
         who = msgspec.json.decode(columns.detail).get("who")

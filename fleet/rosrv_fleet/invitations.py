@@ -1,12 +1,9 @@
 """Keep the invitations with which robots enrol themselves.
 
-Invariants:
-
-1. Only the output of `add` has a token; its hash is the name of its file. The secret has 256 random bits, so a fast
-   hash is enough.
-2. A token is valid for one request of one robot, until it expires, or a newer invitation of the robot replaces it, or
-   it is withdrawn. The first request is noted in the file before the robot is enrolled. Repeating it is harmless, also
-   after a crash; any other request with this token is rejected.
+1. Only the output of `add` has a token; its hash is the name of its file. The secret has 256 random bits, so a
+   fast hash is enough.
+2. A token is valid for one request of one robot, which is noted in the file before the robot is enrolled.
+   Repeating it is harmless, also after a crash; any other request with this token is rejected.
 3. Whatever else changes a robot's certificate withdraws its invitations, so no repeated request can undo it.
 """
 
@@ -29,7 +26,7 @@ _TOKEN = re.compile("rosrv-join_[A-Za-z0-9_-]{43}")
 
 
 class InvalidInvitationError(Exception):
-    """A token that is not valid; the text does not reveal why."""
+    """A token is not valid; the text does not reveal why."""
 
     def __init__(self) -> None:
         super().__init__(
@@ -39,10 +36,9 @@ class InvalidInvitationError(Exception):
 
 
 class PendingRobot(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A robot that may join until `expires` (seconds since the epoch). `group` is SITE/GROUP, or empty.
+    """A robot that may join until `expires` (seconds since the epoch).
 
-    `appliance` is the name of the appliance of a pair, or empty.
-    `request` is the SHA-256 of the request that used the invitation, in hexadecimal; empty: none has.
+    `request` is the SHA-256 of the request that used the invitation, or empty.
     """
 
     name: str
@@ -53,16 +49,13 @@ class PendingRobot(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
 
 
 class Invitations:
-    """The invitations in a folder of the data folder, one file each; a running collector immediately accepts new ones.
-
-    Making and withdrawing one are acts (`recorded`).
-    """
+    """The invitations in a folder, one file each; a running collector immediately accepts new ones."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
 
     def add(self, name: str, group: str, seconds: float, appliance: str = "") -> tuple[PendingRobot, str]:
-        """Make an invitation that replaces earlier ones of the appliance; return its token. Raises `OSError`."""
+        """Replace earlier invitations of the appliance; return the token. Raises `OSError`."""
         pending = PendingRobot(name=name, group=group, expires=clock.wall() + seconds, appliance=appliance)
         token = f"rosrv-join_{secrets.token_urlsafe(32)}"
         with changing(self._folder), recorded(self._folder.parent, "robot invite", name, group):
@@ -71,7 +64,7 @@ class Invitations:
         return pending, token
 
     def withdraw(self, name: str) -> None:
-        """Remove the invitations of a robot, even used ones. Raises `OSError`."""
+        """Remove also used invitations. Raises `OSError`."""
         with changing(self._folder):
             kept = map(_read, self._folder.glob("*.json"))
             if any(pending is not None and pending.name == name for pending in kept):
@@ -87,10 +80,10 @@ class Invitations:
 
     @contextmanager
     def using(self, token: str, request: bytes) -> Iterator[PendingRobot]:
-        """Use a token for a request, and enrol its robot in the block; `request` is set if the request is repeated.
+        """`request` is set if the request is repeated. If the block raises `EnrolmentError`, another request may
+        use the token.
 
-        If the block raises `EnrolmentError`, another request may use the token. Raises
-        `InvalidInvitationError` and `OSError`.
+        Raises `InvalidInvitationError` and `OSError`.
         """
         digest = hashlib.sha256(request).hexdigest()
         with changing(self._folder):

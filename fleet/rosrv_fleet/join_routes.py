@@ -1,7 +1,7 @@
 """Enrol a robot that sends an invitation's token, the key of its log and its certificate.
 
-The certificate's own signature proves that the sender has its private key. A robot that lost the answer repeats its
-request, and gets the same answer. Every wrong token gets the same answer, and an address that sends many has to wait.
+The certificate's own signature proves that the sender has its private key. A robot that lost the answer repeats
+its request. Every wrong token gets the same answer, and an address that sends many has to wait.
 """
 
 from collections import deque

@@ -42,8 +42,7 @@ def answer_to(
 ) -> Iterator[httpx.Response]:
     """Yield the collector's answer before its body is read.
 
-    `not_found` explains the status 404, `given` are further arguments of `httpx.stream`. Prints an error and exits with
-    status 1, also for errors of the block.
+    `not_found` explains the status 404. Prints an error and exits with status 1, also for errors of the block.
     """
     try:
         token = read_given(token_file, 4096).decode().strip()

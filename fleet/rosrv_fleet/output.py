@@ -20,7 +20,7 @@ def say_json(fields: dict[str, Any]) -> None:
 
 
 def configure_log() -> None:
-    """Log to standard error. Tracebacks never show local variables, because a key or a password might be among them."""
+    """Tracebacks never show local variables, because a key or a password might be among them."""
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
     *processors, _renderer = structlog.get_config()["processors"]
     renderer = structlog.dev.ConsoleRenderer(

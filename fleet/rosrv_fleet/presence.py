@@ -1,7 +1,6 @@
 """Note when each appliance of a robot was last heard: it pushed a segment, or stated that it has nothing to push.
 
-A file for each appliance, `heard/ROBOT/APPLIANCE`, has the time as its own, so that a restart of the collector does not
-make robots silent, and commands see it.
+The times are those of files, so that a restart does not make robots silent, and commands see them.
 """
 
 import contextlib
@@ -34,7 +33,6 @@ class RobotPresence:
             os.utime(file, ns=(now, now))
 
     def last(self, robot: str, appliance: str) -> float | None:
-        """Return when an appliance was last heard; None: never."""
         found = self._heard.get((robot, appliance))
         if found is not None:
             return found

@@ -89,7 +89,7 @@ def _later(status: int, detail: str, seconds: float) -> HTTPException:
 
 
 class _Cost(msgspec.Struct):
-    """The cost of an upload: compressed and uncompressed bytes, and seconds of processor time."""
+    """Compressed and uncompressed bytes, and seconds of processor time."""
 
     received: int = 0
     unpacked: int = 0
@@ -97,10 +97,9 @@ class _Cost(msgspec.Struct):
 
 
 class _Uploads:
-    """The running uploads: at most one for each robot, and a limited number in total.
+    """At most one upload runs for each robot, and a limited number in total.
 
-    Verification happens in workers. The first try of each segment is short, so robots with small segments do not wait
-    behind large ones. A segment that takes longer waits for its turn among the large segments.
+    The first try of each segment is short; a segment that takes longer waits among the large segments.
     """
 
     def __init__(self, collector: Collector) -> None:

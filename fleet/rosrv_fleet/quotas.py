@@ -1,8 +1,7 @@
 """Limit the bytes of each robot in a day, and pause a robot after refused uploads.
 
-The used bytes are on the disk, one file for each robot, so that a restart gives no robot a new quota. They
-decrease evenly, by the quota in a day, to below 0: a robot that was off may send its backlog faster. A new
-robot has saved none. The files are not synced: a power cut may lose the last changes.
+The used bytes are on the disk, so that a restart gives no robot a new quota. They decrease evenly to below 0: a
+robot that was off may send its backlog faster.
 """
 
 from collections.abc import Callable
@@ -32,10 +31,7 @@ class OverQuotaError(Exception):
 
 
 class UsedBytes(msgspec.Struct, frozen=True):
-    """The bytes that a robot has used at a time (seconds since the epoch): compressed and uncompressed ones.
-
-    Negative numbers are saved bytes.
-    """
+    """The bytes that a robot has used at a time (seconds since the epoch); negative numbers are saved bytes."""
 
     time: float = 0.0
     received: float = 0.0
@@ -72,7 +68,7 @@ class RobotQuotas:
                 )
 
     def charge(self, robot: str, received: int, unpacked: int) -> None:
-        """Add the bytes of an upload, stored or refused. Raises `OSError`."""
+        """Count also refused uploads. Raises `OSError`."""
         used = self._used(robot)
         added = msgspec.structs.replace(
             used,
@@ -84,7 +80,6 @@ class RobotQuotas:
         making.rename(self._folder / f"{robot}.json")
 
     def refused(self, robot: str, seconds: float) -> None:
-        """Make the robot pause after a refused upload that took `seconds` of processor time."""
         self._pauses[robot] = clock.now() + max(_LEAST_PAUSE, _REST * seconds)
 
     def _used(self, robot: str) -> UsedBytes:

@@ -15,11 +15,11 @@ from appliance.base.atomic_files import write_whole
 
 
 class ReceiptKeyError(Exception):
-    """The key is missing or unreadable; the message has the file and the remedy."""
+    """The key is missing or unreadable."""
 
 
 def make_receipt_key(folder: Path) -> Path:
-    """Make the key unless it exists; return the file of the public key, which robots need. Raises `OSError`."""
+    """Return the file of the public key, which robots need. Raises `OSError`."""
     file, public = folder / "receipts.key", folder / "receipts.pub"
     if not file.exists():
         made = Ed25519PrivateKey.generate()
@@ -30,7 +30,7 @@ def make_receipt_key(folder: Path) -> Path:
 
 
 def read_receipt_key(folder: Path) -> Ed25519PrivateKey:
-    """Return the key. Raises `ReceiptKeyError`."""
+    """Raises `ReceiptKeyError`."""
     file = folder / "receipts.key"
     try:
         key = load_pem_private_key(file.read_bytes(), password=None)

@@ -9,7 +9,7 @@ _SECONDS = 30.0
 
 
 async def read_body(request: Request, longest: int) -> bytes:
-    """Return a body of at most `longest` bytes. Raises `HTTPException`, also if the client is slow or gone."""
+    """Raises `HTTPException`, also if the client is slow or gone."""
     body = b""
     try:
         async with asyncio.timeout(_SECONDS):

@@ -1,10 +1,7 @@
 """Remove old data: whole partitions of the index, and segments from the beginning of a log.
 
-The last segment of a log stays, and so does a segment that waits for the index. Before segments are removed, the last
-removed checkpoint is noted, so that `verify` can prove the rest (`RemovalNote`).
-
-Afterwards, the segments that the index could not have wait for it again, so none stays set aside for a reason that has
-passed.
+The last segment of a log stays. The last removed checkpoint is noted before, so that `verify` can prove the rest.
+Afterwards, segments that were set aside wait for the index again, because the reason may have passed.
 """
 
 import threading
@@ -37,7 +34,7 @@ _log = structlog.get_logger()
 
 
 class Pruner:
-    """The retention of a collector: `step` once, or `run` every hour until `stop`."""
+    """The retention of a collector."""
 
     def __init__(
         self, store: SegmentStore, robots: Robots, database: IndexDatabase, retention: RetentionConfig
@@ -50,7 +47,6 @@ class Pruner:
         self.trouble: str | None = None
 
     def run(self) -> None:
-        """Prune until `stop`; a failure is reported and tried again."""
         while not self._ending.is_set():
             try:
                 self.step()
@@ -63,10 +59,7 @@ class Pruner:
         self._ending.set()
 
     def step(self) -> None:
-        """Remove data that is too old; a damaged log stays, and is reported.
-
-        Raises `psycopg.Error` and `OSError`.
-        """
+        """A damaged log stays, and is reported. Raises `psycopg.Error` and `OSError`."""
         trouble = None
         if self._retention.segment_days is not None:
             by = f"retention.segment_days: {self._retention.segment_days}"
@@ -92,7 +85,7 @@ class Pruner:
 
 
 def drop_partitions(database: IndexDatabase, oldest: date) -> list[date]:
-    """Drop the partitions of days before `oldest`; return the days. Raises `psycopg.Error`."""
+    """Return the dropped days. Raises `psycopg.Error`."""
     with database.writing() as connection:
         found = connection.execute(_DAYS, (oldest,))
         days: list[date] = [day for (day,) in found]

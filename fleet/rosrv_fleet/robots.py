@@ -1,9 +1,7 @@
 """Keep the enrolled robots: one file for each, so that uploads need no database.
 
-A robot is identified by the exact client certificate of one of its appliances. The keys of their audit logs' signers
-are pinned here: a robot can push only segments that these keys sealed. Its group is pinned too: it gets the bundles of
-this group only, and counts only there. A removed robot keeps its file, because its segments are still verified. Each
-change is an act (`recorded`).
+The exact client certificates, the keys of the audit logs' signers and the group are pinned here. A removed robot
+keeps its file, because its segments are still verified.
 """
 
 import fcntl
@@ -42,7 +40,7 @@ _log = structlog.get_logger()
 
 @contextmanager
 def changing(folder: Path) -> Iterator[None]:
-    """Exclude other changes of a folder during a block, also those of other processes. Raises `OSError`."""
+    """Exclude other changes of a folder, also those of other processes. Raises `OSError`."""
     make_folder(folder)
     descriptor = os.open(folder, os.O_RDONLY | os.O_CLOEXEC)
     try:
@@ -53,9 +51,9 @@ def changing(folder: Path) -> Iterator[None]:
 
 
 class Robots:
-    """The robots in a folder of the data folder. Thread-safe.
+    """The robots in a folder. Thread-safe; changes by another process are noticed.
 
-    Changes by another process are noticed, and wait for one another.
+    The methods raise `EnrolmentError` and `OSError`.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -69,20 +67,18 @@ class Robots:
 
     @property
     def trouble(self) -> str | None:
-        """Return why a robot's file is unreadable; None: all are readable."""
         return next(iter(self.unreadable.values()), None)
 
     def all(self) -> dict[str, Robot]:
-        """Return the robots by name, if every file is readable. Raises `EnrolmentError` for an unreadable file."""
+        """Raise `EnrolmentError` for an unreadable file."""
         known = self.known()
         if self.trouble is not None:
             raise EnrolmentError(self.trouble)
         return known
 
     def known(self) -> dict[str, Robot]:
-        """Return the robots by name, so that a damaged file of one does not stop the others. Raises `OSError`.
-
-        A robot whose file became unreadable keeps its last valid state; `unreadable` has the reasons by name.
+        """A damaged file does not stop the others: its robot keeps its last valid state, and `unreadable` has the
+        reason.
         """
         with self._lock:
             now = clock.wall_ns()
@@ -114,12 +110,10 @@ class Robots:
         self._robots, self.unreadable = robots, unreadable
 
     def with_certificate(self, der: bytes) -> Robot | None:
-        """Return the robot that may connect with this certificate (DER), or None. Raises `OSError`."""
         self.known()
         return self._connecting.get(hashlib.sha256(der).hexdigest())
 
     def groups(self) -> dict[str, RobotGroup]:
-        """Return the group of each robot that may connect and has one. Raises `OSError`."""
         return {
             robot.name: RobotGroup.parse(robot.group)
             for robot in self.known().values()
@@ -127,10 +121,6 @@ class Robots:
         }
 
     def add(self, name: str, key: bytes, certificate: bytes, group: str = "", appliance: str = "") -> Robot:
-        """Enrol a robot with PEM files, in a group or in none; with `appliance`, the second appliance of a robot.
-
-        Raises `EnrolmentError` and `OSError`.
-        """
         with changing(self.folder):
             known = self.all().get(name)
             if known is not None and appliance in ("", *known.appliances):
@@ -142,7 +132,7 @@ class Robots:
             return self._keep(robot, "robot add", f"{group} {_detail(robot, own)}".strip())
 
     def renew(self, name: str, certificate: bytes, appliance: str = "") -> Robot:
-        """Replace an appliance's certificate (PEM); a removed robot may connect again. Raises `EnrolmentError`."""
+        """A removed robot may connect again."""
         with changing(self.folder):
             known = self.named(name)
             own = appliance or (known.appliance if len(known.connecting) < 2 else "")
@@ -154,7 +144,6 @@ class Robots:
             return self._keep(robot, "robot renew", _detail(robot, own))
 
     def move(self, name: str, group: str) -> Robot:
-        """Put a robot into another group. Raises `EnrolmentError` and `OSError`."""
         with changing(self.folder):
             return self._keep(moved(self.named(name), group), "robot group", group)
 
@@ -168,11 +157,10 @@ class Robots:
         *,
         again: bool = False,
     ) -> Robot:
-        """Enrol an invited robot or its second appliance, or replace the certificate of an enrolled one with
-        the same log key.
+        """Enrol a robot or its second appliance, or replace the certificate of an enrolled one with the same log
+        key.
 
-        Without a `group`, an enrolled robot keeps its group. `again`: the robot repeats its request; nothing
-        changes if it has this certificate already. Raises `EnrolmentError` and `OSError`.
+        Without a `group`, an enrolled robot keeps its group. `again`: the robot repeats its request.
         """
         with changing(self.folder):
             known = self.all().get(name)
@@ -182,10 +170,7 @@ class Robots:
             return self._keep(robot, "robot join", _detail(robot, own))
 
     def remove(self, name: str, appliance: str = "") -> None:
-        """Reject a robot's connections from now on, or those of one of its two appliances; its segments stay.
-
-        Raises `EnrolmentError` and `OSError`.
-        """
+        """Reject the connections of a robot, or of one of its two appliances; its segments stay."""
         with changing(self.folder):
             known = self.named(name)
             if appliance:
@@ -194,7 +179,6 @@ class Robots:
                 self._keep(msgspec.structs.replace(known, removed=clock.wall_ns()), "robot remove")
 
     def named(self, name: str) -> Robot:
-        """Return the robot with this name. Raises `EnrolmentError`."""
         robot = self.known().get(name)
         if robot is None:
             if name in self.unreadable:
@@ -205,10 +189,7 @@ class Robots:
     def _with(
         self, known: Robot | None, name: str, appliance: str, made: RobotAppliance, group: str
     ) -> tuple[Robot, str]:
-        """Return a robot with an appliance, and the appliance's name. Raises `EnrolmentError`.
-
-        The log key identifies the appliance: a known appliance gets the certificate.
-        """
+        """The log key identifies the appliance: a known appliance gets the certificate. Return also its name."""
         if appliance:
             check_name(appliance)
         if known is None:
@@ -226,7 +207,7 @@ class Robots:
         return self._unique(moved(robot, group) if group else robot), own or appliance or FIRST
 
     def _unique(self, robot: Robot) -> Robot:
-        """Return the robot. Raises `EnrolmentError` if another one has its certificate or key, or is unreadable."""
+        """Raise `EnrolmentError` if another robot has its certificate or key, or is unreadable."""
         for other in self.all().values():
             if other.name == robot.name:
                 continue
@@ -252,7 +233,6 @@ def _detail(robot: Robot, appliance: str) -> str:
 
 
 def _read(file: Path, known: Robot | None) -> Robot:
-    """Return the robot in a file. `known` was read from it earlier. Raises `EnrolmentError`."""
     try:
         robot = msgspec.json.decode(file.read_bytes(), type=Robot)
         if robot == known:  # all files are read again after each change

@@ -42,7 +42,7 @@ class Searches:
 
     @contextmanager
     def turn(self, token: str) -> Iterator[IndexDatabase]:
-        """Count a search with a token during a block. Raises `TooManySearchesError`."""
+        """Raises `TooManySearchesError`."""
         with self._lock:
             if self._running[token] >= max(1, self._most // 2):
                 raise TooManySearchesError(
@@ -61,9 +61,9 @@ class Searches:
 
 
 class FleetPage(msgspec.Struct, frozen=True, kw_only=True):
-    """A page: the records with `robot` and `log`, newest first, and the cursor of the next page; None at the end.
+    """The records with `robot` and `log`, newest first, and the cursor of the next page.
 
-    `waiting` is the number of stored segments that the index did not have, at most 1,000: a search misses these.
+    A search misses the `waiting` segments, counted up to 1,000.
     """
 
     records: list[dict[str, Any]]
@@ -74,10 +74,7 @@ class FleetPage(msgspec.Struct, frozen=True, kw_only=True):
 def search_fleet(
     database: IndexDatabase, wanted: FleetFilter, cursor: str | None, limit: int, waiting: int
 ) -> FleetPage:
-    """Return a page of at most `limit` records.
-
-    Raises `FilterError`, `SearchTooLongError` and `IndexDownError`.
-    """
+    """Raises `FilterError`, `SearchTooLongError` and `IndexDownError`."""
     after = None if cursor is None else parse_cursor(cursor)
     try:
         rows = _rows(database, wanted, after, limit + 1)

@@ -26,7 +26,6 @@ MOST_WAITING = 1000
 
 @functools.wraps(filter_given)
 def filter_asked(**words: Any) -> Filter:
-    """Return the filter of a request's parameters, which are those of `filter_given`; answer 422 for invalid ones."""
     try:
         return filter_given(**words)
     except TimestampError as error:

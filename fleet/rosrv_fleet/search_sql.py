@@ -28,7 +28,7 @@ assert _COLUMNS.split(", ")[2:] == list(StoredColumns._fields)  # noqa: S101  `S
 
 
 class FleetFilter(NamedTuple):
-    """The records to find: of the robots that match the glob `robot` (None: all), and the words of one log."""
+    """The glob `robot` (None: all robots), and the words of one log."""
 
     robot: str | None
     record: Filter
@@ -46,7 +46,7 @@ class SearchCursor(msgspec.Struct, frozen=True, array_like=True):
 
 
 def parse_cursor(text: str) -> SearchCursor:
-    """Parse a printed cursor. Raises `FilterError`."""
+    """Raises `FilterError`."""
     try:
         cursor = msgspec.json.decode(base64.urlsafe_b64decode(text), type=SearchCursor)
     except (binascii.Error, ValueError) as error:
@@ -64,8 +64,6 @@ class SearchStatement(NamedTuple):
 
 
 class _Conditions:
-    """The conditions of a WHERE clause, and their values."""
-
     def __init__(self) -> None:
         self._found: list[LiteralString] = []
         self._values: list[object] = []
@@ -77,7 +75,6 @@ class _Conditions:
     def matching(
         self, name: str, equal: LiteralString, glob: LiteralString, value: str | None, times: int = 1
     ) -> None:
-        """Add a condition for a value that is exact, or a glob; its parameter occurs `times` times."""
         if value is None:
             return
         value = checked_pattern(name, value).replace("\0", "\u2400")
@@ -92,7 +89,7 @@ class _Conditions:
 
 
 def days_statement(record: Filter) -> SearchStatement | None:
-    """Return the statement that finds the days with records in the filter's time range; None without a range."""
+    """Return None without a time range."""
     if record.since is None and record.until is None:
         return None
     found = _Conditions()
@@ -106,7 +103,7 @@ def days_statement(record: Filter) -> SearchStatement | None:
 def search_statement(
     wanted: FleetFilter, cursor: SearchCursor | None, limit: int, days: list[object] | None
 ) -> SearchStatement:
-    """Return the statement of a page with at most `limit` rows in the partitions `days`. Raises `FilterError`."""
+    """Return a page in the partitions `days`. Raises `FilterError`."""
     found, record = _Conditions(), wanted.record
     if days is not None:
         found.add("day = ANY(%s::date[])", days)
@@ -141,7 +138,7 @@ def _escaped(text: str) -> str:
 
 
 def regex_of(glob: str) -> str:
-    """Return PostgreSQL's regular expression for a pattern of SQLite's GLOB. Raises `FilterError`."""
+    """Translate a pattern of SQLite's GLOB to PostgreSQL. Raises `FilterError`."""
     parts, at = ["^"], 0
     while at < len(glob):
         sign = glob[at]

@@ -12,7 +12,7 @@ from rosrv_fleet.workers import OutOfTimeError, processor_time
 
 
 class SegmentVerdict(NamedTuple):
-    """The result of a check: the summary of a valid segment, or the error; `late` if the time was too short.
+    """The summary of a valid segment, or the error; `late` if the time was too short.
 
     `size` is the number of uncompressed bytes that were read, `seconds` the processor time.
     """
@@ -25,7 +25,7 @@ class SegmentVerdict(NamedTuple):
 
 
 def check_segment(upload: Path, keys: Collection[bytes], most_bytes: int, seconds: float) -> SegmentVerdict:
-    """Verify a compressed segment with one of the raw public keys `keys` in at most `seconds`. Raises `OSError`."""
+    """`keys` are raw public keys, `seconds` limit the processor time. Raises `OSError`."""
     begun = time.process_time()
     summary, reason, late = None, "", False
     with gzip.open(upload) as file:

@@ -1,23 +1,17 @@
-"""Store segments as files, before any other part of the collector uses them.
+"""Store segments as files, before any other part of the collector uses them (docs/reference/fleet.md lists the
+files).
 
-    segments/ROBOT/LOG/BUCKET/NUMBER-NAME.ndjson.gz    a segment; a bucket has a thousand numbers
-    newest/ROBOT                                       LOG~NUMBER~NAME: the robot's newest segment
-    removed/ROBOT/LOG.json                             the segments that retention removed (`RemovalNote`)
-    KIND/ROBOT/LOG~NUMBER~NAME                         a marker of a segment; the kinds:
-        pending, large     the index does not have it yet
-        damaged            the index could not have it; with `large`: it is tried again
-        gaps               it does not follow a stored one
-        forks              another segment has the same number
-    incoming/                                          uploads that are not verified
+A marker KIND/ROBOT/LOG~NUMBER~NAME names a segment: `pending` and `large` ones are not in the index yet; the
+index could not have a `damaged` one, which with `large` is tried again; `gaps` do not follow a stored segment,
+and `forks` have the number of another.
 
-Invariants:
-1. A stored segment was verified, and is on the disk with its folder before `keep` returns. It never changes; if the
-   disk has damaged it, its robot's next upload of the same segment replaces it.
-2. A crash leaves a segment either stored or absent. Everything that refers to the segment is written first, and
-   repaired by `keep`.
+1. A stored segment was verified, and is on the disk with its folder before `keep` returns. It never changes,
+   unless the disk has damaged it and the robot uploads it again.
+2. Everything that refers to a segment is written before it, and repaired by `keep`, so a crash leaves a segment
+   either stored or absent.
 3. The state that uploads need is in names: no database, and no memory that grows with the number of segments.
-4. Work for one robot does not grow with the data of others, and the names that a robot can choose are limited
-   (`_MOST_LOGS`, `_MOST_BUCKETS`, `_MOST_FORKS`): it can neither slow down nor hide others.
+4. Work for one robot does not grow with the data of others, and the names that a robot can choose are limited, so
+   it can neither slow down nor hide others.
 """
 
 import contextlib
@@ -63,14 +57,14 @@ class StoreFullError(OSError):
 
 
 class NotStorableError(ValueError):
-    """The store cannot keep a valid segment at its place; the message has the reason."""
+    """The store cannot keep a valid segment at its place."""
 
 
 class RemovalNote(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The segments at the beginning of a log that retention removed.
+    """The segments at the beginning of a log that retention removed; the numbers count from its beginning.
 
-    `ends` are the headers of the last removed number, `time` is that of the last removal (nanoseconds since the epoch),
-    `by` the setting. `segments`, `gaps` and `forks` count what was removed since the log began.
+    `ends` are the headers of the last removed number, `time` is in nanoseconds since the epoch, `by` is the
+    setting.
     """
 
     ends: list[SegmentHeader]
@@ -86,7 +80,7 @@ class RemovalNote(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 
 
 class SegmentPlace(NamedTuple):
-    """The place of a segment: robot, log, the number of its checkpoint, and its name."""
+    """Robot, log, the number of the segment's checkpoint, and its name."""
 
     robot: str
     log: str
@@ -99,10 +93,13 @@ class SegmentPlace(NamedTuple):
 
 
 class SegmentStore:
-    """The segments of a collector, in a folder. Thread-safe; one process writes."""
+    """The segments of a collector, in a folder. Thread-safe; one process writes.
+
+    The methods raise `OSError`.
+    """
 
     def __init__(self, folder: Path, reserve: int) -> None:
-        """Prepare the folders. `reserve` bytes of the disk stay free."""
+        """`reserve` bytes of the disk stay free."""
         self._folder = folder
         self._reserve = reserve
         self._locks: dict[str, threading.Lock] = {}
@@ -134,16 +131,14 @@ class SegmentStore:
         return self._folder / "segments" / place.robot / place.log / bucket / name
 
     def has(self, place: SegmentPlace) -> bool:
-        """Return whether the segment is stored, and its header can be read. Raises `OSError`."""
         return self.path(place).exists() and self._readable(place) is not None
 
     def header(self, place: SegmentPlace) -> SegmentHeader:
-        """Return the header of a stored segment. Raises `OSError`, `EOFError`, `zlib.error` and `ValueError`."""
+        """Raises `OSError`, `EOFError`, `zlib.error` and `ValueError`."""
         with gzip.open(self.path(place)) as file:
             return msgspec.json.decode(file.readline(LONGEST_LINE), type=SegmentHeader)
 
     def _readable(self, place: SegmentPlace) -> SegmentHeader | None:
-        """Return the header of a stored segment; None, and the indexer reports it, if the disk has damaged it."""
         try:
             return self.header(place)
         except _DAMAGED:
@@ -151,14 +146,11 @@ class SegmentStore:
             return None
 
     def headers(self, places: list[SegmentPlace]) -> list[SegmentHeader]:
-        """Return the readable headers of stored segments. Raises `OSError`."""
+        """Leave out unreadable headers."""
         return [header for header in map(self._readable, places) if header is not None]
 
     def keep(self, robot: str, upload: Path, summary: SegmentSummary, size: int) -> SegmentPlace:
-        """Store a verified upload of `size` uncompressed bytes; when this returns, the segment is on the disk.
-
-        Raises `NotStorableError` and `OSError`.
-        """
+        """Return when the upload of `size` uncompressed bytes is on the disk. Raises `NotStorableError`."""
         header = summary.header
         place = SegmentPlace(robot, header.end.log, header.end.number, summary.name)
         path = self.path(place)
@@ -175,7 +167,7 @@ class SegmentStore:
         return place
 
     def _check(self, place: SegmentPlace) -> None:
-        """Raise `NotStorableError` for a segment that was removed, or is one too many."""
+        """Raise `NotStorableError` for a segment that was removed, or is above a limit."""
         note = self.removal(place.robot, place.log)
         if note is not None and place.number <= note.number:
             raise NotStorableError(
@@ -202,7 +194,6 @@ class SegmentStore:
         making.rename(file)
 
     def newest(self, robot: str) -> tuple[int, SegmentPlace] | None:
-        """Return when a robot's last segment arrived (nanoseconds since the epoch), and its newest; None: none yet."""
         try:
             with (self._folder / "newest" / robot).open(encoding="ascii", errors="replace") as file:
                 found = _MARK.fullmatch(file.read())
@@ -212,7 +203,7 @@ class SegmentStore:
         return None if found is None else (arrived, _place(robot, found))
 
     def settle(self, place: SegmentPlace, header: SegmentHeader) -> None:
-        """Complete the files of a stored segment after a killed collector. Raises `OSError`."""
+        """Complete the files of a stored segment after a killed collector."""
         with self._lock(place.robot):
             self._settle(place, header)
 
@@ -271,12 +262,11 @@ class SegmentStore:
         )
 
     def numbered(self, robot: str, log: str, number: int) -> list[SegmentPlace]:
-        """Return the stored segments with this number: one, unless the robot signed two histories."""
+        """Return one segment, unless the robot signed two histories."""
         bucket = self.path(SegmentPlace(robot, log, number, "")).parent
         return [one for one in _in_bucket(robot, log, bucket) if one.number == number]
 
     def head(self, robot: str, log: str, upto: int = 10**_DIGITS - 1) -> SegmentPlace | None:
-        """Return the stored segment of a log with the largest number up to `upto`, or None."""
         last = f"{upto // _BUCKET:0{_DIGITS}}"
         for bucket in reversed(_folders(self._folder / "segments" / robot / log)):
             if bucket.name > last:
@@ -294,11 +284,10 @@ class SegmentStore:
             yield from _in_bucket(robot, log, bucket)
 
     def received(self, place: SegmentPlace) -> int:
-        """Return when the segment arrived, in nanoseconds since the epoch. Raises `OSError`."""
+        """Return nanoseconds since the epoch."""
         return self.path(place).stat().st_mtime_ns
 
     def marked(self, kind: str, robot: str, most: int) -> list[SegmentPlace]:
-        """Return at most `most` segments of a robot with markers of a kind, in any order."""
         found = []
         with contextlib.suppress(FileNotFoundError), os.scandir(self._folder / kind / robot) as entries:
             for entry in entries:
@@ -313,7 +302,6 @@ class SegmentStore:
         return sorted(os.listdir(self._folder / kind))  # noqa: PTH208  names, not paths
 
     def waiting(self, most: int) -> int:
-        """Return the number of segments that the index does not have, counted up to `most`."""
         found = set[SegmentPlace]()  # those that are tried again have two markers
         for kind in ("pending", "large", "damaged"):
             for robot in self.robots_with(kind):
@@ -327,7 +315,6 @@ class SegmentStore:
             self._unmark(kind, place)
 
     def stamp(self, place: SegmentPlace) -> FileStamp | None:
-        """Return a stamp that changes when `keep` replaces the file of a segment; None: it is absent."""
         try:
             found = self.path(place).stat()
         except FileNotFoundError:
@@ -335,10 +322,7 @@ class SegmentStore:
         return found.st_ino, found.st_size, found.st_mtime_ns
 
     def set_aside(self, place: SegmentPlace, stamp: FileStamp | None) -> bool:
-        """Note that the index cannot have the file with this stamp; return False if it was replaced since.
-
-        Raises `OSError`.
-        """
+        """Return False if the file with this stamp was replaced since."""
         with self._lock(place.robot):
             if self.stamp(place) != stamp:
                 return False
@@ -348,7 +332,7 @@ class SegmentStore:
             return True
 
     def try_again(self) -> None:
-        """Let the segments that the index could not have wait for it again; they stay reported. Raises `OSError`."""
+        """Let the segments that the index could not have wait for it again; they stay reported."""
         for robot in self.robots_with("damaged"):
             for place in self.marked("damaged", robot, sys.maxsize):
                 self._touch("large", place)
@@ -360,10 +344,6 @@ class SegmentStore:
                 self.indexed(place)
 
     def removal(self, robot: str, log: str) -> RemovalNote | None:
-        """Return the note of the segments of a log that retention removed; None: no segment was removed.
-
-        Raises `OSError`.
-        """
         try:
             return read_stored(self._note(robot, log), RemovalNote)
         except FileNotFoundError:
@@ -373,10 +353,10 @@ class SegmentStore:
         return self._folder / "removed" / robot / f"{log}.json"
 
     def prune(self, robot: str, log: str, before: int, by: str) -> int:
-        """Remove the segments at the beginning of a log that arrived before a time (ns); return their number.
+        """Return the number of removed segments, which arrived before a time (ns).
 
-        The last segment of a log stays. So does every segment that is not in the index yet, with all later ones. Raises
-        `OSError`, `EOFError`, `zlib.error` and `ValueError`.
+        The last segment of a log stays. So does every segment that is not in the index yet, with all later ones.
+        Raises also `EOFError`, `zlib.error` and `ValueError`.
         """
         with self._lock(robot):
             note = self.removal(robot, log)
@@ -403,7 +383,6 @@ class SegmentStore:
             return len(old)
 
     def _old(self, robot: str, log: str, before: int) -> list[SegmentPlace]:
-        """Return the segments of a log, by number, up to the last number that can be removed."""
         head = self.head(robot, log)
         found: list[SegmentPlace] = []
         for place in self.segments(robot, log):
@@ -431,7 +410,7 @@ def _place(robot: str, mark: re.Match[str]) -> SegmentPlace:
 
 
 def _folders(folder: Path) -> list[Path]:
-    """Return the folders in a folder, sorted; without a call for each, as there may be thousands."""
+    """Make no call for each folder, as there may be thousands."""
     try:
         with os.scandir(folder) as entries:
             return [folder / name for name in sorted(one.name for one in entries if one.is_dir())]
@@ -449,7 +428,6 @@ def _in_bucket(robot: str, log: str, bucket: Path) -> list[SegmentPlace]:
 
 
 def sync(path: Path) -> None:
-    """Write a file, or the names in a folder, to the disk. Raises `OSError`."""
     descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
     try:
         os.fsync(descriptor)

@@ -32,7 +32,7 @@ class ServerTls:
     """The TLS context of the server. Certificates of robots that are enrolled later are added to it."""
 
     def __init__(self, certificate: str, key: str, robots: Robots) -> None:
-        """Load the server's certificate. Raises `ssl.SSLError` and `OSError`."""
+        """Raises `ssl.SSLError` and `OSError`."""
         self.context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
         self.context.minimum_version = ssl.TLSVersion.TLSv1_3
         self.context.load_cert_chain(certificate, key)
@@ -45,7 +45,7 @@ class ServerTls:
         self._fingerprints: set[str] = set()
 
     def reload(self) -> None:
-        """Trust the robots that were enrolled since; a removed one is refused by each request."""
+        """Trust new robots; each request of a removed robot is refused."""
         for robot in self._robots.known().values():
             for appliance in robot.connecting.values():
                 if appliance.certificate not in self._trusted:
@@ -54,7 +54,6 @@ class ServerTls:
                     self._trust(robot.name, appliance)
 
     def owner(self, certificate: bytes | None) -> str | None:
-        """Return the fingerprint of a robot's certificate (DER); None for any other certificate."""
         found = None if certificate is None else hashlib.sha256(certificate).hexdigest()
         return found if found in self._fingerprints else None
 
@@ -66,8 +65,6 @@ class ServerTls:
 
 
 def _protocol(header_seconds: float, table: ClientConnections, tls: ServerTls) -> type[HttpToolsProtocol]:
-    """Return the protocol that passes on the client's certificate, and ends connections without a request."""
-
     class _Connection(HttpToolsProtocol):
         def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]  # asyncio's own type
             super().connection_made(transport)
@@ -100,7 +97,7 @@ def _protocol(header_seconds: float, table: ClientConnections, tls: ServerTls) -
 
 
 class _Server(uvicorn.Server):
-    """The server, which also watches for enrolled robots, and ends the robots' event streams when it stops."""
+    """The server also watches for enrolled robots, and ends the robots' event streams when it stops."""
 
     def __init__(self, config: uvicorn.Config, tls: ServerTls, bundles: BundleService | None) -> None:
         super().__init__(config)
@@ -124,7 +121,7 @@ class _Server(uvicorn.Server):
             ending.cancel()
 
     async def _end_idle(self) -> None:
-        """End connections without a request: a client that only waits does not answer the end of TLS."""
+        """A client that only waits does not answer the end of TLS."""
         while True:
             await asyncio.sleep(_CLOSE_SECONDS)
             for connection in list(self.server_state.connections):
@@ -142,7 +139,7 @@ class _Server(uvicorn.Server):
 
 
 def serve(collector: Collector) -> None:
-    """Serve until a signal ends the process. Raises `OSError` and `ssl.SSLError`."""
+    """Raises `OSError` and `ssl.SSLError`."""
     config = collector.config
     tls = ServerTls(str(config.certificate), str(config.key), collector.robots)
     tls.reload()

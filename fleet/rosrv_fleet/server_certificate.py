@@ -17,10 +17,7 @@ class ServerCertificateError(Exception):
 
 
 def make_certificate(config: FleetConfig, address: str | None) -> bool:
-    """Make a key and a certificate for an address, unless they exist; return whether they were made.
-
-    Raises `ServerCertificateError` and `OSError`.
-    """
+    """Return whether a key and a certificate were made. Raises `ServerCertificateError` and `OSError`."""
     if config.certificate.exists():
         named = _addresses(config.certificate)
         if address is not None and address not in named:
@@ -41,7 +38,7 @@ def make_certificate(config: FleetConfig, address: str | None) -> bool:
 
 
 def authority_of(certificate: Path) -> str:
-    """Return the last certificate of the file (PEM), which must sign itself. Raises `ServerCertificateError`."""
+    """Return the last certificate (PEM), which must sign itself. Raises `ServerCertificateError`."""
     last = x509.load_pem_x509_certificates(certificate.read_bytes())[-1]
     if last.issuer != last.subject:
         raise ServerCertificateError(
@@ -51,7 +48,7 @@ def authority_of(certificate: Path) -> str:
 
 
 def url_of(config: FleetConfig) -> str:
-    """Return the URL of the collector for robots. Raises `ServerCertificateError`."""
+    """Raises `ServerCertificateError`."""
     addresses = _addresses(config.certificate)
     if not addresses:
         raise ServerCertificateError(

@@ -14,7 +14,7 @@ class DamagedFileError(OSError):
 
 
 def read_stored(file: Path, type_: type[T]) -> T:
-    """Return the content of a JSON file. Raises `OSError`, also if it is damaged (`DamagedFileError`)."""
+    """Raises `OSError`, also if the file is damaged (`DamagedFileError`)."""
     try:
         return msgspec.json.decode(file.read_bytes(), type=type_)
     except ValueError as error:

@@ -1,7 +1,4 @@
-"""Keep the tokens of operators: only their SHA-256, because a token is random and as long as a key.
-
-Each change is an act (`recorded`).
-"""
+"""Keep the tokens of operators: only their SHA-256, because a token is random and as long as a key."""
 
 import enum
 import hashlib
@@ -29,7 +26,7 @@ class FleetRole(enum.StrEnum):
 
 
 class OperatorToken(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A token: the holder's name, the role, the hash, and the time of creation in nanoseconds since the epoch."""
+    """`added` is in nanoseconds since the epoch."""
 
     name: str
     role: FleetRole
@@ -42,29 +39,27 @@ class OperatorToken(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
 
 
 class TokenError(Exception):
-    """A token cannot be made or removed; the message has the reason."""
+    """A token cannot be made or removed."""
 
 
 class OperatorTokens:
-    """The tokens in a file of the data folder; changes by another process are noticed at once."""
+    """The tokens in a file; changes by another process are noticed at once. The methods raise `OSError`."""
 
     def __init__(self, file: Path) -> None:
         self._file = file
 
     def all(self) -> list[OperatorToken]:
-        """Return the tokens. Raises `OSError`."""
         try:
             return read_stored(self._file, list[OperatorToken])
         except FileNotFoundError:
             return []
 
     def holder(self, token: str) -> OperatorToken | None:
-        """Return the token with this text, or None. Raises `OSError`."""
         digest = hashlib.sha256(token.encode("utf-8", "replace")).hexdigest()
         return next((one for one in self.all() if secrets.compare_digest(one.hash, digest)), None)
 
     def add(self, name: str, role: FleetRole) -> str:
-        """Make a token and return its text, which is stored nowhere. Raises `TokenError` and `OSError`."""
+        """Return the token's text, which is stored nowhere. Raises `TokenError`."""
         if _NAME.fullmatch(name) is None:
             raise TokenError(
                 f"{name!a}: use 1 to 63 small letters, digits, '.', '_', '-'; first a letter or digit"
@@ -83,7 +78,7 @@ class OperatorTokens:
         return text
 
     def remove(self, name: str) -> None:
-        """Remove a token. Raises `TokenError` and `OSError`."""
+        """Raises `TokenError`."""
         with changing(self._file.parent):
             tokens = self.all()
             left = [one for one in tokens if one.name != name]

@@ -1,8 +1,7 @@
 """Prove from the stored segments that no record of a robot is missing.
 
-Each segment is read and verified again with the robot's keys. A log is complete if its segments form one chain: each
-begins with the checkpoint that ends the one before. The first begins at the log's beginning, or after records whose
-removal by retention the signer signed, or after the segments that the collector's own retention noted as removed.
+A log is complete if its segments form one chain. The first segment begins at the log's beginning, after records
+whose removal the signer signed, or after segments that the collector's own retention noted as removed.
 """
 
 import gzip
@@ -22,9 +21,8 @@ _UNREADABLE = (SegmentError, OSError, EOFError, zlib.error, gzip.BadGzipFile)
 class LogProof(msgspec.Struct, kw_only=True):
     """The result for one log: `records` in `segments` are proven, up to sequence `last`.
 
-    `begins_after` is the last record that retention removed before the collector had it, `removed` the last one that
-    the collector's own retention removed (`removal`: when, why and how much). `missing` is the number of records that
-    no segment has; `findings` are sentences about these, and about damaged and forked segments.
+    `begins_after` is the last record that retention removed before the collector had it. `missing` is the number
+    of records that no segment has.
     """
 
     robot: str
@@ -48,7 +46,7 @@ def prove(store: SegmentStore, robot: Robot, segment_bytes: int) -> list[LogProo
 
 
 def _prove_log(store: SegmentStore, robot: Robot, log: str, segment_bytes: int) -> LogProof:
-    """Prove a log, and again if retention has just removed segments. Retention writes its note before."""
+    """Prove a log again if retention has just removed segments: it writes its note before."""
     for _attempt in range(_MOST_ATTEMPTS):
         note, damage = _removal(store, robot, log)
         proof = _proof_after(note, store, robot, log, segment_bytes)

@@ -1,8 +1,7 @@
-"""Run work on segments in separate processes.
+"""Run work on segments in separate processes, with a lower priority than the server.
 
-A segment may need minutes of processor time. In a separate process, it blocks neither the server's interpreter lock nor
-its threads. Workers have a lower priority than the server, and end with it. They are not a sandbox: they have the
-server's user, and the server unpickles their results.
+A segment may need minutes of processor time, and would block the server's interpreter lock. Workers are not a
+sandbox: they have the server's user, and the server unpickles their results.
 """
 
 import multiprocessing
@@ -39,7 +38,7 @@ class Workers:
         self._pool: ProcessPoolExecutor | None = None
 
     def submit(self, work: Callable[P, T], *arguments: P.args, **named: P.kwargs) -> Future[T]:
-        """Begin work. Its future raises `BrokenProcessPool` if a worker was killed; the next work has new ones."""
+        """The future raises `BrokenProcessPool` if a worker was killed; the next work has new ones."""
         with self._lock:
             try:
                 return self._present().submit(work, *arguments, **named)
@@ -55,7 +54,7 @@ class Workers:
         return self._pool
 
     def close(self) -> None:
-        """End the workers at once, and wait until they have ended; unfinished work is lost."""
+        """End the workers at once, and wait for their end; unfinished work is lost."""
         with self._lock:
             if self._pool is not None:
                 self._pool.shutdown(wait=False, cancel_futures=True)

@@ -11,10 +11,8 @@ from appliance.specifications.specification_files import Sources, Specifications
 
 
 def findings_of(contents: BundleContents) -> list[str]:
-    """Return all errors: in hosts.yaml, the policy, its test cases and the specifications.
-
-    The policy may name hosts only if hosts.yaml declares their addresses. Signatures of the site are checked on the
-    robots, which have the site's keys.
+    """The policy may name hosts only if hosts.yaml declares their addresses. Robots check the signatures of the
+    site.
     """
     found: list[str] = []
     hosts = {}

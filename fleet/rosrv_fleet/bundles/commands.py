@@ -189,7 +189,7 @@ def publish(
 
 @contextmanager
 def _opened(repository: Path, keys: Path | None, passphrase_file: Path | None) -> Iterator[BundleRepository]:
-    """Open a repository; print an error and exit with status 1 instead of raising it."""
+    """Print an error and exit with status 1 instead of raising it."""
 
     def passphrase(key: Path) -> str:
         if passphrase_file is not None:
@@ -214,7 +214,6 @@ def _opened(repository: Path, keys: Path | None, passphrase_file: Path | None) -
 
 
 def _findings_of(contents: BundleContents) -> list[str]:
-    """Return the errors of a bundle. Raises `BundleArchiveError` if this machine cannot check it."""
     try:
         # The collector's machine has no compiler of policies and specifications, and signs no bundles.
         from rosrv_fleet.bundles.checks import findings_of  # noqa: PLC0415  only where bundles are signed
@@ -244,7 +243,6 @@ def _ring(text: str) -> Ring:
 
 
 def _files_in(folder: Path) -> dict[str, bytes]:
-    """Return the files of a bundle in a folder. Raises `BundleArchiveError` for a file that does not belong there."""
     files = {}
     for path in files_below(folder):
         name = str(path.relative_to(folder))

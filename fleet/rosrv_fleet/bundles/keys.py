@@ -22,11 +22,11 @@ _SHORTEST = 8
 
 
 class KeyFileError(Exception):
-    """A key cannot be read or made; the message has the file and the remedy."""
+    """A key cannot be read or made."""
 
 
 class KeyFolder:
-    """The folder of key files. `passphrase(file)` returns the passphrase of a file; it is asked once for each file."""
+    """The folder of key files; each passphrase is asked once."""
 
     def __init__(self, folder: Path, passphrase: Callable[[Path], str]) -> None:
         self.folder = folder
@@ -34,7 +34,7 @@ class KeyFolder:
         self._signers: dict[Path, CryptoSigner] = {}
 
     def make(self, role: str) -> Key:
-        """Make a key for a role, encrypted with the passphrase; return its public half. Raises `KeyFileError`."""
+        """Return the public half. Raises `KeyFileError`."""
         signer = CryptoSigner.generate_ed25519()
         path = self.folder / f"{role}.{signer.public_key.keyid[:_ID_DIGITS]}.pem"
         passphrase = self._passphrase(path)
@@ -46,7 +46,7 @@ class KeyFolder:
         return signer.public_key
 
     def signers(self, role: str, keyids: Collection[str]) -> list[CryptoSigner]:
-        """Return the signers of a role whose keys have these ids. Raises `KeyFileError` if there are none."""
+        """Raises `KeyFileError` if there is no key with these ids."""
         found = []
         for path in sorted(self.folder.glob("*.pem")):
             name = _FILE.fullmatch(path.name)
@@ -71,21 +71,19 @@ class KeyFolder:
 
 
 def _if_lost(role: str) -> str:
-    """Return what to do if the key of a role is lost. A new root key needs the old one."""
     if role == "root":
         return "; if it is lost, make a new repository, and give its root.json to the robots"
     return f"; if it is lost: rosrv-fleet bundle rotate {role}"
 
 
 def make_online_key(path: Path) -> Key:
-    """Make the collector's timestamp key without a passphrase; return its public half."""
     signer = CryptoSigner.generate_ed25519()
     write_whole(path, _pem(signer, None), 0o600)
     return signer.public_key
 
 
 def load_online_key(path: Path) -> CryptoSigner:
-    """Return the collector's timestamp key. Raises `KeyFileError`."""
+    """Raises `KeyFileError`."""
     try:
         key = load_pem_private_key(path.read_bytes(), None)
     except (OSError, ValueError, TypeError) as error:

@@ -1,8 +1,6 @@
 """Read what the operator published, check that it is complete, and sign the timestamp that names it.
 
-The collector serves the folder's files as they are. It signs only the timestamp: at each new snapshot, and again before
-the last one expires. A snapshot is named only if everything that it lists is there and verifies, so robots never see
-half of a publication.
+Robots never see half of a publication: a snapshot is named only if everything in it is there and verifies.
 """
 
 import datetime
@@ -23,13 +21,13 @@ S = TypeVar("S", Root, Snapshot, Targets)
 _ROOT = re.compile(r"([1-9][0-9]*)\.root\.json")
 _SNAPSHOT = re.compile(r"([1-9][0-9]*)\.snapshot\.json")
 LIFETIME = datetime.timedelta(hours=24)
-"""The life of a timestamp: robots notice within this time that newer metadata are withheld."""
+"""Robots notice within this time that newer metadata are withheld."""
 
 _RENEW = datetime.timedelta(hours=8)  # the age at which a timestamp is signed again
 
 
 class PublicationError(Exception):
-    """The published files are not complete or not valid; the text has the reason and what to do."""
+    """The published files are not complete or not valid."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +41,7 @@ class PublishedBundles:
 
 
 def read_publication(folder: Path) -> PublishedBundles:
-    """Return the newest publication in a folder, fully verified. Raises `PublicationError`."""
+    """Raises `PublicationError` if the newest publication does not verify."""
     metadata = folder / "metadata"
     try:
         root = _load(metadata / f"{_newest(metadata, _ROOT)}.root.json", Root)
@@ -72,7 +70,7 @@ def read_publication(folder: Path) -> PublishedBundles:
 def next_timestamp(
     publication: PublishedBundles, last: bytes | None, key: CryptoSigner, now: datetime.datetime
 ) -> bytes | None:
-    """Return a new timestamp, or None if the last one is good. Raises `PublicationError`.
+    """Return None if the last timestamp is good. Raises `PublicationError`.
 
     Versions follow the clock, so a collector that lost its state still signs later versions than before.
     """
@@ -100,7 +98,7 @@ def next_timestamp(
 
 
 def _signed_before(last: bytes | None, root: Root) -> Timestamp | None:
-    """Return the last timestamp; None if the present root does not accept it, so that robots also discard it."""
+    """Return None if the present root does not accept the timestamp, so that robots also discard it."""
     if last is None:
         return None
     try:

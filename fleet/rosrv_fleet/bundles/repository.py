@@ -1,19 +1,11 @@
 """Edit the operator's repository of bundles: delegate groups, add and withdraw bundles, sign, rotate keys.
 
-The repository is a folder on the operator's machine. The collector publishes `metadata/` and `targets/`
-(`publish`). Robots first trust `root.json`. The keys are encrypted files in `keys/`, or anywhere else; the
-collector never gets them. It gets `timestamp.pem` only.
+Each group has a delegated role with a path pattern of its own, so the holder of its key can sign for no other
+group. Only the timestamp is online, because it is signed every few hours: a stolen timestamp key can freeze the
+fleet until the snapshot expires, but it cannot mix versions.
 
-Roles, by TUF's own guidance: root and targets sign seldom, so their keys are offline. Each group of a site
-has a delegated role with a path pattern of its own, so the holder of its key can sign for no other group.
-Bundles come from operators only, so the snapshot is signed offline together with them, and expires after
-weeks. Only the timestamp is online, because it is signed every few hours: a stolen timestamp key can freeze
-the fleet until the snapshot expires, but it cannot mix versions.
-
-Invariants:
-1. Metadata files are never changed: each new version is a new file. A killed command leaves the former state, and the
-   next one completes it.
-2. A snapshot lists only metadata that are on the disk.
+Metadata files are never changed: each new version is a new file, and a snapshot lists only files on the disk. So
+a killed command leaves the former state, and the next one completes it.
 """
 
 import datetime
@@ -52,7 +44,7 @@ def _utc_now() -> datetime.datetime:
 
 
 class RepositoryError(Exception):
-    """The repository cannot be changed like this; the text has the reason and what to do."""
+    """The repository cannot be changed like this."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +58,7 @@ class Lifetimes:
 
 
 class BundleRepository:
-    """A repository in a folder, with the keys that sign it. `now()` returns the present time in UTC."""
+    """A repository in a folder, with the keys that sign it; the methods raise `RepositoryError`."""
 
     def __init__(
         self,
@@ -85,7 +77,6 @@ class BundleRepository:
     # --- commands ---
 
     def init(self) -> None:
-        """Make the keys and the first metadata. Raises `RepositoryError` if there is a repository."""
         if self.metadata.exists():
             raise RepositoryError(f"{self.folder} has a repository: use it, or choose another folder")
         self.metadata.mkdir(parents=True)
@@ -100,7 +91,6 @@ class BundleRepository:
         self.snapshot()
 
     def delegate(self, site: str, group: str) -> None:
-        """Make a key and a role for a group of a site. Raises `RepositoryError` and `TermsError`."""
         role = role_of(site, group)
         top = self._open("targets", Targets)
         if role in self._delegated(top):
@@ -120,7 +110,7 @@ class BundleRepository:
     ) -> BundlePath:
         """Sign a bundle of these files as the next version of a group, and withdraw all but the newest `keep`.
 
-        Raises `RepositoryError`, `TermsError` and `BundleArchiveError`.
+        Raises also `TermsError` and `BundleArchiveError`.
         """
         role = self._require_role(site, group)
         listed = self._open(role, Targets)
@@ -139,7 +129,6 @@ class BundleRepository:
         return path
 
     def withdraw(self, path: BundlePath) -> None:
-        """Sign a group's bundles without this one; no robot takes it any more. Raises `RepositoryError`."""
         role = self._require_role(path.site, path.group)
         listed = self._open(role, Targets)
         if str(path) not in listed.targets:
@@ -150,17 +139,15 @@ class BundleRepository:
         self.snapshot()
 
     def sign(self) -> None:
-        """Sign everything again with new expiry dates, except the root."""
         for role in ("targets", *self.roles()):
             self._save(role, self._open(role, Targets))
         self.snapshot()
 
     def rotate(self, role: str) -> None:
-        """Replace the key of a role. Raises `RepositoryError`.
+        """Replace the key of a role; a new root is signed with the old root key and the new one.
 
-        A new root is signed with the old root key and the new one. If the snapshot or timestamp key is
-        replaced, robots discard the old key's metadata, so they recover from versions that a thief set too
-        high.
+        If the snapshot or timestamp key is replaced, robots discard the old key's metadata, so they recover from
+        versions that a thief set too high.
         """
         if role in _TOP:
             before = self._open("root", Root)
@@ -217,7 +204,7 @@ class BundleRepository:
         self._save("snapshot", snapshot)
 
     def _save_root(self, root: Root, before: Root) -> None:
-        """Sign a root with its own keys and those of the former one; write it also as the robots' trusted root."""
+        """Write the root also as the robots' trusted root, signed with its own keys and those of the former one."""
         keyids = {*before.roles["root"].keyids, *root.roles["root"].keyids}
         path = self._save("root", root, keyids)
         write_whole(self.folder / "root.json", path.read_bytes(), 0o644)
@@ -272,6 +259,6 @@ class BundleRepository:
         return [BundlePath.parse(name).version for name in listed.targets]
 
     def _last_version(self, site: str, group: str) -> int:
-        """Return the last version that was ever made for a group, even if it was withdrawn."""
+        """Count also versions that were withdrawn."""
         names = (path.name.split(".")[1] for path in (self.targets / site / group).glob("*.tar"))
         return max(map(int, names), default=0)

@@ -1,7 +1,6 @@
 """Serve bundles to robots: metadata and targets as immutable files, their selection, events, and their reports.
 
-A robot is identified by its certificate, and its group is pinned at the enrolment. Metadata are the same for all
-robots; targets, selections, events and reports are those of the robot's own group.
+A robot gets targets, selections and events only of its own group, which was pinned at the enrolment.
 """
 
 import asyncio
@@ -32,7 +31,7 @@ _LONGEST_REPORT = 16_384
 _MOST_LISTENERS = 2  # event streams of one robot: the old one may still be open when it connects again
 
 Identify = Callable[[Request], Robot | Awaitable[Robot]]
-"""A function that returns the robot with the client's certificate, or raises `HTTPException` for any other caller."""
+"""Returns the robot with the client's certificate, or raises `HTTPException`."""
 
 
 class EventStreams:
@@ -43,7 +42,7 @@ class EventStreams:
         self._open: Counter[str] = Counter()
 
     def open(self, robot: str, group: RobotGroup) -> AsyncIterator[bytes]:
-        """Return the stream of a robot's events. Raises `HTTPException` if it has too many."""
+        """Raises `HTTPException` if the robot has too many streams."""
         if self._open[robot] >= _MOST_LISTENERS:
             raise HTTPException(429, "this robot has too many event streams")
         return self._stream(robot, group)
@@ -78,7 +77,7 @@ class OwnGroups:
         self._logged: set[str] = set()
 
     def of(self, robot: Robot, site: str, group: str) -> RobotGroup:
-        """Return a robot's group. Raises `HTTPException` (403) if the robot claims another one."""
+        """Raises `HTTPException` (403) if the robot claims another group."""
         claimed = f"{site[:80]}/{group[:80]}"
         if robot.group == claimed:
             self._logged.discard(robot.name)

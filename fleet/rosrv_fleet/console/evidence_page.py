@@ -22,7 +22,6 @@ _COLUMNS = (
 
 
 def evidence_page(collector: Collector, asked: Mapping[str, str], *, may_get: bool) -> str:
-    """Return the page's body; `may_get` adds links to the bundles. Raises `OSError`."""
     stored = collector.evidence.all(asked["robot"])
     rows = (_bundle(one, may_get=may_get) for one in stored if asked["id"] in ("", one.id))
     return (

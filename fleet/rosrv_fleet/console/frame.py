@@ -32,7 +32,6 @@ class Column(NamedTuple):
 
 
 def page(title: str, body: str, holder: OperatorToken | None, status: int = 200) -> HTMLResponse:
-    """Return a page; `holder` is the operator (None: no operator is logged in)."""
     head = (
         '<!doctype html><html lang="en"><head><meta charset="utf-8">'
         f"<title>{escape(title)} - ROSRV fleet</title>"
@@ -70,7 +69,6 @@ def badge(tone: Tone, word: str) -> str:
 
 
 def table(caption: str, columns: Sequence[Column], rows: Iterable[str], empty: str) -> str:
-    """Return a table of rows that are already HTML; without rows, the text `empty`."""
     body = "".join(rows)
     if not body:
         return f'<section><h2>{text(caption)}</h2><p class="muted">{text(empty)}</p></section>'
@@ -87,7 +85,6 @@ _NUMBER = ' class="number"'
 
 
 def row(columns: Sequence[Column], cells: Sequence[str]) -> str:
-    """Return a row of cells that are already HTML; the first one names the row."""
     first, *others = zip(columns, cells, strict=True)
     return (
         f'<tr><th scope="row">{first[1]}</th>'
@@ -97,7 +94,7 @@ def row(columns: Sequence[Column], cells: Sequence[str]) -> str:
 
 
 def link(path: str, label: str, **parameters: str) -> str:
-    """Return a link with the parameters that are not empty."""
+    """Leave out empty parameters."""
     given = {name: value for name, value in parameters.items() if value}
     return f'<a href="{escape(path + ("?" + urlencode(given) if given else ""))}">{text(label)}</a>'
 

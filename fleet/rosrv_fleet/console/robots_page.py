@@ -67,7 +67,7 @@ class RobotRow(NamedTuple):
 
     @property
     def rank(self) -> tuple[int, str]:
-        """Return its place in the table: the worst problem first, then by name."""
+        """The worst problem is first."""
         worst = min(
             (_PROBLEMS.index(word) for word in self.words if word in _PROBLEMS), default=len(_PROBLEMS)
         )
@@ -75,7 +75,6 @@ class RobotRow(NamedTuple):
 
 
 def robot_rows(collector: Collector, health: FleetHealth) -> list[RobotRow]:
-    """Return all robots that may connect, problems first."""
     enrolled = collector.robots.known()
     bundles = {} if collector.bundles is None else _bundles(collector.bundles)
     return sorted(
@@ -97,7 +96,7 @@ def _bundles(service: BundleService) -> dict[str, tuple[RobotCondition, str]]:
 
 
 def robots_page(collector: Collector, asked: Mapping[str, str]) -> str:
-    """Return the page's body. Raises `OSError`."""
+    """Raises `OSError`."""
     health = health_of(collector)
     rows = robot_rows(collector, health)
     shown = [one for one in rows if _wanted(one, asked)]
@@ -183,7 +182,6 @@ def robot_row(one: RobotRow) -> str:
 
 
 def _heard(state: RobotState) -> str:
-    """Return when a robot was last heard; with a standby for each appliance, by its name."""
     found = {
         name: "never" if seconds is None else ago(seconds) for name, seconds in state.heard_seconds.items()
     }

@@ -78,7 +78,6 @@ def _group(state: dict[str, Any]) -> str:
 
 
 def group_page(service: BundleService, group: RobotGroup, *, may_change: bool) -> str:
-    """Return the page's body of one group; operators get the buttons of the possible acts."""
     state = group_state(service, group)
     head = f"<h1>Rollouts of {text(group)}</h1>"
     if state["rollout"] is None:
@@ -174,7 +173,6 @@ _EFFECTS: dict[Act, str] = {
 
 
 def confirm_page(group: RobotGroup, act: Act, stored: StoredRollout) -> str:
-    """Return the body of the page that asks for a confirmation of an act."""
     rollout = stored.rollout
     back = f"<p>All robots get {text(rollout.before or 'no bundle')}.</p>" if act == "revert" else ""
     return (

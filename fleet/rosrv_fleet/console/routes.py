@@ -1,7 +1,7 @@
 """The routes of the console: log in, look, and stop or revert a rollout after a confirmation.
 
-A request that changes something needs the operator's role, the cookie (which browsers send from this site only), and
-an `Origin` of this site, if there is one.
+A change needs the operator's role, the cookie (which browsers send from this site only), and an `Origin` of this
+site, if there is one.
 """
 
 from collections.abc import Callable
@@ -134,7 +134,6 @@ def console_router(collector: Collector) -> APIRouter:
 
 
 def _session_router(tokens: OperatorTokens) -> APIRouter:
-    """Return the routes without a session: log in, log out, and the style."""
     router = APIRouter()
 
     @router.get("/login")
@@ -178,7 +177,7 @@ def _forbidden(holder: OperatorToken) -> Response:
 
 
 def _require_own_origin(request: Request) -> None:
-    """Answer 403 to a form of another site. Browsers send `Origin` with every form; other clients need not."""
+    """Browsers send `Origin` with every form; other clients need not."""
     own = f"https://{request.headers.get('host', '')}"
     if request.headers.get("origin", own) != own:
         raise HTTPException(403, "this form was sent by another site")

@@ -1,6 +1,7 @@
 """Verify an evidence bundle with the appliance's verifier and a robot's pinned key. This runs in a worker.
 
-The robot's collected segments are the checkpoints that were kept elsewhere: a bundle of a rewritten log is invalid.
+The robot's collected segments are the checkpoints that were kept elsewhere: a bundle of a rewritten log is
+invalid.
 """
 
 import contextlib
@@ -41,15 +42,15 @@ class _Manifest(msgspec.Struct, frozen=True):
 
 
 class EvidenceError(Exception):
-    """The bundle is not valid evidence of the robot; the message has the reason."""
+    """The bundle is not valid evidence of the robot."""
 
 
 class _OtherKeyError(Exception):
-    """The bundle has another key than the robot's; the message is that key, in hexadecimal."""
+    """The message is the bundle's key in hexadecimal, which is not the robot's."""
 
 
 class _RobotVerifier(Verifier):
-    """The verifier with a robot's key and collected segments. It runs no other program, which would have no limits."""
+    """Runs no other program, which would have no limits."""
 
     def __init__(self, bundle: Path, robot: Robot, store: SegmentStore) -> None:
         self._robot, self._store = robot, store
@@ -78,7 +79,7 @@ class _RobotVerifier(Verifier):
 
 
 def check_evidence(config: FleetConfig, bundle: Path, robot: Robot) -> EvidenceContent:
-    """Verify a bundle of a robot within the limits. Raises `EvidenceError` and `OSError`."""
+    """Raises `EvidenceError` and `OSError`."""
     store = SegmentStore(config.data, config.limits.reserve_bytes)
     try:
         with memory(_MEMORY), processor_time(config.evidence.check_seconds):

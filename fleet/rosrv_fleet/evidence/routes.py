@@ -31,7 +31,7 @@ RobotName = Annotated[str, Query(max_length=63)]
 
 
 def evidence_router(collector: Collector) -> APIRouter:
-    """Return the routes of evidence. Viewers list bundles; their content is for operators, as on the appliance."""
+    """Viewers list bundles; their content is for operators, as on the appliance."""
     router = APIRouter(prefix="/v1/evidence")
     additions = _Additions(collector)
     viewer = [Depends(holder_of(collector.tokens, FleetRole.VIEWER))]
@@ -97,7 +97,7 @@ class _Additions:
                 await asyncio.to_thread(shutil.rmtree, upload, ignore_errors=True)
 
     async def _receive(self, request: Request, bundle: Path) -> None:
-        """Copy the body to a file within the limits. Segments have the last reserve of the disk to themselves."""
+        """Segments have the last reserve of the disk to themselves."""
         most, seconds = self._limits.bundle_bytes, self._limits.upload_seconds
         reserve = self._collector.config.limits.reserve_bytes
         try:

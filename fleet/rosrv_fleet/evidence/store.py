@@ -1,10 +1,7 @@
-"""Store verified evidence bundles as files.
+"""Store verified evidence bundles as files: `evidence/ID`, where the id is the bundle's SHA-256.
 
-    evidence/ID/bundle.zip    a bundle; its id is its SHA-256
-    evidence/ID/about.json    `StoredEvidence`
-    evidence/incoming/        uploads that are not verified, and bundles while they are removed
-
-A folder gets its id in one step, when both files are on the disk. It never changes until `remove`.
+A folder gets its id in one step, when both files are on the disk. Uploads that are not verified, and bundles
+while they are removed, are in `evidence/incoming`.
 """
 
 import re
@@ -33,9 +30,8 @@ _log = structlog.get_logger()
 class EvidenceContent(msgspec.Struct, frozen=True, kw_only=True):
     """The verified content of an evidence bundle; times are nanoseconds since the epoch.
 
-    It has `records` records of `log` from `since` (inclusive) to `until` (exclusive), and the messages of `recording`,
-    if that is not empty. `collected` of its `checkpoints` are also in the robot's collected segments. `unproven` lists
-    facts that the robot's log does not prove.
+    `collected` of its `checkpoints` are also in the robot's collected segments. `unproven` lists facts that the
+    robot's log does not prove.
     """
 
     log: str
@@ -58,7 +54,6 @@ class StoredEvidence(EvidenceContent, frozen=True, kw_only=True):
     by: str
 
     def has(self, record: Mapping[str, Any]) -> bool:
-        """Return whether it contains a record of a search."""
         is_same_log = self.robot == record["robot"] and self.log == record["log"]
         return is_same_log and rfc3339(self.since) <= str(record["time"]) < rfc3339(self.until)
 
@@ -78,11 +73,11 @@ class EvidenceStore:
             shutil.rmtree(upload)
 
     def incoming(self) -> Path:
-        """Return a new folder for the file `BUNDLE`; the caller removes the folder unless it was kept."""
+        """Return a new folder for the file `BUNDLE`; the caller removes it unless it was kept."""
         return Path(tempfile.mkdtemp(dir=self._folder / "incoming"))
 
     def keep(self, upload: Path, about: StoredEvidence) -> None:
-        """Store a verified upload and record the act; when this returns, it is on the disk. Raises `OSError`."""
+        """Record the act; when this returns, the upload is on the disk. Raises `OSError`."""
         bundle = upload / BUNDLE
         bundle.chmod(0o400)
         sync(bundle)
@@ -92,10 +87,7 @@ class EvidenceStore:
             sync(self._folder)
 
     def remove(self, evidence: str) -> StoredEvidence | None:
-        """Remove a bundle and record the act; return the bundle's description, or None for an unknown ID.
-
-        Raises the errors of `get`.
-        """
+        """Record the act; return None for an unknown ID. Raises as `get` does."""
         about = self.get(evidence) if _ID.fullmatch(evidence) else None
         if about is not None:
             removed = self.incoming()  # a killed command leaves it there
@@ -109,17 +101,14 @@ class EvidenceStore:
         return self._folder / evidence / BUNDLE
 
     def get(self, evidence: str) -> StoredEvidence | None:
-        """Return the bundle with this id, or None. Raises `OSError`."""
+        """Raises `OSError`."""
         try:
             return read_stored(self._folder / evidence / _ABOUT, StoredEvidence)
         except FileNotFoundError:
             return None
 
     def all(self, robot: str = "") -> list[StoredEvidence]:
-        """Return the bundles of a robot (default: of all robots), the latest first. Raises `OSError`.
-
-        A bundle with a damaged description is left out, and logged once.
-        """
+        """Return the latest bundle first. A damaged description is left out, and logged once. Raises `OSError`."""
         names = {path.name for path in self._folder.iterdir() if _ID.fullmatch(path.name)}
         for name in names - self._known.keys():
             try:

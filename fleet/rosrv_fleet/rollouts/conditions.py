@@ -8,7 +8,7 @@ from rosrv_fleet.rollouts.machine import BundleRollout, HealthGates, RobotSeen, 
 
 
 class ConditionKind(enum.StrEnum):
-    """The conditions that a robot can have, the most severe one first. A robot has one of them."""
+    """The conditions of a robot, the most severe first. A robot has one of them."""
 
     UNHEALTHY = "unhealthy"
     SILENT = "silent"
@@ -19,7 +19,7 @@ class ConditionKind(enum.StrEnum):
 
 
 class RobotCondition(NamedTuple):
-    """The condition of a robot, and the reason; an empty string if it needs none."""
+    """The reason is empty if the condition needs none."""
 
     kind: ConditionKind
     why: str = ""
@@ -28,10 +28,7 @@ class RobotCondition(NamedTuple):
 def conditions(
     rollout: BundleRollout | None, robots: Mapping[str, RobotSeen], now: float
 ) -> dict[str, RobotCondition]:
-    """Return the condition of each robot of a group; `rollout` is the group's last one, or None.
-
-    A report about the bundle of a reverted rollout no longer counts.
-    """
+    """`rollout` is the group's last one. A report about the bundle of a reverted rollout no longer counts."""
     sick = {} if rollout is None or rollout.state == "reverted" else unhealthy(rollout, robots, now)
     silent = (HealthGates() if rollout is None else rollout.gates).silent_seconds
     found = {}

@@ -1,17 +1,12 @@
-"""Advance a rollout from ring to ring while its robots stay healthy, and stop it when they do not. No I/O, no clock.
+"""Advance a rollout from ring to ring while its robots stay healthy, and stop it when they do not. No I/O, no
+clock.
 
-A rollout brings one signed bundle to the robots of a group. The rings are in the bundle's signed terms. The collector
-opens one ring after the other.
-
-Invariants:
 1. A robot gets the bundle only if its ring is open, and no ring opens before its signed time.
-2. The next ring opens only after enough robots of all open rings have had the bundle in force, healthy, for a time
-   without interruption.
-3. If too many robots of an open ring are unhealthy, the rollout stops. Then no further robot gets the bundle, until an
-   operator decides. A stopped rollout never starts again automatically.
-4. Every selection is the bundle of the rollout or the one before it; nothing else.
-5. Only robots that are enrolled in the group are given to this module. A robot that has left the group does not count,
-   but a ring that has lost all its robots stops the rollout.
+2. The next ring opens only after enough robots of all open rings have had the bundle in force, healthy, for a
+   time without interruption.
+3. If too many robots of an open ring are unhealthy, the rollout stops, and never starts again automatically.
+4. Every selection is the bundle of the rollout or the one before it.
+5. A robot that has left the group does not count, but a ring that has lost all its robots stops the rollout.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -39,14 +34,7 @@ class RobotSeen(msgspec.Struct, frozen=True):
 
 
 class HealthGates(msgspec.Struct, frozen=True):
-    """When a ring is healthy. Shares are of the ring's robots, times in seconds.
-
-    A ring is taken when `share` of its robots have the bundle in force. The next ring opens after
-    `healthy_seconds` in this state. The rollout stops if more than `tolerance` robots are unhealthy, or if a
-    ring is not taken after `ring_seconds`. A robot is unhealthy if it refused the bundle, was silent for
-    `silent_seconds`, has more failing monitors than before, or `denial_factor` times as many denials a minute
-    (and at least `least_denials`).
-    """
+    """When a ring is healthy (docs/fleet-bundles.md). Shares are of the ring's robots, times in seconds."""
 
     share: float = 0.95
     tolerance: float = 0.05
@@ -65,7 +53,7 @@ class Baseline(msgspec.Struct, frozen=True):
 
 
 class OperatorAct(msgspec.Struct, frozen=True):
-    """The act of an operator (the name of the token) on a rollout, at a time in seconds since the epoch."""
+    """`who` is the name of a token, the time is in seconds since the epoch."""
 
     at: float
     who: str
@@ -75,10 +63,9 @@ class OperatorAct(msgspec.Struct, frozen=True):
 class BundleRollout(msgspec.Struct, frozen=True):
     """A rollout of the bundle `path` over the bundle `before` (empty: none).
 
-    The rings up to `ring` are open; -1: none yet. `opened` is the time at which the last ring opened, or the earliest
-    one for the first. `healthy` is the time since which all open rings have been taken and healthy; None: they are not.
-    `baselines` has the robots that count for the gates: those that were not silent when their ring opened. `why`
-    explains the state. `acts` are the acts of operators.
+    The rings up to `ring` are open; -1: none yet. `opened` is the time at which the last ring opened, or the
+    earliest one for the first. `healthy` is the time since which all open rings have been taken and healthy.
+    `baselines` has the robots that were not silent when their ring opened.
     """
 
     path: str
@@ -104,7 +91,6 @@ def ring_of(rollout: BundleRollout, robot: str) -> int:
 
 
 def fault_of_rings(rollout: BundleRollout, robots: Collection[str]) -> str:
-    """Return why the rings do not fit the robots that are enrolled in the group; empty if they do."""
     place = f"{rollout.bundle.site}/{rollout.bundle.group}"
     for ring in rollout.terms.rings:
         unknown = [robot for robot in ring.robots if robot not in robots]
@@ -120,10 +106,7 @@ def fault_of_rings(rollout: BundleRollout, robots: Collection[str]) -> str:
 
 
 def selected(rollout: BundleRollout, robot: str, seen: RobotSeen | None) -> str:
-    """Return the bundle that a robot should have; empty for none.
-
-    After a stop, a robot keeps the bundle if it has it in force, and no other robot gets it.
-    """
+    """Return an empty text for none. After a stop, only robots that have the bundle in force keep it."""
     if rollout.state == "reverted":
         return rollout.before
     if rollout.state == "done":
@@ -135,7 +118,6 @@ def selected(rollout: BundleRollout, robot: str, seen: RobotSeen | None) -> str:
 
 
 def advanced(rollout: BundleRollout, robots: Mapping[str, RobotSeen], now: float) -> BundleRollout:
-    """Return the next state of the rollout, from the state of the group's robots at `now`."""
     if rollout.state != "running":
         return rollout
     if rollout.ring < 0:
@@ -152,7 +134,6 @@ def advanced(rollout: BundleRollout, robots: Mapping[str, RobotSeen], now: float
 
 
 def _healthy(rollout: BundleRollout, robots: Mapping[str, RobotSeen], now: float) -> BundleRollout:
-    """Open the next ring, or end the rollout, if all open rings have been healthy for long enough."""
     healthy = now if rollout.healthy is None else rollout.healthy
     since = msgspec.structs.replace(rollout, healthy=healthy, why="healthy")
     if now - healthy < rollout.gates.healthy_seconds:
@@ -167,14 +148,14 @@ def stopped(rollout: BundleRollout, why: str) -> BundleRollout:
 
 
 def reverted(rollout: BundleRollout, why: str) -> BundleRollout:
-    """Return the rollout as reverted: all robots get the previous bundle."""
+    """All robots get the previous bundle."""
     if rollout.state == "reverted":
         return rollout
     return msgspec.structs.replace(rollout, state="reverted", healthy=None, why=why)
 
 
 def resumed(rollout: BundleRollout, seconds: float) -> BundleRollout:
-    """Return a running rollout after `seconds` in which the collector heard no robot, which no gate counts."""
+    """No gate counts the `seconds` in which the collector heard no robot."""
     if rollout.state != "running":
         return rollout
     why = f"the collector heard no robot for {seconds:.0f} s; the time of health begins again"
@@ -183,7 +164,6 @@ def resumed(rollout: BundleRollout, seconds: float) -> BundleRollout:
 
 
 def counts(rollout: BundleRollout, robots: Mapping[str, RobotSeen], now: float) -> list[dict[str, object]]:
-    """Return each ring with the numbers of its robots: all, with the bundle in force, refusing, and unhealthy."""
     sick = unhealthy(rollout, robots, now)
     rows: list[dict[str, object]] = []
     for index, ring in enumerate(rollout.terms.rings):

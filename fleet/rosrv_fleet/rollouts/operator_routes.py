@@ -17,7 +17,7 @@ from rosrv_fleet.rollouts.machine import HealthGates
 from rosrv_fleet.rollouts.service import BundleService, RolloutRefusedError
 
 Authorize = Callable[[Request], str | Awaitable[str]]
-"""A function that returns the name of the operator, or raises `HTTPException` if the request is not authorized."""
+"""Returns the name of the operator, or raises `HTTPException`."""
 
 _DEFAULTS = HealthGates()
 _HISTORY = 20
@@ -110,7 +110,6 @@ def operator_routes(service: BundleService, may_read: Authorize, may_change: Aut
 
 
 def group_state(service: BundleService, group: RobotGroup) -> dict[str, Any]:
-    """Return a group's last rollout with its rings, and the number of its robots by condition."""
     stored = service.rollouts.get(group)
     found = Counter(condition.kind for condition in service.conditions(group).values())
     state: dict[str, Any] = {
@@ -143,7 +142,6 @@ def _group(service: BundleService, site: str, group: str) -> RobotGroup:
 
 
 async def _answered(work: Any) -> Any:
-    """Return the result of an order; answer 409 if it is rejected, 503 if the database does not answer."""
     try:
         return await work
     except RolloutRefusedError as error:

@@ -1,11 +1,7 @@
 """Serve bundles to robots and advance their rollouts: the state in memory, refreshed from the database.
 
-Robots' requests are answered from memory. `run` looks at the publication and the database once a second, advances the
-running rollouts, and wakes robots whose selection has changed. While the database is unreachable, robots get the last
-known selections, and no rollout advances.
-
-While the collector or the database is down, the collector hears no robot. This time counts neither as silence nor as
-health of robots.
+While the database is unreachable, robots get the last known selections, and no rollout advances. Time in which
+the collector or the database was down counts neither as silence nor as health of robots.
 """
 
 import asyncio
@@ -47,16 +43,16 @@ _Stamp = tuple[tuple[str, int, int], ...]
 
 
 Members = Callable[[], Mapping[str, RobotGroup]]
-"""A function that returns the group of each enrolled robot that has one. Raises `OSError`."""
+"""Returns the group of each enrolled robot that has one. Raises `OSError`."""
 
 
 class RolloutRefusedError(Exception):
-    """An order about a rollout is rejected; the message has the reason and the remedy."""
+    """An order about a rollout is rejected."""
 
 
 @dataclass(eq=False)
 class SelectionListener:
-    """A robot that listens for events: `changed` is set when its selection differs from the last one."""
+    """`changed` is set when the robot's selection differs from the last one."""
 
     robot: str
     group: RobotGroup
@@ -65,7 +61,10 @@ class SelectionListener:
 
 
 class BundleService:
-    """The collector's bundles. `folder` has the operator's publication; `key` is the file of the timestamp's key."""
+    """The collector's bundles; orders raise `RolloutRefusedError`.
+
+    `folder` has the operator's publication; `key` is the file of the timestamp's key.
+    """
 
     def __init__(
         self,
@@ -94,7 +93,6 @@ class BundleService:
         self.stopping = False
 
     async def run(self) -> None:
-        """Keep the state up to date until the task is cancelled."""
         while True:
             try:
                 await self.tick()
@@ -104,10 +102,7 @@ class BundleService:
             await asyncio.sleep(_TICK_SECONDS)
 
     async def tick(self) -> None:
-        """Read the publication and the database, sign a due timestamp, advance rollouts, wake robots.
-
-        One tick at a time: the older of two would replace what the newer has read.
-        """
+        """Allow one tick at a time: the older of two would replace what the newer has read."""
         async with self._ticking:
             await self._publish()
             members = await asyncio.to_thread(self._members)
@@ -121,13 +116,12 @@ class BundleService:
 
     @property
     def advancing(self) -> bool:
-        """Whether rollouts advance: the database and the robots were read lately."""
         return self._clock() - self._ticked < _DEAF_SECONDS
 
     # --- robots ---
 
     def selection(self, robot: str, group: RobotGroup) -> str:
-        """Return the bundle that a robot should have; empty for none, or if it is no longer signed."""
+        """Return an empty text for none, or if the bundle is no longer signed."""
         stored = self.rollouts.get(group)
         if stored is None:
             return ""
@@ -135,7 +129,7 @@ class BundleService:
         return chosen if chosen in self._signed() else ""
 
     async def report(self, robot: str, group: RobotGroup, report: RobotReport) -> None:
-        """Store the report of a robot of a group. Raises `RolloutRefusedError` for an invalid report."""
+        """Raises `RolloutRefusedError` for an invalid report."""
         seen = _checked(report, self._clock())
         await asyncio.to_thread(self.store.save_report, robot, group, seen)
         self._arrived[robot] = StoredReport(group, seen)
@@ -143,17 +137,15 @@ class BundleService:
             self.robots[group][robot] = seen
 
     def group(self, site: str, group: str) -> RobotGroup:
-        """Return a group. Raises `RolloutRefusedError` for invalid names."""
+        """Raises `RolloutRefusedError` for invalid names."""
         try:
             return RobotGroup.parse(f"{site}/{group}")
         except EnrolmentError as error:
             raise RolloutRefusedError(str(error)) from error
 
     def listen(self, robot: str, group: RobotGroup) -> SelectionListener:
-        """Return a listener for a robot; `unlisten` ends it.
-
-        It is woken at once if the robot has not reported its selection in force, because it may have missed an event;
-        and if the collector stops, because a request that began earlier must not delay the stop.
+        """Return a listener, which is woken at once if the robot may have missed an event, and if the collector
+        stops.
         """
         listener = SelectionListener(robot, group, last=self.selection(robot, group))
         seen = self.robots.get(group, {}).get(robot)
@@ -167,7 +159,6 @@ class BundleService:
         self.listeners.discard(listener)
 
     def end_streams(self) -> None:
-        """End the event streams of all robots, because the collector stops."""
         self.stopping = True
         for listener in self.listeners:
             listener.changed.set()
@@ -175,7 +166,6 @@ class BundleService:
     # --- orders ---
 
     async def start(self, path: BundlePath, gates: HealthGates, who: str) -> StoredRollout:
-        """Begin the rollout of a signed bundle. Raises `RolloutRefusedError`."""
         group = self.group(path.site, path.group)
         terms = None if self.publication is None else self.publication.bundles.get(str(path))
         if terms is None:
@@ -203,18 +193,13 @@ class BundleService:
         return self.rollouts[group]
 
     async def stop(self, group: RobotGroup, who: str, number: int | None = None) -> StoredRollout:
-        """Stop the running rollout of a group; with `number`, only this one. Raises `RolloutRefusedError`."""
-
         def stop(rollout: BundleRollout) -> BundleRollout:
             return self._by(machine.stopped(rollout, f"stopped by {who}"), rollout, who, "stop")
 
         return await self._change(group, stop, number)
 
     async def revert(self, group: RobotGroup, who: str, number: int | None = None) -> StoredRollout:
-        """Give all robots the bundle that preceded the last rollout; with `number`, only of this rollout.
-
-        Raises `RolloutRefusedError`.
-        """
+        """Give all robots the bundle that preceded the last rollout; with `number`, only of this rollout."""
 
         def back(rollout: BundleRollout) -> BundleRollout:
             if not rollout.before:
@@ -248,7 +233,7 @@ class BundleService:
         return msgspec.structs.replace(changed, acts=[*before.acts, OperatorAct(self._clock(), who, act)])
 
     def _heard(self, group: RobotGroup) -> dict[str, RobotSeen]:
-        """Return the robots of a group; time in which the collector could hear none of them is not silence."""
+        """Time in which the collector could hear none of the robots is not silence."""
         since, seconds = self._deaf
         return {
             robot: msgspec.structs.replace(seen, seen=seen.seen + seconds) if 0 < seen.seen <= since else seen
@@ -256,7 +241,6 @@ class BundleService:
         }
 
     async def _resume(self, reports: Mapping[str, StoredReport]) -> None:
-        """Resume the running rollouts if the collector could not hear robots since the last tick."""
         now = self._clock()
         heard = max([self._ticked, *(report.seen.seen for report in reports.values())])
         self._ticked = now
@@ -273,10 +257,7 @@ class BundleService:
     async def _change(
         self, group: RobotGroup, change: Callable[[BundleRollout], BundleRollout], number: int | None
     ) -> StoredRollout:
-        """Change the last rollout of a group, also if a tick changes it at the same time.
-
-        Raises `RolloutRefusedError`, also if an operator changes it at the same time.
-        """
+        """Repeat the change if a tick changes the rollout at the same time, but not if an operator does."""
         acts: list[OperatorAct] | None = None
         for _attempt in range(_MOST_ATTEMPTS):
             stored = (await asyncio.to_thread(self.store.latest)).get(group)
@@ -330,7 +311,6 @@ class BundleService:
     async def _save(
         self, group: RobotGroup, stored: StoredRollout, rollout: BundleRollout, now: float
     ) -> None:
-        """Store the next state of a rollout, unless another collector or an operator was faster."""
         if rollout == stored.rollout or not await asyncio.to_thread(
             self.store.replace, group, stored, rollout, now
         ):
@@ -358,7 +338,7 @@ def _by_group(
 
 
 def _checked(report: RobotReport, now: float) -> RobotSeen:
-    """Return a report as it is stored. Raises `RolloutRefusedError` if no robot can have written it."""
+    """Raise `RolloutRefusedError` if no robot can have written the report."""
     for path in filter(None, (report.in_force, report.trying, report.refused)):
         try:
             BundlePath.parse(path)

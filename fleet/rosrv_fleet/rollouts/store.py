@@ -19,7 +19,7 @@ _LOCK_GROUP = "SELECT pg_advisory_xact_lock(hashtextextended(%s, 0))"
 
 
 class StoredReport(NamedTuple):
-    """The last report of a robot, and the group that it was enrolled in at that time."""
+    """The last report of a robot, and its group at that time."""
 
     group: RobotGroup
     seen: RobotSeen
@@ -33,14 +33,14 @@ class StoredRollout(NamedTuple):
 
 
 class Connections(Protocol):
-    """A pool of connections to the database; `writing` runs a block in one transaction."""
+    """A pool of connections to the database."""
 
     def writing(self) -> AbstractContextManager[Connection[tuple[Any, ...]]]:
         """Run a block in one transaction. Raises `psycopg.Error`."""
 
 
 class RolloutStore:
-    """The tables of rollouts in a database. Each method raises `psycopg.Error` if it does not answer."""
+    """The tables of rollouts. Each method raises `psycopg.Error` if the database does not answer."""
 
     def __init__(self, database: Connections) -> None:
         self._database = database
@@ -58,7 +58,7 @@ class RolloutStore:
             connection.execute(query, (name, *group, document))
 
     def reports(self) -> dict[str, StoredReport]:
-        """Return the last report of every robot that ever sent one, without unreadable ones."""
+        """Leave out unreadable reports."""
         query = "SELECT name, site, robot_group, report::text FROM bundle_robot"
         found = {}
         with self._database.writing() as connection:
@@ -90,7 +90,7 @@ class RolloutStore:
     def begin(
         self, group: RobotGroup, last: StoredRollout | None, rollout: BundleRollout, now: float
     ) -> int | None:
-        """Store a new rollout and return its number; None if `last` is no longer the last one, or runs."""
+        """Return the number; None if `last` is no longer the last one, or runs."""
         newest = """
             SELECT id, document = %s::jsonb FROM rollout WHERE site = %s AND robot_group = %s
             ORDER BY id DESC LIMIT 1
@@ -110,7 +110,6 @@ class RolloutStore:
         return None if row is None else int(row[0])
 
     def replace(self, group: RobotGroup, before: StoredRollout, rollout: BundleRollout, now: float) -> bool:
-        """Store the next state of a group's last rollout; return False if another one has changed it."""
         query = """
             UPDATE rollout SET document = %s, state = %s, changed = %s WHERE id = %s AND document = %s::jsonb
             AND id = (SELECT max(id) FROM rollout WHERE site = %s AND robot_group = %s)
