@@ -1,8 +1,7 @@
-"""Message and service types: definitions by name, with their md5sums, full texts and layouts.
+"""Message and service types by name, with their md5sums, full texts and layouts.
 
-Definitions come as text: from ROS (`standard.py`), from `.msg` and `.srv` files, or from the `message_definition` of
-a publisher's connection header. A type that contains itself, or nests deeper than `MAX_DEPTH`, is rejected. Work and
-memory are bounded by the size of the text, and by the limits of `message_text` and `message_layout`.
+A type that contains itself, or nests deeper than `MAX_DEPTH`, is rejected, so that untrusted text takes
+bounded work.
 """
 
 import difflib
@@ -25,7 +24,6 @@ from roswire.message_text import (
 )
 
 MAX_DEPTH = 64
-"""The most levels of nested messages."""
 
 _FILE = re.compile(r"([A-Za-z][A-Za-z0-9_]*+)/(?:(msg|srv)/)?([A-Za-z][A-Za-z0-9_]*+)\.(msg|srv)\Z")
 _TYPE = re.compile(r"[A-Za-z][A-Za-z0-9_]*+/[A-Za-z][A-Za-z0-9_]*+\Z")
@@ -52,8 +50,7 @@ class Definitions:
 
     @classmethod
     def from_files(cls, files: Mapping[str, str]) -> Self:
-        """Return the definitions in files; `files` maps names (`pkg/T.msg`, `pkg/msg/T.msg`, `pkg/T.srv` or
-        `pkg/srv/T.srv`) to texts.
+        """Return the definitions in files, by name: `pkg/T.msg`, `pkg/msg/T.msg`, `pkg/T.srv` or `pkg/srv/T.srv`.
 
         Raises `DefinitionError` with the file and line.
         """
@@ -74,7 +71,7 @@ class Definitions:
 
     @classmethod
     def from_full_text(cls, name: str, text: str) -> Self:
-        """Return the definitions in a text that, as in connection headers, also defines all nested types.
+        """Return the definitions in a text that also has all nested types, as in connection headers.
 
         Raises `DefinitionError`.
         """
@@ -90,12 +87,12 @@ class Definitions:
         return cls(messages)
 
     def extended(self, other: "Definitions") -> "Definitions":
-        """Return the definitions of both; if both define a type, that of `other` is used."""
+        """Return the definitions of both; a type of `other` replaces one of the same name."""
         return Definitions(self._messages | other._messages, self._services | other._services)
 
     @property
     def message_types(self) -> list[str]:
-        """Return the names of all message types, with requests and responses."""
+        """Include requests and responses."""
         return sorted(self._messages)
 
     @property
@@ -103,11 +100,11 @@ class Definitions:
         return sorted(self._services)
 
     def message(self, name: str) -> MessageDefinition:
-        """Return a message type. Raises `DefinitionError` with similar names."""
+        """Raises `DefinitionError` with similar names."""
         return _lookup(name, self._messages, "message")
 
     def service(self, name: str) -> ServiceDefinition:
-        """Return a service type. Raises `DefinitionError` with similar names."""
+        """Raises `DefinitionError` with similar names."""
         return _lookup(name, self._services, "service")
 
     def md5sum(self, name: str) -> str:
@@ -132,7 +129,7 @@ class Definitions:
         return "\n".join([own.text, *(f"{_RULE}\nMSG: {part.name}\n{part.text}" for part in parts)])
 
     def layout(self, name: str) -> MessageLayout:
-        """Return the layout of a type. Raises `DefinitionError`."""
+        """Raises `DefinitionError`."""
         return self._layout(name, ())
 
     # `outer` always lists the types that contain this type, outermost first.

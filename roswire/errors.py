@@ -10,7 +10,7 @@ class EncodingError(RosError):
 
 
 class PeerError(RosError):
-    """The sender's fault: the text names the fault, its position and the remedy, and may be sent back to the sender."""
+    """The sender's fault; the text may be sent back to the sender."""
 
 
 class InvalidNameError(PeerError):
@@ -26,7 +26,7 @@ class ProtocolError(PeerError):
 
 
 class LimitExceededError(ProtocolError):
-    """A limit is exceeded; the part that was read is well-formed."""
+    """A limit is exceeded, though the part that was read is well-formed."""
 
 
 class DefinitionError(PeerError):

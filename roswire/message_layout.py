@@ -1,9 +1,7 @@
 """The layout of a message in its bytes, for reading a few fields without decoding the rest.
 
-A serialised ROS 1 message is its fields one after another, little-endian, without padding. A layout flattens the nested
-messages. Consecutive fields of fixed size form one `FixedPart`, in which each field has an offset. Strings and arrays
-of variable size separate these parts. Two fixed parts are never adjacent, so everything before the first string or
-array has the same offset in every message.
+A layout flattens nested messages. Consecutive fields of fixed size form one `FixedPart`; two such parts are
+never adjacent, so everything before the first string or array has the same offset in every message.
 """
 
 from collections.abc import Mapping
@@ -12,19 +10,17 @@ from dataclasses import dataclass, field, replace
 from roswire.message_text import PRIMITIVES
 
 MAX_ITEMS = 20_000
-"""The most leaves, strings and arrays in one layout; nested definitions can need exponentially many."""
+"""The most leaves, strings and arrays in a layout; nested definitions can need exponentially many."""
 
 MAX_SIZE = 1 << 32
-"""The most bytes of one fixed part or array of fixed length; a TCPROS message is never longer."""
+"""The most bytes of a fixed part or array of fixed length; a TCPROS message is never longer."""
 
 
 @dataclass(frozen=True, slots=True)
 class FixedField:
-    """A field of fixed size; `type` is primitive, or for arrays also a message of fixed size, with its `layout`.
+    """A field of fixed size; `offset` and `size` are in bytes, and `count` is None for a scalar.
 
-    `count` is None for a scalar.
-
-    `offset` and `size` are in bytes.
+    `type` is primitive, or for arrays also a message of fixed size, with its `layout`.
     """
 
     path: str
@@ -37,7 +33,7 @@ class FixedField:
 
 @dataclass(frozen=True, slots=True)
 class FixedPart:
-    """Consecutive fields of fixed size; `size` is the number of their bytes."""
+    """Consecutive fields of fixed size; `size` is in bytes."""
 
     size: int
     leaves: tuple[FixedField, ...]
@@ -54,8 +50,8 @@ class StringPart:
 class ArrayPart:
     """An array of variable length, or of elements of variable size.
 
-    `count` is the number of elements of a fixed array. If it is None, the number (4 bytes) precedes the elements.
-    `element_size` is in bytes, or None if the size varies. `layout` is the layout of the elements if they are messages.
+    `count` is the length of a fixed array; otherwise it is None, and the length (4 bytes) precedes the
+    elements. `element_size` is in bytes, or None if it varies.
     """
 
     path: str
@@ -78,10 +74,9 @@ class FieldLocation:
 
 @dataclass(frozen=True, slots=True)
 class MessageLayout:
-    """The layout of a message; `size` is the number of bytes of every such message, or None if it varies,
-    `minimum` that of the shortest.
+    """The layout of a message; `size` is None if it varies, and `minimum` is the size of the shortest message.
 
-    `places` finds the items by path (`pose.position.x`); the elements of an array are in the array's layout.
+    `places` finds the items by path (`pose.position.x`); elements of an array are in the array's layout.
     """
 
     parts: tuple[Part, ...]
@@ -104,7 +99,7 @@ class LayoutBuilder:
         self._items = 0
 
     def add_primitive(self, path: str, type_name: str, count: int | None) -> None:
-        """Add a primitive field; `count` makes a fixed array."""
+        """`count` makes a fixed array."""
         size = PRIMITIVES[type_name][1] * (1 if count is None else count)
         self._add_leaf(FixedField(path, type_name, self._offset, size, count))
 
@@ -121,7 +116,7 @@ class LayoutBuilder:
             self._add_part(ArrayPart(path, type_name, count, size, layout))
 
     def add_message(self, path: str, layout: MessageLayout) -> None:
-        """Add a nested message; `path` is a prefix of the paths of its items."""
+        """`path` is a prefix of the paths of the message's items."""
         for part in layout.parts:
             if isinstance(part, FixedPart):
                 for leaf in part.leaves:

@@ -1,7 +1,7 @@
 """Parse the text of `.msg` and `.srv` files into fields and constants.
 
-The rules for comments, constants and names of types are those of genmsg, because the md5sum of a type depends on
-them. A definition may come from the connection header of an unknown host: its text is data only, never executed.
+Comments, constants and names of types follow genmsg, because the md5sum depends on them. The text may come
+from an unknown host's connection header, and is never executed.
 """
 
 import itertools
@@ -27,10 +27,9 @@ PRIMITIVES = {
     "time": ("II", 8),
     "duration": ("ii", 8),
 }
-"""Types of fixed size: the `struct` code (little-endian, unpadded) and the number of bytes of one value."""
+"""Types of fixed size: the `struct` code (little-endian, unpadded) and the bytes of one value."""
 
 BUILTINS = frozenset({*PRIMITIVES, "string"})
-"""Types that have no definition of their own."""
 
 MAX_FIELDS = 10_000
 
@@ -60,10 +59,8 @@ class Constant:
 
 @dataclass(frozen=True, slots=True)
 class Field:
-    """A field; `type` is the element type (`float64`, `geometry_msgs/Point`).
-
-    `length` is the number of elements of a fixed array; None for a scalar, and for an array of variable
-    length.
+    """A field; `type` is the type of an element, and `length` is None for a scalar and for an array of
+    variable length.
     """
 
     type: str
@@ -100,10 +97,7 @@ class ServiceDefinition:
 
 
 def parse_message(name: str, text: str, source: str, first_line: int = 1) -> MessageDefinition:
-    """Return the type that a text defines; `source` and `first_line` give its position for error messages.
-
-    Raises `DefinitionError`.
-    """
+    """Raises `DefinitionError` at a position that `source` and `first_line` give."""
     fields: dict[str, Field] = {}
     constants: dict[str, Constant] = {}
     for number, line in enumerate(text.split("\n"), first_line):
@@ -126,7 +120,7 @@ def parse_message(name: str, text: str, source: str, first_line: int = 1) -> Mes
 
 
 def parse_service(name: str, text: str, source: str) -> ServiceDefinition:
-    """Return the service type that a text defines. Raises `DefinitionError`."""
+    """Raises `DefinitionError`."""
     lines = text.split("\n")
     breaks = [index for index, line in enumerate(lines) if line.startswith("---")]
     if len(breaks) != 1:
@@ -140,9 +134,7 @@ def parse_service(name: str, text: str, source: str) -> ServiceDefinition:
 def split_full_text(name: str, text: str) -> list[tuple[str, str, int]]:
     """Return (type, text, number of its first line) for `name`, then for each nested type.
 
-    In the text, each nested type follows a line `===…` and a line `MSG: package/Type`.
-
-    Raises `DefinitionError`.
+    A nested type follows the lines `===…` and `MSG: package/Type`. Raises `DefinitionError`.
     """
     lines = text.split("\n")
     starts = [index for index, line in enumerate(lines) if _SEPARATOR.match(line)]

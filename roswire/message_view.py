@@ -1,7 +1,6 @@
-"""Show a message as fields and values for a person, within limits, as far as its bytes can be read.
+"""Show a message to a person, within limits, as far as its bytes can be read: they may be cut off, or malicious.
 
-A value that cannot be read is shown as `…`: the bytes may be cut off, or malicious. Long strings, arrays and messages
-are shortened, with a note on the omitted part (`… 344 more`). The result is plain values that a log can hold.
+An unreadable value is shown as `…`; the rest of a long one as a note (`… 344 more`).
 """
 
 import hashlib
@@ -136,7 +135,6 @@ class _CutError(Exception):
 
 
 def read_bytes(data: bytes) -> str:
-    """Return hexadecimal digits, with the number of omitted bytes."""
     return data[:MOST_BYTES].hex() + _more(len(data) - MOST_BYTES)
 
 

@@ -1,16 +1,14 @@
 """ROS graph names: the spelling that `rosmaster` acts on, or an error.
 
-`rosmaster` resolves the names of topics, services, nodes and parameters against the `caller_id`, folds `//` and drops a
-trailing slash, but checks almost no characters. A decision of this side must be about the same name.
-
+A decision of this side must be about the name that `rosmaster` acts on, which checks almost no characters.
 Invariants:
 
 1. `resolve` returns the same as `resolve_name` of `rosmaster`, or raises.
 2. A returned name is canonical: it starts with `/`, has no empty segment, and resolves to itself.
 3. Two different returned names mean different things to `rosmaster` and look different: ASCII only, no control
    characters. Only slashes are normalised.
-4. `rosmaster` never resolves a `caller_id`, but rospy and roscpp fold the slashes of a node's name before they send
-   it, and other client libraries do not (rosgo sends `//name`). So this side folds them, and passes on only the result.
+4. `rosmaster` never resolves a `caller_id`. rospy and roscpp fold its slashes before they send it, but rosgo sends
+   `//name`. So this side folds them, and passes on only the result.
 """
 
 import re
@@ -18,7 +16,7 @@ import re
 from roswire.errors import InvalidNameError, quoted
 
 MAX_NAME_LENGTH = 1024
-"""The longest name; those on robots have far less than a quarter of this number of characters."""
+"""Names on robots have far less than a quarter of this length."""
 
 _NAME = re.compile(r"[A-Za-z/~][A-Za-z0-9_/]*+\Z")
 _CANONICAL = re.compile(r"(?:/[A-Za-z0-9_]++){1,512}\Z")  # a name of MAX_NAME_LENGTH has at most 512 segments
@@ -31,10 +29,7 @@ _SLASHES = re.compile("/{2,}+")
 
 
 def resolve(name: str, caller_id: str) -> str:
-    """Return the canonical form of a name.
-
-    `/a` is global, `~a` private to the caller, `a` relative to the caller's namespace. An empty `caller_id`
-    is the global namespace, as for `rosmaster`.
+    """Return the canonical form of a name; an empty `caller_id` is the global namespace, as for `rosmaster`.
 
     Raises `InvalidNameError` for a name outside the ROS grammar, for the global namespace, and for a relative
     name if the caller's own name is invalid.
@@ -53,8 +48,8 @@ def resolve_namespace(name: str, caller_id: str) -> str:
 def resolve_parameter(name: str, caller_id: str) -> str:
     """Like `resolve_namespace`, but segments may have any printable ASCII, as in YAML keys.
 
-    These are still rejected: `~` (except as the first character), `*`, `?`, quotes, backslash, and spaces at the ends
-    of a segment.
+    Rejected are `~` (except as the first character), `*`, `?`, quotes, backslash, and spaces at the ends of a
+    segment.
     """
     return _resolve(name, caller_id, _PARAMETER)
 
@@ -62,13 +57,13 @@ def resolve_parameter(name: str, caller_id: str) -> str:
 def canonical_caller_id(caller_id: str) -> str:
     """Return the canonical form of a node's name: `//a//b/` becomes `/a/b`, as with rospy and roscpp.
 
-    Raises `InvalidNameError` for any other text, such as a relative name.
+    Raises `InvalidNameError`, also for a relative name.
     """
     return _canonical_id(caller_id, _CANONICAL)
 
 
 def canonical_tool_id(caller_id: str) -> str:
-    """Return the canonical form of a caller that need not be a node, such as `/rosparam-4711`."""
+    """Like `canonical_caller_id`, for a caller that need not be a node, such as `/rosparam-4711`."""
     return _canonical_id(caller_id, _TOOL)
 
 
@@ -78,7 +73,7 @@ def is_global_name(name: str) -> bool:
 
 
 def is_relative_member(name: str) -> bool:
-    """Whether a name is relative, not `/a` or `~a`, and without empty segments."""
+    """Whether a name is relative (not `/a` or `~a`), and has no empty segment."""
     return not name.startswith("~") and all(name.split("/"))
 
 
@@ -93,7 +88,7 @@ def namespace(name: str) -> str:
 
 
 def searched(key: str, caller_id: str) -> list[str]:
-    """Return the keys that a search tries in order: in the caller's namespaces, from its own upwards."""
+    """Return the keys that a search tries, from the caller's own namespace upwards."""
     if key.startswith("/"):
         return [resolve_parameter(key, caller_id)]
     levels = [part for part in caller_id.split("/") if part]

@@ -10,7 +10,7 @@ Tree = dict[str, Value]
 
 @lru_cache(256)
 def parts_of(key: str) -> tuple[str, ...]:
-    """Return the parts of a key; cached, because setters call it often."""
+    """Cached, because setters call it often."""
     return tuple([part for part in key.split("/") if part])
 
 
@@ -20,8 +20,7 @@ def holds_others(value: Value) -> bool:
 
 
 def standing_at(tree: Tree, key: str) -> tuple[Value, str | None]:
-    """Return the value at a canonical `key` (or None), and the name of a parent that is not a namespace (or
-    None).
+    """Return the value at a canonical key (or None), and the name of a parent that is not a namespace (or None).
 
     If a key below such a parent is set, `rosmaster` replaces the parent by a namespace.
     """

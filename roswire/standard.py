@@ -1,7 +1,7 @@
-"""The definitions that ROS Noetic ships: messages from the type store of `rosbags`, and the common services.
+"""The definitions that ROS Noetic ships.
 
-The store lacks services, the messages of actions, and the message of `/tf`. This module defines the common services and
-messages among these. The definitions of mavros_msgs are in `mavros`.
+Messages come from the type store of `rosbags`. It lacks services, the messages of actions, and the message of
+`/tf`: the common ones among these are here and in `mavros`.
 """
 
 from itertools import islice
@@ -73,7 +73,7 @@ _ACTIONS = {
     ),
     "control_msgs/GripperCommand": ("GripperCommand command\n", _GRIPPER, _GRIPPER),
 }
-"""Goal, result and feedback of each action. The messages that `actionlib` sends are made from these."""
+"""Goal, result and feedback of each action, from which the messages of `actionlib` are made."""
 
 _CONSTANTS_BEFORE = {
     "actionlib_msgs/GoalStatus": {"text": 10},
@@ -86,7 +86,7 @@ _CONSTANTS_BEFORE = {
 }
 """The number of constants directly before a field, in types whose file does not begin with all constants.
 
-The type store does not keep these places. Viewers compare a definition with their own, and report another order.
+The type store loses this order, and viewers report a definition that differs from their own.
 """
 
 _NOT_ROS_1 = "builtin_interfaces"  # has `time` and `duration` as ROS 2 messages

@@ -1,16 +1,13 @@
 """TCPROS without I/O: connection headers, message frames and service replies.
 
-A connection starts with one header in each direction: a length, then fields `name=value`, each with its own length.
-Then frames follow: a length and a body. A service reply has one byte before its frame: 1 for success, or 0 for an
-error, whose text is the body. All lengths are little-endian and have 32 bits.
+One header in each direction (a length, then fields `name=value`, each with its own length), then frames: a
+length and a body. A service reply has one byte before its frame: 1, or 0 if the body is the text of an error.
+All lengths are little-endian and have 32 bits. Invariants:
 
-Invariants:
-
-1. Before any byte of data is stored, its length is checked against the limit. The length of a field is also checked
-   against the length of its header.
+1. Before any byte of data is stored, its length is checked against the limit; that of a field also against its header.
 2. A header that is accepted has each field once, and every field has a name.
-3. Header text is UTF-8. Only `message_definition` may have other bytes, because roscpp copies comments unchanged. These
-   bytes survive decoding and encoding as surrogate escapes.
+3. Header text is UTF-8. Only `message_definition` may have other bytes, because roscpp copies comments unchanged; they
+   survive decoding and encoding as surrogate escapes.
 """
 
 import struct
@@ -21,26 +18,25 @@ from typing import TypeAlias
 from roswire.errors import LimitExceededError, ProtocolError
 
 HEADER_LIMIT = 65536
-"""The most bytes of a header; the largest message definitions of MoveIt need about half of this."""
+"""The largest message definitions of MoveIt need about half of this."""
 
 MESSAGE_LIMIT = 256 << 20
 
 Body: TypeAlias = bytes | bytearray
-"""The bytes of a message. Nobody changes them: all receivers share them."""
+"""Shared by all receivers of a message, which never change it."""
 
 _LENGTH = struct.Struct("<I")
 _ANY_BYTES = frozenset({"message_definition"})
 
 
 def encode_header(fields: Mapping[str, str]) -> bytes:
-    """Return a header with its length, and the fields in the given order."""
+    """Return a header with its length."""
     lines = [f"{name}={value}".encode("utf-8", "surrogateescape") for name, value in fields.items()]
     body = b"".join([_LENGTH.pack(len(line)) + line for line in lines])
     return _LENGTH.pack(len(body)) + body
 
 
 def encode_frame(body: bytes | bytearray | memoryview) -> bytes:
-    """Return a frame: the length, then the bytes."""
     return _LENGTH.pack(len(body)) + body
 
 
@@ -49,15 +45,11 @@ def encode_service_reply(body: bytes | bytearray | memoryview) -> bytes:
 
 
 def encode_service_error(text: str) -> bytes:
-    """Return an error reply, whose `text` the calling node shows."""
     return b"\x00" + encode_frame(text.encode("utf-8", "replace"))
 
 
 def decode_header(body: bytes) -> dict[str, str]:
-    """Return the fields of a header; `body` is without its length.
-
-    Raises `ProtocolError`.
-    """
+    """Take the body of a header, without its length. Raises `ProtocolError`."""
     fields: dict[str, str] = {}
     position = 0
     while position < len(body):
@@ -90,7 +82,7 @@ class HeaderParser:
         self._done = False
 
     def feed(self, data: bytes) -> dict[str, str] | None:
-        """Take bytes; return the header once it is complete, otherwise None.
+        """Take bytes; return the header once it is complete.
 
         Raises `LimitExceededError` as soon as the announced length exceeds the limit, `ProtocolError` for a
         malformed header, and RuntimeError if the header was already returned.
@@ -125,10 +117,7 @@ class FrameParser:
         self._buffer = bytearray()
 
     def feed(self, data: bytes) -> list[bytes]:
-        """Take bytes; return the bodies that are now complete.
-
-        Raises `LimitExceededError`.
-        """
+        """Take bytes; return the bodies that are now complete. Raises `LimitExceededError`."""
         buffer = self._buffer
         buffer += data
         frames = []
@@ -163,8 +152,7 @@ class ServiceReplyParser:
     def feed(self, data: bytes) -> list[ServiceReply]:
         """Take bytes; return the replies that are now complete.
 
-        Raises `ProtocolError` if the first byte is neither 0 nor 1, and `LimitExceededError` if the length
-        exceeds the limit.
+        Raises `ProtocolError` if the first byte is neither 0 nor 1, and `LimitExceededError`.
         """
         buffer = self._buffer
         buffer += data

@@ -1,8 +1,8 @@
 """Node API URIs (`http://host:port/`) and service URIs (`rosrpc://host:port`), as nodes announce them.
 
-Invariants: the host is a host name, an IPv4 address or an IPv6 address. The port is given, and is between 1 and 65535.
-There is no user info, query or fragment. A URI that two parsers could read differently is rejected. rospy writes an
-IPv6 address without brackets (`http://::1:4000/`); there, the port follows the last colon.
+A URI that two parsers could read differently is rejected. The host is a name or an address, the port is 1 to
+65535, and there is no user info, query or fragment. rospy writes an IPv6 address without brackets
+(`http://::1:4000/`); there, the port follows the last colon.
 """
 
 import ipaddress
@@ -34,15 +34,12 @@ class NodeUri:
 
 @lru_cache(4096)  # a node sends its own URI with every call
 def parse_node_uri(text: str) -> NodeUri:
-    """Parse the URI of a node. Raises `InvalidUriError`."""
+    """Raises `InvalidUriError`."""
     return _parse(text, "http", "node API", "http://host:port/")
 
 
 def parse_service_uri(text: str) -> NodeUri:
-    """Parse the URI of a service, whose path must be empty.
-
-    Raises `InvalidUriError`.
-    """
+    """Raises `InvalidUriError`, also if there is a path."""
     uri = _parse(text, "rosrpc", "service", "rosrpc://host:port")
     if uri.path not in ("", "/"):
         raise InvalidUriError(f"service URI {quoted(text)} has a path; write rosrpc://host:port")
@@ -50,12 +47,10 @@ def parse_service_uri(text: str) -> NodeUri:
 
 
 def node_uri(host: str, port: int, path: str = "/") -> str:
-    """Return the URI of a node; an IPv6 `host` gets brackets."""
     return f"http://{_bracketed(host)}:{port}{path}"
 
 
 def service_uri(host: str, port: int) -> str:
-    """Return the URI of a service; an IPv6 `host` gets brackets."""
     return f"rosrpc://{_bracketed(host)}:{port}"
 
 

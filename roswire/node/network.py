@@ -1,7 +1,7 @@
 """TCP with one source address, and the tasks and errors of a node.
 
-Every connection of a node leaves from its source address, and its servers listen only there, so that a peer can
-identify the node by its address. Tests replace `SourceNetwork` by a network in memory.
+Every connection leaves from the source address, and servers listen only there, so that peers can identify the
+node by it.
 """
 
 import asyncio
@@ -37,10 +37,7 @@ class ByteWriter(Protocol):
     def write(self, data: Body) -> None: ...
 
     async def drain(self) -> None:
-        """Wait until the peer has room for more.
-
-        Raises `OSError` if the connection has ended.
-        """
+        """Wait until the peer has room for more. Raises `OSError` if the connection has ended."""
 
     def close(self) -> None: ...
 
@@ -52,10 +49,10 @@ class NodeMemory(Protocol):
     """A memory that a node shares with others."""
 
     def add(self, size: int) -> None:
-        """Take bytes; return them if `size` is negative."""
+        """Take bytes; a negative `size` returns them."""
 
     def refusal(self, size: int) -> str:
-        """Return why there is no room for `size` more bytes; empty if there is."""
+        """Return the reason why `size` more bytes have no room; empty if they have."""
 
 
 class ListeningServer(Protocol):
@@ -74,16 +71,13 @@ class NodeNetwork(Protocol):
     def source(self) -> str: ...
 
     async def connect(self, host: str, port: int) -> tuple[asyncio.StreamReader, ByteWriter]:
-        """Open a connection. Raises `OSError`."""
+        """Raises `OSError`."""
 
     async def receive(self, host: str, port: int, receiver: asyncio.BufferedProtocol) -> None:
-        """Connect, and give what the peer sends to `receiver`. Raises `OSError`."""
+        """Give the bytes of the peer to `receiver`. Raises `OSError`."""
 
     async def serve(self, serve: Serve) -> ListeningServer:
-        """Listen at a free port.
-
-        Raises `OSError`.
-        """
+        """Listen at a free port. Raises `OSError`."""
 
 
 class SourceNetwork:

@@ -8,7 +8,7 @@ from roswire.node.topics import NodePublication, NodeSubscription
 from roswire.xmlrpc import MethodCall, Value
 
 ParameterChanged = Callable[[str, Value], None]
-"""A function that takes the key that changed, and its new value; `{}` if it was deleted."""
+"""Takes the changed key and its new value; `{}` if it was deleted."""
 
 _DONE: list[Value] = [1, "", 0]
 

@@ -2,8 +2,8 @@
 
 Invariants:
 
-1. A topic, service or subscribed parameter is in the tables of the node from before its registration until after the
-   end of it, so that a call of the master about it always finds it.
+1. A topic, service or subscribed parameter is in the node's tables from before its registration until after the end of
+   it, so that a call of the master about it always finds it.
 2. Registrations of one name happen one after another.
 3. After `close`, the node has no task and no connection.
 """
@@ -47,9 +47,9 @@ _Kind = Literal["publisher", "subscriber", "service", "parameter"]
 class RosNode:
     """A node; `name` is canonical, `master` is a URI.
 
-    `shut_down` is called with the reason if the master ends the node, for example because another node has its name.
-    `memory` bounds the messages that wait for other nodes; by default, the node has one of its own. `skipped()` is
-    called for each message that is dropped because too many large ones come (`NodeLimits.arriving_bytes`).
+    `shut_down` is called with the reason if the master ends the node, for example because another node has
+    its name. `memory` bounds the messages that wait for other nodes. `skipped()` is called for each message
+    dropped for `NodeLimits.arriving_bytes`.
     """
 
     def __init__(
@@ -119,7 +119,7 @@ class RosNode:
     # --- the master ---
 
     async def master(self, method: str, *params: Value) -> Value:
-        """Call the master. Raises `MasterDenialError` with the master's reason, or another `RosError`."""
+        """Raises `MasterDenialError` with the master's reason, or another `RosError`."""
         return await self._call_master(self.name, method, *params)
 
     async def _call_master(self, caller_id: str, method: str, *params: Value) -> Value:
@@ -143,9 +143,7 @@ class RosNode:
     async def subscribe(
         self, topic: str, received: Received, wanted: MessageType = ANY_TYPE
     ) -> NodeSubscription:
-        """Subscribe to a topic. Raises ValueError if the node already has a subscription, and `RosError` if
-        the master denies it.
-        """
+        """Raises ValueError if the node already has a subscription, and `RosError` if the master denies it."""
         async with self._lock("subscriber", topic):
             if topic in self.subscribers:
                 raise ValueError(f"{self.name} already subscribes to {topic}")
@@ -180,11 +178,10 @@ class RosNode:
     async def advertise(
         self, topic: str, kind: MessageType, *, latched: bool, queue: int, replay: float = 0.0
     ) -> NodePublication:
-        """Publish a topic; `queue` is the number of messages that may wait for each subscriber.
+        """Publish a topic; `queue` messages may wait for each subscriber.
 
-        Subscribers that connect within `replay` seconds get the messages that were published until then.
-
-        Raises ValueError if the node already publishes it, and `RosError` if the master denies it.
+        Subscribers that connect within `replay` seconds get the messages published until then. Raises
+        ValueError if the node already publishes it, and `RosError` if the master denies it.
         """
         async with self._lock("publisher", topic):
             if topic in self.publishers:
@@ -206,10 +203,7 @@ class RosNode:
             return publisher
 
     async def advertise_again(self, topic: str) -> None:
-        """Register a publication again, to find out whether the master still grants it.
-
-        Raises `RosError`.
-        """
+        """Register a publication again, to learn whether the master still grants it. Raises `RosError`."""
         await self.master("registerPublisher", topic, self.publishers[topic].type.name, self._uri)
 
     async def unadvertise(self, topic: str) -> None:
@@ -221,8 +215,7 @@ class RosNode:
     # --- parameters ---
 
     async def subscribe_parameter(self, key: str, changed: ParameterChanged) -> None:
-        """Subscribe to a parameter; `changed` is called for each new value of the canonical key, or of a key
-        below.
+        """Call `changed` for each new value of the canonical key, or of a key below.
 
         Raises ValueError if the node already subscribes to it, and `RosError` if the master denies it.
         """
@@ -243,10 +236,10 @@ class RosNode:
                 del self.parameters[key]
 
     async def set_parameter(self, name: str, value: Value) -> None:
-        """Set a parameter. Raises `RosError`.
+        """Set a parameter under a name of its own. Raises `RosError`.
 
-        A master sends the node that sets a parameter no update. So the call has its own name, and
-        subscriptions of this node get all values in the order of the master.
+        A master sends the setter no update; with another name, this node's subscriptions get all values in
+        the master's order.
         """
         key = resolve_parameter(name, self.name)
         await self._call_master(f"{self.name}/parameters", "setParam", key, value)
@@ -256,7 +249,7 @@ class RosNode:
     async def offer(
         self, service: str, kind: ServiceType, answer: Callable[[bytes], Awaitable[bytes]]
     ) -> ServiceServer:
-        """Offer a service. Raises ValueError if the node already offers it, and `RosError` if the master denies it."""
+        """Raises ValueError if the node already offers it, and `RosError` if the master denies it."""
         async with self._lock("service", service):
             if service in self.services:
                 raise ValueError(f"{self.name} already offers {service}")
@@ -275,17 +268,11 @@ class RosNode:
                 del self.services[service]
 
     async def probe_service(self, service: str) -> dict[str, str]:
-        """Return the connection header of a service, with `type` and `md5sum`.
-
-        Raises `RosError`.
-        """
+        """Return the connection header of a service, with `type` and `md5sum`. Raises `RosError`."""
         return await probe_service(self._link, service, await self._service_uri(service))
 
     async def call_service(self, service: str, md5sum: str, request: bytes, seconds: float) -> bytes:
-        """Call a service, and return the serialised response.
-
-        Raises `ServiceFailedError` with the service's reason, or another `RosError`.
-        """
+        """Raises `ServiceFailedError` with the service's reason, or another `RosError`."""
         uri = await self._service_uri(service)
         return await call_service(self._link, service, uri, md5sum=md5sum, request=request, seconds=seconds)
 
@@ -339,6 +326,6 @@ class RosNode:
         return lock
 
     async def _forget(self, method: str, *params: Value) -> None:
-        """Unregister; a master that has ended has forgotten the registration, or will notice the end of the node."""
+        """If the master has ended, it has forgotten the registration, or will notice the end of the node."""
         with contextlib.suppress(RosError):
             await self.master(method, *params)

@@ -32,13 +32,13 @@ class ServiceType:
 
     @classmethod
     def defined(cls, definitions: Definitions, name: str) -> "ServiceType":
-        """Return the service type of a name. Raises `DefinitionError`."""
+        """Raises `DefinitionError`."""
         service = definitions.service(name)
         return cls(name, definitions.service_md5sum(name), service.request.name, service.response.name)
 
 
 async def probe_service(link: NodeLink, service: str, uri: NodeUri) -> dict[str, str]:
-    """Return the connection header of a service. Raises `RosError`."""
+    """Raises `RosError`."""
     fields = {"callerid": link.name, "service": service, "md5sum": ANY, "probe": "1"}
     header, _reply = await _connected(
         link, service, uri, fields, request=b"", seconds=link.limits.call_seconds
@@ -49,7 +49,7 @@ async def probe_service(link: NodeLink, service: str, uri: NodeUri) -> dict[str,
 async def call_service(
     link: NodeLink, service: str, uri: NodeUri, *, md5sum: str, request: bytes, seconds: float
 ) -> bytes:
-    """Return the response of a service. Raises `ServiceFailedError` with its reason, or another `RosError`."""
+    """Raises `ServiceFailedError` with the service's reason, or another `RosError`."""
     fields = {"callerid": link.name, "service": service, "md5sum": md5sum, "persistent": "0"}
     _header, reply = await _connected(
         link, service, uri, fields, request=encode_frame(request), seconds=seconds

@@ -3,10 +3,10 @@
 The kernel writes a large frame where it stays, so it is never copied. Invariants:
 
 1. A frame of more than `limit` bytes ends the connection as soon as its length is known.
-2. A large frame takes memory only if `memory` has room for all of it. Otherwise, its bytes are read and dropped, and
-   the next frame is received. Its memory is given back immediately before it is delivered: the receiver may take it.
+2. A large frame takes memory only if `memory` has room for all of it; otherwise its bytes are dropped. The memory is
+   given back immediately before delivery: the receiver may take it.
 3. A frame is delivered only while one is wanted: bytes after it wait, and the connection is not read.
-4. After a large frame, and after `_TURN` small ones, other tasks have a turn before the next is delivered.
+4. After a large frame, and after `_TURN` small ones, other tasks have a turn.
 5. Each frame is delivered once. An error of the receiver of a frame ends the connection.
 """
 
@@ -39,10 +39,7 @@ class TcprosReceiver(asyncio.BufferedProtocol):
         self._ended: asyncio.Future[None] = asyncio.get_running_loop().create_future()
 
     async def next(self, limit: int) -> Body:
-        """Return the next frame, of at most `limit` bytes.
-
-        Raises `LimitExceededError`, or `OSError` if the connection ends.
-        """
+        """Return the next frame. Raises `LimitExceededError`, or `OSError` if the connection ends."""
         frame: asyncio.Future[Body] = asyncio.get_running_loop().create_future()
 
         def take(body: Body) -> None:
@@ -54,7 +51,7 @@ class TcprosReceiver(asyncio.BufferedProtocol):
         return await (frame if frame.done() else self._end())
 
     async def deliver_to(self, deliver: Callable[[Body], None], limit: int) -> None:
-        """Deliver frames of at most `limit` bytes until the connection ends. Raises what `next` raises."""
+        """Deliver frames until the connection ends. Raises the errors of `next`."""
         self._begin(deliver, limit)
         await self._end()
 

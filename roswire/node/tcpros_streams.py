@@ -42,7 +42,7 @@ class MessageType:
 
     @classmethod
     def defined(cls, definitions: Definitions, name: str) -> "MessageType":
-        """Return the message type of a name. Raises `DefinitionError`."""
+        """Raises `DefinitionError`."""
         return cls(name, definitions.md5sum(name), definitions.full_text(name))
 
 
@@ -51,8 +51,8 @@ ANY_TYPE = MessageType(ANY, ANY, "")
 
 
 async def read_frame(reader: asyncio.StreamReader, limit: int) -> bytes:
-    """Return a frame. Raises `LimitExceededError` as soon as the announced length exceeds the limit, and
-    `OSError` if the connection ends.
+    """Raises `LimitExceededError` as soon as the announced length is too large, and `OSError` if the
+    connection ends.
     """
     try:
         return await reader.readexactly(await _read_size(reader, limit))
@@ -62,7 +62,7 @@ async def read_frame(reader: asyncio.StreamReader, limit: int) -> bytes:
 
 @contextlib.asynccontextmanager
 async def held_frame(reader: asyncio.StreamReader, limit: int, memory: NodeMemory) -> AsyncIterator[bytes]:
-    """Read a frame, and hold its memory during the block. Raises what `read_frame` raises, also if there is no room."""
+    """Hold the frame's memory during the block. Raises the errors of `read_frame`, also if there is no room."""
     try:
         size = await _read_size(reader, limit)
         held = _COPIES * size
@@ -89,7 +89,7 @@ def _ended() -> ConnectionResetError:
 
 
 async def read_header(reader: asyncio.StreamReader, seconds: float) -> dict[str, str]:
-    """Return a header. Raises `ProtocolError`, or `OSError` if the connection ends or the time limit passes."""
+    """Raises `ProtocolError`, or `OSError` if the connection ends or the time limit passes."""
     async with asyncio.timeout(seconds):
         return decode_header(await read_frame(reader, HEADER_LIMIT))
 
@@ -97,7 +97,7 @@ async def read_header(reader: asyncio.StreamReader, seconds: float) -> dict[str,
 async def exchange_headers(
     reader: asyncio.StreamReader, writer: ByteWriter, header: Mapping[str, str], seconds: float
 ) -> dict[str, str]:
-    """Returns the answer. Raises what `accepted` raises, or `OSError`."""
+    """Return the answer. Raises the errors of `accepted`, or `OSError`."""
     writer.write(encode_header(header))
     return accepted(await read_header(reader, seconds))
 

@@ -1,6 +1,6 @@
 """The topics of a node: subscribers that follow their publishers, and publishers with a queue for each subscriber.
 
-A publisher never waits: if a subscriber is slower than its topic, the oldest waiting messages are dropped and counted.
+A publisher never waits for a subscriber: the oldest waiting messages are dropped and counted.
 """
 
 import asyncio
@@ -53,7 +53,7 @@ class OwnMemory:
 class NodeLink:
     """The name, network and send queues of a node, as its topics and services use them.
 
-    Large frames that come take `arriving`. `skipped()` is called for each message that finds no room there.
+    Large received frames take `arriving`; `skipped()` is called for each message that finds no room there.
     """
 
     name: str
@@ -97,13 +97,13 @@ class NodeSubscription:
                 self._followed[uri] = self._tasks.start(self._follow(uri))
 
     async def headers(self) -> list[Mapping[str, str]]:
-        """Return the headers of publishers, once one is connected."""
+        """Wait until a publisher is connected."""
         while not self.connected:
             await self._connection.wait()
         return [*self.connected.values()]
 
     def hear_own(self, body: Body, header: Mapping[str, str]) -> None:
-        """Other types than the wanted one are ignored."""
+        """Ignore messages of other types than the wanted one."""
         if self.wanted.md5sum in (ANY, header["md5sum"]):
             self._received(body, header)
 
@@ -170,7 +170,7 @@ class NodeSubscription:
     def repeat(self, received: Received) -> None:
         """Give `received` the last message of each latched publisher, which sends it over a connection of its own.
 
-        A message that the present connection brings in the meantime, or has yet to bring, comes only from there.
+        A message that the present connection brings at the same time, or later, comes only from there.
         """
         for uri in [uri for uri, header in self.connected.items() if header.get("latching") == "1"]:
             self._tasks.start(self._repeat(uri, received))
@@ -214,13 +214,11 @@ class NodeSubscription:
 
 
 class NodePublication:
-    """A publication; `queue` messages wait for each subscriber, and `dropped` counts older ones that are
-    dropped.
+    """A publication; `queue` messages wait for each subscriber, and `dropped` counts those lost.
 
     A latched publication sends its last message to each new subscriber. Subscribers connect some time after
-    the registration; those that connect within `replay` seconds get the messages that were published until
-    then. `own` returns the node's own subscription to the topic: as with rospy and roscpp, its messages take
-    no connection.
+    the registration, so those within `replay` seconds get all messages until then. `own` returns the node's
+    own subscription: as with rospy and roscpp, its messages take no connection.
     """
 
     def __init__(
@@ -269,7 +267,7 @@ class NodePublication:
         return self._dropped + sum(one.dropped for one in self._served)
 
     def publish(self, body: bytes) -> None:
-        """Send a serialised message to all subscribers. Raises `LimitExceededError` if a latched one cannot be kept."""
+        """Raises `LimitExceededError` if a latched message cannot be kept."""
         stays = self.latched or self._replays()
         frame = encode_frame(body) if self._served or stays else b""
         if stays:
@@ -286,7 +284,6 @@ class NodePublication:
                 received(frame[4:], self._header)  # without its length
 
     def replay_from_now(self) -> None:
-        """Forget earlier messages, and keep new ones for subscribers that connect soon."""
         loop = asyncio.get_running_loop()
         self._kept.clear()
         self._replay_until = loop.time() + self._replay
@@ -300,7 +297,6 @@ class NodePublication:
     async def serve(
         self, reader: asyncio.StreamReader, writer: ByteWriter, header: Mapping[str, str]
     ) -> None:
-        """Serve a subscriber from its header on, until the connection ends."""
         if header.get("md5sum") not in (ANY, self.type.md5sum):
             refuse(
                 writer,
@@ -341,7 +337,7 @@ class SendQueues:
         self.queues: set[_SendQueue] = set()
 
     def make_room(self, own: "_SendQueue", size: int) -> str:
-        """Drop messages until `own` has room for a message of this size; return why it has none.
+        """Drop messages until `own` has room for a message of this size; return the reason if it gets none.
 
         A queue drops messages of others only while it would not be the longest itself, unless it is pinned.
         """
@@ -359,7 +355,7 @@ class SendQueues:
 
 
 class _SendQueue:
-    """The messages that wait for one subscriber, or that are kept for later ones. Those `pinned` are never dropped."""
+    """The messages that wait for one subscriber, or for later ones. Those `pinned` are never dropped."""
 
     def __init__(self, name: str, most: int, queues: SendQueues, *, pinned: bool = False) -> None:
         self.name = name
@@ -374,7 +370,7 @@ class _SendQueue:
             queues.queues.add(self)
 
     def put(self, frame: bytes) -> None:
-        """Add a frame; without room, drop older ones or this one. Raises `LimitExceededError` if it is pinned."""
+        """Without room, drop older frames or this one. Raises `LimitExceededError` if this one is pinned."""
         size = _held(frame)
         reason = self._queues.make_room(self, size)
         if reason and self.pinned:
@@ -405,7 +401,6 @@ class _SendQueue:
         self._queues.queues.discard(self)
 
     async def send_to(self, writer: ByteWriter) -> None:
-        """Send the queue until the connection ends."""
         try:
             while True:
                 await self._ready.wait()

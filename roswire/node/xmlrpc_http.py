@@ -26,9 +26,9 @@ from roswire.xmlrpc import (
 )
 
 CALL_LIMITS = XmlRpcLimits(body=1 << 20, elements=20_000, depth=8, string=1 << 16, parts=1)
-"""Limits for the answer of a node, whose largest one names its topics."""
+"""The largest answer of a node names its topics."""
 SERVED_LIMITS = XmlRpcLimits(parts=1)
-"""Limits for a call to the node itself, whose largest one has the value of a parameter."""
+"""The largest call to a node has the value of a parameter."""
 
 _HEAD_BYTES = 16 << 10
 _IDLE_SECONDS = 120.0
@@ -44,10 +44,7 @@ async def call_xmlrpc(
     seconds: float,
     limits: XmlRpcLimits = DEFAULT_LIMITS,
 ) -> Value:
-    """Call a method over a new connection, and return its value.
-
-    Raises `PeerUnreachableError`, or another `RosError` if the answer is not usable.
-    """
+    """Raises `PeerUnreachableError`, or another `RosError` if the answer is not usable."""
     where = node_uri(uri.host, uri.port, uri.path)
     host = f"[{uri.host}]" if ":" in uri.host else uri.host
     body = build_call(method, params)
@@ -75,7 +72,7 @@ async def call_xmlrpc(
 
 
 class _Message:
-    """Callbacks of httptools; collects the bodies of complete messages."""
+    """Collects the bodies of complete messages for httptools."""
 
     def __init__(self) -> None:
         self.bodies: deque[bytes] = deque()
@@ -93,7 +90,7 @@ class _Message:
 
 
 def _value(status: int, answer: bytes, limits: XmlRpcLimits) -> Value:
-    """Return the value of an answer; a status other than 200 may come with the reason as a fault."""
+    """A status other than 200 may come with the reason as a fault."""
     try:
         value = parse_response(answer, limits)
     except FaultReceived:

@@ -1,8 +1,4 @@
-"""XML-RPC as ROS 1 uses it, without I/O: parse requests and answers under limits, and build them.
-
-Received bytes are never forwarded. They are parsed into values (`xmlrpc_reader`, or `common_documents` for simple
-documents). After a decision, the values are encoded again (`xmlrpc_writer`).
-"""
+"""XML-RPC as ROS 1 uses it, without I/O. Received bytes are never forwarded: values are parsed, then encoded again."""
 
 from roswire.xmlrpc.common_documents import FaultReceived, MethodCall, parse_call, parse_response
 from roswire.xmlrpc.xmlrpc_values import DEFAULT_LIMITS, Value, XmlRpcLimits

@@ -1,9 +1,9 @@
 """Parse requests and answers; common ones fast: names, numbers, and lists of both, as ROS clients write them.
 
-One pattern matches the whole document, or each part of a multicall, whereas `xmlrpc_reader` visits each element. This
-module accepts a subset of the documents that `xmlrpc_reader` accepts, with the same values. All other documents, and
-all errors, are left to `xmlrpc_reader`. A single complex part of a multicall is also left to `xmlrpc_reader`, so that
-it does not slow the other parts. Strings are printable ASCII without characters that XML escapes.
+One pattern matches the whole document, or each part of a multicall. It accepts a subset of the documents that
+`xmlrpc_reader` accepts, with the same values; all others, and all errors, are left to `xmlrpc_reader`. A
+single complex part of a multicall also is, so that it does not slow the other parts. Strings are printable
+ASCII that XML need not escape.
 """
 
 import re
@@ -25,7 +25,7 @@ _DOUBLE = rb"-?[0-9]++(?:\.[0-9]++)?(?:e[-+]?[0-9]++)?"
 
 
 def _scalar(group: bytes = b"(?:") -> bytes:
-    """Return the pattern of a scalar; the name of the group for each kind of content begins with `group`."""
+    """Return the pattern of a scalar; the group of each kind of content has a name that begins with `group`."""
     kinds = (
         (b"string", _TEXT), (b"int", _INTEGER), (b"i4", _INTEGER), (b"boolean", b"[01]"), (b"double", _DOUBLE)
     )  # fmt: skip
@@ -44,10 +44,7 @@ def _spaced(*parts: bytes) -> re.Pattern[bytes]:
 
 
 def _list_in(group: bytes) -> bytes:
-    """Return the pattern of a list whose last item may be a list of scalars.
-
-    The name of each group begins with `group`.
-    """
+    """Return the pattern of a list whose last item may be a list of scalars."""
     each = group + _EACH + b")"
     return _ARRAY + each + b"(?:" + _ARRAY + each + _END + b")?" + _END
 
@@ -85,10 +82,7 @@ _STRUCT_END = re.compile(b"</struct>" + _SPACE + b"</value>" + _SPACE)
 
 
 def read_common_call(body: bytes, limits: XmlRpcLimits) -> tuple[str, list[Value]] | None:
-    """Return the method and the parameters; None unless all parameters are scalars.
-
-    For a multicall, the parameters are those of all parts.
-    """
+    """Return the method and the parameters (of a multicall: of all parts); None unless all are scalars."""
     if not _fits(body, limits):
         return None
     found = _CALL.match(body) if len(body) <= _LONGEST else None
@@ -132,9 +126,7 @@ def _several(
 
 
 def _struct(body: bytes, begin: int, limits: XmlRpcLimits) -> tuple[Value, int]:
-    """Return the struct as `reader` does, and its end.
-
-    Raises `PeerError` if there is no struct.
+    """Return the struct as `reader` does, and its end. Raises `PeerError` if there is no struct.
 
     A value that is valid alone in a document is also valid in any other position one level deeper.
     """

@@ -1,16 +1,12 @@
 """Parse an XML-RPC document into values, under limits.
 
-The parser follows one table, `_GRAMMAR`: the elements that each element may contain, in order. Unknown elements and
-attributes, text between elements, and invalid values are rejected. The parser also accepts some forms outside the
+The parser follows one table, `_GRAMMAR`, and rejects everything else. It also accepts some forms outside the
 specification, because ROS clients send them: values without a type (strings; XmlRpc++), `<nil/>`, `inf` and `nan`,
-space around numbers, CDATA sections (rosnodejs), and the extensions of Apache XML-RPC (rosjava).
+space around numbers, CDATA sections (rosnodejs), and the extensions of Apache XML-RPC (rosjava). Invariants:
 
-Invariants:
-
-1. The document starts with an optional XML declaration and the root element. A document type is rejected, so only the
-   five entities of XML exist, and there are no external references. Processing instructions are rejected.
-2. The parser takes one pass, in time linear in the body, and stores only values. The number, depth and size of the
-   values are bounded.
+1. A document type and processing instructions are rejected, so only the five entities of XML exist, and there are no
+   external references.
+2. The parser takes one pass, in linear time, and stores only values, whose number, depth and size are bounded.
 3. Every error is a `PeerError` with a byte offset.
 """
 
@@ -120,7 +116,7 @@ class XmlRpcDocument:
 
         When a handler raises, expat still reads the rest of its piece and keeps a stack of the elements
         there. An unfinished tag is scanned again with the next piece, and its attributes are collected. Small
-        pieces and short tags keep all three costs low.
+        pieces and short tags keep all three cheap.
         """
         parser = self._expat
         if len(body) <= _PIECE:
@@ -198,7 +194,7 @@ class XmlRpcDocument:
         return string
 
     def _scalar(self) -> str:
-        """Return the text of a scalar, which is limited because a pattern is matched to it without interruption."""
+        """Return the text of a scalar; it is limited because a pattern is matched to it without interruption."""
         text = self._string()
         if len(text) > _LONGEST_SCALAR:
             raise self._error(
@@ -264,7 +260,7 @@ class XmlRpcDocument:
         return self._state if self._state != "full" else "an element that is complete"
 
     def _pass_space(self) -> None:
-        """Skip whitespace between elements, where only it may be; ROS clients write a line feed there."""
+        """ROS clients write a line feed between elements."""
         if self._text != _LINE_FEED:
             text = "".join(self._text).strip(_SPACE)
             if text:

@@ -9,7 +9,7 @@ Value: TypeAlias = "bool | int | float | str | bytes | datetime | list[Value] | 
 
 @dataclass(frozen=True, slots=True)
 class XmlRpcLimits:
-    """The limits of a document; the defaults exceed what a large robot sends."""
+    """The defaults exceed the documents of a large robot."""
 
     body: int = 16 << 20  # bytes
     elements: int = 1_000_000  # values, including those in arrays and structs

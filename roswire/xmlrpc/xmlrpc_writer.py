@@ -1,7 +1,7 @@
-"""Build XML-RPC documents in the notation of Python's `xmlrpc.client`, which every ROS client reads.
+r"""Build XML-RPC documents in the notation of Python's `xmlrpc.client`, which every ROS client reads.
 
-A parsed value has one notation. This module, `rosmaster` and rospy read the output back as the same value. roscpp also
-does, except for `\\r`, because XmlRpc++ knows no character references. Values without a notation raise `EncodingError`.
+This module, `rosmaster` and rospy read the output back as the same value. roscpp also does, except for `\r`,
+because XmlRpc++ knows no character references.
 """
 
 import binascii
@@ -18,7 +18,7 @@ _MAX_WRITE_DEPTH = 200  # well below Python's own limit, far above the reader's 
 
 
 def build_call(method: str, params: Sequence[Value]) -> bytes:
-    """Build a call. Raises `EncodingError` for a value that XML-RPC has no notation for."""
+    """Raises `EncodingError` for a value that XML-RPC has no notation for."""
     out = ["<?xml version='1.0'?>\n<methodCall>\n<methodName>", _text(method), "</methodName>\n<params>\n"]
     for value in params:
         if type(value) is str:
@@ -32,7 +32,7 @@ def build_call(method: str, params: Sequence[Value]) -> bytes:
 
 
 def build_response(value: Value) -> bytes:
-    """Build an answer. Raises `EncodingError` for a value that XML-RPC has no notation for."""
+    """Raises `EncodingError` for a value that XML-RPC has no notation for."""
     out = ["<?xml version='1.0'?>\n<methodResponse>\n<params>\n<param>\n"]
     _write(value, out, 0)
     out.append("</param>\n</params>\n</methodResponse>\n")
@@ -40,7 +40,7 @@ def build_response(value: Value) -> bytes:
 
 
 def build_fault(code: int, text: str) -> bytes:
-    """Build a fault; characters of `text` that XML has no notation for are replaced by `?`."""
+    """Replace characters of `text` that XML has no notation for by `?`."""
     out = ["<?xml version='1.0'?>\n<methodResponse>\n<fault>\n"]
     _write({"faultCode": code, "faultString": _NOT_XML.sub("?", text)}, out, 0)
     out.append("</fault>\n</methodResponse>\n")
