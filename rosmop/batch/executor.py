@@ -1,6 +1,6 @@
 """Define the interface of executors, and the loop that submits jobs and retries those whose worker died.
 
-`work` of `rosmop.batch.jobs` depends on nothing but the job and the recording, so the result is the same everywhere.
+`work` of `rosmop.batch.jobs` depends only on the job and the recording, so the result is the same everywhere.
 """
 
 from collections import deque
@@ -30,7 +30,7 @@ class Executor(Protocol):
     def submit(self, number: int, job: bytes) -> None: ...
 
     def finished(self) -> list[tuple[int, bytes | WorkerDeath]]:
-        """Wait until at least one submitted job has ended, and return the ended jobs."""
+        """Wait until at least one submitted job has ended."""
 
     def close(self) -> None: ...
 

@@ -1,7 +1,7 @@
 """Jobs on one recording, and `work`, the pure function that executes them.
 
-A job has all that its result depends on, except the messages. Results are bounded: their size does not depend on the
-recording's length.
+A job has all that its result depends on, except the messages. The size of a result does not depend on the recording's
+length.
 """
 
 import os
@@ -96,13 +96,13 @@ def packed(job: Job) -> bytes:
 
 
 def unpacked(result: bytes) -> Result | Failure:
-    """Return the result that `work` returned as bytes. Raises `ValueError`."""
+    """Raises `ValueError`."""
     decoded: Result | Failure = msgspec.msgpack.decode(result, type=Result | Failure)
     return decoded
 
 
 def work(job: bytes) -> bytes:
-    """Return the result of a job. Every error becomes a `Failure`, so one recording never ends the work on others."""
+    """Every error becomes a `Failure`, so one recording never ends the work on others."""
     result: Result | Failure
     try:
         envelope = msgspec.msgpack.decode(job, type=_Envelope)
@@ -176,9 +176,9 @@ def definitions_by_type(texts: dict[str, str]) -> Definitions:
 
 @contextmanager
 def local_file(recording: RecordingName) -> Iterator[Path]:
-    """Open a block with the path of a recording, which is fetched if it is remote. Errors have the name of the user.
+    """Open a block with the path of a recording, which is fetched if it is remote.
 
-    Also raises `RecordingError` if a local file changed after the command listed it, or during the block.
+    Raises `RecordingError`, also if a local file changed after the command listed it, or during the block.
     """
     with ExitStack() as opened:
         if recording.uri.startswith(SCHEME):

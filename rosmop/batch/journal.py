@@ -1,8 +1,8 @@
-"""Keep the results of finished jobs in a file, so that an interrupted command can continue, or only temporarily.
+"""Keep the results of finished jobs, so that an interrupted command can continue, or only temporarily.
 
 The key of a result is the hash of its job, which contains the specifications, the options, the version, and the
-recording's name, size and time of change: if one of them differs, the job runs again. It also runs again if its
-result is damaged; each line has a checksum. A line that was cut off by a crash is removed.
+recording's name, size and time of change. Each line has a checksum: a job with a damaged result runs again, and a
+line that was cut off by a crash is removed.
 """
 
 import base64
@@ -102,7 +102,7 @@ class ResumeJournal:
 
 
 def append(descriptor: int, data: bytes) -> None:
-    """Write all data, which may take several system calls. Raises `OSError`."""
+    """One `write` may take only a part. Raises `OSError`."""
     left = memoryview(data)
     while left:
         left = left[os.write(descriptor, left) :]

@@ -1,7 +1,4 @@
-"""Read recordings from S3, or from a server with its interface (`AWS_ENDPOINT_URL`), with boto3.
-
-Boto3 finds credentials, region and endpoint: in the environment, a profile, or the role of the machine.
-"""
+"""Read recordings from S3, or from a server with its interface (`AWS_ENDPOINT_URL`), with boto3."""
 
 import shutil
 from collections.abc import Iterator

@@ -1,7 +1,6 @@
 """Execute jobs in processes of this machine. A process that dies takes only its own job with it.
 
-`concurrent.futures` gives up all jobs if one process dies, and does not report which job it had. Here each
-process has its own pipe. Jobs and results are bytes, so nothing is unpickled.
+`concurrent.futures` gives up all jobs then. Here each process has its own pipe, for bytes, so nothing is unpickled.
 """
 
 import ctypes

@@ -15,8 +15,8 @@ ENDINGS = (".bag", ".mcap")
 class RecordingName(msgspec.Struct, frozen=True):
     """A path or an S3 URI, with the size in bytes, and the time of change or the hash, which identify the contents.
 
-    Bytes of a path outside UTF-8 are escaped in `uri`. `path` is the absolute path of a local file, because workers
-    have other current folders.
+    Bytes of a path outside UTF-8 are escaped in `uri`. `path` is absolute, because workers have other current
+    folders.
     """
 
     uri: str
@@ -28,8 +28,7 @@ class RecordingName(msgspec.Struct, frozen=True):
 def recordings_of(files: Sequence[Path], sets: Sequence[str]) -> list[RecordingName]:
     """Return each recording once: the files, then those of each set in the order of their names.
 
-    A set is a folder (with its folders), a pattern or an S3 prefix. Raises `RecordingError` for a set without
-    recordings.
+    A set is a folder (with its folders), a pattern or an S3 prefix. Raises `RecordingError` for an empty set.
     """
     found: dict[str, RecordingName] = {}
     for file in files:

@@ -26,8 +26,8 @@ _LONGEST = 4096  # characters of the text of an effect
 class Specifications(msgspec.Struct, frozen=True):
     """Specifications by file name, and message and service definitions by file name (`package/Type.msg`).
 
-    `chosen` is the only monitor to run, with those that share its variables; None for all. `topics` and `given` have
-    topics and constants that are given to monitors, by monitor and name; others have the values of the texts.
+    `chosen` is the only monitor to run, with those that share its variables; None for all. `topics` and `given`
+    replace values of the texts, by monitor and name.
     """
 
     texts: dict[str, str]
@@ -42,7 +42,7 @@ class Specifications(msgspec.Struct, frozen=True):
         return recorded.extended(own)
 
     def monitors(self, recorded: Definitions, *, margins: bool = False) -> MonitorSet:
-        """Return the monitors, compiled if possible. Raises `SpecificationError`."""
+        """Raises `SpecificationError`."""
         compiled = compiled_from(self.texts, self.known(recorded), margins=margins, topics=self.topics)
         fast = fast_path_of(compiled) if find_spec("wasmtime") is not None else None
         monitors = MonitorSet.of(compiled, fast=fast)
@@ -56,8 +56,8 @@ class Specifications(msgspec.Struct, frozen=True):
 class ReplayJob(msgspec.Struct, frozen=True, tag=True):
     """Runs specifications on the topics that match a pattern, between two times in nanoseconds.
 
-    `most`: the number of places that are kept for each monitor, topic and kind. `strict`: a topic of another type than
-    the specifications expect is an error, otherwise its messages are dropped.
+    `most`: the number of places that are kept for each monitor, topic and kind. `strict`: a topic of another type
+    than the specifications expect is an error, otherwise its messages are dropped.
     """
 
     recording: RecordingName
@@ -131,7 +131,7 @@ class Found(NamedTuple):
 
 
 def replayed(job: ReplayJob, path: Path) -> Replayed:
-    """Run the monitors. Raises `RecordingError` and `SpecificationError`."""
+    """Raises `RecordingError` and `SpecificationError`."""
     with closing(open_recording(path)) as reader:
         monitors = job.specifications.monitors(definitions_of(reader), margins=job.margins)
         notes = refusals(monitors, reader, job.topics)

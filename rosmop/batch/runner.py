@@ -24,7 +24,7 @@ class JobRunner:
     def run(
         self, jobs: Sequence[Job], done: Callable[[int], None] = lambda _number: None
     ) -> Iterator[tuple[int, Result | Failure]]:
-        """Yield the number and the result of each job, in the order in which they end. Failures are not kept."""
+        """Yield results in the order in which they end. Failures are not kept."""
         waiting: list[int] = []
         for number, job in enumerate(jobs):
             known = self.journal.result(packed(job)) if self.journal is not None else None
@@ -50,7 +50,7 @@ class JobRunner:
     def in_order(
         self, jobs: Sequence[Job], done: Callable[[int], None] = lambda _number: None
     ) -> Iterator[Result | Failure]:
-        """Yield the results in the order of the jobs. Early results wait in a temporary file."""
+        """Yield results in the order of the jobs. Early results wait in a temporary file."""
         following = 0
         places: dict[int, tuple[int, int]] = {}
         with TemporaryStore() as early:
@@ -67,10 +67,7 @@ class JobRunner:
 
 @contextmanager
 def executor_for(recordings: int, workers: int | None, cluster: str | None) -> Iterator[Executor]:
-    """Open a block with an executor: a cluster, processes of this machine, or this process for one recording or worker.
-
-    Raises `ClusterError`.
-    """
+    """Raises `ClusterError`."""
     executor: Executor
     count = min(workers or len(os.sched_getaffinity(0)), recordings)
     if cluster is not None:

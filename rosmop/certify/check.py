@@ -1,12 +1,11 @@
 """Check that an automaton gives, after every trace, the verdict of its formula's definition.
 
-The check follows the formula and the automaton side by side, event by event, from the start. A pair is the remaining
-obligation of the definition and the state of the automaton. There are finitely many pairs, and the check visits each
-pair with every event. Therefore a result for all pairs holds after every trace. The names of states do not matter, nor
-how the automaton was built or minimised.
+The check follows the formula and the automaton side by side, event by event. A pair is the remaining obligation of
+the definition and the state of the automaton. There are finitely many pairs, and the check visits each with every
+event, so a result for all pairs holds after every trace.
 
-Properties that are not certified are reported with the reason: time bounds and grammars, whose monitors are not finite
-automata, and properties that exceed the work limit.
+Time bounds and grammars, whose monitors are not finite automata, and properties that exceed the work limit are not
+certified.
 """
 
 import itertools
@@ -45,11 +44,9 @@ class AutomatonTables:
 
 @dataclass(frozen=True)
 class Certificate:
-    """The result for one property. If it is neither `proved` nor `wrong`, the property was not certified, and `text`
-    gives the reason.
+    """The result for one property, which was not certified if it is neither `proved` nor `wrong`.
 
-    `proved`: every trace's verdict is that of the definition; `text` describes the check. `wrong`: some trace's
-    verdict differs; `text` gives such a trace.
+    `text` describes the check, or gives a trace whose verdict differs, or the reason.
     """
 
     proved: bool
@@ -62,7 +59,6 @@ class _WrongError(Exception):
 
 
 def certify(logic: str, formula: str, events: Sequence[str], tables: AutomatonTables | None) -> Certificate:
-    """Compare the automaton of a property, if it has one, with its formula."""
     check = _CHECKS.get(logic)
     if check is None or tables is None:
         known = "it has no automaton" if tables is None else "the certifier does not know this logic"
@@ -80,10 +76,7 @@ def certify(logic: str, formula: str, events: Sequence[str], tables: AutomatonTa
 
 
 def _look_at_form(logic: str, events: Sequence[str], tables: AutomatonTables) -> None:
-    """Reject tables that are not an automaton. A negative state would index from the end in Python.
-
-    Only `tfsm` has time limits.
-    """
+    """Reject tables that are not an automaton. A negative state would index from the end in Python."""
     limits = [limit for limit in tables.timeouts if limit is not None]
     if len(tables.verdicts) != len(tables.table) or (
         tables.timeouts and len(tables.timeouts) != len(tables.table)
@@ -251,7 +244,7 @@ def _check_endless(
 
 
 def _check_machine(formula: str, events: Sequence[str], tables: AutomatonTables) -> int:
-    """Check a state machine; its time limits, and their next states, must be as written."""
+    """The time limits of a state machine, and their next states, must be as written."""
     machine = StateMachineFollower(formula, events)
 
     def silently(before: str, state: int) -> str | None:

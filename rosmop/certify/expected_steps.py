@@ -1,6 +1,4 @@
-"""Compute the expected effect of a walk on messages: the order and effects of `run/execution.py`, over certified
-automata.
-"""
+"""Compute the expected effect of a walk on messages, as in `run/execution.py`, over certified automata."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -213,7 +211,7 @@ def _initial(property_: CompiledProperty) -> int:
 
 
 def begun_in(one: PropertyStep, state: int) -> Any:
-    """Return a property's state. If the property has a clock, the clock begins at `BEGAN`."""
+    """If the property has a clock, the clock begins at `BEGAN`."""
     return state if isinstance(one.compiled, FiniteProperty) else (state, BEGAN, BEGAN)
 
 

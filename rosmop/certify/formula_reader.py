@@ -1,7 +1,7 @@
 """Parse a formula into nested tuples, without using code of the compilers.
 
-A node is (operator, operand, …), ("event", name), ("true",) or ("false",). A formula that the certifier does not know
-raises `UnsupportedFormulaError`; the property is then not certified.
+A node is (operator, operand, …), ("event", name), ("true",) or ("false",). A property with an unknown formula is not
+certified.
 """
 
 import re
@@ -105,7 +105,7 @@ MTL = (
     {**_NOT, **{word: word for word in ("previously", "once", "historically")}},
     ({"since": "since"}, *_BOOLEAN),
 )
-"""The operators of a logic: first the unary operators, then the binary operators from tightest to loosest."""
+"""First the unary operators, then the binary operators from tightest to loosest."""
 
 Grammar = tuple[Mapping[str, str], Sequence[Mapping[str, str]]]
 
@@ -160,10 +160,7 @@ def _unbounded(words: WordReader, grammar: Grammar) -> None:
 
 
 def expression(text: str, events: Sequence[str]) -> Node:
-    """Parse an extended regular expression (union, intersection, sequence, not, star, power).
-
-    Raises `UnsupportedFormulaError`.
-    """
+    """Parse an extended regular expression. Raises `UnsupportedFormulaError`."""
     words = WordReader(text, "|&~*+^()")
     node = _union(words, events, 0)
     words.end()

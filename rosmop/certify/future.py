@@ -1,5 +1,5 @@
-"""Formulas about the future, over endless traces. A state is the remaining obligation after an event: a set of
-*clauses*, of which one must come true.
+"""Formulas about the future, over endless traces. A state is the remaining obligation: *clauses*, of which one must
+come true.
 
 A clause is a set of parts of the formula, each beginning with a temporal operator; all of them must come true. A
 clause that requires more than another clause is left out, so there are finitely many states. The remainder of a part
@@ -22,9 +22,7 @@ FALSE: State = frozenset()
 
 
 class FutureFollower:
-    """Follows a formula over numbered letters, one at each position. More than `work` clauses raise
-    `WorkLimitError`.
-    """
+    """Follows a formula over numbered letters, one at each position. Raises `WorkLimitError` above `work` clauses."""
 
     def __init__(self, letters: int, work: int) -> None:
         self._letters = range(letters)
@@ -168,7 +166,7 @@ class FutureFollower:
 
 
 def _fulfils(group: set[Clause], ways: dict[Clause, set[Way]]) -> bool:
-    """Return whether a trace can stay in these clauses forever and fulfil every `until`."""
+    """Whether a trace can stay in these clauses forever and fulfil every `until`."""
     inside = [off for clause in group for after, off in ways[clause] if after in group]
     return bool(inside) and not frozenset.intersection(*inside)
 
@@ -209,7 +207,7 @@ def _circles(ways: dict[Clause, set[Way]]) -> list[set[Clause]]:
 def positive(formula: Node, letters: int, *, wanted: bool = True) -> Node:
     """Return the formula (or its negation) using only `one of`, `and`, `or`, `next`, `until` and `release`.
 
-    `letters` is the number of letters. A `one of` names its letters by a set of bits.
+    A `one of` names its letters by a set of bits.
     """
     operator, everything = formula[0], (1 << letters) - 1
     if operator in ("one of", "true", "false"):

@@ -9,7 +9,7 @@ its first event on:
     c requires d    not c  W  ((d and not c) or q)
     c forbids d     (c => next (not d  W  q))  W  q
 
-Before and after are strict: no event answers itself. An event that closes the scope is not inside the scope.
+No event answers itself. An event that closes the scope is not inside the scope.
 """
 
 from collections.abc import Sequence
@@ -20,7 +20,7 @@ _FALSE: Node = ("false",)
 
 
 def meaning(formula: str, events: Sequence[str]) -> Node:
-    """Return the pattern as a formula. Raises `UnsupportedFormulaError`."""
+    """Raises `UnsupportedFormulaError`."""
     words = WordReader(formula, (":", "(", ")"))
     opens, closes = _scope(words, events)
     words.expect(":")

@@ -1,12 +1,9 @@
 """Replace the functions of events and handlers in a finished module with stubs that return scripted results.
 
-The walks of topics and the data, tables included, stay byte for byte the same. The script is stored after the frames:
-the notes of calls, the state to restore before each try, and the result of each function.
-
-The encoders and decoders in this file share no code with the writer of modules (`fast/wasm.py`). So an error in the
-writer's encoding of a number or section is not repeated here. The file shares only facts about the module
-(`WasmModule`) with the writer. If the writer records a wrong address, the module traps or the comparison in
-`steps.py` fails, unless the writer uses the same wrong address everywhere.
+The walks of topics and the data, tables included, stay byte for byte the same. The encoders and decoders in this file
+share no code with the writer of modules (`fast/wasm.py`), so an error in the writer's encoding is not repeated here.
+They share facts about the module (`WasmModule`). If the writer records a wrong address, the module traps or the
+comparison in `steps.py` fails, unless the writer uses the same wrong address everywhere.
 """
 
 import struct
@@ -15,9 +12,8 @@ from collections.abc import Iterable, Iterator, Mapping
 from rosmop.fast.batch_codegen import WasmModule
 
 RECORD, NOTE = struct.Struct("<qqqii"), struct.Struct("<3i")
-"""The format of a try's result: answer, first effect, state, end of the notes.
-
-The format of a call's note: function and two arguments.
+"""The format of a try's result (answer, first effect, state, end of the notes) and of a call's note (function and two
+arguments).
 """
 TELL, SCRIPT = 4096, 8192
 """Offsets after the first frame: of the end of the notes, and of the results of the functions."""
@@ -70,8 +66,8 @@ def _stub(module: WasmModule, number: int, kind: bytes) -> bytes:
 def _sweep(module: WasmModule, walk: int) -> bytes:
     """Return `try(first, behind, cell, out, end, now)`.
 
-    This function runs the walk on the frames up to `end` with each of these states in `cell`. It restores all other
-    state before each run.
+    This function runs the walk on the frames up to `end` with each of these states in `cell`, with all other state
+    restored.
     """
     state, last, cell, out, end, now, answer = range(7)
     told, template = module.frames + TELL, module.frames + TELL + 16
@@ -145,7 +141,7 @@ def sections_of(code: bytes) -> dict[int, bytes]:
 
 
 def _types(section: bytes) -> Iterator[bytes]:
-    """Yield the types of functions; each has at most 127 arguments."""
+    """Each function has at most 127 arguments."""
     count, at = _read_leb(section, 0)
     for _ in range(count):
         begin = at

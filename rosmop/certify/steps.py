@@ -1,26 +1,22 @@
 """Run the steps of a compiled module in every state, and compare them with the certified automata.
 
-For each topic, a module exports a *walk* (`fast/batch_codegen.py`): a function that calls the functions of events,
-looks up states in tables, and runs handlers. The check runs the same bytes, tables included, but with stubs in place of
-the functions of events and handlers (`scripted_module.py`). A stub notes its call and returns a scripted result, so the
-check can let every event happen in every state of every property. The effect is compared with `expected_steps.py`: the
-certified automaton, and the order and effects of `run/execution.py`.
-
-For each topic the check runs:
+For each topic, a module exports a *walk* (`fast/batch_codegen.py`), which calls the functions of events, looks up
+states in tables, and runs handlers. The check runs the same bytes, but with stubs for events and handlers
+(`scripted_module.py`) that note their calls and return scripted results, and compares the effect with
+`expected_steps.py`:
 
 - each event alone, in every state of every property; with a clock before, at and after its bound;
 - each handler with no result, a drop, `__RESET;`, both, and a message that is left to the engine;
-- each event that may drop, with a drop; two events on one message in every state, with a drop by the second if it may
-  drop, up to `MOST` steps for all specifications of the module; and several messages in one read, all with the same
-  results;
+- each event that may drop, with a drop; two events on one message in every state, with a drop by the second, up to
+  `MOST` steps for the module; and several messages in one read, all with the same results;
 - a monitor that is switched off, and a drop and a verdict that are left to the engine.
 
-Not checked: the functions themselves (`prove` compares the functions of events with their form), the list of effects
-after a changed message, the stored explanations, and the translation of the module to machine code.
+Not checked: the functions themselves (see `prove`), the list of effects after a changed message, the stored
+explanations, and the translation of the module to machine code.
 
-The check depends on the code generator for some data: the addresses of states, clocks, frames and counters
-(`WasmModule`, `Cells`). It also takes the numbers of events and properties from `form/specification_groups.py`, and the
-steps of clocked properties from `ClockedRun`. It encodes the stubs without the code generator.
+The check takes from the code generator the addresses of states, clocks, frames and counters (`WasmModule`, `Cells`),
+from `form/specification_groups.py` the numbers of events and properties, and from `ClockedRun` the steps of clocked
+properties.
 """
 
 import struct
@@ -63,7 +59,7 @@ class StepDiffersError(Exception):
 
 
 def check_steps(compiled: Compiled, module: WasmModule) -> int:
-    """Run the steps of a module, and return their number. Raises `StepDiffersError` for the first wrong step."""
+    """Return the number of steps. Raises `StepDiffersError` for the first wrong step."""
     if not module.feeds:
         return 0
     pairs = MOST
@@ -153,7 +149,7 @@ def _handling(one: PropertyStep) -> tuple[int, int] | None:
 
 
 def _answers(one: PropertyStep, bits: int) -> dict[int, int]:
-    """Return the results of handlers. Handlers that may not drop get no drop."""
+    """Handlers that may not drop get no drop."""
     bits |= HAPPENED | CHANGED
     return {
         each.function: bits if each.drops else bits & ~DROPPED
@@ -191,7 +187,7 @@ class _Bench:
             self._memory[at : at + 20] = struct.pack("<I", len(_FRAME)) + _FRAME
 
     def run(self, case: StepCase, number: int | None, *, everywhere: bool) -> int:
-        """Run a case and return the number of tried states. Raises `StepDiffersError`."""
+        """Return the number of tried states. Raises `StepDiffersError`."""
         one = None if number is None else self._topic.properties[number]
         states = 1 if one is None else one.states if everywhere else min(one.states, _FEW)
         for first in range(0, states, self._most):

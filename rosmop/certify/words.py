@@ -1,7 +1,7 @@
 """Extended regular expressions by their derivatives (the expression after an event).
 
-Each expression has a number. Unions and intersections are sets of numbers, so order and repetition do not matter, and
-there are finitely many derivatives (Brzozowski, 1964).
+Unions and intersections are sets of numbers of expressions, so order and repetition do not matter, and there are
+finitely many derivatives (Brzozowski, 1964).
 """
 
 from collections.abc import Iterable

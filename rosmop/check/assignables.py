@@ -12,7 +12,7 @@ class Variable:
     """A variable: its names in the text and in the code.
 
     `flag` is the code's name for "was assigned"; only for parameters that are bound to fields. `alias` is the value
-    that a reference refers to. `shared` variables belong to the set of specifications, other variables to one function.
+    that a reference refers to. `shared` variables belong to the set, other variables to one function.
     """
 
     name: str
@@ -22,7 +22,7 @@ class Variable:
     shared: bool = False
     constant: bool = False
     known: bool | int | float | None = None
-    """The value of a `const` number that is a literal; None for other variables."""
+    """The value of a `const` number that is a literal."""
     table: bytes | None = None
     """The elements of a `const` array of numbers that are known, as in a message."""
     flag: str | None = None
@@ -39,8 +39,8 @@ class Variable:
 class Value:
     """A compiled expression: its form, and the facts known about it.
 
-    `place` is the place of a value that can be assigned. `owned`: nothing else refers to the value, so it needs no
-    copy. `constant` is the value if it is known at compile time. `first` lists the expressions at the start of the form
+    `place` is set if the value can be assigned. `owned`: nothing else refers to the value, so it needs no copy.
+    `constant` is the value if it is known at compile time. `first` lists the expressions at the start of the form
     that are evaluated before the place is known. For an iterator, `vector` is the vector that it points into.
     """
 
@@ -109,7 +109,7 @@ class TimePartLvalue(Lvalue):
 
 
 def path(value: Value) -> tuple[object, ...]:
-    """Return the path of a value: the name of its variable, then indices and fields."""
+    """Return the name of the variable, then indices and fields."""
     place = value.place
     if isinstance(place, VariableLvalue):
         alias = place.variable.alias

@@ -20,7 +20,7 @@ from rosmop.types import value_types
 
 
 def require_place(target: Value, what: str) -> Lvalue:
-    """Return the place of a value. Rejects constants and values without a place."""
+    """Reject constants and values without a place."""
     if target.place is None:
         raise SpecificationError.at(target.position, f"{what} needs a variable, a field or an element")
     variable = root(target)
@@ -64,7 +64,6 @@ def write_store(scope: FunctionScope, target: Value, value: nodes.Expression) ->
 
 
 def marked(flag: str | None, change: nodes.Expression) -> nodes.Expression:
-    """If there is a `flag`, set it before the change."""
     if flag is None:
         return change
     assigned = nodes.Assign(value_types.BOOL, flag, nodes.Literal(value_types.BOOL, True))
@@ -100,7 +99,7 @@ def _store(scope: FunctionScope, place: Lvalue, value: nodes.Expression) -> node
 
 
 def _store_part(scope: FunctionScope, place: Lvalue, value: nodes.Expression) -> nodes.Expression:
-    """Return an expression that stores the whole, because strings and times do not change in place."""
+    """Store the whole, because strings and times do not change in place."""
     assert isinstance(place, CharacterLvalue | TimePartLvalue)  # the remaining kinds of places
     inner, base = require_place(place.base, "an assignment"), place.base.form
     if isinstance(place, TimePartLvalue):

@@ -1,7 +1,6 @@
-"""Compile `v.begin()`, `v.end()` and the functions that take them: `erase`, `insert`, `std::sort`, `std::reverse`,
-`std::accumulate`.
+"""Compile `v.begin()`, `v.end()` and the functions that take them: `erase`, `insert`, `std::sort`, and others.
 
-A cursor is an index into a vector. The vector is known at compile time, and a variable cannot hold a cursor.
+A cursor is an index into a vector that is known at compile time; a variable cannot hold a cursor.
 """
 
 from collections.abc import Sequence
@@ -18,7 +17,7 @@ ALGORITHMS = frozenset({"sort", "reverse", "accumulate"})
 
 
 def moved(operator: str, left: Value, right: Value, position: Position) -> Value | None:
-    """Compile `begin + n`, `end - n` or `end - begin`; return None for other operands."""
+    """Return None unless it is `begin + n`, `end - n` or `end - begin`."""
     if left.vector is None or operator not in ("+", "-"):
         return None
     if value_types.is_number(right.type):

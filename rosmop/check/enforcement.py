@@ -21,7 +21,7 @@ _TAKES = {
 def blocking_refused(
     compiled: CompiledProperty, specification: tree.Specification, category: str
 ) -> str | None:
-    """Return why a handler cannot drop the message that caused its verdict, or None if it can."""
+    """Return the reason why a handler cannot drop the message that caused its verdict, or None if it can."""
     refused = compiled.blocking_refused(category)
     if refused is not None:
         return refused
@@ -90,7 +90,7 @@ def _bringing(compiled: CompiledProperty, graph: VerdictGraph, category: str) ->
 
 
 def topics_of_remedy(names: SpecificationNames, compiled: CompiledProperty) -> list[str]:
-    """Return the topics of a property's remedy. Raises `SpecificationError` if the remedy is not suitable."""
+    """Raises `SpecificationError` if the remedy is not suitable."""
     name = compiled.remedy
     if name is None:
         return []
@@ -109,7 +109,7 @@ def topics_of_remedy(names: SpecificationNames, compiled: CompiledProperty) -> l
 
 
 def with_remedy(compiled: CompiledProperty, node: tree.Property) -> list[tree.Handler]:
-    """Return the handlers of a property. The handler of `enforced` calls the remedy first."""
+    """The handler of `enforced` calls the remedy first."""
     handlers = list(node.handlers)
     if compiled.remedy is None:
         return handlers

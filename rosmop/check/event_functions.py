@@ -1,7 +1,7 @@
 """Compile events: match a message against the pattern, run the action, write back the assigned fields.
 
-`e(m)` takes the message (None for a timer) and returns whether the event happened. Only fields that the action,
-the `when` or a constant of the pattern uses are decoded; only assigned fields are written.
+`e(m)` takes the message (None for a timer) and returns whether the event happened. Only fields in use are decoded;
+only assigned fields are written.
 """
 
 import math
@@ -71,8 +71,9 @@ def _key(
     trigger: tree.MessageTrigger,
     kind: str,
 ) -> str:
-    """Write the function that returns the values that an event binds: False if the message does not match, otherwise
-    True alone, or a list of True and the values.
+    """Write the function that returns the values that an event binds.
+
+    It returns False if the message does not match, otherwise True alone, or a list of True and the values.
     """
     scope = FunctionScope(shared, names, "action")
     scope.message_type = kind
@@ -171,8 +172,7 @@ def _bind(
 def _binds_nothing(
     scope: FunctionScope, binding: tree.Binding, parameters: dict[str, tree.ParameterDeclaration], kind: str
 ) -> bool:
-    """Return whether a variable of a pattern is not a parameter of the event. ROSMOP accepts this, so it is only a
-    warning.
+    """Whether a variable of a pattern is not a parameter of the event; ROSMOP accepts this, so it is only a warning.
 
     Raises `SpecificationError` if the message has no such field.
     """
@@ -253,7 +253,7 @@ def _held(constant: bool | int | float | bytes, field: Type) -> bool | int | flo
 def _body(
     scope: FunctionScope, event: tree.EventDefinition, trigger: tree.MessageTrigger
 ) -> tuple[list[nodes.Statement], list[nodes.Statement], list[nodes.Statement]]:
-    """Compile the body of an event; `when`, the action and the rest come first: they determine the needed fields."""
+    """The `when`, the action and the rest are compiled first: they determine the needed fields."""
     when = trigger.when
     with scope.nested() as conditions:
         if when is not None:
@@ -279,9 +279,7 @@ def _assemble(
     bound: list[PatternField],
     body: tuple[list[nodes.Statement], list[nodes.Statement], list[nodes.Statement]],
 ) -> tuple[int, bool]:
-    """Assemble an event's function; return the number of statements before the action, and whether facts
-    about the event are kept.
-    """
+    """Return the number of statements before the action, and whether facts about the event are kept."""
     conditions, action, after = body
     read_fields(scope, bound)  # at a site without parameters, because they have no values yet
     site = scope.lines.site = scope.site(event)

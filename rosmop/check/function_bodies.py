@@ -91,7 +91,7 @@ def compile_start(
 ) -> tuple[str, ...]:
     """Write the functions that start a specification: constants and zeros, first values, `init`.
 
-    Each stage runs for all specifications before the next stage, because a specification may read another's variables.
+    Each stage runs for all specifications before the next one, because a specification may read another's variables.
     """
     scopes = [
         _constants(shared, names, specification),

@@ -1,7 +1,7 @@
 """Compile the givens of a specification: constants that operators set while it runs, and topics that a load replaces.
 
-A constant is a variable of the set that no function assigns, so code and proofs hold for all of its values. It is not
-part of the state. First values and `init` cannot read it, because they would keep the value of the start.
+A constant is a variable of the set that no function assigns, so code and proofs hold for all of its values. First
+values and `init` cannot read it, because they would keep the value of the start.
 """
 
 from collections.abc import Iterator, Mapping
@@ -21,7 +21,7 @@ from rosmop.types.messages import shown
 from rosmop.types.resolve import resolve
 
 Topics = Mapping[str, Mapping[str, str]]
-"""The topics that a load gives, by specification and by their names in its text."""
+"""By specification and by their names in its text."""
 
 
 def declare_givens(
@@ -99,7 +99,7 @@ def _renamed(node: Any, topics: Mapping[str, str]) -> Any:
 def given_topics(
     shared: CompilationContext, specification: tree.Specification, given: Mapping[str, str]
 ) -> tuple[GivenTopic, ...]:
-    """Return the topics that a load may replace, and report invalid ones."""
+    """Report invalid topics."""
     found: dict[str, GivenTopic] = {}
     for node in specification.givens:
         if isinstance(node, tree.TopicDeclaration):
@@ -116,7 +116,7 @@ def given_topics(
 
 
 def with_given(identity: bytes, topics: tuple[GivenTopic, ...]) -> bytes:
-    """Return the identity of a specification whose topics replace defaults, so that its state belongs to both."""
+    """The state of a specification belongs to its text and to the topics that replace defaults."""
     changed = [(one.name, one.topic) for one in topics if one.topic != one.default]
     return sha256(identity + repr(changed).encode()).digest() if changed else identity
 

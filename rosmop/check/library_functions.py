@@ -170,9 +170,7 @@ def is_quaternion(kind: Type) -> bool:
 
 
 def invoke(scope: FunctionScope, name: str, values: Sequence[Value]) -> nodes.Expression:
-    """Return the call of a function of the library. Arguments for parameters that are not `auto` must already have
-    the right types.
-    """
+    """Arguments for parameters that are not `auto` must already have the right types."""
     function = _instance(scope, functions()[name], [value.type for value in values])
     given = [
         number(value.form, parameter.type) if value_types.is_number(parameter.type) else value.form

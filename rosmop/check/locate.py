@@ -1,7 +1,7 @@
 """Find fields in the bytes of a message.
 
-Offsets that are the same in every message are computed here. Only positions after a string or an array of
-variable length are computed for each message, once for all fields that need them.
+Offsets that are the same in every message are computed here; positions after a string or an array of variable length
+once for each message.
 """
 
 from rosmop.form import nodes
@@ -18,7 +18,7 @@ _PARTS_OF_TIME = {"sec": 0, "nsec": 4}
 
 
 def type_of_path(messages: MessageTypes, record: str, path: tuple[tree.PathStep, ...]) -> Type:
-    """Return the type of a path. The error for an invalid path suggests the nearest name."""
+    """The error for an invalid path suggests the nearest name."""
     kind: Type = value_types.RecordType(record)
     for step in path:
         kind = _step(messages, kind, step)
@@ -144,7 +144,7 @@ class FieldLocator:
         return Spot(end, 0)
 
     def element(self, item: FixedField | ArrayPart, start: Spot, step: tree.PathStep) -> Spot:
-        """Return the position of an element; if it does not exist, the event does not happen."""
+        """If the element does not exist, the event does not happen."""
         index = step.index or 0
         if isinstance(item, FixedField):
             return start.plus(index * (item.size // (item.count or 1)))

@@ -19,7 +19,7 @@ Write = Callable[[FunctionScope, tree.Statement], None]
 """Writes a statement. Loops take it as a parameter because statements and loops contain each other."""
 
 MAX_NESTED = 15
-"""The most nested loops, because Python allows 20."""
+"""Python allows 20."""
 
 
 def charge(scope: FunctionScope, node: tree.SyntaxNode) -> None:
@@ -139,7 +139,7 @@ def _by_reference(
 
 
 def write_switch(scope: FunctionScope, node: tree.SwitchStatement, write: Write) -> None:
-    """Compile a `switch`: the index of the first case, then every block from there on until a `break`."""
+    """Write the index of the first case, then every block from there on until a `break`."""
     value = scope.value_of(node.value)
     kind = value_types.promoted(value.type)
     if not isinstance(kind, value_types.IntegerType):

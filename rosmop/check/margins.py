@@ -1,8 +1,7 @@
 """Note how close comparisons of numbers came: both sides when they were nearest, while true and while false.
 
-The comparison is replaced by an expression that also notes both sides. This expression has the same value, compares
-the sides in the same type as C++, and charges nothing. Comparisons in `when`, first values and `init` are not noted,
-nor are loop conditions, because a counter's distance from its end means nothing.
+The noting expression has the same value, compares the sides in the same type as C++, and charges nothing. Comparisons
+in `when`, first values and `init` are not noted, nor are loop conditions, whose distance from the end means nothing.
 """
 
 from dataclasses import replace
@@ -18,7 +17,6 @@ from rosmop.text import tree
 from rosmop.types import value_types
 
 MOST_NOTED = 32
-"""The most comparisons of a specification that are noted."""
 
 _COMPARED = frozenset({"<", "<=", ">", ">="})
 _TRUE, _FALSE = (nodes.Literal(value_types.BOOL, truth) for truth in (True, False))

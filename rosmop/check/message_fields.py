@@ -1,7 +1,7 @@
 """Generate code that reads bound fields from the bytes of a message, and code that writes assigned fields.
 
-Numbers at known distances from each other are read together. A changed number is written in place. A new buffer is made
-only for a changed string, array or message of a different size.
+Numbers at known distances are read together. A changed number is written in place; a new buffer is made only for a
+changed string, array or message of a different size.
 """
 
 from dataclasses import dataclass
@@ -49,7 +49,7 @@ def writes(scope: FunctionScope, written: list[PatternField]) -> tuple[nodes.Wri
 
 
 def _slots(scope: FunctionScope, field: PatternField) -> list[int | str]:
-    """Return the slots of a field; the parts of a time keep their names (`sec`, `nsec`), other steps are indices."""
+    """The parts of a time keep their names (`sec`, `nsec`), other steps are indices."""
     kind: Type = value_types.RecordType(scope.message_type or "")
     path: list[int | str] = []
     for step in field.binding.path:
@@ -147,7 +147,7 @@ def check_overlaps(bound: list[PatternField], written: list[PatternField]) -> No
 
 
 def _overlap(one: tree.Binding, other: tree.Binding) -> bool:
-    """Whether two bindings overlap; an array without an index means all its elements."""
+    """An array without an index means all its elements."""
     return all(
         step.name == beside.name and (step.index == beside.index or None in (step.index, beside.index))
         for step, beside in zip(one.path, other.path, strict=False)

@@ -1,8 +1,8 @@
 """Keep the order of evaluation of C++17 by storing values in variables first.
 
-The form is evaluated from left to right. In an assignment the right side comes first, then the indices on the left. In
-a member call the object comes first, then the arguments. References and members are read after all arguments are
-evaluated. Where C++ leaves the order open, any order is correct.
+The form is evaluated from left to right. In an assignment the right side comes first, then the indices on the left;
+in a member call the object, then the arguments. References and members are read after all arguments. Where C++ leaves
+the order open, any order is correct.
 """
 
 from collections.abc import Sequence
@@ -33,7 +33,6 @@ def after(first: Sequence[nodes.Expression], value: Value) -> Value:
 
 
 def kept(scope: FunctionScope, value: nodes.Expression) -> tuple[First, nodes.Expression]:
-    """Store a value in a new variable, and return the value read from it."""
     if isinstance(value, nodes.Literal):
         return [], value
     name = scope.temporary()

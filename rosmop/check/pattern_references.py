@@ -1,9 +1,9 @@
 """Rewrite patterns that refer to an earlier message: `globally: a as A forbids b {x < @A.x}`.
 
-The condition compares a value of the later message with a value of an earlier one. Only the extreme earlier value
-matters: `x < @A.x` holds for some earlier `A` exactly if `x` is less than the greatest `A.x`. A variable keeps this
-value. With `within`, a list keeps the values that can still become the extreme one. A new event happens with each later
-message that violates the pattern, and the property becomes `globally: no …` of this event.
+Only the extreme earlier value matters: `x < @A.x` holds for some earlier `A` exactly if `x` is less than the greatest
+`A.x`, which a variable keeps. With `within`, a list keeps the values that can still become the extreme one. A new
+event happens with each later message that violates the pattern, and the property becomes `globally: no …` of this
+event.
 """
 
 import re
@@ -29,7 +29,7 @@ _SHAPE = "`globally: a as A forbids b {x < @A.x}`, or `b as B requires a {x < @B
 
 
 def with_references(specification: tree.Specification) -> tree.Specification:
-    """Return a specification with rewritten patterns. Raises `SpecificationError`."""
+    """Raises `SpecificationError`."""
     for number, node in enumerate(specification.properties, 1):
         if _refers(node):
             specification = _Rewriting(specification, node, number).done()

@@ -1,7 +1,4 @@
-"""Compile output: `ROS_INFO("…%f…", x)`, `printf`, `std::cout << x`.
-
-A format is read when the specification is compiled, and its conversions are checked against the arguments.
-"""
+"""Compile output: `ROS_INFO("…%f…", x)`, `printf`, `std::cout << x`. Formats are checked against their arguments."""
 
 import re
 from collections.abc import Sequence
@@ -22,7 +19,7 @@ _TEXTS = (value_types.StringType, value_types.CharactersType)
 
 
 def formatted(scope: FunctionScope, template: Value, arguments: Sequence[Value]) -> nodes.Expression:
-    """Compile a format and its arguments. Rejects conversions that do not fit their arguments."""
+    """Rejects conversions that do not fit their arguments."""
     if not isinstance(template.constant, bytes):
         if arguments or not isinstance(template.type, _TEXTS):
             raise SpecificationError.at(
@@ -125,9 +122,7 @@ def _conversion(
 
 
 def _integer(letter: bytes, size: bytes | None, value: Value) -> nodes.Expression:
-    """Compile an integer conversion; without a size the number has the width of the value. A floating-point
-    value is truncated.
-    """
+    """Without a size the number has the width of the value. A floating-point value is truncated."""
     kind = value_types.promoted(value.type)
     bits = kind.bits if isinstance(kind, value_types.IntegerType) else 64
     bits = {b"hh": 8, b"h": 16, None: bits}.get(size, 64)

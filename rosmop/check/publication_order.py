@@ -1,6 +1,6 @@
-"""Warn of monitors that act on a topic, but do not see what another monitor publishes there.
+"""Warn of monitors that act on a topic, but do not see messages that another monitor publishes there.
 
-A published message goes through the monitors that come later than its publisher in the order of all specifications.
+A published message only goes through the monitors after its publisher in the order of all specifications.
 """
 
 from collections.abc import Iterator, Mapping, Sequence

@@ -1,6 +1,4 @@
-"""Find the message types that a specification uses, including nested types.
-
-The state of a specification survives a change of definitions only if these types are unchanged.
+"""Find the message types that a specification uses: only if they are unchanged, its state survives new definitions.
 
 The result may include an unused type, if a string equals the name of a type.
 """

@@ -26,7 +26,7 @@ ValueOf = Callable[["FunctionScope", tree.Expression], Value]
 class HelperFunction:
     """A helper function; `references` are the parameters whose new values it returns.
 
-    `names` are the names of other variables that are read or assigned by this function, or by a function that it calls.
+    `names` are the other variables that it, or a function that it calls, reads or assigns.
     """
 
     name: str
@@ -62,7 +62,7 @@ class SpecificationNames:
     parameters: dict[str, Variable] = field(default_factory=dict)
     """The parameters of slices, which are also variables."""
     misdeclared: set[str] = field(default_factory=set)
-    """Names of variables and functions with rejected declarations; using them is not reported again."""
+    """Names with rejected declarations; using them is not reported again."""
     events: list[str] = field(default_factory=list)
     uses: set[str] = field(default_factory=set)
     comparisons: dict[tree.BinaryExpression, Comparison] = field(default_factory=dict)
@@ -85,9 +85,7 @@ class SpecificationNames:
 
 @dataclass(eq=False)
 class LoopScope:
-    """A loop or switch around the current statement. `step` runs before a `continue`, and sees the names of `blocks`,
-    not those at the `continue`.
-    """
+    """A loop or switch around the current statement. Before a `continue`, `step` sees the names of `blocks`."""
 
     step: Callable[[], None] | None
     blocks: list[dict[str, Variable]] = field(default_factory=list)
@@ -115,7 +113,7 @@ class CompilationContext:
         self.functions: dict[str, nodes.Function] = {}
         self.specifications: list[SpecificationNames] = []
         self.types: dict[str, Type] = {}
-        """The types of the variables, by their names in the form."""
+        """By their names in the form."""
         self.owners: dict[str, list[SpecificationNames]] = {}
         self.unsliced: set[str] = set()
         """The variables that slices share, by their names in the form."""
@@ -223,7 +221,7 @@ class FunctionScope:
         return variable
 
     def find(self, name: str, position: Position) -> Variable | None:
-        """Return a variable, and note its use; it may belong to another specification."""
+        """Note the use of the variable, which may belong to another specification."""
         variable, owner = self._known(name, position)
         if owner is not None:
             self.names.uses.add(owner)

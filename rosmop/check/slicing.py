@@ -1,7 +1,7 @@
 """Compile parametric specifications: their parameters as variables, and the parameters that each event binds.
 
-An event binds a parameter of the specification if the event has a parameter of the same name and type. A second
-function of the event returns the bound values, and reads nothing else of the message.
+An event binds a parameter of the same name and type. A second function of the event returns the bound values, and
+reads nothing else of the message.
 """
 
 from collections.abc import Iterable, Sequence

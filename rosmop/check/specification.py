@@ -1,7 +1,4 @@
-"""Compile a set of files with specifications.
-
-Specifications of one set see each other's variables. One pass finds all errors.
-"""
+"""Compile a set of files with specifications, which see each other's variables. One pass finds all errors."""
 
 import dataclasses
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -69,7 +66,7 @@ def compile_files(
     margins: bool = False,
     topics: Topics = MappingProxyType({}),
 ) -> Compiled:
-    """Compile the files. Raises `SpecificationError` with all errors.
+    """Raises `SpecificationError` with all errors.
 
     With `margins`, comparisons of numbers are noted (`margins.py`). `topics` replace the topics in the files.
     """
@@ -100,9 +97,8 @@ def compile_files(
 
 
 def findings_of(files: Sequence[tree.SpecificationFile], definitions: Definitions) -> list[Diagnostic]:
-    """Return the errors of these files while other files of the set cannot be parsed.
-
-    Unknown names are not reported, because the other files may declare them.
+    """Return the errors of these files while other files of the set, which may declare unknown names, cannot be
+    parsed.
     """
     shared = CompilationContext(MessageTypes(definitions), value_of)
     shared.partial = True
@@ -144,7 +140,7 @@ def _compile_all(
 
 
 def _rewritten(shared: CompilationContext, specification: tree.Specification) -> tree.Specification:
-    """Return a specification with rewritten patterns; one with an invalid reference loses all such patterns."""
+    """A specification with an invalid reference loses all such patterns."""
     rewritten = _noted(shared, partial(with_references, specification))
     return without_references(specification) if rewritten is None else rewritten
 

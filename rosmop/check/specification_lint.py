@@ -109,9 +109,7 @@ def _for_good(compiled: CompiledProperty) -> set[str]:
 
 
 def unused_events(specification: tree.Specification, properties: Sequence[_HasProperty]) -> list[Diagnostic]:
-    """Return warnings of unused events; `default` counts as a use of every event. Without properties nothing
-    is reported.
-    """
+    """`default` counts as a use of every event. Without properties nothing is reported."""
     if not properties:
         return []
     named = {word for code in properties for word in _WORD.findall(code.property.formula)}
@@ -158,7 +156,7 @@ def _assigned(condition: tree.Expression) -> Iterator[Diagnostic]:
 
 
 def _acts(expression: tree.Expression) -> bool:
-    """Whether an expression may have an effect; each call may."""
+    """Each call may have an effect."""
     acting = (tree.Assignment, tree.IncrementExpression, tree.CallExpression, tree.NewExpression)
     return stream_of(expression) is not None or any(
         isinstance(node, acting) for node in tree.walk(expression)

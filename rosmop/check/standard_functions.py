@@ -55,7 +55,7 @@ Function = Callable[[Arguments], Value]
 
 
 def find_function(parts: tuple[str, ...], *, is_library: bool = False) -> Function | None:
-    """Return a function by its name, which may begin with `std::`. `is_library`: the call is in a library function."""
+    """Take a name that may begin with `std::`. `is_library`: the call is in a library function."""
     if parts[0] == "std" and len(parts) == 2:
         parts = parts[1:]
     if len(parts) != 1:
@@ -113,7 +113,7 @@ def _rounded(name: str) -> Function:
 
 
 def _absolute_of_long(call: Arguments) -> Value:
-    """Compile `labs`, which takes any number here."""
+    """Take any number."""
     for value in call.values:
         require_number(value, "`labs`")
     call.values = [Value(number(value.form, value_types.LONG), value.position) for value in call.values]
@@ -165,7 +165,7 @@ def _finite(call: Arguments) -> Value:
 
 
 def _of_library(name: str, *wanted: str) -> Function:
-    """Compile a library function. `wanted` describes each argument, as in `_FITS`."""
+    """`wanted` describes each argument, as in `_FITS`."""
 
     def function(call: Arguments) -> Value:
         call.count(len(wanted))

@@ -1,7 +1,4 @@
-"""Compile statements: one function for each class of statement in `text/tree.py`.
-
-After an error, compilation continues with the next statement, so that one check finds as many errors as possible.
-"""
+"""Compile statements. After an error, compilation continues with the next one, so that one check finds many errors."""
 
 import struct
 from collections.abc import Callable, Mapping

@@ -56,7 +56,7 @@ def _unlike_a_sender(specification: tree.Specification) -> Iterator[Diagnostic]:
 
 
 def _wrong_sender(function: str, text: str) -> str:
-    """Return why no sender can have this host or name, or an empty string."""
+    """Return the reason why no sender can have this host or name, or an empty string."""
     if function == "caller" and text and not text.startswith("/"):
         return f"the name of a node begins with `/`, so this is never equal; write {shown('/' + text)}"
     if function != "host" or not text:
@@ -137,7 +137,7 @@ def _assigned(statement: tree.ExpressionStatement) -> str:
 
 
 def _passed_nan(event: tree.EventDefinition) -> Iterator[Diagnostic]:
-    """Warn of a bound that NaN passes: each comparison with it is false, and `std::min` may return it."""
+    """Each comparison with NaN is false, and `std::min` may return it."""
     numbers = {one.name for one in event.parameters if one.type.name in _FLOATING}
     if isinstance(event.trigger, tree.MessageTrigger) and event.trigger.when is not None:
         yield from _bounds(event.trigger.when, event.action, numbers)
@@ -206,9 +206,7 @@ def _assigned_in(statement: tree.Statement) -> set[str]:
 
 
 def rival_changes(specifications: Sequence[tree.Specification], phases: Phases) -> Iterator[Diagnostic]:
-    """Warn about two specifications that change the same field: the later one decides. Pairs in `phases` are
-    intended.
-    """
+    """The later specification decides. Pairs in `phases` are intended."""
     changed = [
         (specification, topic, field, binding)
         for specification in specifications

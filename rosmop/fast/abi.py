@@ -1,7 +1,7 @@
 """The interface between a module and its runner: addresses in its memory, results of its calls, and data about it.
 
-A variable of the set is 8 bytes at its address: a number, or the address and length of a string or an array of numbers
-(`strings_codegen.py`).
+A variable of the set is 8 bytes at its address: a number, or the address and length of a string or an array of
+numbers (`strings_codegen.py`).
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,8 +17,7 @@ from roswire.definitions import Definitions
 
 POSITION, UNDO, SAID, NOW, SURE, REST, FIRST = 0, 8, 12, 16, 24, 32, 40
 """Addresses of: the current frame; the ends of the log and of the lines; the time; the end of the lines of earlier
-messages; the number (i64) of bytes of the message that are not shown to the module. Memory is allocated from `FIRST`
-on.
+messages; the number (i64) of bytes of the message that are not shown to the module; allocated memory.
 """
 
 MOST_KEPT = 1024
@@ -43,7 +42,7 @@ def most_kept(kind: Type) -> int:
 
 
 SENDER = 16 + 2 * MOST_KEPT
-"""The size of a sender: address and length of its host and caller, and then their bytes."""
+"""Address and length of its host and caller, and then their bytes."""
 
 AREA = 512 << 10
 """The bytes of frames in one batch; one read takes the same number."""
@@ -56,8 +55,9 @@ LOUD = 1 << 63
 
 @dataclass
 class Cells:
-    """Addresses of the state of specifications that share topics or variables: 8 bytes for each property, then 8
-    bytes for each variable. Variables that are only `noted` are not undone.
+    """Addresses of the state of specifications that share topics or variables, 8 bytes for each property and variable.
+
+    Variables that are only `noted` are not undone.
     """
 
     base: int
@@ -89,10 +89,10 @@ class Cells:
 class TopicCode:
     """The code for a topic: its export, whether it may drop or change messages, and the address of its counters.
 
-    `verdicts` has for each verdict the indices of an event, of its step of a property, and of the handler. `log` is the
-    address of the log of patches. `undo` has the addresses of variables, and the addresses of their values before the
-    current message. `brief`: the code has no loops. `functions` are the numbers of the functions of events in the
-    module. `says`: the code may print lines; the lines before the address stored at `SURE` are final.
+    `verdicts` has for each verdict the indices of an event, of its step of a property, and of the handler. `log` is
+    the address of the log of patches. `undo` has the addresses of variables, and of their values before the current
+    message. `brief`: the code has no loops. `functions` are the numbers of the functions of events. `says`: the code
+    may print lines; those before the address stored at `SURE` are final.
     """
 
     name: str

@@ -259,7 +259,7 @@ class ArithmeticCodegen(FunctionBuilder):
         return self._limited(node.type, self._of_parts(old + self._seconds(), value))
 
     def _nanoseconds(self) -> bytes:
-        """Return the nanoseconds of a time, which are never negative."""
+        """The nanoseconds of a time are never negative."""
         code, value = self._set("moment", I64), self._get("moment", I64)
         whole = self._get("whole", I64)
         code += value + constant(I64, BILLION) + I64_REM_S + self._set("whole", I64)
@@ -281,8 +281,8 @@ class ArithmeticCodegen(FunctionBuilder):
 def in_seconds() -> bytes:
     """Write a function that converts a time to seconds as a double, rounded only once.
 
-    A time of more than 53 bits is divided by 10^9 in two steps. It is divided by 5^9 in fixed point, with 40
-    fractional bits; the last bit is set if there is a remainder. The result is divided by 2^9.
+    A time of more than 53 bits is divided by 5^9 in fixed point, with 40 fractional bits, whose last bit is set if
+    there is a remainder. The result is divided by 2^9.
     """
     moment, size, part, result = (local_get(local) for local in range(4))
     negative = moment + constant(I64, 0) + I64_LT_S

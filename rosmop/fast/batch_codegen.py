@@ -1,26 +1,22 @@
 """Write the WebAssembly module of a set of specifications: a loop over received frames runs the events of every
 message.
 
-For each topic the module exports `feed(at, end, now)`. It processes the frames from `at` to before `end` in the memory;
-a frame is a length (4 bytes, little-endian) and the message. The result has three parts: the address of the first frame
-that is left (i64: the low 32 bits), the number of effects (the next 24 bits), and `LEFT` if that frame is for the
-interpreter.
+For each topic the module exports `feed(at, end, now)` for the frames (a length of 4 bytes, little-endian, and the
+message) from `at` to before `end`. The result has the address of the first frame that is left (i64: the low 32 bits),
+the number of effects (the next 24 bits), and `LEFT` if that frame is for the interpreter.
 
 - A message is either processed, with all consequences, or left. `TopicCode.undo` lists the data to restore for a
-  message that is left. After a trap, that message begins at the address stored at `POSITION`. If the address is 0, no
-  message had begun.
-- A message that is dropped or replaced by the safe one does not change the states of properties that suppress it
+  message that is left. After a trap, that message begins at the address stored at `POSITION` (0: no message had
+  begun).
+- A message that is dropped or replaced does not change the states of properties that suppress it
   (`nodes.Advance.suppresses`). Later events process the safe message.
-- The options for all messages are stored at `Cells.source`, in this order: their sender; *told*, the events (bit N for
-  the topic's event N) whose drops are left, and with `LOUD` also all changes; *enabled*, bits of the topic's enabled
-  specifications; *counted*, the verdicts (bit N for `TopicCode.verdicts[N]`) that are only counted. A message with any
-  other verdict is left.
+- The options at `Cells.source` are: the sender; *told*, the events (bit N for the topic's event N) whose drops are
+  left, and with `LOUD` also all changes; *enabled*, bits of the topic's specifications; *counted*, the verdicts (bit
+  N for `TopicCode.verdicts[N]`) that are only counted. A message with any other verdict is left.
 - An effect is 16 bytes: a set of events (i64) and the number (i64) of consecutive messages that they changed. For
   dropped frames it is -1 and their start and end (i32, i32).
-- If a message gives a property with a clock a deadline before the time at `Cells.until`, the loop ends after this
-  message with `SOONER`.
-- `TopicCode.counters` counts the events that happened, then the drops of each event, then the verdicts. `TOLD` is set
-  if there were verdicts.
+- If a message gives a property a deadline before the time at `Cells.until`, the loop ends after it with `SOONER`.
+- `TopicCode.counters` counts the events that happened, then the drops of each event, then the verdicts (`TOLD`).
 """
 
 import struct
@@ -245,7 +241,7 @@ def _assembled(
     constants: Mapping[bytes, int],
     memory: int,
 ) -> bytes:
-    """Assemble a module; functions are given by parameter types, result type and code; constants by address."""
+    """Functions are given by parameter types, result type and code; constants by address."""
     types = [function_type(given, result) for given, result, _ in functions]
     exported = [text(name) + EXPORTED_FUNCTION + unsigned(number) for name, number in exports.items()]
     pages = unsigned(memory // PAGE)
@@ -393,9 +389,7 @@ class TopicCodegen:
         return any(written.drops for written in (self._written[number], *run))
 
     def _table(self, number: int, place: int) -> int | None:
-        """Return the address of a step's table, or None if the step does nothing. An entry of -1 marks a handler that
-        is not compiled.
-        """
+        """Return None if the step does nothing. An entry of -1 marks a handler that is not compiled."""
         advance = self._events[number].advances[place]
         left: set[int] = set()
         for index, handled in enumerate(advance.handlers):
@@ -593,7 +587,7 @@ class TopicCodegen:
         return code + again + END
 
     def _advance_clock(self, number: int, clock: nodes.PropertyClock, event: int, table: int) -> bytes:
-        """Advance a property's clock, whose steps `ClockedRun` and `ClockedSteps` define."""
+        """`ClockedRun` and `ClockedSteps` define the steps."""
         state, (since, now, count) = (
             self._states[number],
             range(self._clocks[number], self._clocks[number] + 3),

@@ -44,10 +44,10 @@ def require_loadable(data: bytes) -> None:
 
 
 def parts_of(data: bytes, wanted: Iterable[tuple[Collection[str], Collection[str]]]) -> Iterator[bytes]:
-    """Yield the parts of a certified set as bytes: for each, the specifications in it, and those in shadow mode.
+    """Yield independent parts of a certified set: for each, the specifications in it, and those in shadow mode.
 
-    Each part is independent of the rest. Raises `SpecificationError` if its module cannot be built, which is a
-    defect, and `msgspec.ValidationError` if `data` is not a set.
+    Raises `SpecificationError` if its module cannot be built, which is a defect, and `msgspec.ValidationError` if
+    `data` is not a set.
     """
     whole = _set(data)
     for names, shadows in wanted:

@@ -1,23 +1,14 @@
 """Translate functions of the intermediate form (`form/nodes.py`) to WebAssembly.
 
-The translation includes numbers, conditions, loops, message fields and drops. Strings, vectors and messages within
-the current message are read in place if their parts have a fixed size (`codegen_access.py`), and variables can hold
-strings (`strings_codegen.py`). `batch_codegen.py` writes the loop over the frames that were received together.
-
 - The function of an event or handler takes the address of the message and its size (i32, i32), and returns flags
-  (i32): `HAPPENED` (the event happened), `DROPPED` (the message is dropped), `CHANGED` (bytes of the message were
-  changed), `ELSEWHERE` (the interpreter must process the message), `RESET` (the handler restarts the property),
-  `REPLACED` (the safe message has taken the place of the message).
-- `ELSEWHERE` is returned at each fault and at each node that is not compiled. The effects of the message are undone,
-  and the interpreter processes the message. Functions that events and handlers call trap instead of returning
-  `ELSEWHERE`. An event is not compiled at all if every message would reach such a node; `NotCompiledError` gives the
-  reason. The tables `STATEMENTS` and `EXPRESSIONS` list the nodes that are not compiled.
-- A line of output is stored after the earlier lines, at the address in `SAID`; the current message is at `POSITION`
-  (`deferred_output.py`).
-- Before a field is written, the old bytes are appended to a log; `UNDO` holds the end of this log. An entry takes 16
-  bytes: address (i32), size (i32) and the old bytes (i64).
-- The charges of the intermediate form (`nodes.Charge`, `nodes.Allocate`) are taken from the specification's budget,
-  as in the interpreter.
+  (i32): `HAPPENED`, `DROPPED`, `CHANGED` (bytes of the message), `ELSEWHERE` (the interpreter must process the
+  message), `RESET` (the handler restarts the property), `REPLACED` (by the safe message).
+- `ELSEWHERE` is returned at each fault and at each node that is not compiled (`STATEMENTS`, `EXPRESSIONS`). The
+  effects of the message are undone. Functions that events and handlers call trap instead. An event is not compiled at
+  all if every message would reach such a node.
+- Before a field is written, the old bytes are appended to a log, whose end is at `UNDO`. An entry takes 16 bytes:
+  address (i32), size (i32) and the old bytes (i64).
+- Charges (`nodes.Charge`, `nodes.Allocate`) are taken from the specification's budget, as in the interpreter.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -117,7 +108,6 @@ EARLY = 16
 """The first bytes of a message, in which the fields of a header begin."""
 
 MOST_SAFE = 1024
-"""The maximum size in bytes of a safe message in the module."""
 
 
 @dataclass(frozen=True)
@@ -126,9 +116,8 @@ class WasmFunction:
 
     `brief`: it has no loops. `passes`: conditions may end it early for some messages. `says`: it may print lines.
     `early`: it may write to the first bytes of the message, where a header is. `changes_elements`: it may change an
-    element of an array. `replaces`: it may replace the message by the safe one. `references` pairs each reference
-    parameter with the address where the function stores its value before it returns. `names` are those of the local
-    variables, by number.
+    element of an array. `references` pairs each reference parameter with the address where the function stores its
+    value before it returns. `names` are those of the local variables, by number.
     """
 
     number: int
@@ -164,7 +153,7 @@ class ModuleCodegen(MemoryLayout):
         self.left.setdefault(function, []).append(error)
 
     def event(self, name: str, channel: str = "") -> WasmFunction:
-        """Write an event's function. Raises `NotCompiledError`."""
+        """Raises `NotCompiledError`."""
         function = self.functions[name]
         return self.function(function, {"at": I32, "size": I32}, I32, function.context, channel=channel)
 
@@ -256,7 +245,7 @@ class _FunctionCodegen(StringCodegen):
             self._local(name, I32)
 
     def written(self) -> WasmFunction:
-        """Write the function. Raises `NotCompiledError`."""
+        """Raises `NotCompiledError`."""
         body = self._block(self._function.body)
         if isinstance(self._function, nodes.Skipper):
             body += self._position(self._function.end) + RETURN
@@ -382,7 +371,7 @@ class _FunctionCodegen(StringCodegen):
         return self._when(many, lambda: self._allocated(self._length()))
 
     def _pending(self, _node: nodes.Pending) -> bytes:
-        """Write nothing for the list of fields, which only `Whole` uses, and `Whole` is not compiled."""
+        """Only `Whole` uses the list of fields, and `Whole` is not compiled."""
         return b""
 
     def _drop(self, _node: nodes.Drop) -> bytes:
@@ -558,7 +547,7 @@ class _FunctionCodegen(StringCodegen):
         return code + self._noted_line(line, cost) + stores + constant(I32, 0)
 
     def _noted_line(self, line: OutputLine, cost: bytes) -> bytes:
-        """Note a line of output; the local variable `line` is the address of the stored head."""
+        """The local variable `line` is the address of the stored head."""
         known = self._layout.lines
         code = load(I32, SAID) + self._set("line")
         end = self._get("line") + constant(I32, line.size) + I32_ADD
@@ -706,8 +695,9 @@ class _FunctionCodegen(StringCodegen):
         return self._called(node)[0]
 
     def _called(self, node: nodes.Invoke) -> tuple[bytes, tuple[tuple[str, int], ...]]:
-        """Return the code, and the address of each reference's value after the call. A string or vector is returned
-        as address (32 bits) and length.
+        """Return the code, and the address of each reference's value after the call.
+
+        A string or vector is returned as address (32 bits) and length.
         """
         if node.depth is not None:
             raise NotCompiledError("calls a recursive function")
@@ -762,7 +752,7 @@ class _FunctionCodegen(StringCodegen):
         return code + answer + RETURN
 
     def _handed(self, name: str, node: nodes.Expression) -> bytes:
-        """Call a function, and assign its value and the values of the references to numbered local variables."""
+        """Assign the result and the values of the references to numbered local variables."""
         if not isinstance(node, nodes.Invoke):
             raise NotCompiledError.of(node.type)
         code, references = self._called(node)

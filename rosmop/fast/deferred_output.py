@@ -1,8 +1,8 @@
 """Lines of output: the module stores their values, and Python formats them later.
 
-A line is stored in the module's memory: its number among the module's lines, the address of the frame (i32 each), and 8
-bytes for each value. A value is an integer, a double, or a string's address (the low 32 bits) and length. The highest
-possible cost of the line is charged, because a text must be paid for before it is made.
+A stored line has its number among the module's lines, the address of the frame (i32 each), and 8 bytes for each
+value: an integer, a double, or a string's address (the low 32 bits) and length. The highest possible cost of the line
+is charged, because a text must be paid for before it is made.
 """
 
 import struct
@@ -44,9 +44,9 @@ class OutputLine(msgspec.Struct, tag=True, array_like=True, dict=True):
 
     @property
     def cost(self) -> int:
-        """The cost in instructions without strings.
+        """Return the cost in instructions without strings.
 
-        Plus one instruction for each `BYTES_PER_INSTRUCTION` bytes of its strings, it is at least the cost that the
+        With one instruction for each `BYTES_PER_INSTRUCTION` bytes of its strings, it is at least the cost that the
         form charges.
         """
         return OUTPUT_COST + 3 * (self.longest // BYTES_PER_INSTRUCTION + 1)  # formatting, joining, output

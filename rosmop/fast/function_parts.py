@@ -37,9 +37,7 @@ ELSEWHERE = 8
 
 
 class FunctionBuilder(ABC):
-    """Writes a function; `context` names the budget that pays for it. `answers`: the function is an event or
-    handler.
-    """
+    """Writes a function, such as an event or handler (`answers`); `context` names the budget that pays for it."""
 
     def __init__(
         self, layout: MemoryLayout, parameters: Mapping[str, int], context: str, *, answers: bool
@@ -107,7 +105,7 @@ class FunctionBuilder(ABC):
         return self._repeated(over + less + each, body)
 
     def _repeated(self, before: bytes, body: Sequence[nodes.Statement]) -> bytes:
-        """Write a loop; in an endless one, `before` may leave the outer of the two blocks."""
+        """In an endless loop, `before` may leave the outer of the two blocks."""
         self._depth += 2
         self._loops.append(self._depth)
         code = before + self._block(body)

@@ -13,9 +13,6 @@ def prepare() -> None:
 
 
 def loaded(data: bytes) -> tuple[Compiled, WasmFastPath]:
-    """Return the specifications of a part and its fast path. Without data, the set is empty.
-
-    Raises `ValueError` if the data are not a part.
-    """
+    """Without data, the set is empty. Raises `ValueError` if the data are not a part."""
     part = decoded_part(data) if data else SetPart.empty()
     return part.compiled, WasmFastPath(part.module)

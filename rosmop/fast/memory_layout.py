@@ -11,7 +11,7 @@ from rosmop.types import value_types
 from rosmop.types.value_types import Type
 
 LINES = 64 << 10
-"""The bytes for the lines of output; a message whose line does not fit in these bytes is left."""
+"""A message whose line does not fit in these bytes is left."""
 
 
 class NotCompiledError(Exception):
@@ -38,7 +38,7 @@ def reason_of(error: NotCompiledError | RecursionError) -> NotCompiledError:
 
 
 def machine_type(kind: Type) -> int:
-    """Return the machine type of values. Raises `NotCompiledError`."""
+    """Raises `NotCompiledError`."""
     if isinstance(kind, value_types.BoolType) or (
         isinstance(kind, value_types.IntegerType) and kind.bits <= 32
     ):
@@ -72,7 +72,6 @@ class MemoryLayout:
         self.senders: dict[str, int] = {}
         """By specification: the address of the sender of messages."""
         self.constants: dict[bytes, int] = {}
-        """Addresses of constant bytes."""
         self.strings: set[bytes] = set()
         self.references: list[range] = []
         """Addresses of memory for the values of references that functions return."""
@@ -88,9 +87,7 @@ class MemoryLayout:
         return cells.variables.setdefault(name, (place, kind))[0]
 
     def size(self, kind: Type) -> int:
-        """Return the size of values. Raises `NotCompiledError` if the values of a type have different sizes
-        in a message.
-        """
+        """Raises `NotCompiledError` if values of this type have different sizes in a message."""
         code = struct_code(kind)
         if code is not None:
             return struct_size(code)
@@ -101,14 +98,15 @@ class MemoryLayout:
         raise NotCompiledError.of(kind)
 
     def offset(self, kind: Type, number: int) -> int:
-        """Return the offset of a field. Raises `NotCompiledError` if it differs between messages."""
+        """Raises `NotCompiledError` if the offset differs between messages."""
         if not isinstance(kind, value_types.RecordType):
             raise NotCompiledError.of(kind)
         return sum(map(self.size, self._values.fields(kind)[:number]))
 
     def element(self, kind: Type) -> tuple[Type, int]:
-        """Return the type of the elements, and their distance in bytes: for strings, in the table. Raises
-        `NotCompiledError`.
+        """Return the type of the elements, and their distance in bytes: for strings, in the table.
+
+        Raises `NotCompiledError`.
         """
         if isinstance(kind, value_types.StringType):
             return value_types.UINT8, 1
@@ -119,7 +117,7 @@ class MemoryLayout:
         )
 
     def copied(self, kind: Type) -> Type:
-        """Return the type of a message whose copy is free. Raises `NotCompiledError` for other messages."""
+        """Raises `NotCompiledError` for messages whose copy is not free."""
         if isinstance(kind, value_types.RecordType):
             for field in self._values.fields(kind):
                 self.copied(field)

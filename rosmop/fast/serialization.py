@@ -1,7 +1,4 @@
-"""Serialize a compiled set: one process compiles it, and another runs it.
-
-Reading accepts only valid sets. Only message definitions in use are included.
-"""
+"""Serialize a compiled set: one process compiles it, and another runs it. Reading accepts only valid sets."""
 
 from typing import Any, get_type_hints
 
@@ -58,7 +55,7 @@ _DECODER = msgspec.msgpack.Decoder(Compiled, dec_hook=_made)
 
 
 def encoded(compiled: Compiled) -> bytes:
-    """Serialize a set; equal sets give equal bytes."""
+    """Equal sets give equal bytes."""
     definitions = compiled.messages.definitions
     reached = {name for one in compiled.specifications for name in one.reached}
     reached |= {one.type for one in compiled.publications}
@@ -78,16 +75,16 @@ def encoded(compiled: Compiled) -> bytes:
 
 
 def decoded(data: bytes) -> Compiled:
-    """Return the set in these bytes. Raises `msgspec.ValidationError`."""
+    """Raises `msgspec.ValidationError`."""
     return _DECODER.decode(data)
 
 
 def encoded_part(part: SetPart) -> bytes:
-    """Serialize a part; equal parts give equal bytes."""
+    """Equal parts give equal bytes."""
     return msgspec.msgpack.encode((msgspec.Raw(encoded(part.compiled)), part.module))
 
 
 def decoded_part(data: bytes) -> SetPart:
-    """Return the part in these bytes. Raises `msgspec.ValidationError`."""
+    """Raises `msgspec.ValidationError`."""
     compiled, module = _PARTS.decode(data)
     return SetPart(_DECODER.decode(compiled), module)

@@ -26,7 +26,7 @@ class SlowPath:
 
 
 def slow_paths(compiled: Compiled) -> list[SlowPath]:
-    """Return the messages that are left, without those with a fault or with due output, which are always left."""
+    """Leave out messages with a fault or with due output, which always go to the interpreter."""
     module = written_of(compiled)
     found: dict[SlowPath, None] = {}
     channels = dict.fromkeys(

@@ -1,13 +1,12 @@
 """Generate code for strings and arrays of numbers: constants, those of the message, and variables of the set.
 
-A variable is 8 bytes: the address and the length of its string or array (4 bytes each). While a batch is processed, it
-may be in a message, in a constant, or in the former memory of another variable. So assignments copy nothing. A topic
-that keeps an array is not compiled if it changes an element of one. At the end of a batch all are copied together
-(`settling`). Each variable has two buffers, which batches use in turn, because lines of output may still read the
-strings of the last batch.
+While a batch is processed, the string or array of a variable may be in a message, in a constant, or in the former
+memory of another variable, so assignments copy nothing. A topic that keeps an array is not compiled if it changes an
+element of one. At the end of a batch all are copied together (`settling`), to one of two buffers in turn, because
+lines of output may still read the strings of the last batch.
 
-Values longer than `most_kept` are not kept. The message that brings such a value is left to the interpreter, and the
-variable is marked `BEYOND`. Messages that read this variable are also left to the interpreter.
+A message that brings a value longer than `most_kept` is left to the interpreter, and the variable is marked `BEYOND`.
+Messages that read this variable are also left.
 """
 
 from rosmop.fast.abi import Cells, kept_size, most_kept
@@ -206,10 +205,10 @@ def mismatch() -> bytes:
 
 
 def settling(layout: MemoryLayout, cells: Cells) -> bytes:
-    """Copy the strings and arrays of all variables to one of their two buffers, in turn.
+    """Copy the strings and arrays of all variables to one of their two buffers, in turn, and return 0 (i32).
 
     The number of the current buffer is stored last. A stopped function runs again after the current message is
-    undone. It returns 0 (i32).
+    undone.
     """
     cells.generation = layout.take(8)
     kept = {at: kind for at, kind in cells.variables.values() if kept_size(kind)}

@@ -1,8 +1,4 @@
-"""Encode a WebAssembly module as bytes: numbers, names, rows, and instructions.
-
-Only this file of the writer has opcodes. Instructions have the names of the specification. Instructions without an
-operand are constants; others are functions.
-"""
+"""Encode a WebAssembly module. Only this file has opcodes; instructions have the names of the specification."""
 
 import struct
 from collections.abc import Sequence
@@ -93,7 +89,7 @@ def function_type(parameters: Sequence[int], result: int) -> bytes:
 
 
 def function(made: Sequence[tuple[int, int]], code: bytes) -> bytes:
-    """Encode a function. Locals are pairs of number and type; `code` has no final `END`."""
+    """Locals are pairs of number and type; `code` has no final `END`."""
     whole = row([unsigned(count) + bytes((machine,)) for count, machine in made]) + code + END
     return unsigned(len(whole)) + whole
 

@@ -1,12 +1,10 @@
 """Run one WebAssembly module, with bounds on its memory and its work.
 
-Theory of operation:
-
-- Work is bounded by *fuel*: about one unit for each instruction or copied byte, the same on every machine. Memory is
-  bounded by a limit. Exceeding either bound raises `WasmTrap`.
-- Addresses for the whole limit are reserved at the start, and the memory grows in place. So an older view of the memory
-  stays valid; it is only shorter. A view keeps the memory alive after the instance is closed.
-- One process translates a module into machine code (`translated`). Others run it (`WasmInstance`) and compile nothing.
+- Work is bounded by *fuel*: about one unit for each instruction or copied byte, the same on every machine. Exceeding
+  it, or the limit of memory, raises `WasmTrap`.
+- Addresses for the whole limit are reserved at the start, and the memory grows in place. So an older view stays
+  valid, only shorter. A view keeps the memory alive after the instance is closed.
+- One process translates a module into machine code (`translated`). Others run it and compile nothing.
 - The library of the package `wasmtime` is called through its C functions (0.4 µs a call, instead of 20 µs through its
   Python code). Calls hold Python's lock, so no other thread runs in an instance. The relay cannot load wasmtime's
   Python code: it has functions that C calls, for which libffi needs memory that is writable and executable. For the
@@ -57,10 +55,10 @@ class WasmTrap(Exception):  # noqa: N818  its name in WebAssembly
 
 
 class WasmInstance:
-    """A module, which has no imports, and the memory that it exports as `memory`.
+    """A module, which has no imports, and the memory that it exports as `memory`, of at most `limit` bytes.
 
-    `code` must be the result of `translated` with the same `limit`, because it is run unchecked. `limit` is the largest
-    size of the memory, in bytes. Raises `WasmError`, and `WasmTrap` if the module's start traps.
+    `code` must be the result of `translated` with the same `limit`, because it is run unchecked. Raises `WasmError`,
+    and `WasmTrap` if the module's start traps.
     """
 
     def __init__(self, code: bytes, limit: int) -> None:
@@ -99,9 +97,7 @@ class WasmInstance:
 
     @property
     def memory(self) -> memoryview:
-        """Return the memory, which is writable. Read it again after it has grown. Raises `WasmError` if the
-        instance is closed.
-        """
+        """Read the property again after the memory has grown. Raises `WasmError` if the instance is closed."""
         asked = self._asked()
         size = load().wasmtime_memory_data_size(*asked)
         if size != len(self._view):
@@ -120,11 +116,11 @@ class WasmInstance:
         )
 
     def call(self, name: str | int, *arguments: int, fuel: int) -> int | None:
-        """Call an exported function of integers by its name or number.
+        """Call an exported function of integers by its name or number; a 32-bit parameter gets the low bits of its
+        argument.
 
-        Each argument is a signed 64-bit integer; a 32-bit parameter gets its low bits. Raises `WasmTrap`. Raises
-        `WasmError` if the function does not exist or the instance is closed. Raises `struct.error` for a wrong number
-        of arguments, or for an argument that is too large.
+        Raises `WasmTrap`, `WasmError` if the function does not exist or the instance is closed, and `struct.error`
+        for a wrong number of arguments, or for one beyond 64 bits.
         """
         function = self.function(name)
         self.refuel(fuel)
@@ -145,11 +141,11 @@ class WasmInstance:
         return self._natives[name]
 
     def refuel(self, fuel: int) -> None:
-        """Set the fuel of the next calls. Raises `WasmError` if the instance is closed."""
+        """Raises `WasmError` if the instance is closed."""
         _check(load().wasmtime_context_set_fuel(self._asked()[0], fuel))
 
     def close(self) -> None:
-        """Close the instance; the memory is freed with its last view."""
+        """The memory is freed with its last view."""
         self._functions, self._view, self._store = {}, memoryview(b""), None
 
     def _asked(self) -> tuple[int, Any]:
@@ -326,7 +322,7 @@ def failure(error: int, trap: int) -> Exception:
 
 
 def _kinds(vector: Any) -> list[Any]:
-    """Return the kinds of a function's parameters or results; a kind that is not an integer becomes None."""
+    """Replace kinds other than integers by None."""
     found = vector.contents
     return [_KINDS.get(load().wasm_valtype_kind(found.data[number])) for number in range(found.size)]
 

@@ -1,17 +1,15 @@
-"""Run the compiled module of a set: decide when it may process a topic or a part of a service (a *lane*), and process
-batches of messages.
+"""Run the compiled module of a set: decide when it may process a topic or a part of a service (a *lane*).
 
 Invariants:
 
 - A batch ends before the first message that the module leaves to the engine; nothing of that message has happened.
-- The earlier messages have the same effect as if `MonitorSet.process` had processed each message at the time of the
-  batch: bytes, variables, states of properties, events.
-- The state of specifications that share topics or variables is in one place at a time. From the first batch on it is
-  in the module's memory (`ModuleState.prepare`). Before that, and whenever Python reads it, it is in Python
+- The earlier messages have the same effect as if `MonitorSet.process` had processed each at the time of the batch.
+- The state of specifications that share topics or variables is in one place at a time: in the module's memory from
+  the first batch on (`ModuleState.prepare`), and in Python before that and whenever Python reads it
   (`ModuleState.leave`).
 - Frames that were received into the module's memory (`Lanes.area`) are read and changed in place. The beginning of
-  any other frame is copied to the module, and copied back if it was changed. Code that reads further leaves the
-  message to the engine.
+  any other frame is copied to the module, and back if it was changed. Code that reads further leaves the message to
+  the engine.
 """
 
 import struct
@@ -55,8 +53,8 @@ from rosmop.types.value_types import Type
 FUEL = FUEL_PER_SECOND // 1000
 """The maximum number of instructions of one call: about a millisecond.
 
-The fuel that a call leaves is used by the next calls, because setting the fuel costs a quarter of a call. When the fuel
-is used up, the batch pauses before the current message.
+The rest is left for the next calls, because setting the fuel costs a quarter of a call. When the fuel is used up, the
+batch pauses before the current message.
 """
 
 BEGINNING = 8192
@@ -95,9 +93,7 @@ class ModuleState:
     ) -> None:
         """`throttles` has specification, site, and the address of the time when output there was last due.
 
-        `senders` has the addresses of senders of messages (`abi.SENDER`).
-
-        `properties` and `known` have their keys by monitor.
+        `senders` has the addresses of senders (`abi.SENDER`). `properties` and `known` have their keys by monitor.
         """
         self.machine = machine
         self._memory = machine.memory

@@ -17,8 +17,9 @@ from rosmop.types.value_types import Type
 
 @dataclass(frozen=True)
 class EventCode:
-    """A compiled event: its function and its trigger. `service_type` is that of the service; `type` is that of the
-    message, request or response.
+    """A compiled event: its function and its trigger.
+
+    `service_type` is that of the service; `type` is that of the message, request or response.
     """
 
     name: str
@@ -51,7 +52,7 @@ class Comparison:
     """A comparison. `when_true` and `when_false` each name the variables (double) for its two sides.
 
     The left variable is infinite until the comparison is evaluated. `threshold` is the constant side (0: left, 1:
-    right), or None.
+    right).
     """
 
     position: Position
@@ -114,7 +115,7 @@ class Given:
 
 @dataclass(frozen=True)
 class GivenTopic:
-    """A topic that a load may replace; `name` is the one in the text."""
+    """A topic that a load may replace; `name` is that in the text."""
 
     name: str
     topic: str
@@ -148,8 +149,9 @@ class PropertyCode:
 
 @dataclass(frozen=True)
 class SpecificationCode:
-    """A compiled specification. `variables` maps shared variables to their names in the code; `start` lists the
-    functions that initialise it: constants and zeros, first values, `init`.
+    """A compiled specification. `variables` maps shared variables to their names in the code.
+
+    `start` lists the functions that initialise it: constants and zeros, first values, `init`.
     """
 
     name: str
@@ -215,12 +217,12 @@ class Compiled:
         return [group for group in sharing(uses) if not group.isdisjoint(names)]
 
     def without(self, names: Collection[str]) -> "Compiled":
-        """Return the set without `names`, and without specifications that share variables with them."""
+        """Also leave out specifications that share variables with `names`."""
         gone = {name for group in self.groups(names) for name in group}
         return self.part({one.name for one in self.specifications} - gone)
 
     def part(self, names: Collection[str]) -> "Compiled":
-        """Return the set with only `names`, which must include all that share variables with one of them."""
+        """`names` must include all that share variables with one of them."""
         return replace(
             self,
             specifications=tuple(one for one in self.specifications if one.name in names),

@@ -4,10 +4,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 
 
 def sharing(uses: Mapping[str, Collection[str]]) -> list[set[str]]:
-    """Group specifications that share variables, directly or indirectly.
-
-    `uses` maps each specification to those whose variables it uses.
-    """
+    """`uses` maps each specification to those whose variables it uses."""
     names = list(uses)
     return [
         {names[number] for number in group} for group in connected([(name, *uses[name]) for name in names])
@@ -15,7 +12,7 @@ def sharing(uses: Mapping[str, Collection[str]]) -> list[set[str]]:
 
 
 def connected(keys: Sequence[Iterable[object]]) -> Iterable[Sequence[int]]:
-    """Return groups of indices whose items share keys, directly or indirectly."""
+    """Return groups of indices whose items share keys."""
     owners: dict[object, int] = {}
     chief = list(range(len(keys)))
 
@@ -34,7 +31,5 @@ def connected(keys: Sequence[Iterable[object]]) -> Iterable[Sequence[int]]:
 
 
 def channel_of(service: str, part: str) -> str:
-    """Return the name of the `request` or `response` of a service, in place of a topic; it contains a blank,
-    as no topic does.
-    """
+    """Name a part of a service in place of a topic; the name contains a blank, as no topic does."""
     return f"{service} {part}"

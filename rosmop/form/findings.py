@@ -1,8 +1,4 @@
-"""The errors and warnings of specifications: findings, with their positions in the files.
-
-Lines and columns count from 1; a column is a character (a tab is one). The names of the fields are those of
-``rosrv monitor check --json``.
-"""
+"""The errors and warnings of specifications, with the names of fields of ``rosrv monitor check --json``."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -13,7 +9,7 @@ Severity = Literal["error", "warning"]
 
 @dataclass(frozen=True, order=True)
 class Position:
-    """A character of a file: ``line`` and ``column`` count from 1."""
+    """Line and column count from 1; a column is a character (a tab is one)."""
 
     file: str
     line: int
@@ -37,7 +33,7 @@ def line_of(text: str, number: int) -> str:
 
 @dataclass(frozen=True)
 class Diagnostic:
-    """A finding for the author of a specification; the text says what to write instead."""
+    """A finding for the author of a specification; the text names the remedy."""
 
     position: Position
     severity: Severity

@@ -1,21 +1,17 @@
 """The form: typed expressions, statements and functions, without names to look up or types to infer.
 
-All nodes are immutable. Types are those of `types/value_types.py`; every expression has one, and its operands have the
-types that the operation takes (conversions are explicit). Values are as in C++ on a 64-bit machine: integers wrap at
-their width, floats have 32 or 64 bits, strings are bytes. Times and durations are nanoseconds. Vectors and messages
-are references: assigning one shares it, so copies are also explicit (`Copy`).
+Every expression has a type (`types/value_types.py`), and its operands have the types that the operation takes;
+conversions are explicit. Values are as in C++ on a 64-bit machine: integers wrap at their width, floats have 32 or 64
+bits, strings are bytes. Times and durations are nanoseconds. Vectors and messages are references: assigning one
+shares it, so copies are also explicit (`Copy`).
 
-Names belong to the set of specifications (`g…`, the variables that specifications share) or to one call of one
-function. A *site* is the number of a position in the text, for reports of faults; -1 means the statement's own site.
+Names belong to the set of specifications (`g…`) or to one call of one function. A *site* is the number of a position
+in the text, for reports of faults; -1 means the statement's own site.
 
-A message is its bytes, counted from 0. A `Spot` is a position in the message: an offset from the start, or from a
-position that an earlier statement named. Reading beyond the end is a fault.
-
-The effects of an action form a list, in order: drop this message (`Drop`, or a `Return` that drops), replace it by
-the safe one (`StopMessage`), write fields (`WriteBack`), print a line (`Log`), publish a message (`Publish`), restart
-the property (`Reset`). Each back end has a table with a row for each kind of expression and statement: an
-implementation, or `Left`. `Charge` and `Allocate` take from the budgets of instructions and bytes, and functions with
-long values do the same. Exceeding a budget is a fault.
+A message is its bytes. A `Spot` is an offset from the start, or from a position that an earlier statement named.
+Reading beyond the end is a fault, and so is exceeding the budgets of instructions and bytes, from which `Charge`,
+`Allocate` and functions with long values take. The effects of an action are a list, in order. Each back end has a
+table with a row for each kind of node: an implementation, or `Left`.
 """
 
 from collections.abc import Iterator, Mapping
@@ -66,8 +62,9 @@ class Assign(FormNode, frozen=True):
 
 
 class Convert(FormNode, frozen=True):
-    """Convert a number to another type: integers wrap, floating-point numbers are truncated toward zero within the
-    limits (NaN is 0) or rounded, and every number other than zero is true.
+    """A number of another type: integers wrap, floating-point numbers are truncated toward zero or rounded.
+
+    Truncation stays within the limits (NaN is 0). Every number other than zero is true.
     """
 
     type: Type
@@ -125,7 +122,7 @@ class Compare(FormNode, frozen=True):
 
 
 class CompareTexts(FormNode, frozen=True):
-    """Compare strings.
+    """A comparison of strings.
 
     The left string is charged by its length, unless either string is `short` or the right one is a variable with few
     bytes.
@@ -236,9 +233,7 @@ class Call(FormNode, frozen=True):
 
 
 class Accumulate(FormNode, frozen=True):
-    """The sum of `start` and a vector's elements from `first` to before `last`. Each step is calculated in the type
-    `wide`, then converted to the node's type.
-    """
+    """The sum of `start` and a vector's elements from `first` to before `last`, each step in the type `wide`."""
 
     type: Type
     vector: "Expression"
@@ -263,8 +258,9 @@ class Invoke(FormNode, frozen=True):
 
 
 class Format(FormNode, frozen=True):
-    """Text formatted by a template, as with Python's `%` of bytes. `size` is the maximum length of the text without its
-    strings, or None if the text is not charged.
+    """Text formatted by a template, as with Python's `%` of bytes.
+
+    `size` is the maximum length without its strings, or None if the text is not charged.
     """
 
     template: bytes
@@ -375,7 +371,7 @@ class Continue(FormNode, frozen=True):
 
 
 class Select(FormNode, frozen=True):
-    """Look up a value in a table, and assign the number found there, or the default."""
+    """A lookup in a table, which assigns the number found there, or the default."""
 
     site: int
     name: str
@@ -486,10 +482,7 @@ class AfterText(FormNode, frozen=True):
 
 
 class Count(FormNode, frozen=True):
-    """Name the number of elements of the array at `at`.
-
-    Fault if this number of elements, of `least` bytes each, does not fit.
-    """
+    """Names the number of elements of the array at `at`; a fault if they, of `least` bytes each, do not fit."""
 
     site: int
     name: str
@@ -508,7 +501,7 @@ class AfterElements(FormNode, frozen=True):
 
 
 class Skip(FormNode, frozen=True):
-    """Name the position after `count` elements of variable size; `skipper` measures each (None: strings).
+    """Names the position after `count` elements of variable size; `skipper` measures each (None: strings).
 
     The elements are charged if there are many, or if they are `inner` (within a skipped element).
     """
@@ -555,7 +548,7 @@ class Require(FormNode, frozen=True):
 
 
 class Write(FormNode, frozen=True):
-    """Assign a value (of the field's type) to a field if `flag` is set; `end` names the end of a variable field.
+    """Assigns a value (of the field's type) to a field if `flag` is set; `end` names the end of a variable field.
 
     `path` is its path in the message: numbers of fields and elements, and `sec` or `nsec` at the end.
     """
@@ -576,8 +569,9 @@ class Pending(FormNode, frozen=True):
 
 
 class WriteBack(FormNode, frozen=True):
-    """Write all assigned fields to the message or, if that faults, none. `name` is a variable for spliced bytes. A
-    dropped or replaced message is not changed, and the event has happened.
+    """Writes all assigned fields to the message or, if that faults, none. `name` is a variable for spliced bytes.
+
+    A dropped or replaced message is not changed, and the event has happened.
     """
 
     site: int
@@ -624,8 +618,10 @@ class Function(FormNode, frozen=True):
 
 
 class PropertyClock(FormNode, frozen=True):
-    """The clock of a property: the table for events more than `within` ns after the clock's start, and for each state
-    the time from this start to its deadline (-1: none).
+    """The clock of a property: the table for events more than `within` ns after its start, and the deadline of each
+    state.
+
+    A deadline counts from the clock's start (-1: none).
     """
 
     late: tuple[int, ...]
@@ -644,10 +640,10 @@ class HandledCategory(FormNode, frozen=True):
 class Advance(FormNode, frozen=True):
     """The step of a property at an event: the next state for each state (-1: no table).
 
-    `property` is the number of the property among those with tables; None without a table. `event` is the event's
-    number in its specification. `handlers` run in their order, and may restart the property in its state `initial`.
-    With a `clock`, an entry is twice the next state, plus one where the clock restarts, or -1 where a handler runs. A
-    property that `suppresses` undoes the step when the message is dropped.
+    `property` is its number among those with tables; `event` is the event's number in its specification. `handlers`
+    run in their order, and may restart the property in its state `initial`. With a `clock`, an entry is twice the
+    next state, plus one where the clock restarts, or -1 where a handler runs. A property that `suppresses` undoes the
+    step when the message is dropped.
     """
 
     property: int | None
@@ -660,8 +656,9 @@ class Advance(FormNode, frozen=True):
 
 
 class Event(FormNode, frozen=True):
-    """An event on a topic, and the steps of properties after it. `specification` is an index among the specifications
-    of the topic.
+    """An event on a topic, and the steps of properties after it.
+
+    `specification` is an index among the specifications of the topic.
     """
 
     function: str
@@ -670,8 +667,7 @@ class Event(FormNode, frozen=True):
 
 
 class Component(FormNode, frozen=True):
-    """Specifications that share topics or variables only with each other: their variables, the number of properties
-    with tables, and their topics (also requests and responses of services) with the events on each, in order.
+    """Specifications that share topics or variables only with each other, with the events on each topic in order.
 
     `noted` are variables that serve only explanations; processing a message again does not change them.
     """
@@ -711,7 +707,7 @@ def moved(root: Any, sites: Mapping[int, int]) -> Any:
 
 
 PURE = "lib"
-"""The names of functions without effects begin with this prefix."""
+"""The prefix of functions without effects."""
 
 
 def acts(root: Expression) -> bool:

@@ -12,8 +12,9 @@ from rosmop.types.value_types import Type
 
 @dataclass(frozen=True, slots=True)
 class SiteVariable:
-    """A variable that a report shows; `code` is its name in the form. The value of a `steady` variable never
-    changes in place.
+    """A variable that a report shows; `code` is its name in the form.
+
+    The value of a `steady` variable never changes in place.
     """
 
     name: str
@@ -36,10 +37,7 @@ class Site:
 
 
 class Symbols:
-    """Makes names and sites during compilation.
-
-    The names of a specification do not depend on the rest of the set.
-    """
+    """Makes names and sites; the names of a specification do not depend on the rest of the set."""
 
     def __init__(self) -> None:
         self.sites: list[Site] = []

@@ -12,7 +12,7 @@ from rosmop.logics.interface import ClockedProperty, FiniteProperty
 @dataclass(frozen=True)
 class SpecificationGroup:
     """A component, with the indices of its specifications, of its properties with tables, and of the events on each
-    channel (a topic or a part of a service).
+    channel.
 
     A property is a pair (specification, property), an event a pair (specification, event). Topics of parametric
     specifications have no events here: the engine processes their messages.

@@ -1,8 +1,7 @@
 """Propose conditions on a topic's messages and on their order, each with a bound that the recordings support.
 
-Bounds are levels from `extremes`: all bounds of the file together are expected to be exceeded once in `QUIET_HOURS`.
-Conditions without content are left out, such as a rate that allows any change, or a standstill as long as the
-recording. Each topic keeps at most `MOST` conditions of a kind: the conditions that the most messages exercised.
+All bounds of the file together are expected to be exceeded once in `QUIET_HOURS` (`extremes`). Conditions without
+content are left out, such as a rate that allows any change, or a standstill as long as the recording.
 """
 
 import math
@@ -18,7 +17,9 @@ from rosmop.learn.topics import TopicContent, TopicRhythm
 
 QUIET_HOURS = 10.0
 MOST = {"range": 10, "constant": 12, "values": 6, "rate": 6, "unchanged": 6, "moves": 2, "order": 2}
-"""The most conditions for one topic and kind. Other kinds have at most one condition for each field."""
+"""The most conditions for one topic and kind, those that the most messages exercised. Other kinds have one for each
+field.
+"""
 
 _FEWEST = 20  # the minimum number of messages for a statement about all messages
 _FEWEST_SET = 10

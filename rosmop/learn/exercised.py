@@ -1,8 +1,7 @@
 """Measure how often recordings exercise events, branches, handlers, functions, states and transitions.
 
-The specifications are compiled with a counter before each action, branch and handler. Counters are added to the
-syntax tree, not to the text, so line numbers stay the same. The runs of state machines are observed from outside, and
-no messages are stored.
+A counter is added before each action, branch and handler in the syntax tree, not in the text, so line numbers stay
+the same. The runs of state machines are observed from outside.
 """
 
 import re
@@ -42,9 +41,9 @@ def items_of(texts: Mapping[str, str]) -> list[CoverageItem]:
 
 
 def covered(texts: Mapping[str, str], definitions: Definitions, recording: RecordingSource) -> list[int]:
-    """Return the counts in the order of `items_of`.
+    """Return the counts in the order of `items_of`. Raises `SpecificationError`.
 
-    The number for a state is how often an event entered it or stayed in it. Raises `SpecificationError`.
+    The number for a state is how often an event entered it or stayed in it.
     """
     compiled_from(texts, definitions)  # reports errors for the unchanged text
     marked = _marked(texts)
@@ -66,7 +65,6 @@ def covered(texts: Mapping[str, str], definitions: Definitions, recording: Recor
 
 
 def merged(one: Sequence[int], other: Sequence[int]) -> list[int]:
-    """Return the sum of counts; the order of recordings makes no difference."""
     return [a + b for a, b in zip(one, other, strict=True)]
 
 

@@ -1,21 +1,20 @@
 """Set a bound beyond the observed values, by extreme value theory on the extremes of independent windows.
 
-The largest value of each window is a draw from an extreme value distribution. Gumbel's distribution, which suits
-exponential tails, is fitted by L-moments (Hosking 1990). The bound is the level that is passed once in a given number
-of windows. No shape parameter is fitted, because some twenty windows are too few. If the quantity has a limit, the
-margin is therefore wider than needed, which causes no false alarm.
+Gumbel's distribution, which suits exponential tails, is fitted to the largest value of each window by L-moments
+(Hosking 1990). The bound is the level that is passed once in a given number of windows. No shape parameter is fitted,
+because some twenty windows are too few: if the quantity has a limit, the margin is wider than needed, which causes no
+false alarm.
 
 Windows may be of different kinds, for example if a robot often stays near and sometimes goes far. Then the upper
-quarter of windows has its own tail, longer than that of the fit. The exponential through its mean excess (Weissman
-1978) is the bound if it is higher. An extreme that several windows reach exactly is a stop, such as a joint's limit or
-a clamped command. The stop is then the bound.
+quarter of windows has a longer tail: the exponential through its mean excess (Weissman 1978) is the bound if it is
+higher. An extreme that several windows reach exactly is a stop, such as a joint's limit or a clamped command, and is
+then the bound.
 """
 
 import math
 from collections.abc import Iterable
 
 FEWEST_WINDOWS = 8
-"""The minimum number of windows for a statement about an extreme."""
 
 _STOP = 3  # the minimum number of windows that reach the same extreme
 _SAME = 1e-9  # relative difference that rounding can cause between equal extremes
@@ -26,8 +25,8 @@ _EULER = 0.5772156649015329
 def upper(highs: Iterable[float], windows: float, *, stops: bool = False) -> float | None:
     """Return the level that the maximum of a window exceeds once in `windows` windows, or None with too little data.
 
-    `stops`: the quantity may have a stop. Calculated quantities have no stops, because differences of rounded numbers
-    can be equal by chance.
+    `stops`: the quantity may have a stop. Calculated quantities have none, because rounded differences can be equal
+    by chance.
     """
     values = sorted(highs)
     count = len(values)

@@ -1,9 +1,8 @@
 """Read the values of a message's fields by path, as far as they are useful for learning.
 
-Numbers, strings and times are scalars, arrays of numbers are tuples, and arrays of strings are lists. A string that is
-not UTF-8 is bytes. Only the length
-of an array of messages is read. Bytes (images, points, maps) are left out, because single bytes mean nothing.
-The `seq` of headers is left out, because every publisher increments it automatically.
+Numbers, strings and times are scalars, arrays of numbers are tuples, and arrays of strings are lists. Only the length
+of an array of messages is read. Bytes (images, points, maps) are left out, because single bytes mean nothing, and the
+`seq` of headers, because every publisher increments it automatically.
 """
 
 import struct
@@ -14,9 +13,7 @@ from roswire.message_layout import ArrayPart, FixedField, FixedPart, MessageLayo
 from roswire.message_text import PRIMITIVES
 
 MOST_ELEMENTS = 20_000
-"""The longest array that is read; a longer one is represented by its length, because a monitor that reads it
-would be too slow.
-"""
+"""A monitor that reads a longer array would be too slow, so only its length is read."""
 
 _LENGTH = struct.Struct("<I")
 _BYTES = frozenset({"uint8", "int8", "char", "byte", "bool"})
@@ -39,7 +36,7 @@ class Fields:
         """The primitive types of the fields that are read, `[]` for arrays; `length` if only the length is read."""
 
     def read(self, data: bytes) -> dict[str, Value]:
-        """Return the fields of a message. Raises `MessageError`."""
+        """Raises `MessageError`."""
         values: dict[str, Value] = {}
         position = 0
         try:

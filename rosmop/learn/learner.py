@@ -1,13 +1,12 @@
 """Learn in two passes over all recordings, and one over the held-out part.
 
 1. The first pass reads only times: the rhythm of each topic.
-2. The second pass reads the fields of each message, and the order of topics. Then the candidates of the training
-   recordings are written as specifications.
+2. The second pass reads the fields, and the order of topics. The candidates of the training recordings become
+   specifications.
 3. The specifications run on the held-out recordings. A bound that was exceeded there is learnt again from all
    recordings, and so stays untested. Any other candidate with an alarm is left out.
 
-`passes` executes a pass on one recording. Messages are never stored, so the memory depends only on the number of topics
-and fields.
+Messages are never stored, so the memory depends only on the number of topics and fields.
 """
 
 import math
@@ -44,7 +43,7 @@ _WINDOWS = 24  # the minimum number for all recordings together
 
 @dataclass(frozen=True)
 class LearningResult:
-    """The result of learning; `alarms` are the alarms on the held-out recordings."""
+    """`alarms` are the alarms on the held-out recordings."""
 
     text: str
     candidates: tuple[Candidate, ...]
@@ -62,9 +61,7 @@ class LearningResult:
 def learn(
     recordings: Sequence[RecordingFacts], definitions: Definitions, held_out: float, run: Run
 ) -> LearningResult:
-    """Learn from recordings, of which the fraction `held_out` is held out; `run` executes the passes. Raises
-    `LearningError`.
-    """
+    """Hold out the fraction `held_out`; `run` executes the passes. Raises `LearningError`."""
     return _Learner(recordings, definitions, held_out, run).learnt()
 
 

@@ -1,7 +1,6 @@
 """The passes of learning over one recording, and the merging of their results.
 
-A step is the input of a pass, besides the messages and their definitions. Merging is associative and commutative, so
-the recordings may be read in any order, and anywhere.
+Merging is associative and commutative, so the recordings may be read in any order, and anywhere.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -95,7 +94,7 @@ AnyStep = TimeStep | ContentStep | AlarmStep
 
 
 def facts_of(step: AnyStep, source: RecordingSource, definitions: Definitions) -> Facts:
-    """Execute a step. Raises `LearningError`."""
+    """Raises `LearningError`."""
     if isinstance(step, TimeStep):
         return _times(step, source)
     if isinstance(step, ContentStep):

@@ -52,10 +52,7 @@ class LearnedSpan:
 def split(
     recordings: Sequence[RecordingFacts], held_out: float
 ) -> tuple[list[LearnedSpan], list[LearnedSpan]]:
-    """Hold out whole recordings, spread evenly, or the end of a single one.
-
-    If there is only one recording and it is too short to split, nothing is held out.
-    """
+    """Hold out whole recordings, spread evenly, or the end of a single one, unless it is too short to split."""
     parts = [
         LearnedSpan(number, recording.name, recording.began, recording.ended)
         for number, recording in enumerate(recordings)

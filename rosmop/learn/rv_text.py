@@ -30,7 +30,7 @@ def rounded_down(value: float, width: float) -> str:
 
 
 def number(value: float) -> str:
-    """Write a number; an integer stays an integer."""
+    """Write an integer as an integer."""
     text = repr(value)
     if isinstance(value, int) and value >= 1 << 63:
         return f"{text}u"  # only an unsigned type holds it
@@ -50,7 +50,7 @@ def quoted(text: str) -> str:
 
 
 def one_line(text: str) -> str:
-    """Return a text in one line: spaces replace line ends, and other control characters are escaped."""
+    """Replace line ends by spaces, and escape other control characters."""
     words = " ".join(text.split())
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in words)
 

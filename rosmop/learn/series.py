@@ -1,7 +1,6 @@
 """Statistics of one field: extremes by window, few values, rates of change, standstills.
 
-Memory is bounded: one number for each window, and a limited set of values. Statistics of different recordings are
-merged. As recordings have different windows, merging is associative and commutative.
+Memory is bounded. Merging the statistics of recordings is associative and commutative.
 """
 
 import math
@@ -107,12 +106,12 @@ class Series(msgspec.Struct):
     since: float = 0.0
 
     def end(self) -> None:
-        """End a recording; the values of the next one are independent of its values."""
+        """The values of the next recording are independent of those of this one."""
         self.last, self.time, self.since = None, 0.0, 0.0
         self.values.end()
 
     def merged(self, other: "Series") -> "Series":
-        """Return the series together; both must have ended."""
+        """Both series must have ended."""
         return Series(
             self.period, self.count + other.count, self.changed + other.changed, self.nan or other.nan,
             self.infinite or other.infinite, self.highs.merged(other.highs), self.lows.merged(other.lows),
@@ -120,7 +119,7 @@ class Series(msgspec.Struct):
         )  # fmt: skip
 
     def add(self, value: float | int, seconds: float, window: int) -> None:
-        """Add a number; only whole numbers may be an enumeration."""
+        """Only whole numbers may be an enumeration."""
         self.count += 1
         if not self.values.many and not isinstance(value, float):
             self.values.add(value, window)
@@ -144,7 +143,7 @@ class Series(msgspec.Struct):
             self.infinite = True
 
     def add_array(self, low: float, high: float, nan: bool, infinite: bool, window: int) -> None:
-        """Add an array; the extremes are those of its finite elements."""
+        """The extremes are those of the array's finite elements."""
         self.count += 1
         self.nan |= nan
         self.infinite |= infinite

@@ -1,8 +1,7 @@
 """Find which topics follow each other: alternations, answers and preconditions, with their times.
 
-For each pair of topics, three things are measured: the time from a message of the second topic back to the last message
-of the first (`back`); the time from the first unanswered message to its answer (`forth`); and whether the topics take
-turns. `by_chance` returns whether chance would give the same result.
+Three things are measured for each pair: the time from a message of the second topic back to the last message of the
+first (`back`); the time from the first unanswered message to its answer (`forth`); and whether the topics take turns.
 """
 
 import math
@@ -13,7 +12,7 @@ import msgspec
 from rosmop.learn.series import HighestValues, merged_rows
 
 MOST_TOPICS = 24
-"""The most topics; those with more messages are preferred."""
+"""Topics with more messages are preferred."""
 
 _SURE = 1e-6  # the probability that any of all pairs looks like an order by chance
 _FEWEST = 20  # the minimum number of messages for an order
@@ -80,11 +79,7 @@ class TopicOrders:
         self.pairs = merged_rows(self.pairs, pairs, TopicPair.merged)
 
     def by_chance(self, bound: float, rate: float, count: int) -> bool:
-        """Return whether `count` messages would be within `bound` seconds of another topic's messages by chance
-        alone.
-
-        `rate` is the other topic's rate (1/s).
-        """
+        """Whether `count` messages would be within `bound` seconds of another topic's (`rate`, 1/s) by chance alone."""
         share = bound * rate
         return share >= 0.5 or count * math.log(max(share, 1e-12)) > math.log(_SURE / max(len(self.pairs), 1))
 

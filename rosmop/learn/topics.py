@@ -48,7 +48,7 @@ class TopicRhythm(msgspec.Struct):
         self.last = None
 
     def merged(self, other: "TopicRhythm") -> "TopicRhythm":
-        """Return the rhythms together; both must have ended and be of different parts."""
+        """Both rhythms must have ended and be of different parts."""
         return TopicRhythm(
             self.count + other.count, self.recordings | other.recordings, self.gaps.merged(other.gaps),
             {**self.some, **other.some},
@@ -143,7 +143,7 @@ class TopicContentReader:
         return content
 
     def add(self, data: bytes, time: int, window: int) -> None:
-        """Add a message. Raises `MessageError`."""
+        """Raises `MessageError`."""
         seconds = time / 10**9
         for path, value in self._fields.read(data).items():
             kind = self._types[path]

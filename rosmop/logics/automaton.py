@@ -1,7 +1,7 @@
 """Finite automata as tables: explore, minimise and walk them.
 
-States and events are numbers. ``verdicts[s]`` are the categories of a property after a step *into* ``s``; the
-categories of the initial state count only if the automaton enters it again.
+``verdicts[s]`` are the categories after a step *into* ``s``; those of the initial state count only if it is entered
+again.
 """
 
 from collections import deque
@@ -11,7 +11,7 @@ from typing import TypeVar
 
 MAX_STATES = 10_000
 MAX_TRANSITIONS = 500_000
-"""The most transitions; minimising takes about 300 bytes for each."""
+"""Minimising takes about 300 bytes for each transition."""
 
 State = TypeVar("State", bound=Hashable)
 
@@ -47,7 +47,7 @@ def explore(
     verdict: Callable[[State], tuple[str, ...]],
     limit: int = MAX_STATES,
 ) -> Automaton:
-    """Return the minimised automaton of all states reachable from ``initial``. Raises `TooManyStatesError`."""
+    """Return the minimised automaton of all reachable states. Raises `TooManyStatesError`."""
     numbers: dict[State, int] = {initial: 0}
     states = [initial]
     table: list[tuple[int, ...]] = []
@@ -69,10 +69,7 @@ def explore(
 
 
 def minimise(automaton: Automaton) -> Automaton:
-    """Return the smallest automaton with the same verdicts on every trace.
-
-    States are numbered in order of discovery.
-    """
+    """Return the smallest automaton with the same verdicts on every trace, with states in order of discovery."""
     block_of = _coarsest_partition(automaton)
     numbers = {block_of[automaton.initial]: 0}
     order = [automaton.initial]
@@ -141,10 +138,7 @@ def _split(blocks: list[set[int]], block_of: list[int], cut: int, members: list[
 
 
 def reachable(automaton: Automaton) -> list[int]:
-    """Return the states that a trace can lead to, nearest first.
-
-    The initial state is included only if a trace enters it again.
-    """
+    """Return the states that a trace can enter, nearest first; the initial state only if one enters it again."""
     seen: dict[int, None] = {}
     frontier = [automaton.initial]
     while frontier:
@@ -159,8 +153,8 @@ def reachable(automaton: Automaton) -> list[int]:
 def letter_classes(events: Sequence[str], named: Sequence[str]) -> tuple[list[int], list[int]]:
     """Group the events that a formula cannot distinguish: all events that it does not name form one class.
 
-    Returns the class of each event, and the index of each class in ``named`` (-1 for the class of unnamed events).
-    Classes are numbered in the order of their first events.
+    Returns the class of each event, and the index of each class in ``named`` (-1 for unnamed events), in the order of
+    events.
     """
     position = {name: index for index, name in enumerate(named)}
     classes: dict[int, int] = {}

@@ -1,21 +1,17 @@
 """Monitors for mtl formulas about a bounded future (`past_monitors.py` implements the part about the past).
 
-The formula is evaluated at every event. Its value at an event is reported once it is certain: after an event, or when
-a bound passes. `x or y` is certain once either operand is true. `x until[l,h] y` is certain once `y` came in time and
-`x` held until then, once `x` failed, or once the time is over.
+The value of the formula at an event is reported once it is certain: after an event, or when a bound passes.
 
 Theory of operation. A `PastProgram` lists the distinct subformulas; those that only look back are computed at their
-event (`FoldedProgram`). For each other subformula, a *cell* is its value at one event while the value is open. A
-decided cell notifies its *users*. Cells exist only where needed: for `fire => eventually[0,1s] safe`, only the
-waiting `fire` events are kept.
+event (`FoldedProgram`). Each other subformula has a *cell*: its value at one event while the value is open. A decided
+cell notifies its *users*. Cells exist only where needed: for `fire => eventually[0,1s] safe`, only the waiting `fire`
+events are kept.
 
-- `until` over operands known at once keeps the waiting events in order and decides the oldest first. So the cost of a
-  step does not depend on their number.
-- `until` and `since` over open operands keep *rows*, one for each relevant event. A result is certain if it is the
-  same whether all open operands fail or all hold (both operators are monotonic). When an operand is decided, `until`
-  visits only the rows that the operand may decide; `since` visits all rows.
-
-A run waits for at most `MOST_OPEN` events; a step beyond that is a fault, and its event is ignored.
+- `until` over operands known at once decides the oldest waiting event first, so the cost of a step does not depend on
+  their number.
+- `until` and `since` over open operands keep *rows*, one for each relevant event. A result is certain if it is the same
+  whether all open operands fail or all hold, because both operators are monotonic. When an operand is decided, `until`
+  visits only the rows that it may decide; `since` visits all rows.
 
 To undo a step, `BoundedRun.mark` copies the operators' rows, and `FormulaCell.touch` copies each cell before its
 first change. Rows do not change after their step.
@@ -36,7 +32,7 @@ from rosmop.logics.past_monitors import FOREVER, VERDICTS, PastInstruction, Past
 MOST_OPEN = 10_000
 
 MOST_OPEN_IN_SLICE = 1_000
-"""The most waiting events of a slice, because a parametric specification may have many slices."""
+"""Less than `MOST_OPEN`, because a parametric specification may have many slices."""
 
 _LATER = ("until", "next")
 
@@ -45,8 +41,7 @@ class FormulaCell:
     """The open value of a subformula at one event.
 
     `tells` is the number of the event (`BoundedRun.place`) if the subformula is the whole formula; otherwise it is 0.
-
-    With a `kind` (`and`, `or`, `xor`, `not`) the value is computed from `operands`, of which `missing` are open.
+    With a `kind` the value is computed from `operands`, of which `missing` are open.
     """
 
     __slots__ = ("journal", "kind", "missing", "operands", "tells", "users", "value")
@@ -99,7 +94,7 @@ def _known(value: Value) -> bool | None:
 
 
 def _use(value: Value, user: "FormulaCell | _Operator") -> bool:
-    """Return whether the value is open, and then have the user notified when it is known."""
+    """Return whether the value is open; if so, `user` is notified once it is known."""
     if isinstance(value, FormulaCell) and value.value is None:
         value.touch()
         value.users.append(user)
@@ -182,8 +177,6 @@ class _Operator(ABC):
 
 
 class _Until(_Operator):
-    """`until` over known values."""
-
     def take(self, now: int) -> None:
         rows = self.rows
         if not rows:
@@ -215,8 +208,6 @@ _Marks = tuple[list[_Mark], ...]
 
 
 class _Rows(_Operator):
-    """An operator that keeps the values of its operands."""
-
     def keep(self, now: int) -> _Row:
         if not self.rows or self.rows[-1].left is not None:
             self.rows.append(_Row(self.run.place, now, None, None, None))
@@ -237,10 +228,10 @@ class _Rows(_Operator):
 class _OpenUntil(_Rows):
     """`until` over values that may be open. Bounds up to the time `passed` have expired.
 
-    `pending` are the undecided rows. They are decided from sorted lists of marks: the events where the right operand
-    holds (`holds`) or may hold (`hopes`), and where the left operand fails (`fails`) or may fail (`doubts`). A new
-    value concerns only the pending rows for which it was the first or last of its kind. These rows are found by their
-    times, so the cost of a step depends only on the number of rows that it decides.
+    The undecided rows (`pending`) are decided from sorted lists of marks: the events where the right operand holds
+    (`holds`) or may hold (`hopes`), and where the left operand fails (`fails`) or may fail (`doubts`). A new value
+    concerns only the rows for which it was the first or last of its kind. They are found by their times, so a step
+    costs only the rows that it decides.
     """
 
     def __init__(self, run: "BoundedRun", number: int, instruction: PastInstruction) -> None:
@@ -398,7 +389,7 @@ def _supposed(value: Value | None, *, hopeful: bool) -> bool:
 class _OpenSince(_Rows):
     """`since` over values that may be open; `window` is its state before the rows.
 
-    `least` is its state after the newest row if all open values fail, `most` its state if all open values hold.
+    `least` is its state after the newest row if all open values fail, `most` if all hold.
     """
 
     def __init__(self, run: "BoundedRun", number: int, instruction: PastInstruction) -> None:
@@ -440,8 +431,6 @@ class _OpenSince(_Rows):
 
 
 class _OpenPreviously(_Operator):
-    """`previously` of a value that may be open."""
-
     before: Value = False
     time = -FOREVER
 
@@ -461,7 +450,7 @@ class _OpenPreviously(_Operator):
 
 
 class _Next(_Operator):
-    """`next`; `before` has the rows of the previous event, `rows` the rows of the current event."""
+    """`next`; `before` has the rows of the previous event, `rows` those of the current event."""
 
     def __init__(self, run: "BoundedRun", number: int, instruction: PastInstruction) -> None:
         super().__init__(run, number, instruction)
@@ -535,9 +524,7 @@ class BoundedProperty(CompiledProperty):
         return found
 
     def _decided_late(self) -> set[str]:
-        """Return the categories that are decided late: an `until` or `next` fails when its bound expires,
-        which is `violation`, or `validation` if it is negated.
-        """
+        """An `until` or `next` fails when its bound expires: a `violation`, or a `validation` if it is negated."""
         signs: dict[int, set[bool]] = {self.program.result: {False}}
         for number in sorted(self.later, reverse=True):
             instruction = self.program.instructions[number]
@@ -551,7 +538,7 @@ class BoundedProperty(CompiledProperty):
         return {VERDICTS[sign] for signs_of in found for sign in signs_of}
 
     def blocking_refused(self, category: str) -> str | None:
-        """Return a refusal, because a deadline may decide the category without a message."""
+        """A deadline may decide the category without a message."""
         super().blocking_refused(category)
         if category not in self._failing:
             return None
@@ -570,7 +557,7 @@ _KINDS: dict[str, type[_Operator]] = {
 
 
 _FORWARD = (_Until, _OpenUntil, _Next)
-"""The operators that keep nothing but waiting events (`rows`)."""
+"""The operators that keep only waiting events (`rows`)."""
 
 
 class BoundedRun:
@@ -650,7 +637,6 @@ class BoundedRun:
         return self.place, list(map(copy, self._at_once)), operators
 
     def take_back(self, mark: tuple[Any, ...]) -> None:
-        """Restore the marked state, but keep the time."""
         self.place, self._at_once, operators = mark
         for operator, before in zip(self.operators.values(), operators, strict=True):
             operator.restore(before)
@@ -665,7 +651,6 @@ class BoundedRun:
         self._at_once, self.place, self._now, self._told, self._about = saved
 
     def value(self, number: int) -> Value:
-        """Return the value of an instruction at the current event, or a cell while it is open."""
         index = self._compiled.at_once.get(number)
         if index is not None:
             return bool(self._at_once[self._places[index]])
@@ -692,7 +677,7 @@ class BoundedRun:
         return cell if cell.missing else _together(kind, cell.operands)
 
     def decide(self, cell: FormulaCell | None, value: bool) -> None:
-        """Decide a cell, unless it is None because it is unused."""
+        """The cell is None if it is unused."""
         if cell is not None and cell.value is None:
             cell.touch()
             cell.value = value

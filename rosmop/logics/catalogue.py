@@ -52,8 +52,8 @@ def compile_property(
 ) -> CompiledProperty:
     """Compile a property. Raises `FormulaError`.
 
-    The case of ``logic`` does not matter. ``events`` are in source order, each name once. ``origin`` is the
-    position of the formula, and ``logic_position`` is the position of the logic's name (default: ``origin``).
+    The case of ``logic`` does not matter. ``events`` are in source order, each name once. ``origin`` is the position
+    of the formula.
     """
     found = LOGICS.get(logic.lower())
     if found is None:

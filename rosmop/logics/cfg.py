@@ -1,8 +1,5 @@
 """``cfg``: context-free grammars over the events, as MOP's CFG plugin reads them.
 
-``S -> a S b | epsilon``. Any grammar is accepted, even if it is ambiguous or derives the empty word. The verdict's
-category is ``match`` while the trace so far is in the language, and ``fail`` once no continuation can be in it.
-
 If the recogniser has few states, as for a regular language, the grammar becomes a table.
 """
 
@@ -27,7 +24,6 @@ FAIL: Categories = ("fail",)
 UNDECIDED: Categories = ()
 
 MAX_TABLE_FRAMES = 500
-"""The limit of the search for a finite table."""
 
 
 class GrammarProperty(CompiledProperty):
@@ -51,7 +47,7 @@ class GrammarRun(UntimedRun):
         self.frame: EarleySet | None = recogniser.initial
 
     def step(self, event: int, _time_ns: int) -> Categories:
-        """Step an event. If this raises `RunFaultError`, the run is unchanged."""
+        """If this raises `RunFaultError`, the run is unchanged."""
         if self.frame is None:
             return FAIL
         after = self._step(self.frame, event)

@@ -1,8 +1,5 @@
 """Read the context-free grammars of ``cfg`` properties, and transform them for parsing.
 
-``S -> a S b | epsilon, T -> c``. The first left side is the start symbol. The comma between productions is optional. As
-in MOP, ``( … )`` groups, and ``*`` and ``+`` after a symbol or a group repeat it.
-
 A symbol is a number: an event has its index, a nonterminal a number from ``terminals`` on.
 """
 
@@ -148,9 +145,9 @@ class _GrammarReader:
 def prepare(grammar: Grammar) -> Grammar:
     """Keep only useful symbols, each of which derives more than the empty word.
 
-    ``A -> A x A`` becomes ``A -> A x B``, where ``B`` has the other rules of ``A``. Both mean "B, any number of
-    times, with x between", but only the second form is unambiguous. The start symbol may still derive the empty word.
-    If the start symbol derives nothing else, no rule remains.
+    ``A -> A x A`` becomes ``A -> A x B``, where ``B`` has the other rules of ``A``: both mean the same, but only the
+    second form is unambiguous. The start symbol may still derive the empty word; if it derives nothing else, no rule
+    remains.
     """
     rules = _flat_repetitions(grammar)
     productive = _closure(rules, grammar.terminals)

@@ -1,12 +1,7 @@
 """``ere``: extended regular expressions, as MOP's ERE plugin reads them.
 
-From loosest to tightest: ``|`` union, ``&`` intersection, juxtaposition, ``~`` complement, the suffixes ``*``, ``+``,
-``^n``. ``epsilon`` is the empty trace, and ``empty`` matches no trace. The verdict's category is ``match`` while the
-trace so far is in the language, and ``fail`` once no continuation can be in it.
-
-The monitor uses Brzozowski's derivatives: a state is an expression, and an event leads to the derivative of the
-expression. Expressions that are equal by associativity, commutativity and idempotence of union and intersection are
-stored once, so their number is finite.
+The states are Brzozowski's derivatives. Expressions that are equal by associativity, commutativity and idempotence of
+union and intersection are stored once, so their number is finite.
 """
 
 from dataclasses import dataclass

@@ -1,7 +1,6 @@
 """Parse temporal formulas of ltl, ptltl and mtl, with a table of operators for each logic.
 
-A ``Syntax`` names the unary operators, which bind tightest, and the levels of binary operators from tightest to
-loosest. Nesting is bounded, so no walk over a formula can exhaust the stack.
+Nesting is bounded, so no walk over a formula can exhaust the stack.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -37,9 +36,8 @@ class Formula:
 
 @dataclass(frozen=True)
 class Level:
-    """Binary operators of equal precedence.
-
-    ``flat`` operators associate, ``left`` ones group leftwards, and ``once`` ones do not chain.
+    """Binary operators of equal precedence: ``flat`` ones associate, ``left`` ones group leftwards, ``once`` ones do
+    not chain.
     """
 
     operators: Mapping[str, str]
@@ -48,7 +46,7 @@ class Level:
 
 @dataclass(frozen=True)
 class Syntax:
-    """The operators of a temporal logic by their spelling.
+    """The operators of a temporal logic: unary ones, which bind tightest, then levels of binary ones, tightest first.
 
     ``bounded`` operators may be followed by ``[from,to]``.
     """
@@ -57,7 +55,7 @@ class Syntax:
     levels: tuple[Level, ...]
     bounded: frozenset[str] = frozenset()
     refused: Mapping[str, str] = field(default_factory=dict)
-    """Spellings of other logics, and what to write instead."""
+    """Spellings of other logics, and the spelling to write instead."""
 
     def signs(self) -> list[str]:
         spellings = [*BOOLEAN_SIGNS, "[", "]", ",", *self.unary, *self.refused]

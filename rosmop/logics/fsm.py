@@ -1,9 +1,4 @@
-"""``fsm``: finite state machines, as MOP's FSM plugin reads them.
-
-``s0 [ a -> s1, default s0 ] s1 [ b -> s0 ] alias bad = s1``. The first state is the initial one; an event without a
-transition and without a default leads to ``fail``. No event leaves ``fail``. Categories are the states, the aliases and
-``fail``. ``read_state_machine`` also reads ``tfsm``, where a state may have a ``timeout``.
-"""
+"""``fsm``: finite state machines, as MOP's FSM plugin reads them; ``read_state_machine`` also reads ``tfsm``."""
 
 from dataclasses import dataclass, field
 
@@ -17,7 +12,7 @@ TIMEOUT = "timeout"
 
 @dataclass
 class StateText:
-    """A state as written. Only tfsm has timeouts."""
+    """Only tfsm has timeouts."""
 
     moves: dict[str, FormulaToken] = field(default_factory=dict)
     default: FormulaToken | None = None
@@ -26,7 +21,7 @@ class StateText:
 
 @dataclass
 class StateMachineText:
-    """A machine as written; ``order`` are the states in source order."""
+    """``order`` are the states in source order."""
 
     states: dict[str, StateText]
     aliases: dict[str, list[str]]
@@ -62,7 +57,7 @@ def machine_automaton(source: Source, machine: StateMachineText) -> Automaton:
 
 
 def read_state_machine(source: Source, *, timed: bool) -> StateMachineText:
-    """Return the machine as written. Raises `FormulaError` with all errors."""
+    """Raises `FormulaError` with all errors."""
     reader = TokenReader(source, ("->", "[", "]", "=", ","))
     machine = StateMachineText({}, {})
     used: list[FormulaToken] = []

@@ -1,22 +1,17 @@
 """The interface of every logic to the compiler of ``.rv`` files and to the relay.
 
-A logic compiles a formula to a ``CompiledProperty``, which names the *categories* that may have handlers, and starts
-*runs*. Each step of a run takes an event and returns categories, whose handlers the caller runs.
-
 Contract for the caller of a run:
 
 1. ``property.start(now)`` returns a fresh run. ``now`` is the time when monitoring begins, or when ``__RESET;`` took
    effect.
-2. Before a step at time ``t``: while ``run.deadline`` is not None and ``run.deadline < t``, call ``run.expire()``. A
-   bound is closed: an event exactly at the deadline is in time. So a deadline expires only when no event at or before
-   it can still come. The expiry takes effect at the deadline.
-3. ``run.step(event, t)`` returns the categories after the event, in the order of their handlers. After ``expire()``,
-   handlers run in the order of the returned categories (``timeout`` before the new state).
+2. Before a step at time ``t``: while ``run.deadline`` is not None and ``run.deadline < t``, call ``run.expire()``. An
+   event exactly at the deadline is in time, so a deadline expires only when no event at or before it can still come.
+   The expiry takes effect at the deadline.
+3. ``run.step(event, t)`` returns the categories after the event. Their handlers run in this order, also after
+   ``expire()`` (``timeout`` before the new state).
 4. Times are integer nanoseconds and never decrease: an earlier time than the last counts as the last time.
-5. A `FormulaRun` can undo a dropped message: call `mark` before the first step of the message, and call `take_back`
-   with that mark if the message is dropped. The time is not undone. No deadline expires between the two calls.
-
-A ``FiniteProperty`` and a ``ClockedProperty`` also offer their tables, so that a module can step them.
+5. A `FormulaRun` can undo a dropped message: call `mark` before its first step, and `take_back` with that mark if it is
+   dropped. The time is not undone. No deadline expires between the two calls.
 """
 
 from abc import ABC, abstractmethod
@@ -31,7 +26,7 @@ Categories = tuple[str, ...]
 
 
 class FormulaError(Exception):
-    """A rejected formula: the reasons, their positions, and what to write instead."""
+    """A rejected formula: the reasons, their positions, and the remedies."""
 
     def __init__(self, findings: Sequence[Diagnostic]) -> None:
         super().__init__("; ".join(str(finding) for finding in findings))
@@ -59,7 +54,7 @@ class Run(Protocol):
     def step(self, event: int, time_ns: int) -> Categories: ...
 
     def expire(self) -> Categories:
-        """Let the deadline pass. Call this only while ``deadline`` is not None."""
+        """Call this only while ``deadline`` is not None."""
 
     def saved(self) -> tuple[Any, ...]:
         """Return the values that change (`state_of_runs.py`)."""
@@ -87,7 +82,6 @@ class Source:
     events: tuple[str, ...]
     origin: Position
     suppresses: bool = False
-    """Whether a dropped message does not count (`Logic.suppresses`)."""
 
     def finding(self, offset: int, text: str) -> Diagnostic:
         return Diagnostic(self.origin.within(self.text, min(offset, len(self.text))), "error", text)
@@ -136,18 +130,14 @@ class CompiledProperty(ABC):
         return frozenset(self.categories) if 0 <= event < len(self.events) else frozenset()
 
     def blocking_refused(self, category: str) -> str | None:
-        """Return why a handler may not drop the message, or None if it may."""
+        """Return the reason why a handler may not drop the message, or None if it may."""
         if category not in self.categories:
             raise KeyError(category)
         return None
 
 
 class FiniteProperty(CompiledProperty):
-    """A property whose monitor is a finite automaton.
-
-    ``automaton.verdicts[state]`` are the categories after a step into ``state``; a fresh run is in
-    ``automaton.initial``.
-    """
+    """A property whose monitor is a finite automaton; a fresh run is in ``automaton.initial``."""
 
     def __init__(self, source: Source, categories: Sequence[str], automaton: Automaton) -> None:
         super().__init__(source, categories)
@@ -170,7 +160,6 @@ class UntimedRun:
 
     @property
     def as_new(self) -> bool:
-        """Return False, because this is not known here."""
         return False
 
     def expire(self) -> Categories:
@@ -213,11 +202,11 @@ class FiniteRun(UntimedRun):
 
 
 Move = tuple[int, bool]
-"""A move: the next state, and whether the clock restarts."""
+"""The next state, and whether the clock restarts."""
 
 
 class Wait(NamedTuple):
-    """A wait: after ``after`` nanoseconds on the clock, the move and the categories."""
+    """After ``after`` nanoseconds on the clock, the move and the categories."""
 
     after: int
     move: Move
@@ -227,9 +216,8 @@ class Wait(NamedTuple):
 class ClockedProperty(CompiledProperty):
     """A property whose monitor is an automaton with one clock.
 
-    ``moves[state][event]`` is the move at an event. ``late`` has the same table for events more than
-    ``within`` ns after the clock started. ``verdicts`` are the categories after an event that leads to a
-    state.
+    ``moves[state][event]`` is the move at an event; ``late`` has the moves at events more than ``within`` ns after
+    the clock started. ``verdicts`` are the categories after an event that leads to a state.
     """
 
     timed = True
@@ -324,10 +312,7 @@ class Logic:
     suppresses: bool = False
     """Whether a dropped message does not count. Other logics count each event whose action passes the message."""
     failure: str | None = None
-    """The category of failure.
-
-    `check` warns about a property that always fails at the first event.
-    """
+    """The category of failure: `check` warns about a property that always fails at the first event."""
     has_states: bool = False
     """Whether coverage counts states, and formulas may write `default` for all events."""
     implicit_events: tuple[str, ...] = ()

@@ -1,6 +1,4 @@
-"""Split a formula into tokens. Each logic has its signs; names, numbers, white space and C comments are common. A
-formula longer than ``MAX_CHARACTERS`` is rejected first.
-"""
+"""Split a formula into tokens. Each logic has its signs; names, numbers, white space and C comments are common."""
 
 import re
 from collections.abc import Sequence
@@ -13,7 +11,7 @@ from rosmop.logics.interface import FormulaError, Source
 
 MAX_CHARACTERS = 100_000
 MAX_DURATION_NS = 10**18
-"""The longest bound, about 31 years; longer bounds are rejected as mistakes."""
+"""About 31 years; longer bounds are rejected as mistakes."""
 MAX_NUMBER_DIGITS = 30
 
 UNITS_NS = {
@@ -69,7 +67,7 @@ def tokenize(source: Source, signs: Sequence[str]) -> list[FormulaToken]:
 
 
 def _sign_pattern(sign: str) -> str:
-    """Return a pattern for a sign. A sign that ends with a letter (``~o``) must end where the word ends."""
+    """A sign that ends with a letter (``~o``) must end where the word ends."""
     return re.escape(sign) + (r"(?![A-Za-z_0-9])" if sign[-1].isalnum() else "")
 
 
@@ -95,7 +93,7 @@ def suggestion(name: str, known: Sequence[str]) -> str:
 
 
 class TokenReader:
-    """Walks over tokens, and collects findings that do not stop the reading."""
+    """Walks over tokens, and collects errors that do not stop the reading."""
 
     def __init__(self, source: Source, signs: Sequence[str]) -> None:
         self.source = source
@@ -124,7 +122,7 @@ class TokenReader:
         return False
 
     def expect(self, kind: str, what: str) -> FormulaToken:
-        """Read a token of this kind, or reject the formula: ``what`` was expected."""
+        """Raises `FormulaError` for a token of another kind: ``what`` was expected."""
         if self.token.kind != kind:
             raise self.unexpected(what)
         return self.take()
@@ -133,7 +131,7 @@ class TokenReader:
         return self.source.error(self.token.offset, f"expected {what}, found {describe(self.token)}")
 
     def note(self, token: FormulaToken, text: str) -> None:
-        """Note an error, so that one pass finds as many errors as possible."""
+        """Note an error, so that one pass finds as many as possible."""
         if len(self.findings) < 20:
             self.findings.append(self.source.finding(token.offset, text))
 

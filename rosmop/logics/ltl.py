@@ -1,16 +1,13 @@
-"""``ltl``: future linear temporal logic over infinite traces, as MOP's LTL plugin reads it, with three verdicts.
+"""``ltl``: linear temporal logic over infinite traces, as MOP's LTL plugin reads it, with the three verdicts of LTL3.
 
-Each event is one position, where exactly its own atom holds. The verdict's category is ``violation`` once no
-continuation satisfies the formula, and ``validation`` once all continuations satisfy it. Both are permanent. (Bauer,
-Leucker, Schallhart: LTL3.)
-
-Theory of operation. The normal forms of the formula and of its negation each become a generalised Büchi automaton
-(``buchi``). States that accept no word are removed. Both automata are determinised side by side: an empty left side is
-a violation, an empty right side a validation. The result is minimised.
+Theory of operation (Bauer, Leucker, Schallhart). The formula and its negation each become a generalised Büchi
+automaton (``buchi``), without states that accept no word. Both are determinised side by side: an empty left side is a
+violation, an empty right side a validation. The result is minimised.
 
 An operator about the past is replaced by a proposition, whose value is guessed at each position. A formula about the
 future is added that only the correct guesses satisfy (``_Past``). Every trace has exactly one correct guess, so the
-formula and its negation keep exactly their traces. An event is the set of all letters that differ only in the guesses.
+formula and its negation keep exactly their traces. An event is the set of all letters that differ only in the
+guesses.
 """
 
 from rosmop.logics.automaton import TooManyStatesError, explore, letter_classes, spread
@@ -48,7 +45,7 @@ _PAST = {"previously", "dual previously", "historically", "once", "since", "dual
 _FUTURE = {"next", "always", "eventually", "until", "release"}
 VERDICTS = ("violation", "validation")
 MOST_LETTERS = 1024
-"""The most letters; each operator about the past doubles the classes of events."""
+"""Each operator about the past doubles the classes of events."""
 
 
 def compile_ltl(source: Source) -> FiniteProperty:

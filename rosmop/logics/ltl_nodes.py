@@ -1,8 +1,8 @@
 """Formulas of linear temporal logic in negation normal form, each stored once and identified by a number.
 
-At each position exactly one letter holds. Therefore an atom, or a boolean combination of atoms, is one node
-``letters``: the bit set of the letters at which it holds. The other nodes are ``and`` and ``or`` (flat), ``next``,
-``until`` and ``release``.
+At each position exactly one letter holds, so an atom, or a boolean combination of atoms, is one node ``letters``: the
+bit set of the letters at which it holds. The other nodes are ``and`` and ``or`` (flat), ``next``, ``until`` and
+``release``.
 """
 
 from collections.abc import Iterable, Mapping
@@ -60,13 +60,13 @@ class FormulaNodes:
         return operand if self._mask(operand) in (0, self.everything) else self._intern("next", (operand,))
 
     def until(self, left: int, right: int) -> int:
-        """Return a node by which ``right`` holds at some position, and ``left`` at all positions before it."""
+        """``right`` holds at some position, and ``left`` at all positions before it."""
         if self._mask(right) in (0, self.everything) or self._mask(left) == 0 or left == right:
             return right
         return self._intern("until", (left, right))
 
     def release(self, left: int, right: int) -> int:
-        """Return a node by which ``right`` holds up to and including the first position of ``left``, or always."""
+        """``right`` holds up to and including the first position of ``left``, or always."""
         if self._mask(right) in (0, self.everything) or self._mask(left) == self.everything or left == right:
             return right
         return self._intern("release", (left, right))
@@ -109,7 +109,7 @@ class FormulaTranslation:
         return self._nodes.letters(mask if positive else everything & ~mask)
 
     def _temporal(self, operator: str, parts: list[int], positive: bool) -> int:
-        """Return the node of a temporal operator, whose parts are already negated if necessary."""
+        """The parts are already negated if necessary."""
         nodes = self._nodes
         if operator == "next":
             return nodes.next(parts[0])

@@ -1,14 +1,7 @@
 """``mtl``: metric temporal logic, in words, with closed time bounds.
 
-About the past: ``once[0,500ms] a``, ``historically[…] a``, ``a since[…] b``, ``previously[…] a``. Without bounds,
-these operators mean ``[0,inf]``.
-
-About the future: ``eventually[0,500ms] a``, ``always[…] a``, ``a until[…] b``, ``next[…] a``. These
-operators need an upper bound.
-
-The semantics is pointwise: a formula is evaluated only at events, and its operators see only events, at their times of
-reception. The verdict's category is ``validation`` if the formula holds at an event, and ``violation`` if it does not.
-The verdict comes once it is certain, at the latest when the bounds have passed.
+The semantics is pointwise: a formula is evaluated only at events, and its operators see only events, at their times
+of reception. A verdict comes once it is certain, at the latest when the bounds have passed.
 """
 
 from rosmop.logics.bounded import BoundedProperty

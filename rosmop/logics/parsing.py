@@ -2,7 +2,7 @@
 
 Theory of operation. This is Earley's algorithm with the nullable symbols of Aycock and Horspool. Instead of the
 position where it began, an item holds a *continuation*: the items that wait there for its left side to be completed.
-Positions are therefore not stored, and an item without a waiting continuation is freed.
+So positions are not stored, and an item without a waiting continuation is freed.
 
 - A *frame* is an Earley set: an ``EarleyShape`` (items whose continuations are numbered) and the continuations
   themselves.
@@ -11,12 +11,11 @@ Positions are therefore not stored, and an item without a waiting continuation i
 - If completing a symbol in a frame only completes one of the frame's own continuations, that continuation is used
   instead (Leo, 1991). So right recursion needs neither memory nor time, and LR grammars need constant time per event
   on average.
-- Every step that depends on shapes alone (scanning an event, completing a symbol, joining two sets of items) is
-  computed once and stored in tables. A deterministic grammar soon finds every step there. Large shapes, which only
-  ambiguous grammars have, are not stored.
+- Every step that depends on shapes alone is computed once and stored in tables, where a deterministic grammar soon
+  finds every step. Large shapes, which only ambiguous grammars have, are not stored.
 
 Invariants: the continuations of a frame belong to less deep frames, so completing goes from deep to less deep and
-ends. A frame is viable if it has an item, because every symbol of the grammar can be completed (``grammar.prepare``).
+ends. A frame is viable if it has an item, because every symbol can be completed (``grammar.prepare``).
 """
 
 from collections.abc import Sequence

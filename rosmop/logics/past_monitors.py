@@ -2,12 +2,8 @@
 
 Theory of operation. A formula becomes a *program*: its distinct subformulas, each after its operands. The only
 temporal operators are ``previously`` and ``since`` (``once b`` is ``true since b``). A step computes all subformulas
-from the event and from the values that the last step kept (Havelund and Rosu, 2002):
-
-- for ``previously``: the value of the operand at the last event;
-- for ``since``: its own last value;
-- for either operator with bounds: the intervals of time in which the operator will hold while its left operand holds
-  (`SinceWindow`).
+from the event and from the values that the last step kept (Havelund and Rosu, 2002): the operand of ``previously``,
+the value of ``since`` itself, or with bounds its `SinceWindow`.
 
 Each event determines which atoms hold. Therefore the program is folded in advance, for each event, into the
 operations that remain, as data (`FoldedProgram`). Without time bounds the values are bits and the program is a finite
@@ -37,17 +33,15 @@ VERDICTS = ("violation", "validation")
 ANEW = "anew"
 TOLD: tuple[Categories, Categories] = VERDICTS[:1], VERDICTS[1:]
 MAX_TABLE_WORK = 2_000_000
-"""The limit of the work of building a table."""
 MAX_FOLDED = 50_000
-"""The largest program that is folded."""
 FOREVER = 10**30
 
 
 @dataclass(frozen=True)
 class PastInstruction:
-    """One subformula.
+    """One subformula; ``operands`` are the numbers of earlier instructions.
 
-    ``operands`` are the numbers of earlier instructions. An ``event`` has an index, other operators have bounds.
+    An ``event`` has an index, other operators have bounds.
     """
 
     operator: str
@@ -134,10 +128,8 @@ class FoldedProgram:
     """A program as runs execute it.
 
     A run keeps a list of *values*: first `False` and `True`, so a place below 2 is a constant; then the values kept
-    for the next step; then the values used within one step.
-
-    ``bounds`` has the bounds of each kept window (None for other kept values), ``abstract`` the places of abstract
-    operators. The last residue is for all unnamed events.
+    for the next step; then those used within one step. ``bounds`` has the bounds of each kept window (None for other
+    kept values), ``abstract`` the places of abstract operators. The last residue is for all unnamed events.
     """
 
     bounds: tuple[Bounds | None, ...]
@@ -233,7 +225,6 @@ class _Fold:
         return tuple(reversed(left)), results
 
     def _place(self, number: int, instruction: PastInstruction) -> int:
-        """Return the place of a value; a place below 2 is a constant."""
         operands = [self._places[operand] for operand in instruction.operands]
         operator, kept = instruction.plain, self._kept.get(number, 0)
         if operator == "event" and self._event is None:
@@ -292,8 +283,8 @@ def compile_past(source: Source, formula: Formula) -> CompiledProperty:
 def _table(folded: FoldedProgram, letters: Sequence[int], *, clocked: bool = False) -> Automaton:
     """Return the automaton over letters; letter ``i`` is the event ``letters[i]`` (-1: any unnamed event).
 
-    With a clock, each letter has a second form for events after the clock has run out. A state whose step restarts the
-    clock has `ANEW` after its verdict.
+    With a clock, each letter has a second form for events after the clock has run out. A state whose step restarts
+    the clock has `ANEW` after its verdict.
     """
     values, kept, many = folded.start(), folded.kept, len(letters)
 
@@ -318,10 +309,10 @@ def _table(folded: FoldedProgram, letters: Sequence[int], *, clocked: bool = Fal
 
 
 class _Clock:
-    """A window in a table that begins at once, or (with ``first``) never ends.
+    """A window in a table that begins at once, or (with ``first``) never ends; its state is whether it exists.
 
-    Its state is whether it exists. The time only matters as whether more than the bound has passed since the window's
-    last anchor, or with ``first`` since its first anchor.
+    The time only matters as whether more than the bound has passed since the window's last anchor, or with ``first``
+    since its first anchor.
     """
 
     def __init__(self, there: bool, *, first: bool) -> None:
@@ -355,8 +346,8 @@ class ClockedPastProperty(ClockedProperty):
 class SinceWindow:
     """The state of ``since[low,high]``: the intervals of time in which it will hold while the left operand holds.
 
-    Intervals that touch are merged. So there are at most about ``low/(high-low)`` intervals, and never more than the
-    number of events within ``low``.
+    Intervals that touch are merged, so there are at most about ``low/(high-low)`` of them, and never more than the
+    events within ``low``.
     """
 
     __slots__ = ("_high", "_intervals", "_low")

@@ -1,29 +1,5 @@
 """``pattern``: properties in near-English, after Dwyer's scopes and patterns, with HPL's meaning (Santos et al.).
 
-``globally: no c``, ``after a: some c within 2s``, ``until b: c causes d``, ``after a until b: c requires d within
-1s``, ``… c forbids d``.
-
-Scopes. ``globally`` is open from the start, ``until b`` from the start to the first ``b``, and ``after a`` from the
-first ``a`` on. ``after a until b`` opens at an ``a``, closes at the next ``b``, and so on. The events that open and
-close a scope are not inside the scope. An open scope counts at once, even if it is never closed.
-
-Patterns concern only events inside one scope. Time bounds are closed:
-
-- ``no c [within t]``: no ``c`` (up to t after the scope opened).
-- ``some c [within t]``: a ``c`` (up to t after the scope opened) before the scope closes.
-- ``c causes d [within t]``: after each ``c`` there is a ``d`` (up to t later) before the scope closes.
-- ``c requires d [within t]``: before each ``c`` there was a ``d`` (up to t earlier).
-- ``c forbids d [within t]``: after a ``c`` there is no ``d`` (up to t later).
-
-``before`` and ``after`` are strict: no event answers, requires or forbids itself.
-
-The verdict's category is ``violation`` once the property is certainly violated, and ``validation`` once nothing can
-violate it any more. Both are permanent. A pattern that waits (``some``, ``causes``) may never give a verdict: silence
-violates it only if there is a time bound, and never validates it.
-
-``some c within t enforced by f`` and ``… causes d within t enforced by f``: when the deadline passes, the category is
-``enforced`` and ``f`` publishes the due message, which counts as received.
-
 Theory of operation. A run is in a *mode*: the scope has not opened, is over, or is open and either *quiet* or
 *stirred*. For ``some`` and ``requires``, a run is stirred once the good event came; for ``causes``, while an answer
 is due; for ``forbids``, once the first event came. The mode and the time of one event are the whole state. Whether a
@@ -72,7 +48,7 @@ class Pattern:
         return "quiet" if self.opens is None else "waiting"
 
     def after_event(self, mode: Mode, event: int, *, late: bool) -> Mode:
-        """Return the next mode. ``late``: more than ``within_ns`` after the start of the mode's clock."""
+        """``late``: more than ``within_ns`` after the start of the mode's clock."""
         if mode == "waiting":
             return "quiet" if event == self.opens else "waiting"
         if mode in ("over", "violated"):
@@ -92,9 +68,7 @@ class Pattern:
         return "quiet" if second and self.kind == "causes" else mode
 
     def restarts_clock(self, before: Mode, event: int, mode: Mode) -> bool:
-        """Whether the clock restarts: it runs from the opening of the scope, the oldest unanswered event, or
-        the latest event.
-        """
+        """The clock runs from the opening of the scope, the oldest unanswered event, or the latest event."""
         if before == "waiting":
             return mode == "quiet"
         if mode != "stirred":
@@ -154,8 +128,8 @@ def _reachable(pattern: Pattern, mode: Mode, events: int) -> set[Mode]:
 class TimedPattern(ClockedProperty):
     """A pattern with a time bound, as tables; a state is the number of a mode.
 
-    ``expiries[mode]`` is the mode after the deadline, or None without a deadline. ``at_expiry`` are the categories at
-    the deadline that come before the verdict.
+    ``expiries[mode]`` is the mode after the deadline, or None without one. ``at_expiry`` are the categories at the
+    deadline that come before the verdict.
     """
 
     def __init__(self, source: Source, pattern: Pattern, remedy: str | None) -> None:
@@ -193,7 +167,7 @@ class TimedPattern(ClockedProperty):
         return tuple(table)
 
     def blocking_refused(self, category: str) -> str | None:
-        """Return a refusal, because a deadline may decide the category without a message."""
+        """A deadline may decide the category without a message."""
         super().blocking_refused(category)
         kind = self.pattern.kind
         comes_along = kind == "no" or self.pattern.enforced

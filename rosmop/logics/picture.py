@@ -1,10 +1,7 @@
 """Draw automata, for Graphviz or as SVG, which needs no installed program.
 
-Colours and sizes are attributes, not styles: they also work on pages whose content security policy forbids styles. A
-style sheet can change the classes `title`, `event`, `state` and `edge`.
-
-The column of a state is its distance from the start. One curve joins each pair of states, labelled with all its
-events.
+Colours and sizes are attributes, not styles: they also work on pages whose content security policy forbids styles.
+The column of a state is its distance from the start.
 """
 
 from collections import Counter, deque

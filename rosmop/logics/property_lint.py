@@ -1,7 +1,7 @@
 """Find facts about a property before it runs, such as handlers that never run and constant verdicts.
 
-Only certain facts are reported. No facts are found for a grammar that needs a stack, nor for a formula with several
-time bounds or with bounds about the future.
+Only certain facts are reported: none for a grammar that needs a stack, nor for a formula with several time bounds or
+with bounds about the future.
 """
 
 from collections import deque
@@ -62,10 +62,7 @@ def analyse(compiled: CompiledProperty, handled: Sequence[str]) -> list[Property
 
 
 def shortest_trace_to(compiled: CompiledProperty, category: str) -> tuple[str, ...] | None:
-    """Return a shortest trace to a category, or None if none is known.
-
-    ``TIME`` in it means that a deadline or a time bound passes.
-    """
+    """Return a shortest trace to a category, or None if none is known."""
     graph = graph_of(compiled)
     return None if graph is None else _shortest_traces(graph).get(category)
 

@@ -1,21 +1,8 @@
 """``ptcaret``: past-time linear temporal logic with calls and returns, as MOP's PTCaRet plugin reads it.
 
-The logic adds to ``ptltl`` operators about the *abstract* past, where every call that has returned is one opaque step.
-After the call's ``end``, all events from ``begin`` to ``end``, both included, are invisible. ``(*a) x``, ``<*a> x``,
-``[*a] x`` and ``x Sa y`` look at the abstract past. Other operators are derived from these:
-
-- ``@b x``: ``x`` held at the ``begin`` of the innermost open call; ``@c x``: ``x`` held at the event before this
-  ``begin``;
-- ``x Ss@b y``: ``y`` held at the ``begin`` of an open call, and ``x`` at each such ``begin`` since;
-  ``…s@c``, ``…s@bc`` as below;
-- ``<*s@b> x``, ``[*s@b] x``: ``x`` held at some, at every ``begin`` of an open call;
-- ``…s@c``: at the event before such a ``begin``;
-- ``…s@bc``: at an event ``begin`` or ``call`` that is not within a call that has returned.
-
-``[*s@c] x`` is ``!<*s@c> !x``: a ``begin`` that is the first event has no event before it, and violates nothing.
-
-An ``end`` without a ``begin`` restarts the abstract past. The number of open calls is limited; a ``begin`` beyond the
-limit is a fault of the specification. (Rosu, Chen and Ball, 2008.)
+The *abstract* past has every call that has returned as one opaque step. All operators about stacks (``@b``,
+``<*s@c>``) are derived from its operators (Rosu, Chen and Ball, 2008); ``docs/reference/logics.md`` has the
+definitions.
 """
 
 from itertools import zip_longest
@@ -95,7 +82,7 @@ class CaretRun(UntimedRun):
         return made
 
     def step(self, event: int, _time_ns: int) -> Categories:
-        """Step an event. If this raises `RunFaultError`, the run is unchanged."""
+        """If this raises `RunFaultError`, the run is unchanged."""
         compiled, values, stack = self._compiled, self._values, self._stack
         abstract = compiled.folded.abstract
         if event == compiled.begin:

@@ -1,9 +1,4 @@
-"""``ptltl``: past-time linear temporal logic, as MOP's PTLTL plugin reads it.
-
-The verdict comes after each event: ``validation`` if the formula holds at this event, ``violation`` if it does not. At
-an event that the formula does not name, all its atoms are false. The first event has no previous event: ``(*) a`` is
-false there, and ``[*] a`` is ``a``.
-"""
+"""``ptltl``: past-time linear temporal logic, as MOP's PTLTL plugin reads it."""
 
 from rosmop.logics.formula import NOT, Level, Syntax, boolean_levels, read_formula
 from rosmop.logics.interface import CompiledProperty, Source

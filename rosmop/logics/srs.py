@@ -1,11 +1,5 @@
-"""``srs``: string rewriting systems, as MOP's SRS plugin reads them.
-
-``hasnext next -> #epsilon . ^ next -> #fail .``: each event is appended to a string, which is then rewritten until no
-rule matches. The rule that matches furthest to the left is applied; if several rules match there, the first one in the
-text. ``^`` and ``$`` mean the beginning and the end of the string, and are never replaced. A symbol that is not an
-event is an auxiliary symbol of the author. The categories ``#fail`` and ``#succeed`` are permanent.
-
-A run limits the length of its string and the work for one event; exceeding a limit is a fault of the specification.
+"""``srs``: string rewriting systems, as MOP's SRS plugin reads them, with a limit of length and of work for one
+event.
 """
 
 from collections.abc import Sequence
@@ -19,10 +13,7 @@ CATEGORIES: Categories = ("fail", "succeed")
 MAX_RULES = 1_000
 MAX_STRING = 100_000
 MAX_WORK = 200_000
-"""The limit of rules tried and symbols moved for one event.
-
-Sixteen comparisons of symbols count as one move.
-"""
+"""The limit of rules tried and symbols moved for one event; sixteen comparisons of symbols count as one move."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +56,7 @@ class RewritingRun(UntimedRun):
         self.verdict: Categories = ()
 
     def step(self, event: int, _time_ns: int) -> Categories:
-        """Step an event. If this raises `RunFaultError`, the run is unchanged."""
+        """If this raises `RunFaultError`, the run is unchanged."""
         if not self.verdict:
             self.string, self.verdict = self._rewritten([*self.string, event])
         return self.verdict

@@ -1,11 +1,7 @@
 """``tfsm``: state machines with time bounds.
 
-``s1 [ b -> s0, timeout 2s -> late ]``: after 2 s in ``s1`` without an event the machine moves to ``late``. This move
-gives the category ``timeout``, then the categories of the new state. The new state counts as entered at the deadline,
-not when the expiry is noticed. Every event of the specification starts the clock of the state that the event leads to.
-
-A machine without any timeout clause behaves as in MOP: if no event comes within one second after an event, the category
-``timeout`` comes once, and the machine stays in its state.
+A state entered by a timeout counts as entered at the deadline, not when the expiry is noticed. A machine without any
+timeout clause behaves as in MOP: it reports ``timeout`` once if one second passes after an event without another.
 """
 
 from rosmop.logics.automaton import Automaton
@@ -16,8 +12,9 @@ SILENCE_NS = 10**9
 
 
 class TimedStateMachine(ClockedProperty):
-    """``automaton`` has the transitions on events; ``timeouts[state]`` is (nanoseconds, next state) or None. With
-    ``silence_ns`` set there are no timeout clauses, and the clock runs after each event. Then each state occurs
+    """A machine; ``timeouts[state]`` is (nanoseconds, next state) or None.
+
+    With ``silence_ns`` there are no timeout clauses, and the clock runs after each event. Then each state occurs
     twice: after an event, and (in the second half) while the machine waits for no deadline.
     """
 
@@ -50,16 +47,12 @@ class TimedStateMachine(ClockedProperty):
             self.waits = (*silent, *[None] * size)
 
     def categories_after(self, event: int) -> frozenset[str]:
-        """Return the categories after an event, without ``timeout``, which needs no event."""
+        """A ``timeout`` needs no event, and is left out."""
         verdicts = self.automaton.verdicts
         return frozenset(name for row in self.automaton.table for name in verdicts[row[event]])
 
     def blocking_refused(self, category: str) -> str | None:
-        """Return a refusal for ``timeout``, which comes without a message.
-
-        Other categories may drop the message, because an event may stay in a state that only a timeout
-        enters.
-        """
+        """Only ``timeout`` comes without a message: an event may stay in a state that only a timeout enters."""
         super().blocking_refused(category)
         if category == TIMEOUT:
             return "`timeout` happens when no message comes, so there is none to drop"

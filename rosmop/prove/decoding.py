@@ -1,7 +1,4 @@
-"""Decode a module into functions.
-
-Only the instructions that the writer of modules uses are known; any other raises `UnknownInstructionError`.
-"""
+"""Decode a module into functions, with only the instructions that the writer of modules uses."""
 
 import struct
 from collections.abc import Mapping
@@ -155,8 +152,8 @@ class Reader:
 def functions_of(module: bytes) -> list[Code]:
     """Return the functions of a module without imports.
 
-    Raises `UnknownInstructionError`, `KeyError` for an unknown type, and `IndexError` where the module ends
-    too early.
+    Raises `UnknownInstructionError`, `KeyError` for an unknown type, and `IndexError` where the module ends too
+    early.
     """
     reader = Reader(module)
     reader.take(8)

@@ -1,18 +1,16 @@
 """Ask z3 whether the compiled code of an event can differ from its intermediate form (`form/nodes.py`).
 
-The form of an event and its function in the WebAssembly module are compared for every message of up to `AREA` bytes and
-every state. They are equal if the function leaves the message to Python, which then processes it from the start, or if
-all of these hold:
+Both are compared for every message of up to `AREA` bytes and every state. They are equal if the function leaves the
+message to Python, which then processes it from the start, or if all of these hold:
 
 - the form does not fault,
 - both agree on whether the event happened, dropped or replaced the message, and changed it,
 - the bytes of the message, the variables and the rest of the budget are the same,
 - the lines of output are the same, in order.
 
-Strings in variables and names of senders have an address and a length; whether two are equal is left open. An event
-that reads their bytes is not proved. If the function leaves the message, its effects are
-undone: each variable that it wrote must be among those that are restored, and each byte must be in the log
-(`module_terms.py`).
+Whether two strings in variables or names of senders are equal is left open, and an event that reads their bytes is
+not proved. If the function leaves the message, each variable that it wrote must be among those that are restored, and
+each byte in the log (`module_terms.py`).
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -78,8 +76,10 @@ class _MayDifferError(Exception):
 
 @dataclass(frozen=True)
 class ProofFinding:
-    """The result for an event on a topic, or part of a service. `answer` is `EQUAL`, the reason why equality is not
-    known, or the difference; `differs` is a defect in the writer of modules.
+    """The result for an event on a topic, or part of a service.
+
+    `answer` is `EQUAL`, the reason why equality is not known, or the difference; `differs` is a defect in the writer
+    of modules.
     """
 
     topic: str
@@ -150,7 +150,7 @@ class Validation:
             return ProofFinding(topic, event, str(error))
 
     def _compared(self, name: str, number: int, topic: str) -> str:
-        """For each number of iterations; a difference must also be one after few iterations."""
+        """A difference for any number of iterations must also be one after few iterations."""
         begun = self._clock()
         try:
             return self._answer(name, number, topic, begun)
@@ -215,7 +215,6 @@ class Validation:
         return EQUAL
 
     def _names(self, context: str) -> Mapping[int, Any]:
-        """Return the form's names of variables by their addresses."""
         names: dict[int, Any] = {
             address: ("shared", name)
             for own in self._module.cells
@@ -264,8 +263,8 @@ class Validation:
         return "not decided in time" if undecided else None
 
     def _asked(self, conditions: Sequence[Term], begun: float, *, part: float = 1) -> tuple[Any, Any]:
-        """Return whether the conditions are satisfiable, and a model. The event's first question was at `begun`.
-        The question may take this part of the time that is left.
+        """Return whether the conditions are satisfiable, and a model, within this part of the time that is left since
+        `begun`.
         """
         rest = int(1000 * part * (begun + self._patience - self._clock()))
         if rest <= 0:

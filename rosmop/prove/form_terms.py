@@ -1,6 +1,4 @@
-"""Translate the intermediate form of an event (`form/nodes.py`) to terms of z3.
-
-It follows `run/interpreter.py` line by line, for all messages at once.
+"""Translate the intermediate form of an event (`form/nodes.py`) to terms of z3, as `run/interpreter.py` runs it.
 
 - Positions and counts have 64 bits here, but are unbounded in the interpreter. A function without loops adds a few
   products of a count below 2**32 and a size, which never exceed 64 bits. Times also have 64 bits, and the sum of two
@@ -292,7 +290,7 @@ class FormTerms:
         state.slots[_REPLACED] = z3.BoolVal(True)
 
     def _put_safe(self, safe: nodes.SafeMessage, state: State) -> None:
-        """Write the safe message, but keep `seq` and `stamp` of the header."""
+        """Keep `seq` and `stamp` of the header."""
         message, changed = state.slots[_MESSAGE], state.slots[_CHANGED]
         place = SAFE_HEAD if safe.stamped else 0
         while place < len(
@@ -336,7 +334,7 @@ class FormTerms:
         state.slots[_SAID] = begin + (offset + 7 & ~7)
 
     def _pending(self, node: nodes.Pending, state: State) -> None:
-        """Do nothing for the list of fields, which only `Whole` uses, and `Whole` is not compiled."""
+        """Only `Whole` uses the list of fields, and `Whole` is not compiled."""
 
     def _require(self, node: nodes.Require, state: State) -> None:
         test = self._value(node.test, state)
@@ -574,10 +572,7 @@ class FormTerms:
         return wrapped(value if width(target) == value.size() else z3.Extract(31, 0, value), target)
 
     def _truncated(self, value: Term, target: value_types.IntegerType) -> Term:
-        """Truncate a number toward zero, within the limits of the type.
-
-        Types narrower than 32 bits are first limited as `int`.
-        """
+        """Truncate a number toward zero; types narrower than 32 bits are first limited as `int`."""
         whole = target if target.bits >= 32 else value_types.INT
         bits = whole.bits
         least, most = floating(whole.least, 64), floating(whole.most, 64)
@@ -638,8 +633,8 @@ class FormTerms:
         return self._of_parts(node.type, seconds, rest, state)
 
     def _of_parts(self, kind: Type, seconds: Term, rest: Term, state: State) -> Term:
-        """Return a time. Seconds beyond 2**33 are out of range for all allowed nanoseconds; below, the sum in
-        72 bits shows whether the sum in 64 bits overflows.
+        """Seconds beyond 2**33 are out of range for all allowed nanoseconds; below, the sum in 72 bits shows an
+        overflow in 64 bits.
         """
         far = either(seconds >= 1 << 33, seconds <= -(1 << 33), rest >= 1 << 62, rest <= -(1 << 62))
         known = state.where(far)

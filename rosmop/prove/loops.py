@@ -1,18 +1,17 @@
 """Loops of the form and of the module, as one induction over their iterations.
 
 Both sides run through their loops in the same order, so the loops are paired by number. A loop is *cut* at its head.
-Each slot that an iteration changes gets a new constant there, on the module's side that of the form's variable with the
-same name. Then one iteration, and the statements after the loop, are translated once, for the state at the head of the
-last iteration. `loop_conditions` yields the conditions that must not hold; together they are the induction:
+Each slot that an iteration changes gets a new constant there, on the module's side that of the form's variable with
+the same name. Then one iteration, and the statements after the loop, are translated once, for the state at the head
+of the last iteration. `loop_conditions` yields the conditions that must not hold; together they are the induction:
 
 - both sides reach the loop, or neither does, and paired slots are equal then;
 - if one side begins another iteration, so does the other one, and paired slots are equal again;
 - each iteration takes something from the budget, so the loop of the form ends.
 
-Names of variables are only a guess of equal slots: a wrong pair leaves a condition that may hold. A slot without a pair
-has any value. So a proof is for each number of iterations, but the answer to a condition may be a state that does not
-occur. `equality.py` then searches for a difference in `unrolled` loops, whose first iterations are translated one by
-one.
+Names of variables are only a guess of equal slots: a wrong pair leaves a condition that may hold, and a slot without
+a pair has any value. So a proof is for each number of iterations, but the answer to a condition may be a state that
+does not occur. `equality.py` then searches for a difference in `unrolled` loops.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -37,13 +36,15 @@ from rosmop.runtime.action_context import BUDGET
 BUDGET_SLOT = "budget"
 
 Head = Callable[[int, Any, Any], Any]
-"""The value of a slot at the head of a loop, from the loop's number, the slot's name and its value before the loop."""
+"""Takes the loop's number, the slot's name and its value before the loop; returns the value at the head of the loop."""
 
 
 @dataclass(frozen=True)
 class Cut:
-    """A loop of one side. `head` has the new constants of the slots that an iteration changes, `entry` the values of
-    these slots before the loop, and `back` those after an iteration; `frame` is the call that has the loop.
+    """A loop of one side; `frame` is the call that has the loop.
+
+    `head` has the new constants of the slots that an iteration changes, `entry` their values before the loop, and
+    `back` those after an iteration.
     """
 
     frame: int
@@ -56,8 +57,9 @@ class Cut:
 
 @dataclass
 class Loops:
-    """The loops of one side. With `unrolled`, each has at most that many iterations; `again` has the conditions under
-    which a state is not followed any further.
+    """The loops of one side. With `unrolled`, each has at most that many iterations.
+
+    `again` has the conditions under which a state is not followed any further.
     """
 
     unrolled: int = 0
@@ -76,8 +78,9 @@ class Loops:
         head: Head,
         logs: Sequence[list[Any]],
     ) -> None:
-        """Make `state` that after the loop. `body` returns the states that begin another iteration, and those that
-        leave the loop. Entries of `logs` by a translation that is repeated are removed.
+        """Make `state` that after the loop, and remove entries of `logs` by a translation that is repeated.
+
+        `body` returns the states that begin another iteration, and those that leave the loop.
         """
         left: list[State] = []
         if self.unrolled:
@@ -127,8 +130,9 @@ class Loops:
 def loop_conditions(
     form: Sequence[Cut], module: Sequence[Cut], ended: Term, left: Term
 ) -> Iterator[tuple[str, Term]]:
-    """Yield the conditions that must not hold. `ended`: the form faulted, or uses something unknown. `left`: the
-    module left the message to Python. Raises `NotProvedError`.
+    """Yield the conditions that must not hold. Raises `NotProvedError`.
+
+    `ended`: the form faulted, or uses something unknown. `left`: the module left the message to Python.
     """
     if len(form) != len(module):
         raise NotProvedError("its code has another number of loops")
@@ -161,7 +165,7 @@ def loop_conditions(
 
 
 def assumed(form: Sequence[Cut]) -> Sequence[Term]:
-    """Return what the induction knows at the head of each loop: the budget is at most that before the loop."""
+    """Return that the budget at the head of each loop is at most that before the loop."""
     return [
         both(
             is_budget(cut.head[BUDGET_SLOT]),
@@ -201,7 +205,6 @@ def constant_for(key: Any, value: Any) -> Any:
 
 
 def _same(one: Any, other: Any) -> bool:
-    """Whether two values of a slot are the same term, or structures of the same terms."""
     if isinstance(one, z3.ExprRef) and isinstance(other, z3.ExprRef):
         return bool(one.eq(other))
     return type(one) is type(other) and bool(one == other)

@@ -8,10 +8,9 @@ Memory has these parts; access to any other address counts as a difference:
 - the log, which restores a message that is left. Each write to the message is preceded by an entry with address, size
   and old bytes. Entries are never overwritten.
 
-For strings and arrays in variables, names of senders and constants, the addresses and lengths are known. An element of
-an array in a variable or of a constant array is a byte of `MEMORY`; code that reads bytes of another one is not proved,
-except that two strings are equal or not by the result of one function. A message that is left (`ELSEWHERE`) and a trap
-are treated alike: the effects are undone.
+An element of an array in a variable or of a constant array is a byte of `MEMORY`; code that reads other bytes there
+is not proved, except that two strings are equal or not by the result of one function. A message that is left
+(`ELSEWHERE`) and a trap are treated alike: the effects are undone.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -87,8 +86,8 @@ class ReadableBytes:
 
 @dataclass(frozen=True)
 class LoopGuess:
-    """Guess what is equal at the head of a loop: `cuts` are the loops of the form, `variables` the form's names of
-    variables by address, and `names` those of the local variables of each function.
+    """A guess of equal values at the head of a loop, from the loops of the form and the names of variables on both
+    sides.
     """
 
     cuts: Sequence[Cut]
@@ -116,7 +115,8 @@ class ModuleExecution:
     """Executes the function of one event on these cells. Booleans in cells are also numbers.
 
     `strings` are the addresses of strings, and of the cells that refer to arrays. `routines` are functions of z3 for
-    the results of functions that are not translated, by their numbers. `spans` are the bytes that code may read there.
+    the results of functions that are not translated, by their numbers. `spans` are the bytes that code may read
+    there.
     """
 
     def __init__(  # noqa: PLR0917  a function, its message and its cells
@@ -160,7 +160,7 @@ class ModuleExecution:
         self._number = number
 
     def done(self) -> ModuleResult:
-        """Return the result of the function. Raises `DiffersError` and `NotProvedError`."""
+        """Raises `DiffersError` and `NotProvedError`."""
         state = self._state
         bits = _bits(self._call(self._number, [Pointer("message", integer(0, 32)), self._size], state))
         cells = {
@@ -174,7 +174,7 @@ class ModuleExecution:
         )  # fmt: skip
 
     def _call(self, number: int, arguments: Sequence[Any], state: State) -> Any:
-        """Call a function; `state` becomes the state after the call."""
+        """The given `state` becomes the state after the call."""
         code = self._functions[number]
         self._frames += 1
         outer = self._frame, self._returned, self._function, self._labels

@@ -1,8 +1,7 @@
 """Terms of z3 for both sides, their initial state, and states that merge branches.
 
-- A message is an array of bytes, addressed in 32 bits, with a `size` that no frame exceeds.
-- A number of the language is a bit vector, a boolean, or an IEEE number. Bit vectors have 64 or 32 bits; narrower
-  numbers are extended by their sign or by zeros. There is only one NaN, and its bits cannot be read.
+A message is an array of bytes, addressed in 32 bits, with a `size` that no frame exceeds. Bit vectors have 64 or 32
+bits; narrower numbers are extended by their sign or by zeros. There is only one NaN, and its bits cannot be read.
 """
 
 import struct
@@ -13,7 +12,7 @@ from typing import Any
 import z3
 
 Term = Any
-"""A term; z3 has no Python types."""
+"""z3 has no Python types."""
 
 DOUBLE, SINGLE = z3.Float64(), z3.Float32()
 NEAREST = z3.RNE()
@@ -84,10 +83,7 @@ def opposite(condition: Term) -> Term:
 
 
 def choice(test: Term, yes: Term, no: Term) -> Term:
-    """`test ? yes : no` for terms, or for structures of terms.
-
-    A part that only one structure has is taken from that structure.
-    """
+    """`test ? yes : no` for terms, or for structures of terms; a part that only one has is taken from it."""
     if z3.is_true(test) or no is None or yes is no:
         return yes
     if z3.is_false(test) or yes is None:
@@ -151,7 +147,7 @@ class State:
 
 
 def merged(test: Term, yes: State, no: State) -> dict[Any, Any]:
-    """Return the values of two branches together. A branch that has ended has no values."""
+    """A branch that has ended has no values."""
     if z3.is_false(no.alive):
         return yes.slots
     if z3.is_false(yes.alive):
@@ -161,8 +157,10 @@ def merged(test: Term, yes: State, no: State) -> dict[Any, Any]:
 
 @dataclass(frozen=True)
 class StartTerms:
-    """The initial state of an event: message and size, time, variables by name, budgets by context, and times of output
-    by context and site. `senders` are by context and part, `constants` the addresses of constant strings.
+    """The initial state of an event: message and size, time, variables by name, budgets and times of output.
+
+    Budgets are by context, times of output by context and site, `senders` by context and part. `constants` are the
+    addresses of constant strings.
     """
 
     message: Term
@@ -220,8 +218,8 @@ _FLOATING = frozenset((z3.Z3_FLOATING_POINT_SORT, z3.Z3_ROUNDING_MODE_SORT))
 class Abstraction:
     """Replaces the results of costly operations by variables, with the same variable for equal operands.
 
-    With `floats`, floating-point numbers become values without a meaning, which are only equal or not, and so do the
-    results of all operations on them. If a formula over these variables cannot hold, the original formula cannot hold.
+    With `floats`, floating-point numbers become values without a meaning, which are only equal or not. If a formula
+    over these variables cannot hold, the original formula cannot hold.
     """
 
     def __init__(self, *, floats: bool = False) -> None:

@@ -1,15 +1,14 @@
 """Read a ROS 1 bag in time linear in its size, even if the bag is malicious, and in memory independent of its length.
 
-`rosbags` trusts the headers of a bag, and keeps the index of all messages. This reader keeps the index of one chunk, or
-of chunks whose times overlap, and adds limits:
+`rosbags` trusts the headers of a bag, and keeps the index of all messages. This reader keeps the index of one chunk,
+or of chunks whose times overlap (as the flight recorder writes them), and adds limits:
 
 1. It reads at most `LARGEST_CHUNK` bytes at once, and unpacks a chunk to at most that size.
 2. It unpacks and reads at most `PER_BYTE` bytes for each byte of the bag, plus one chunk. Without this limit, index
    entries could name one message many times, or unpack many chunks in turn.
 3. The index has at most as many entries as fit in the bag, so chunks cannot share an index.
 
-The flight recorder writes a chunk for each stream, so the times of its chunks overlap. Messages of a chunk that is not
-compressed are read from the file. Unpacked chunks are kept until their last message, up to `LARGEST_CHUNK` bytes.
+Unpacked chunks are kept until their last message, up to `LARGEST_CHUNK` bytes.
 """
 
 import bz2
@@ -52,7 +51,7 @@ class _Content(NamedTuple):
 
 
 class BoundedReader(Reader):
-    """A reader of a bag; raises `ReaderError` and `ValueError` beyond a limit."""
+    """Raises `ReaderError` and `ValueError` beyond a limit."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(regular_files.BoundedPath(path))
@@ -70,7 +69,7 @@ class BoundedReader(Reader):
         return sum(sum(info.connection_counts.values()) for info in self.chunk_infos)
 
     def read_index_data(self, pos: int, indexes: dict[int, list[IndexData]]) -> None:
-        """Read no index: `in_order` reads that of a chunk when its time has come."""
+        """`in_order` reads the index of a chunk when its time has come."""
 
     def in_order(self) -> Iterator[tuple[Connection, int, bytes]]:
         """Yield connection, time (ns) and bytes of messages, by time, then by position in the file."""

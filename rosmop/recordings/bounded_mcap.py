@@ -1,7 +1,7 @@
 """Read an MCAP file with ROS 1 messages, with the limits of `bounded_bag`.
 
-The package `mcap` reads the records; it would unpack a chunk to any size, and keep all chunks whose times overlap. Here
-waiting messages of such chunks have at most `LARGEST_CHUNK` bytes in all.
+The package `mcap` would unpack a chunk to any size, and keep all chunks whose times overlap. Here waiting messages of
+such chunks have at most `LARGEST_CHUNK` bytes in all.
 """
 
 import heapq

@@ -31,13 +31,13 @@ class RecordingError(Exception):
 
 
 def ros_type(name: str) -> str:
-    """Return the ROS name of a type, for which the reader writes `package/msg/Type`."""
+    """The reader writes `package/msg/Type`."""
     package, _, kind = name.partition("/")
     return f"{package}/{kind.rpartition('/')[2]}"
 
 
 def open_recording(path: Path) -> Reader:
-    """Open a recording. Raises `RecordingError`."""
+    """Raises `RecordingError`."""
     is_mcap = False
     try:
         if path.is_file():
@@ -59,10 +59,7 @@ def open_recording(path: Path) -> Reader:
 
 
 def messages_of(reader: Reader) -> Iterator[tuple[Connection, int, bytes]]:
-    """Yield the messages with times in nanoseconds.
-
-    Raises `RecordingError` for a damaged file.
-    """
+    """Yield the messages with times in nanoseconds. Raises `RecordingError` for a damaged file."""
     try:
         yield from reader.in_order()
     except _DAMAGE as error:
@@ -74,7 +71,7 @@ def _text_of(error: Exception) -> str:
 
 
 def definitions_of(reader: Reader) -> Definitions:
-    """Return the definitions in a recording, without those that cannot be parsed."""
+    """Leave out definitions that cannot be parsed."""
     found: dict[str, MessageDefinition] = {}
     sent = dict.fromkeys((ros_type(row.msgtype), row.msgdef.data) for row in reader.connections)
     for name, text in sent:

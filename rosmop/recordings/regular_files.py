@@ -41,10 +41,8 @@ def open_regular(path: Path) -> BufferedReader:
 
 
 class _BoundedFile(BufferedReader):
-    """A file whose reads are limited."""
-
     def read(self, size: int | None = -1, /) -> bytes:
-        """Read bytes. Raises `ValueError` beyond `LARGEST_CHUNK` bytes."""
+        """Raises `ValueError` beyond `LARGEST_CHUNK` bytes."""
         if size is None or not 0 <= size <= LARGEST_CHUNK:
             raise ValueError(f"it has a record of more than {LARGEST_CHUNK} bytes.")
         return super().read(size)
@@ -57,5 +55,5 @@ class BoundedPath(PosixPath):
     """The path of a regular file that is read in bounded pieces."""
 
     def open(self, *_mode: object) -> BinaryIO:  # type: ignore[override] # readers of recordings ask for bytes
-        """Open the file for reading. Raises `OSError`."""
+        """Raises `OSError`."""
         return _BoundedFile(open_regular(Path(self)).detach())

@@ -40,8 +40,8 @@ _Header = tuple[str, str, str, str, str | None, int | None]
 class OutputBag:
     """A new bag. Raises `RecordingError`.
 
-    Tools order messages of the same time by their connections. So a message before or after one of a monitor
-    gets a later time than the earlier of the two, if need be by a nanosecond.
+    Tools order messages of the same time by their connections. So a message before or after one of a monitor gets a
+    later time than the earlier of the two, if need be by a nanosecond.
     """
 
     def __init__(self, path: Path, definitions: Definitions) -> None:
@@ -189,7 +189,7 @@ def _outcome(  # noqa: PLR0917  a message and its facts
 
 
 def _after(started: Outcome, outcome: Outcome) -> Outcome:
-    """Return both outcomes together: the output of `init` comes before the first message."""
+    """The output of `init` comes before the first message."""
     shift = len(started.published)
     outcome.judged = {**started.judged, **{shift + number: one for number, one in outcome.judged.items()}}
     outcome.handling = {
@@ -214,7 +214,7 @@ def _refusal(monitors: MonitorSet, connection: Connection) -> str | None:
 
 
 def refusals(monitors: MonitorSet, reader: Reader, topics: Sequence[str] = ("*",)) -> list[str]:
-    """Return why messages on topics that match a pattern are dropped."""
+    """Return the reasons why messages on topics that match a pattern are dropped."""
     found = [
         _refusal(monitors, connection) for connection in reader.connections if fits(connection.topic, topics)
     ]

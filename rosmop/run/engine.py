@@ -1,20 +1,12 @@
 """The running monitors: `MonitorSet` decides what happens to each message. It does no I/O and reads no clock.
 
-Theory of operation:
-
-1. `MonitorSet.of` takes compiled specifications; `start` gives the variables their first values.
-2. `process` gives a message to the events on its topic (`execution.py`).
-3. The caller gives the time, in nanoseconds, with every message. Ticks and deadlines that are due (`timers.py`)
-   happen before the message; `process` returns their outcomes in `before`. While no message comes, the caller calls
-   `advance` at `next_due`, which may change in the meantime.
-4. For most topics, `lane` returns a lane of the fast path (`fast_path.py`). A lane processes many messages at once,
-   as long as none has to be recorded or explained, with the same results.
-5. `succeed` replaces another set between two messages. Specifications with the same text keep their variables and
-   runs.
-6. Specifications in shadow mode are in separate sets (`shadows`), so that they do not affect other specifications.
-   Each set has specifications that share variables. `tapped` collects copies of their messages. After a message is
-   passed on, the caller gives its copies in order to the sets (`ShadowCopy.give`). The outcome lists the actions that
-   the specifications would have taken.
+- The caller gives the time, in nanoseconds, with every message. Ticks and deadlines that are due (`timers.py`) happen
+  before the message (`before` of the outcome). While no message comes, the caller calls `advance` at `next_due`.
+- A lane of the fast path (`fast_path.py`) processes many messages at once with the same results, as long as none has
+  to be recorded or explained.
+- Specifications in shadow mode are in separate sets (`shadows`), each with those that share variables, so that they
+  do not affect other specifications. After a message is passed on, the caller gives its copies to them
+  (`ShadowCopy.give`).
 """
 
 import sys
@@ -58,7 +50,7 @@ from rosmop.runtime.wire import Buffer, WireMessage
 from roswire.definitions import Definitions
 
 GivenValues = Mapping[str, Mapping[str, bool | int | float | str]]
-"""Given values by specification and name."""
+"""By specification and name."""
 
 _CHANGED = "its text, or the definition of a message, has changed, and its state is lost"
 
@@ -91,8 +83,8 @@ class ShadowCopy(NamedTuple):
 class KeptGroup:
     """A group of specifications, and its state as data that the caller keeps.
 
-    The state is `base`; or `base` and newer `cells` of `size` bytes, with the layout `layout`. The slices of
-    parametric specifications are in parts, of the specifications in `part_names`.
+    The state is `base`; or `base` and newer `cells` of `size` bytes. The slices of parametric specifications are in
+    parts, of the specifications in `part_names`.
     """
 
     def __init__(
@@ -229,7 +221,7 @@ class MonitorSet:
         deadlines: int = sys.maxsize,
         holder_of: HolderOf = no_holder,
     ) -> "MonitorSet":
-        """If a specification is in `shadows`, all that share variables with it are in shadow mode.
+        """Put all specifications that share variables with those in `shadows` into shadow mode.
 
         When something is due, `patience()` (in shadow mode: `shadow_patience()`) returns a function that returns
         whether the work takes too long. A parametric specification has at most `slices` slices.
@@ -342,13 +334,13 @@ class MonitorSet:
         )
 
     def _is_true(self, monitor: MonitorInstance, variable: str) -> bool:
-        """Whether a variable is true, without moving the state of its monitor."""
+        """Do not move the state of the monitor."""
         if monitor.home is not None:
             return monitor.home.is_true(variable)
         return bool(self.interpreter.variables[variable])
 
     def type_of(self, topic: str, *, shadowed: bool = False) -> str | None:
-        """Return the message type of a topic, or None without enabled events. Shadow mode counts only if `shadowed`."""
+        """Return None without enabled events. Shadow mode counts only if `shadowed`."""
         steps = self.steps.get(topic, ())
         return next((step.event.type for step in steps if shadowed or not isinstance(step, _Tap)), None)
 
@@ -356,7 +348,7 @@ class MonitorSet:
         return self.compiled.is_stamped(self.type_of(topic, shadowed=True))
 
     def service_type_of(self, service: str, *, shadowed: bool = False) -> str | None:
-        """Return the type of a service, or None without enabled events. Shadow mode counts only if `shadowed`."""
+        """Return None without enabled events. Shadow mode counts only if `shadowed`."""
         for part in ("request", "response"):
             for step in self.steps.get(channel_of(service, part), ()):
                 if shadowed or not isinstance(step, _Tap):
@@ -364,7 +356,7 @@ class MonitorSet:
         return None
 
     def limit_time(self, clock: Callable[[], float], seconds: float) -> None:
-        """Bound the processor time (seconds) of all monitors together for one message; `clock` returns seconds.
+        """Bound the processor time of all monitors together for one message; `clock` returns seconds.
 
         Exceeding it is a fault. The same bound holds for ticks, deadlines, and monitors in shadow mode.
         """
@@ -412,33 +404,30 @@ class MonitorSet:
         return self._lanes.of_topic.get(topic) if topic in self.steps and not self.taps(topic) else None
 
     def lane_ready(self, lane: FastLane, time_ns: int) -> bool:
-        """Whether a lane may process messages: nothing is due, no monitor waits for its first message, and
-        none has failed to start.
-        """
+        """Whether nothing is due, no monitor waits for its first message, and none has failed to start."""
         return not self._agenda.has_come(time_ns) and not self._broken and lane.ready()
 
     def monitor(self, name: str) -> MonitorInstance:
-        """Return a monitor by its name. Raises `KeyError`."""
+        """Raises `KeyError`."""
         for monitor in self._monitors:
             if monitor.name == name:
                 return monitor
         raise KeyError(name)
 
     def value(self, name: str, variable: str) -> Any:
-        """Return the value of a variable. Raises `KeyError`."""
+        """Raises `KeyError`."""
         monitor = self.monitor(name)
         monitor.move_to_python()
         return self.interpreter.variables[monitor.code.variables[variable]]
 
     def take_margins(self) -> Iterator[Margin]:
-        """Yield the closest true and the closest false result of each comparison since the last call, if the set was
-        compiled with `margins`.
+        """Yield the closest true and the closest false result of each comparison since the last call, if compiled
+        with `margins`.
         """
         return taken_margins(self.monitors, self.interpreter.variables)
 
     @staticmethod
     def topics_of(monitors: Iterable[MonitorInstance]) -> frozenset[str]:
-        """Return the topics and services of monitors."""
         return frozenset(
             step.event.topic for monitor in monitors for step in monitor.steps if step.event.topic
         )
@@ -457,9 +446,9 @@ class MonitorSet:
     ) -> Outcome:
         """Start, and return the output of `init`.
 
-        `expected` are topics that are known to carry messages, as in a recording. A specification with events on such
-        a topic starts its timers at its first message. With `restarted`, specifications declared `hold` block their
-        topics until `resume`, except in shadow mode.
+        A specification with events on a topic in `expected`, which is known to carry messages, starts its timers at
+        its first message. With `restarted`, specifications declared `hold` block their topics until `resume`, except
+        in shadow mode.
         """
         outcome = self._start(self._monitors, time_ns, expected)
         for monitor in self._monitors if restarted else ():
@@ -469,7 +458,7 @@ class MonitorSet:
         return self._with_shadows(outcome, [shadow.start(time_ns, expected) for shadow in self.shadows])
 
     def kept_groups(self) -> "list[KeptGroup]":
-        """Return the groups whose state can be kept outside the process; changes of slices are noted from now on."""
+        """Note changes of slices from now on."""
         return [
             KeptGroup(group, self.interpreter.variables, self._types, _slice_parts(group))
             for group in self.groups
@@ -480,9 +469,8 @@ class MonitorSet:
     ) -> Outcome:
         """Start with the state of earlier processes: for each specification, the last state in `kept`.
 
-        A specification restarts if its state is `lost` (with the reason; key "": all) or unusable. Then `hold_lost`
-        decides whether it holds its topics. With `restarted`, specifications declared `hold` always hold their
-        topics. Safe messages are sent until a message comes on their topics.
+        A specification restarts if its state is `lost` (with the reason; key "": all) or unusable; `hold_lost`
+        decides whether it holds its topics. With `restarted`, specifications declared `hold` always hold them.
         """
         states, slices, unread = states_of(kept)
         fresh, reasons = [], {**lost, **unread}
@@ -519,8 +507,8 @@ class MonitorSet:
         return self._with_shadows(outcome, [shadow.start(time_ns) for shadow in self.shadows])
 
     def hold_lost(self, monitor: MonitorInstance, why: str) -> None:
-        """Let a monitor that has restarted without its state hold its topics if it is declared `hold`, or if
-        its actions depend on a state and it is not declared `begin`.
+        """Hold the topics of a restarted monitor that is declared `hold`, or depends on a state and is not declared
+        `begin`.
         """
         if self.holds_if_lost(monitor.code):
             self.hold(monitor, why)
@@ -536,7 +524,6 @@ class MonitorSet:
         return [monitor.name for monitor in self._monitors if monitor.enabled and topic in monitor.safes]
 
     def is_safe(self, topic: str, data: bytes) -> bool:
-        """Return whether a message is the safe one of an enabled monitor."""
         senders = [one.safes[topic] for one in self._monitors if one.enabled and topic in one.safes]
         return any(safe_messages.is_safe(sender.safe, data) for sender in senders)
 
@@ -551,7 +538,7 @@ class MonitorSet:
         return code.hold or (code.name in self._guards.names and not code.begins)
 
     def identity(self, code: SpecificationCode) -> bytes:
-        """Return the identity of a state, which belongs to the text, and to the definitions of its message types."""
+        """A state belongs to the text of its specification and to the definitions of its message types."""
         return code.identity + self._types[code.name]
 
     def _start(
@@ -575,13 +562,13 @@ class MonitorSet:
     def succeed(
         self, before: "MonitorSet", time_ns: int, incomplete: Collection[str] = frozenset()
     ) -> Outcome:
-        """Replace another set and start; `began` names the specifications that start with this set.
+        """Replace another set between two messages, and start; `began` names the specifications that start with this
+        set.
 
-        Specifications with the same text keep their state, and `init` does not run again. They restart if the
-        definition of a message type that they use has changed. A specification that restarts still holds its topics
-        if it held them and is still declared `hold`. A specification that enters or leaves shadow mode keeps its
-        state; in shadow mode it holds no topic. Specifications in `incomplete` have missed messages in shadow mode,
-        so they restart when they leave it.
+        Specifications with the same text keep their state, also into and out of shadow mode, and `init` does not run
+        again. They restart if the definition of a message type has changed, or if they leave shadow mode and are
+        `incomplete`, because they missed messages there. A specification that restarts still holds its topics if it
+        is still declared `hold`; in shadow mode it holds none.
         """
         known = {
             monitor.name: (monitor, part.interpreter.variables)
@@ -644,8 +631,7 @@ class MonitorSet:
     def switch(self, enabled: Mapping[str, bool], time_ns: int) -> tuple[MonitorInstance, ...]:
         """Enable or disable monitors, ignoring unknown names; return the monitors that changed.
 
-        The time while a monitor is disabled does not count: its timers, and its properties with time bounds,
-        restart.
+        The time while a monitor is disabled does not count: its timers, and its properties with time bounds, restart.
         """
         changed = [monitor for shadow in self.shadows for monitor in shadow.switch(enabled, time_ns)]
         for monitor in self._monitors:
@@ -671,7 +657,7 @@ class MonitorSet:
         return tuple(changed)
 
     def give(self, values: GivenValues) -> None:
-        """Set given constants, by specification and name; the others get their defaults. The state stays.
+        """Set given constants; the others get their defaults. The state stays.
 
         Unknown names, and values outside their ranges, are ignored, because the caller has checked them.
         """
@@ -729,10 +715,7 @@ class MonitorSet:
         prepare: Callable[[FastLane], BatchOptions],
         fuel: int = MESSAGE_FUEL,
     ) -> Outcome | None:
-        """Return None, and do nothing, unless a lane accepts the message. The topic may be `channel_of` a service.
-
-        `prepare` returns the options.
-        """
+        """Return None, and do nothing, unless a lane accepts the message. The topic may be `channel_of` a service."""
         lane = self.lane(topic)
         if lane is None or not self.lane_ready(lane, time_ns):
             return None
@@ -745,7 +728,6 @@ class MonitorSet:
 
     @property
     def next_due(self) -> int | None:
-        """Return the time of the next tick or deadline."""
         return self._agenda.due
 
     def advance(self, time_ns: int) -> list[Outcome]:
@@ -763,9 +745,8 @@ class MonitorSet:
     def _judge_published(self, outcome: Outcome) -> None:
         """Give published messages to the monitors after their publisher, and theirs to later ones.
 
-        A message that a remedy publishes at a deadline also goes to its own monitor if that is `ordered`.
-        There is still no loop: each other message goes only further back, and its deadlines are later than a
-        message.
+        A message that a remedy publishes at a deadline also goes to its own monitor if that is `ordered`. There is
+        still no loop: each other message goes only further back, and its deadlines are later than a message.
         """
         judged: dict[int, Outcome] = {}
         for number, message in enumerate(outcome.published):
@@ -785,8 +766,7 @@ class MonitorSet:
     def _after_faults(self, outcome: Outcome) -> None:
         """Note monitors that cannot judge, because an event that keeps their state up to date has faulted.
 
-        If it is declared `begin`, a monitor starts again; otherwise it keeps its state and holds its topics
-        (not in shadow mode).
+        A monitor declared `begin` starts again; any other keeps its state and holds its topics (not in shadow mode).
         """
         for fault in outcome.faults if self.on_fault == "drop" else ():
             monitors = [

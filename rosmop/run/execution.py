@@ -1,16 +1,13 @@
 """Processes one message, tick or deadline: events, properties, handlers, faults. No I/O, no clock.
 
-The events of a message happen specification by specification, in source order. After the action of an event, unless it
-dropped the message, every property of the specification steps, and the handlers of the new categories run. A drop stops
-the processing of the message. A fault also drops the message, unless `on_fault="pass"`. In a parametric specification,
-the event is processed in each of its slices in turn (`slices.py`).
+The events of a message happen specification by specification, in source order. After the action of an event, unless
+it dropped the message, every property steps, and the handlers of the new categories run. A drop, or a fault unless
+`on_fault="pass"`, stops the processing of the message.
 
-For properties that are formulas (`CompiledProperty.suppresses`), a dropped message does not count. In all
-specifications, these properties undo the steps that they made for the message, so their trace is the one that
-subscribers saw. Variables, output and other properties keep the effects of the message.
-
-`STOP;`, and a fault of a monitor with a safe message on the topic, replace the message by the safe one. Formulas undo
-their steps as for a drop; the events behind this one process the safe message.
+For formulas (`CompiledProperty.suppresses`) a dropped message does not count: in all specifications they undo their
+steps, so their trace is the one that subscribers saw. Variables, output and other properties keep the effects.
+`STOP;`, and a fault of a monitor with a safe message on the topic, replace the message by the safe one: formulas undo
+their steps, and the events behind this one process the safe message.
 """
 
 import struct
@@ -37,7 +34,7 @@ OnFault = Literal["drop", "pass"]
 Asked = Callable[[Verdict, int], bool]
 
 EXPLAINED = 3
-"""The most explained verdicts of slices for one message, or for one call with deadlines; each takes a millisecond."""
+"""The most explained verdicts of slices for one message, or one call with deadlines; each takes a millisecond."""
 
 SLICE_SECONDS = 50e-6
 """The additional processor time of a message for each slice concerned."""
@@ -53,7 +50,7 @@ class MonitorExecution:
         """A fault of an event's function in `judging` only drops the message (`Guards.judging`)."""
         self._judging = judging
         self._function: str | None = None
-        """The function of the event that is processed; None for a tick or deadline."""
+        """None for a tick or deadline."""
         self.on_fault: OnFault = on_fault
         self.asked: Asked | None = None
         """Chooses the verdicts to explain, given the source of the message; None chooses all."""
@@ -71,8 +68,8 @@ class MonitorExecution:
         self._passed: int | None = None
 
     def begin(self, monitors: Sequence[MonitorInstance], time_ns: int) -> Outcome:
-        """Start monitors in common stages (constants, first values, `init`), because a monitor may read
-        another's variables.
+        """Start monitors in common stages (constants, first values, `init`), because one may read another's
+        variables.
         """
         outcome = Outcome(time=time_ns)
         self._turn.now, self._turn.until = time_ns, inf  # no time limit: operators wait for it
@@ -99,7 +96,7 @@ class MonitorExecution:
     ) -> None:
         """Process a message received at the time of the outcome.
 
-        A message that a monitor has `published` has what is left of the time of the message that caused it.
+        A message that a monitor has `published` has only the rest of the time of the message that caused it.
         """
         steps[0].monitor.move_to_python()
         steps[0].monitor.touch()
@@ -139,7 +136,7 @@ class MonitorExecution:
         self._finish(message, writers, outcome)
 
     def tick(self, step: Step, time_ns: int) -> Outcome:
-        """Process a tick; the caller must call `collect`."""
+        """The caller must call `collect`."""
         self._sender, self._function = NOBODY, None
         self._taking_back.clear()
         step.monitor.move_to_python()
@@ -169,7 +166,7 @@ class MonitorExecution:
         return outcome
 
     def send_safe(self, monitor: MonitorInstance, sender: SafeSender, time_ns: int) -> Outcome:
-        """Send a safe message; all but the first of a series are `repeated`."""
+        """All but the first message of a series are `repeated`."""
         safe = sender.safe
         outcome = Outcome(time=time_ns)
         outcome.timer, outcome.repeated = f"{monitor.name}.safe", sender.due is not None
@@ -186,7 +183,7 @@ class MonitorExecution:
     ) -> list[Outcome]:
         """Process the deadline of a property or, without `running`, the first deadline of a slice.
 
-        Return the outcomes to report. A slice's verdict is explained only if `explains`.
+        A slice's verdict is explained only if `explains`.
         """
         self._sender, self._bound, self._function = NOBODY, None, None
         monitor.move_to_python()
@@ -470,10 +467,8 @@ class MonitorExecution:
             outcome.changed_at = tuple([sites[site].position for _, at in writers for site in at])
 
     def _first(self, monitor: MonitorInstance, message: WireMessage, outcome: Outcome) -> bool:
-        """Return whether the monitor drops its first message, or a message on a topic that it holds, without
-        judging it.
-
-        It passes the safe message.
+        """Whether the monitor drops its first message, or one on a topic that it holds, unjudged. It passes the safe
+        message.
         """
         if monitor.held:
             why = f" ({monitor.why_held})" if monitor.why_held else ""

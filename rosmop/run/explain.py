@@ -1,19 +1,14 @@
-"""Explain a verdict by few past events that suffice for it.
+"""Explain a verdict by few past events that suffice for it. Each explanation is tested: its events must give the
+verdict.
 
-Theory of operation:
-
-1. For a property with tables, `Exits` stores for each state the event that left it last. From the initial state these
-   events lead to the present state, each later than the previous event: the trace without its loops. Nothing is cut,
-   however long the trace is, and events before `__RESET;` are left out. The compiled module stores the same data in
-   the same memory.
-2. For other properties, `Steps` keeps the last events and the run before them. (With a clock it is `ClockedSteps`,
-   which the compiled module also stores.) If the events give the verdict to a new run, they explain it alone.
-   Otherwise they explain it only together with the run before them (`Explanation.since`). A run about the future
-   cannot be copied. For such runs more events are kept, and the run knows at which event the decided formula was
-   evaluated. The events from there on suffice, unless the formula also looks back; then there is no explanation.
-3. For a parametric specification, the last `TRAIL` events are kept with their bindings. The events of the slice must
-   explain its verdict alone; otherwise there is no explanation.
-4. Each explanation is tested: its events must give the verdict.
+1. With tables, `Exits` stores for each state the event that left it last. From the initial state these events lead to
+   the present state: the trace without its loops, however long it is, and without events before `__RESET;`.
+2. For other properties, `Steps` (with a clock `ClockedSteps`) keeps the last events and the run before them. If the
+   events give the verdict to a new run, they explain it alone; otherwise only with that run (`Explanation.since`). A
+   run about the future cannot be copied, but knows at which event the decided formula was evaluated. The events from
+   there on suffice, unless the formula also looks back; then there is no explanation.
+3. For a parametric specification, the last `TRAIL` events are kept with their bindings, and must explain a slice's
+   verdict alone.
 """
 
 import copy
@@ -38,17 +33,18 @@ TRAIL = 4096
 """The events that are kept for all slices of a parametric specification together."""
 
 KEPT = 64
-"""The least number of events that are kept for a property without tables; the maximum is twice this number."""
+"""The least number of events that are kept without tables; the most is twice this number."""
 
 FUTURE_KEPT = 1024
 """The events that are kept for `mtl` about the future."""
 
 ENTRY = struct.Struct("<qqI4x")
-"""An entry: time (ns) when a state was left; source of the sender; its kind (from bit 24) and the event; its number."""
+"""Time (ns) when a state was left; source of the sender; its kind (from bit 24) and the event; its number."""
 
 RUNS, RING = 4, 256
-"""The runs and steps kept for a property with a clock, twice the needed ones, so that the entries of a
-message that the module leaves to the engine overwrite no needed entry.
+"""The runs and steps kept for a property with a clock.
+
+They are twice the needed ones, so that a message that the module leaves to the engine overwrites no needed entry.
 """
 
 _COUNT = struct.Struct("<q")
@@ -105,10 +101,10 @@ class Exits:
         return run.expire()
 
     def begin(self, time_ns: int) -> None:
-        """Do nothing, because a path from the initial state never has earlier events."""
+        """A path from the initial state never has earlier events."""
 
     def mark(self) -> None:
-        """Do nothing, because a path from the initial state never has an undone step."""
+        """A path from the initial state never has an undone step."""
 
     def take_back(self, mark: object) -> None: ...
 
@@ -116,7 +112,7 @@ class Exits:
         self.room, self.owner = room[: len(self.room)], owner
 
     def forget(self, run: Any, _time_ns: int) -> None:
-        """Forget everything, because the run continues a run of another process."""
+        """The run continues a run of another process."""
         self._at = run.state
         for state in range(len(self._automaton)):
             ENTRY.pack_into(self.room, ENTRY.size * state, 0, _EVENT, 0)
@@ -195,7 +191,6 @@ class Steps:
         self.begin(time_ns)
 
     def begin(self, time_ns: int) -> None:
-        """Forget everything, because the run has restarted."""
         self._started = time_ns
         self._steps: list[EventOccurrence] = []
         self._before: Run | None = None
@@ -209,14 +204,14 @@ class Steps:
         del self._steps[size:]
 
     def step(self, run: Run, event: int, time_ns: int, sender: MessageSender) -> Categories:
-        """Step the run and keep the event. Raises `RunFaultError`."""
+        """Raises `RunFaultError`."""
         self._make_room(run)
         categories = run.step(event, time_ns)
         self._steps.append(EventOccurrence(event, time_ns, sender))
         return categories
 
     def forget(self, run: Run, time_ns: int) -> None:
-        """Explain only from the present state on, because the run continues a run of another process."""
+        """The run continues a run of another process, so explain only from the present state on."""
         self.begin(time_ns)
         self._before = None if isinstance(run, BoundedRun) else copy.copy(run)
 
@@ -407,8 +402,8 @@ def of_slice(
 ) -> Explanation | None:
     """Return the events that caused a verdict in the slice of a binding (parameters by number).
 
-    The last event, or the deadline that has `passed`, gave the verdict. None if it is unknown whether a
-    needed event happened in this slice.
+    The last event, or the deadline that has `passed`, gave the verdict. None if it is unknown whether a needed event
+    happened in this slice.
     """
     own: dict[EventOccurrence, bool] = {}
     happened: list[EventOccurrence] = []

@@ -1,6 +1,4 @@
-"""The interface between the engine and compiled code.
-
-The caller that makes a `MonitorSet` also makes the implementation (`rosmop/fast/wasm_runner.py`) and passes it to the
+"""The interface between the engine and compiled code (`rosmop/fast/wasm_runner.py`), which the caller passes to the
 set.
 """
 
@@ -22,11 +20,11 @@ MESSAGE_FUEL = FUEL_PER_SECOND // 100
 class BatchResult(NamedTuple):
     """The result of one batch.
 
-    `position` is the offset of the first message that was not processed, and `run` is the offset after the last
-    dropped message. `dropped` counts dropped messages for each event of the lane, and `told` counts verdicts for each
-    verdict of the lane. Both are empty if all counts are zero. `sooner`: a deadline is earlier than before. `output`
-    has the printed lines, in order, each with the offset of its message. `paused`: the batch used up its fuel; the
-    next batch may begin with the message at `position`.
+    `position` is the offset of the first message that was not processed, `run` the offset after the last dropped
+    message. `dropped` counts dropped messages for each event of the lane, `told` counts verdicts; both are empty if
+    all counts are zero. `sooner`: a deadline is earlier than before. `output` has the printed lines in order, each
+    with the offset of its message. `paused`: the fuel is used up; the next batch may begin with the message at
+    `position`.
     """
 
     position: int
@@ -42,8 +40,7 @@ class BatchOptions(NamedTuple):
     """The options of all batches of a topic until the state of the engine changes.
 
     `told`, `enabled` and `counted` are bits for the module; `told` also has a bit for whether messages may be
-    changed. Batches count in `changed` how many messages each set of events has changed (see
-    `FastLane.writers`).
+    changed. Batches count in `changed` how many messages each set of events has changed (see `FastLane.writers`).
     """
 
     source: int
@@ -63,11 +60,11 @@ class PreparedState(Protocol):
 class NativeCall(NamedTuple):
     """The addresses with which compiled code passes frames through a lane without Python.
 
-    `invoke` is wasmtime's `wasmtime_func_call_unchecked`, to be called with `context`, `function` and three slots of 16
-    bytes: the address of the first frame in the module, the address after the last one, and the time (ns). Its result
-    is the module's answer (`rosmop.fast.abi`). If it returns an error, or a trap, `failure(error, trap)` frees them and
-    returns the exception that a lane raises for it. If the bytes at `options` are not `packed(options)` of the batch's
-    options, call `home.prepare` first.
+    `invoke` is wasmtime's `wasmtime_func_call_unchecked`, to be called with `context`, `function` and three slots of
+    16 bytes: the address of the first frame in the module, the address after the last one, and the time (ns). Its
+    result is the module's answer (`rosmop.fast.abi`). If it returns an error, or a trap, `failure(error, trap)` frees
+    them and returns the exception that a lane raises for it. If the bytes at `options` are not `packed(options)` of
+    the batch's options, call `home.prepare` first.
 
     The other fields are offsets in `memory`, which does not grow: of the frames, of the first effect, of the lines of
     output (0: the lane prints nothing) and of the word with their end, and offset and size of each part of the state.
@@ -90,10 +87,10 @@ class NativeCall(NamedTuple):
 
 
 class NextDue(Protocol):
-    """A function that returns the time of the next tick or deadline (ns), or None."""
+    """Returns the time of the next tick or deadline (ns), or None."""
 
     def __call__(self, *, anew: bool) -> int | None:
-        """Return the time. `anew`: do not use the last result, because there may be an earlier deadline."""
+        """`anew`: do not use the last result, because there may be an earlier deadline."""
 
 
 class FastLane(Protocol):
@@ -113,7 +110,7 @@ class FastLane(Protocol):
     """The possible verdicts, without explanation."""
 
     def writers(self, who: int) -> tuple[str, ...]:
-        """Return `Outcome.changed_by` for a set of events: bit N stands for event N."""
+        """Return `Outcome.changed_by` for a set of events: bit N is event N."""
 
     def happened(self) -> Sequence[int]:
         """Return the events since the last call."""
@@ -132,8 +129,8 @@ class FastLane(Protocol):
     ) -> BatchOptions:
         """Return options that are valid until the next action of the engine.
 
-        If `loud`, no message may be changed. `told` lists the events that may not drop a message, `counted`
-        the verdicts that are only counted.
+        If `loud`, no message may be changed. `told` lists the events that may not drop a message, `counted` the
+        verdicts that are only counted.
         """
 
     def process_batch(  # noqa: PLR0917  called for every batch: calls and keywords would cost a tenth of it
@@ -146,11 +143,10 @@ class FastLane(Protocol):
         prepared: BatchOptions,
         answer: int | Exception | None = None,
     ) -> BatchResult | None:
-        """Process messages from `position` on, up to the first one that needs the engine. Return None if all were
-        processed and stay in their buffer.
+        """Process messages up to the first one that needs the engine; return None if all were processed and stay in
+        their buffer.
 
         `answer` is the module's answer, or the exception, if it was already called for these messages (`native`).
-
         Call this only while the lane is `ready` and nothing in the set is due. `view` has whole frames and is
         writable. It is in other memory, or begins like `Lanes.area`. Bytes before a dropped message are appended to
         `pieces`.
@@ -166,7 +162,7 @@ class FastLane(Protocol):
         prepared: BatchOptions,
         fuel: int = MESSAGE_FUEL,
     ) -> BatchResult:
-        """Process only the message at `position`. `paused` means that the fuel was not enough."""
+        """`paused` means that the fuel was not enough."""
 
     def native(self) -> NativeCall | None:
         """Return how to call the module for batches in `Lanes.area`; None if its state is more than numbers."""
@@ -174,11 +170,10 @@ class FastLane(Protocol):
     def process_message(
         self, message: Buffer, time_ns: int, prepared: BatchOptions, fuel: int = MESSAGE_FUEL
     ) -> Outcome | None:
-        """Process a message; return None if it is left to the engine. Verdicts are not explained, and
-        positions of changes are not reported.
+        """Return None for a message that is left to the engine. Verdicts are not explained, and changes have no
+        positions.
 
-        The conditions are those of `process_batch`. Use separate options for this method, and do not call
-        `happened`.
+        The conditions are those of `process_batch`. Use separate options for this method, and do not call `happened`.
         """
 
 
@@ -195,6 +190,4 @@ class FastPath(Protocol):
     def lanes(
         self, compiled: Compiled, interpreter: Interpreter, monitors: Sequence[MonitorInstance], due: NextDue
     ) -> Lanes:
-        """Return the lanes, and set `home` of each monitor whose state a lane takes over. The engine
-        processes a topic without a lane.
-        """
+        """Return the lanes, and set `home` of each monitor whose state a lane takes over."""

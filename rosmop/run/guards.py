@@ -1,7 +1,6 @@
-"""Find the specifications whose actions depend on a state, and the events whose faults leave that state out of date.
+"""Find the *guards*, whose actions on messages depend on variables or properties.
 
-A *guard* can drop, change, publish or withhold a message, depending on variables (its own, or those of specifications
-that it uses) or properties. If the state is lost, or an event that keeps it up to date faults, the guard cannot judge.
+If its state is lost, or an event that keeps the state up to date faults, a guard cannot judge.
 """
 
 from collections.abc import Iterator, Mapping
@@ -16,8 +15,8 @@ from rosmop.types import value_types
 class Guards:
     """The guards; `depending` has, for each specification, the guards that depend on its state.
 
-    A fault in the function of an event in `judging` only drops the event's own message, because the guards
-    that depend on the event act on its topic alone: no subscriber saw what the state lacks.
+    A fault in the function of an event in `judging` only drops the event's own message, because the guards that
+    depend on the event act on its topic alone: no subscriber saw the events that the state lacks.
     """
 
     names: frozenset[str]

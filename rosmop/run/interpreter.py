@@ -1,14 +1,9 @@
-"""The interpreter defines the meaning of the intermediate form (`form/nodes.py`). Every faster implementation is
+"""The interpreter defines the meaning of the intermediate form (`form/nodes.py`); every faster implementation is
 compared with it.
 
-Each expression becomes a Python function that computes a value from the variables of a call. Each statement becomes a
-function that returns how it ends its block (None: the block goes on). There is one method for each kind of node
-(`STATEMENTS`, `EXPRESSIONS`). `runtime/` defines the functions that the form calls, and `runtime/values.py` encodes
-values in messages. A function is built on its first call. Strings are bytes, vectors and messages are lists, times
-and durations are integers; every other value has the closest Python type. This is one file because it is the
-definition.
-
-Invariants:
+Each expression becomes a Python function of the variables of a call, each statement one that returns how it ends its
+block (None: the block goes on). Strings are bytes, vectors and messages are lists, times and durations are integers.
+This is one file because it is the definition. Invariants:
 
 1. A name is a variable of the monitor set (`g…`) or of one call. Only variables of the set, and the values they refer
    to, outlive a call. In a call, `m` is the message, `b` its original bytes, `p` the start of a skipped element, and
@@ -108,16 +103,15 @@ class Interpreter:
         return error is self.failed.error and self.failed.happened
 
     def let_go(self) -> None:
-        """Drop all functions, so that no reference cycle keeps the set alive."""
+        """Break the reference cycles that would keep the set alive."""
         self._made.clear()
 
     def value(self, name: str, variables: Mapping[str, Any]) -> Any:
-        """Return the value of a variable; `variables` are those of a call. Raises `KeyError`."""
+        """`variables` are those of a call. Raises `KeyError`."""
         return variables[name] if name in variables else self.variables[name]
 
     def function(self, name: str) -> Callable[..., Any]:
-        """Return a function of a message, or of None if the event has none; for its result see
-        `nodes.Function`.
+        """Return a function of a message, or of None if the event has none; `nodes.Function` describes its result.
 
         The function raises the error that stops it; `failed` has the details.
         """
@@ -171,7 +165,7 @@ class Interpreter:
 
 
 def constant_of(node: nodes.Expression) -> bool | int | float:
-    """Return the value of an expression without variables. Raises `FaultError`."""
+    """Raises `FaultError`."""
     nowhere = nodes.Function("", "", (), ())
     maker = _Maker(_nobody(), nowhere)
     value: bool | int | float = maker.value(node)({})
@@ -272,7 +266,7 @@ class _Maker:
         return run if node.no else run_yes
 
     def _branch(self, site: int, statements: Sequence[nodes.Statement]) -> _Run:
-        """Note the condition of a branch, if the branch drops, changes or publishes a message."""
+        """Note the condition of a branch that drops, changes or publishes a message."""
         block = self.block(statements)
         if not any(isinstance(node, nodes.Drop | nodes.StopMessage | nodes.Publish) or self._marks_field(node)
                    for node in nodes.walk(tuple(statements))):  # fmt: skip
@@ -544,7 +538,7 @@ class _Maker:
         return lambda _: None
 
     def _write_back(self, node: nodes.WriteBack) -> _Run:
-        """Write the fields; those of variable size can fault, so they are encoded before the first byte is written."""
+        """Fields of variable size can fault, so they are encoded before the first byte is written."""
         marks, writes = tuple(self._marks), []
         for write in sorted(node.writes, key=lambda write: write.end is None):
             value, encode = self.value(write.value), self._values.encoder(write.value.type)
@@ -853,7 +847,7 @@ def _is_shared(name: str) -> bool:
 def conversion(  # noqa: PLR0911  one for each kind
     source: Type, target: Type
 ) -> Callable[[Any], Any] | None:
-    """Return a conversion, or None if nothing changes."""
+    """Return None if nothing changes."""
     if source == target:
         return None
     if isinstance(target, value_types.BoolType):

@@ -23,8 +23,10 @@ FAILING_AFTER = 10
 
 
 class CellNames(msgspec.Struct, frozen=True, array_like=True):
-    """The layout of a group's state in a module: states of properties (monitor, number), then variables (monitor,
-    name; None if not part of the state) with their `struct` codes, then clocks of the properties with these numbers.
+    """The layout of a group's state in a module.
+
+    It has the states of properties (monitor, number), then variables (monitor, name; None if not part of the state)
+    with their `struct` codes, then clocks of the properties with these numbers.
     """
 
     properties: list[tuple[str, int]] = []
@@ -53,8 +55,8 @@ class StateHolder(Protocol):
     """Whether the state has been in Python since it was last saved."""
 
     def cells(self) -> bytes | None:
-        """Return the state in the module's memory: empty if it has been in Python since the last save, and None if it
-        must be saved from Python.
+        """Return the state in the module's memory: empty if it has been in Python since the last save, None to save
+        from Python.
         """
 
 
@@ -62,8 +64,7 @@ class StateHolder(Protocol):
 class MonitorGroup:
     """Monitors that share topics or variables: a message changes the state of at most one group.
 
-    `channels` are the topics and parts of services. `changed`: the state may have changed outside the module since it
-    was last saved.
+    `changed`: the state may have changed outside the module since it was last saved.
     """
 
     monitors: tuple["MonitorInstance", ...]
@@ -126,7 +127,7 @@ class Step:
     past: int = 0
     told: int | None = None
     key: Callable[[WireMessage], Any] | None = None
-    """The function that returns the parameters that a message binds."""
+    """Returns the parameters that a message binds."""
 
 
 @dataclass(eq=False, slots=True)
@@ -164,7 +165,6 @@ class MonitorInstance:
     """Whether first values or `init` faulted, so that there is no valid state."""
     faults: int = 0
     seen: bool = False
-    """Whether a message for any of its events has come."""
     home: StateHolder | None = None
     """The holder of the state, if it may be in a module."""
     slices: Slices | None = None
@@ -173,10 +173,10 @@ class MonitorInstance:
     group: MonitorGroup | None = None
     """The monitors whose state changes together with its own."""
     trail: deque[Bound] = field(default_factory=partial(deque, maxlen=TRAIL))
+    """The last events of all slices of a parametric specification."""
     safes: dict[str, SafeSender] = field(default_factory=dict)
     starting: set[str] = field(default_factory=set)
     """The topics with a safe message on which no message has come since the last start."""
-    """The last events of all slices of a parametric specification."""
 
     @property
     def name(self) -> str:
@@ -187,7 +187,7 @@ class MonitorInstance:
         return self.broken or self.faults >= FAILING_AFTER
 
     def picture(self) -> str | None:
-        """Return the automata as SVG, or None if none is finite."""
+        """Return None if no automaton is finite."""
         from rosmop.logics.picture import svg_of  # noqa: PLC0415  only tools draw
 
         return svg_of([code.property for code in self.code.properties])
@@ -217,7 +217,7 @@ class MonitorInstance:
             self.group.changed = True
 
     def move_to_python(self) -> None:
-        """Move the state to Python, before Python reads it or that of other monitors on its topics."""
+        """Call this before Python reads the state, or that of other monitors on its topics."""
         if self.home is not None:
             self.home.leave()
 
@@ -229,7 +229,7 @@ def monitors_of(
     slices: int,
     holder_of: HolderOf,
 ) -> tuple[MonitorInstance, ...]:
-    """Return the monitors of a set; each has at most `slices` slices, which are charged to `holder_of(source)`."""
+    """Each monitor has at most `slices` slices, which are charged to `holder_of(source)`."""
     return tuple(_monitor(interpreter, code, time_ns, slices, holder_of) for code in compiled.specifications)
 
 

@@ -41,7 +41,7 @@ class MessageSender(NamedTuple):
 
 
 Who = Callable[[int], Mapping[str, Any]]
-"""A function that returns data about a source (`MessageSender.source`)."""
+"""Returns data about a source (`MessageSender.source`)."""
 
 NOBODY = MessageSender()
 NO_NUMBER, SEQ = range(2)
@@ -60,8 +60,7 @@ class EventOccurrence(NamedTuple):
 class Explanation(NamedTuple):
     """Events that alone give a verdict. `fewest`: none of them can be left out.
 
-    With `since` (ns), the events lead to the verdict from the property's state at that time; earlier events are not
-    kept.
+    With `since` (ns), the events lead to the verdict from the property's state at that time.
     """
 
     events: tuple[EventOccurrence, ...]
@@ -71,10 +70,10 @@ class Explanation(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """A property's arrival in a category that has a handler. `property` counts from 0 in its specification; `source`
-    is its formula. `why` is None if an explanation was not wanted (`MonitorSet.explain_when`) or is impossible.
+    """A property's arrival in a category that has a handler.
 
-    `binding` has the values of parameters by name.
+    `property` counts from 0 in its specification; `source` is its formula. `why` is None if an explanation was not
+    wanted (`MonitorSet.explain_when`) or is impossible. `binding` has the values of parameters by name.
     """
 
     monitor: str
@@ -90,7 +89,7 @@ class Verdict:
 class Fault:
     """A fault stopped an action. `values` are those of the variables involved.
 
-    `outdates`: the monitor's state may be out of date now, because an event that it observes did not take effect.
+    `outdates`: the monitor's state may be out of date, because an event that it observes did not take effect.
     """
 
     monitor: str
@@ -118,31 +117,22 @@ class Outcome:
     `buffer` is the message to relay: the buffer that came in (changed in place where possible), or another buffer.
     `events` are named `specification.event`. `timer` names the source of a tick or deadline (`specification.tick`,
     `specification.timeout`, `specification.deadline`, `specification.safe`). `time` is in nanoseconds. `before` has
-    the outcomes of ticks and deadlines that were due before this message. `shadowed` has the outcomes of the sets in
-    shadow mode when a set starts.
+    the outcomes of ticks and deadlines that were due before this message; `shadowed` those of the sets in shadow mode
+    when a set starts.
 
-    `changed_by` are the events whose actions changed bytes of the message, in order. It is empty unless the result is
-    `changed`. `changed_at` are the positions of the statements that assigned to the changed fields. An event that
-    assigned nothing, or the same value, is not included. `dropped_by` is the specification that dropped the message:
-    at its last event, after a fault (`fatal`), or for `reason` (the topic is held, or the start failed). `dropped_at`
-    is the position of the statement, the action or the specification. `handling` has the verdicts whose handlers
-    dropped the message (key `DROPPED`) or published messages (keys: their indices in `published`).
+    `changed_by` are, in order, the events whose actions changed bytes of the message (none if they assigned the same
+    value), and `changed_at` the positions of the statements. `dropped_by` is the specification that dropped the
+    message: at its last event, after a fault (`fatal`), or for `reason` (the topic is held, or the start failed).
+    `dropped_at` is the position of the statement, the action or the specification. `handling` has the verdicts whose
+    handlers dropped the message (key `DROPPED`) or published messages (keys: their indices in `published`).
 
-    `began_holding` are the monitors that hold their topics from now on, because of a fault.
+    `began_holding` are the monitors that hold their topics from now on, because of a fault. `judged` has the outcomes
+    of published messages after the monitors behind their publisher, by their indices in `published`. `repeated`: the
+    outcome only repeats a safe message, so it needs no report.
 
-    `judged` has the outcomes of the published messages that have gone through the monitors behind their publisher, by
-    their indices in `published`.
-
-    `repeated`: the outcome only repeats a safe message, so it needs no report.
-
-    `looked` are the conditions that were met during processing, by site, with the values that they compared. They are
-    each `when` of an event that happened, and each `if` around a statement that dropped, changed or published a
-    message.
-
-    For a dropped message, `overwritten` has the original bytes of the buffer that actions overwrote (position and
-    bytes, in order). `restore` writes these bytes again.
-
-    Most messages have none of these, so only the object itself is created for them.
+    `looked` are the conditions that were met, by site, with the values that they compared: each `when` of an event
+    that happened, and each `if` around a statement that dropped, changed or published a message. For a dropped
+    message, `overwritten` has the original bytes that actions overwrote (position and bytes, in order).
     """
 
     result: Result = "passed"
@@ -328,7 +318,6 @@ def decided_by(source: Source, why: Explanation) -> list[str]:
 
 
 def lines_of_why(why: Mapping[str, Any]) -> Iterator[str]:
-    """Yield a line for each event of `why_of`, and how far the events explain the verdict."""
     events = _list(why.get("events"))
     if not why:
         return

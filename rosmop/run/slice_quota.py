@@ -7,11 +7,11 @@ from typing import Generic, TypeVar
 Thing = TypeVar("Thing", bound=Hashable)
 
 Holder = Hashable | None
-"""A holder, named by the caller; None if holders are not distinguished."""
+"""None if holders are not distinguished."""
 
 
 HolderOf = Callable[[int], Holder]
-"""A function that names the holder that is charged for the slices of a source (`MessageSender.source`)."""
+"""Names the holder that is charged for the slices of a source (`MessageSender.source`)."""
 
 
 def no_holder(_source: int) -> Holder:

@@ -1,31 +1,23 @@
 """The slices of a running parametric specification (Chen and Roşu, "Parametric trace slicing and monitoring", 2012).
 
-A *binding* gives a value to some or all of the parameters. The *slice* of a binding contains the events whose
-bindings are part of it, from the first `creation event` on. Without creation events, the slice begins with the first
-event. Each slice whose events bind all parameters is monitored like a separate specification.
+A *binding* gives a value to some or all of the parameters. The *slice* of a binding has the events whose bindings are
+part of it, from the first `creation event` on (without such events: from the first event on). Each slice whose events
+bind all parameters is monitored like a separate specification.
 
-Theory of operation:
-
-1. `targets` returns the slices of an event: every known binding that agrees with the event's binding, joined with it.
-   A new slice starts with the state of the largest known binding within its own binding. That binding is unique,
-   because the union of two known bindings that agree is also known. Slices that lack a parameter (`seeds`) only
-   provide such start states; their actions and handlers have no output.
-2. The engine (`execution.py`) loads each slice in turn into the monitor (`select`), steps the monitor as usual, and
-   stores the state again (`settle`). If an event only changes the states of automata, `step` and `quiet` do so
-   directly.
-3. Each slice has its own clocks. `deadline` is the first deadline of all slices (in a heap), and `due` is the slice
-   with that deadline. A slice has one valid entry in the heap (`Slice.due`), whose time may be too early, but never
-   too late.
-4. A slice ends when it cannot act any more: no event and no deadline leads to a handler, and its actions only change
-   its own variables. Its binding is remembered, so that the slice does not start again. A slice in its initial state
-   is forgotten at once if any relevant event would create it again.
-5. There are at most `limit` slices, and no host (*holder*) has more slices than are left for all other hosts
-   (`slice_quota.py`). A host at its limit pays with its own slices. If the specification only observes, the host's
-   oldest slice is forgotten. If the specification acts on messages or publishes, the new binding is `refused`, so
-   that no host can get rid of an obligation. A host never causes the removal of another host's slice. Ended bindings
-   are remembered under the same rule. No binding has more than `MAX_BINDING` bytes.
-6. These limits bound the cost of one message. An event that does not bind all parameters may concern all slices; then
-   the limit is `TOGETHER_LIMIT`.
+1. An event concerns every known binding that agrees with its own, joined with it (`targets`). A new slice starts with
+   the state of the largest known binding within its own, which is unique, because the union of two known bindings
+   that agree is also known. Slices that lack a parameter (`seeds`) only provide such start states, without output.
+2. The engine (`execution.py`) loads each slice in turn into the monitor (`select`), steps the monitor, and stores the
+   state again (`settle`). If an event only changes the states of automata, `step` and `quiet` do so directly.
+3. Each slice has its own clocks. A slice has one valid entry in the heap of deadlines (`Slice.due`), whose time may
+   be too early, but never too late.
+4. A slice ends when no event and no deadline leads to a handler any more, and its actions only change its own
+   variables. Its binding is remembered, so that it does not start again. A slice in its initial state is forgotten at
+   once if any relevant event would create it again.
+5. No host (*holder*) has more slices than are left for all other hosts (`slice_quota.py`), and none causes the
+   removal of another host's slice or ended binding. At its limit, the host's oldest slice is forgotten if the
+   specification only observes. If it acts on messages or publishes, the new binding is `refused`, so that no host can
+   get rid of an obligation.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -63,10 +55,10 @@ MAX_BINDING = 256
 """The most bytes of all strings of a binding together."""
 
 Key = tuple[Any, ...]
-"""A key: True, and the values of the bound parameters, in their order."""
+"""True, and the values of the bound parameters, in their order."""
 
 Binding = tuple[int, Key]
-"""A binding: the bound parameters as a set of bits, and their values."""
+"""The bound parameters as a set of bits, and their values."""
 
 _NAN = float("nan")  # dictionaries find this one object again, although NaN is not equal to itself
 
@@ -215,10 +207,10 @@ class Slices:
     # The slices of an event
 
     def step(self, event: int, key: Key) -> bool | None:
-        """Step the slice of an event that binds all parameters, if the only effect is new states; otherwise return
-        None and do nothing.
+        """Step the slice of an event that binds all parameters; return None, and do nothing, if that does more than
+        new states.
 
-        Return whether the event happened (False if the slice is over).
+        Return False if the slice is over, so that the event does not happen.
         """
         if key not in self._whole:
             return None
@@ -244,7 +236,7 @@ class Slices:
         return self._whole.get(key)
 
     def quiet(self, event: int, slice_: Slice) -> Sequence[int] | None:
-        """Return the next states, or None if the event has another effect than new states."""
+        """Return the next states, or None if the event has another effect."""
         calm = self._calm[event]
         if calm is None or not slice_.kept:
             return None
@@ -359,7 +351,6 @@ class Slices:
     # The state of the monitor
 
     def select(self, slice_: Slice) -> tuple[Run, ...]:
-        """Load the variables of this slice, and return its runs."""
         namespace = self._namespace
         if slice_.domain == self._all:
             for (_, code, _), value in zip(self._parameters, slice_.key[1:], strict=True):
@@ -378,7 +369,7 @@ class Slices:
     def settle(
         self, slice_: Slice, runs: tuple[Run, ...], values: tuple[Any, ...], *, happened: bool
     ) -> None:
-        """Store the state. A slice that begins with this event is kept only if the event `happened`."""
+        """A slice that begins with this event is kept only if the event `happened`."""
         slice_.runs, slice_.values = runs, values
         if slice_.gone:
             return
@@ -397,8 +388,8 @@ class Slices:
             self._await(slice_)
 
     def forgotten(self, time_ns: int) -> str:
-        """Return as text how many slices were forgotten for newer ones of the same host, or nothing if the last
-        report was less than `FOLDED_NS` ago.
+        """Return the number of slices forgotten for newer ones of the same host; empty within `FOLDED_NS` of the last
+        report.
         """
         number = self._forgotten
         if not number or (self._told is not None and time_ns - self._told < FOLDED_NS):
@@ -432,7 +423,7 @@ class Slices:
         return self._deadlines[0][2]
 
     def _await(self, slice_: Slice) -> None:
-        """Add an entry to the heap at the slice's deadline, unless there is an earlier one."""
+        """Add an entry to the heap, unless there is an earlier one."""
         deadline = slice_.deadline
         if deadline is None or (slice_.due is not None and slice_.due <= deadline):
             return
@@ -480,7 +471,7 @@ class Slices:
         return self._first
 
     def state(self, binding: Binding) -> Slice | None:
-        """Return the slice of a binding, or None if it has ended. Raises `KeyError` for an unknown binding."""
+        """Return None if the slice has ended. Raises `KeyError` for an unknown binding."""
         domain, key = binding
         return self._known[domain].slices[key]
 

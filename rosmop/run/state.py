@@ -1,11 +1,9 @@
-"""Keep the state of monitors as data that outlives their process, written group by group and read back under limits.
+"""Keep the state of monitors as data that outlives their process, group by group, and read it back under limits.
 
-A group shares topics or variables, so a message changes the state of at most one. The state is everything that
-affects later messages: variables, runs of properties, timers, and whether a monitor holds its topics. The events that
-explain a verdict, and the times of throttled output, are not saved.
-
-If the variables of a group are numbers, its state is the bytes in the module's memory, which `CellNames` describes;
-this is the cheap, common case. Times are those of the caller's clock, which the next process continues.
+The state is everything that affects later messages: variables, runs of properties, timers, and whether a monitor
+holds its topics; not the events that explain a verdict. If the variables of a group are numbers, its state is the
+bytes in the module's memory, which `CellNames` describes. Times are those of the caller's clock, which the next
+process continues.
 """
 
 import hashlib
@@ -27,7 +25,7 @@ from rosmop.types import value_types
 from rosmop.types.value_types import Type
 
 MOST_BYTES = 64 << 10
-"""The most bytes of a group without slices, which is written with each batch that changes it."""
+"""The limit for a group without slices, which is written with each batch that changes it."""
 
 _CLOCK = struct.Struct("<qq")
 
@@ -59,7 +57,7 @@ class MonitorSnapshot(msgspec.Struct, frozen=True, array_like=True):
 
 
 def encoded(states: Sequence[MonitorSnapshot]) -> bytes:
-    """Return the states as bytes. Raises `StateTooLargeError`."""
+    """Raises `StateTooLargeError`."""
     data = msgspec.msgpack.encode(states)
     if len(data) > MOST_BYTES:
         raise StateTooLargeError(f"its state has {len(data)} bytes; {MOST_BYTES} are kept")
@@ -72,9 +70,7 @@ def refused(why: str) -> bytes:
 
 
 GroupSnapshot = tuple[Sequence[str], bytes, bytes, bytes | None]
-"""The names of a group's monitors, the layout of its cells (`CellNames` as MessagePack), their state (`encoded`,
-`refused`), and the cells if they are newer.
-"""
+"""A group's monitors, the layout of its cells (`CellNames` as MessagePack), their state, and the cells if newer."""
 
 
 def states_of(
@@ -131,7 +127,7 @@ def _with_cells(states: list[MonitorSnapshot], cells: bytes, names: CellNames) -
 
 
 def kept_monitor(monitor: MonitorInstance, variables: Mapping[str, Any], types: bytes) -> MonitorSnapshot:
-    """Return the state of a monitor. Raises `StateTooLargeError`."""
+    """Raises `StateTooLargeError`."""
     slices = monitor.slices
     first: tuple[list[Any], list[Any]] = ([], [])
     if slices is not None:

@@ -1,8 +1,8 @@
 """Runs of properties as plain data that outlives a process, and back.
 
-A run returns its values that change (`saved`), which become numbers, strings and arrays of MessagePack. A container
-is `[tag, item, …]`. An object with several references is `["o", number]`; the table entry with that number has its
-fields. Reading creates only objects of the classes below.
+The values that change (`saved`) become numbers, strings and arrays of MessagePack. A container is `[tag, item, …]`.
+An object with several references is `["o", number]`, an entry of a table. Reading creates only objects of the classes
+below.
 """
 
 from collections import deque
@@ -16,7 +16,7 @@ from rosmop.logics.interface import ClockedRun, CompiledProperty, FiniteRun, Run
 from rosmop.logics.parsing import EarleySet, EarleyShape
 
 MOST_PARTS = 5_000
-"""The most objects of one run, more than a hundred times the usual number."""
+"""More than a hundred times the usual number of objects of one run."""
 
 _CONTAINERS: Mapping[str, Callable[[list[Any]], Any]] = MappingProxyType(
     {"l": list, "t": tuple, "d": deque, "s": set}
@@ -32,14 +32,14 @@ class StateTooLargeError(Exception):
 
 
 def kept(run: Any) -> list[Any]:
-    """Return a run as plain data. Raises `StateTooLargeError`."""
+    """Raises `StateTooLargeError`."""
     if isinstance(run, FiniteRun | ClockedRun):
         return [[*run.saved()], []]
     return _Writer(run).written()
 
 
 def run_of(compiled: CompiledProperty, data: Any, time_ns: int) -> Run:
-    """Return the run in plain data. Raises `ValueError` for invalid data."""
+    """Raises `ValueError` for invalid data."""
     run = compiled.start(time_ns)
     try:
         _Reader(compiled, run, data).read()
@@ -102,8 +102,6 @@ class _Writer:
 
 
 class _Reader:
-    """Restores the written state in a new run."""
-
     def __init__(self, compiled: CompiledProperty, run: Any, data: Any) -> None:
         self._compiled = compiled
         self._run = run
@@ -151,7 +149,7 @@ class _Reader:
             self._fill(run.operators[number], fields)
 
     def _fill_run(self, fields: list[Any]) -> None:
-        """Fill the run; each value has the type of the new run's value, but a grammar's frame may be gone."""
+        """Each value has the type of the new run's value, but a grammar's frame may be gone."""
         before = self._run.saved()
         self._fill(self._run, fields)
         for first, value in zip(before, self._run.saved(), strict=True):

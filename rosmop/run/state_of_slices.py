@@ -1,7 +1,6 @@
-"""Keep the slices of a running parametric specification as data.
+"""Keep the slices of a running parametric specification as data, in `BUCKETS` parts by their bindings.
 
-The slices are divided by their bindings into `BUCKETS` parts. If a slice has changed, its whole part is written. So a
-message costs a hundredth of all slices, and a part is written completely or not at all.
+A part with a changed slice is written completely or not at all, so a message costs a hundredth of all slices.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -55,9 +54,7 @@ class SliceParts:
         slices.keep()
 
     def changed(self) -> dict[int, bytes]:
-        """Return the parts that have changed since the last call, by number. A part that cannot be saved is
-        replaced by the reason.
-        """
+        """Return the changed parts by number. A part that cannot be saved is replaced by the reason."""
         bindings, dirty = self._slices.changed or {}, set()
         self._slices.changed = {}
         for binding, holder in bindings.items():
@@ -108,10 +105,7 @@ def restore_slices(
     fits: Callable[[Type, Any], bool],
     time_ns: int,
 ) -> None:
-    """Give a new specification these slices. Raises `ValueError`.
-
-    `first` has the initial values of parameters and of the slices' own variables.
-    """
+    """Raises `ValueError`. `first` has the initial values of parameters and of the slices' own variables."""
     assert code.slicing is not None  # noqa: S101  it is parametric
     parameters = [kind for _, _, kind in code.slicing.parameters]
     own = [types[name] for name in code.slicing.own]

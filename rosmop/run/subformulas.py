@@ -1,6 +1,6 @@
 """Find the subformulas that decide a past-time formula over the events of an explanation.
 
-An explanation has few events, so the formula is evaluated by its definition, position by position.
+These are few events, so the formula is evaluated by its definition, position by position.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -25,10 +25,9 @@ _MOST = 8
 
 
 def deciding(source: Source, events: Sequence[int], times: Sequence[int]) -> list[str]:
-    """Return the subformulas that decide the formula.
+    """Return the subformulas; empty for other logics, and for formulas about the future.
 
-    `events` are the numbers of the events in the source, `times` their times (ns). The result is empty for
-    other logics, and for formulas about the future.
+    `events` are the numbers of the events in the source, `times` their times (ns).
     """
     syntax = _SYNTAXES.get(source.logic)
     if syntax is None or not 0 < len(events) <= _MOST_EVENTS:
@@ -136,7 +135,6 @@ class _Words:
         self._spelled = {meant: word for words in levels for word, meant in reversed([*words.items()])}
 
     def text(self, formula: Formula) -> str:
-        """Return a formula as text, with nested operators in parentheses."""
         if not formula.operands:
             return formula.name or formula.operator
         parts = [

@@ -1,11 +1,10 @@
-"""Ticks (`every`), deadlines and safe messages, in the order of their times.
+"""Ticks (`every`), deadlines and safe messages, in the order of their times (ns), which the caller gives.
 
-The caller gives the time, in nanoseconds: all ticks up to it happen, and all deadlines before it. Ticks beyond the
-caller's `patience` are skipped, which is logged; deadlines wait for the next call.
+All ticks up to the present time happen, and all deadlines before it. Ticks beyond the caller's `patience` are
+skipped, which is logged; deadlines wait for the next call.
 
-Slices of parametric specifications have their own deadlines. Senders choose the bindings, and thereby how many
-deadlines pass at one time. Therefore `advance` processes at most `most` deadlines; the others stay due. A slice
-processes no message before its own deadlines have passed (`MonitorExecution`).
+Senders choose the bindings of slices, and thereby how many deadlines pass at one time. So `advance` processes at most
+`most` deadlines; the others stay due. A slice processes no message before its own deadlines (`MonitorExecution`).
 """
 
 from collections.abc import Callable, Sequence
@@ -17,7 +16,7 @@ from rosmop.run.outcomes import Outcome
 Patience = Callable[[], Callable[[], bool]]
 
 MAX_TICKS = 100_000
-"""The most ticks of one timer between two messages. After a larger jump of the clock the rest is skipped."""
+"""After a larger jump of the clock between two messages the rest is skipped."""
 
 
 class Agenda:
@@ -32,7 +31,6 @@ class Agenda:
     ) -> None:
         """When something is due, `patience()` returns a function that returns whether the work takes too long."""
         self.due: int | None = None
-        """The time of the next tick or deadline, or None."""
         self._monitors = monitors
         self._execution = execution
         self._patience = patience
@@ -45,7 +43,7 @@ class Agenda:
         )
 
     def let_go(self) -> None:
-        """Drop all monitors, so that no reference cycle keeps the set alive."""
+        """Break the reference cycle that would keep the set alive."""
         for monitor in self._monitors:
             monitor.steps, monitor.timers, monitor.home, monitor.group = (), (), None, None
         self._monitors = ()
@@ -54,7 +52,7 @@ class Agenda:
         return self.due is not None and self.due <= time_ns
 
     def schedule(self) -> None:
-        """Schedule the next time; a deadline passes after its last nanosecond."""
+        """A deadline passes after its last nanosecond."""
         if not self._timed:
             return
         timer, deadline = self._next_timer(), self._next_deadline()
@@ -70,7 +68,7 @@ class Agenda:
         self.due = min(times, default=None)
 
     def when_due(self, *, anew: bool) -> int | None:
-        """Return the next time. `anew`: do not use the last result, because lanes may have moved deadlines."""
+        """`anew`: do not use the last result, because lanes may have moved deadlines."""
         if anew:
             self.schedule()
         return self.due

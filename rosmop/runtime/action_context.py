@@ -18,18 +18,14 @@ BUDGET = 1_000_000
 """The instructions for one message."""
 
 STEP = 250
-"""The instructions between two readings of the processor time."""
 
 PART = 250
-"""The elements of arrays between two readings of the processor time."""
 
 _AT_ONCE = 10e-9  # seconds: the least that an instruction takes, where many are charged in advance
 
 MAX_BYTES = 16 << 20
-"""The most bytes of all values of a specification together."""
 
 UNMEASURED = 1 << 20
-"""The bytes that may be allocated between two measurements."""
 
 MAX_CALLS = 100
 """The maximum depth of recursive calls of helper functions."""
@@ -65,7 +61,7 @@ class LogLine:
 
 
 def line_of(level: str, text: bytes, monitor: str) -> LogLine:
-    """Return a line, with U+FFFD in place of bytes that are not UTF-8."""
+    """Replace bytes that are not UTF-8 by U+FFFD."""
     return LogLine(level, text.decode("utf-8", "replace").rstrip("\n"), monitor)
 
 
@@ -87,7 +83,7 @@ class Turn:
     now: int = 0
     source: int = 0
     names: Callable[[int], tuple[bytes, bytes]] = lambda _: (b"", b"")
-    """A function that returns host and caller of a source (`MessageSender.source`)."""
+    """Returns host and caller of a source (`MessageSender.source`)."""
     log: list[LogLine] = field(default_factory=list)
     published: list[Published] = field(default_factory=list)
     looked: dict[int, tuple[Any, ...]] = field(default_factory=dict)
@@ -106,7 +102,7 @@ class Turn:
             self.until = self.clock() + self.seconds * self.part
 
     def late(self, more: float = 0.0) -> bool:
-        """Return whether the time is over, or will be after `more` seconds."""
+        """Whether the time is over, or will be after `more` seconds."""
         return self.clock is not None and self.clock() + more > self.until
 
     def check(self) -> None:
@@ -154,7 +150,7 @@ class Context:
         measures: Mapping[str, Measure],
         live: Callable[[], Sequence[Mapping[str, object]]],
     ) -> None:
-        """Make a context; `live` returns the values of all variables, and `measures` has a function for each name."""
+        """`live` returns the values of all variables, and `measures` has a function for each name."""
         self.monitor = monitor
         self.turn = turn
         self.most = BUDGET
@@ -218,7 +214,7 @@ class Context:
         self.turn.log.append(line_of(level, text, self.monitor))
 
     def throttle(self, period: float, site: int) -> bool:
-        """Return whether output is due: the last one was at least `period` seconds ago."""
+        """Whether output is due: the last one was at least `period` seconds ago."""
         now = self.turn.now
         last = self.throttled.get(site)
         if last is not None and last <= now < last + period * 1e9:

@@ -1,7 +1,7 @@
 """Name the functions that the intermediate form (`form/nodes.py`) may call.
 
-A first parameter `context` gets the context of the running specification, which pays for the call. A last parameter
-`site` gets the position to report for a fault.
+A first parameter `context` is the running specification's, which pays for the call; a last parameter `site` is the
+position of a fault.
 """
 
 import inspect

@@ -15,7 +15,6 @@ _F32_LIMIT = 3.4028235677973366e38  # from this number on, the nearest float is 
 
 
 def f32(value: float) -> float:
-    """Return the nearest 32-bit float."""
     if -_F32_LIMIT < value < _F32_LIMIT:
         result: float = _F32.unpack(_F32.pack(value))[0]
         return result
@@ -23,9 +22,7 @@ def f32(value: float) -> float:
 
 
 def f32_of_integer(value: int) -> float:
-    """Return the nearest 32-bit float, rounded only once: a double cannot hold an integer beyond 2**53, so
-    its low bits are first merged into one.
-    """
+    """Round only once: a double cannot hold an integer beyond 2**53, so its low bits are first merged into one."""
     if -_EXACT <= value <= _EXACT:
         return f32(value)
     size = abs(value)
@@ -35,7 +32,7 @@ def f32_of_integer(value: int) -> float:
 
 
 def truncate(value: float, least: int, most: int) -> int:
-    """Truncate a number, and clamp it to the limits; NaN becomes 0."""
+    """Clamp the number to the limits; NaN becomes 0."""
     if value != value:  # noqa: PLR0124  NaN
         return 0
     if value <= least:
@@ -49,7 +46,7 @@ def wrap(value: int, bits: int, signed: bool) -> int:
 
 
 def divide(left: int, right: int, site: int) -> int:
-    """Return the quotient, rounded toward zero."""
+    """Round toward zero."""
     if right == 0:
         raise FaultError(site, "division by zero")
     result = abs(left) // abs(right)
@@ -57,7 +54,7 @@ def divide(left: int, right: int, site: int) -> int:
 
 
 def remainder(left: int, right: int, site: int) -> int:
-    """Return the remainder, with the sign of `left`."""
+    """The remainder has the sign of `left`."""
     if right == 0:
         raise FaultError(site, "division by zero")
     result = abs(left) % abs(right)
@@ -65,7 +62,7 @@ def remainder(left: int, right: int, site: int) -> int:
 
 
 def ratio(left: float, right: float) -> float:
-    """Return the quotient; division by zero gives infinity or NaN."""
+    """Division by zero gives infinity or NaN."""
     try:
         return left / right
     except ZeroDivisionError:

@@ -11,21 +11,21 @@ MAX_DURATION = (1 << 31) * BILLION - 1
 
 
 def time(nanoseconds: int, site: int) -> int:
-    """Return the time; fault where C++ throws, because messages cannot hold it."""
+    """Fault where C++ throws, because messages cannot hold the time."""
     if 0 <= nanoseconds <= MAX_TIME:
         return nanoseconds
     raise FaultError(site, "the time is out of range: from 0 to 2^32 seconds")
 
 
 def duration(nanoseconds: int, site: int) -> int:
-    """Return the duration; fault where C++ throws, because messages cannot hold it."""
+    """Fault where C++ throws, because messages cannot hold the duration."""
     if MIN_DURATION <= nanoseconds <= MAX_DURATION:
         return nanoseconds
     raise FaultError(site, "the duration is out of range: 2^31 seconds")
 
 
 def nanoseconds(seconds: float, site: int) -> int:
-    """Return the nanoseconds, rounded as in ROS, which splits off the whole seconds first."""
+    """Round as ROS, which splits off the whole seconds first."""
     if not math.isfinite(seconds) or abs(seconds) > 1 << 33:
         raise FaultError(site, f"{seconds} seconds are out of range")
     whole = math.floor(seconds)

@@ -1,7 +1,4 @@
-"""Operations on values by type: size, zeros, copies, and encoding in messages.
-
-The value of a message is the list of its fields.
-"""
+"""Operations on values by type: size, zeros, copies, and encoding in messages."""
 
 import struct
 from collections.abc import Callable, Iterator, Sequence
@@ -264,7 +261,6 @@ class ValueCodec:
 
 
 def zero_of(kind: Type) -> bool | float | bytes | None:
-    """Return the zero of a type, or None for void."""
     if isinstance(kind, value_types.BoolType):
         return False
     if isinstance(kind, value_types.FloatingType):

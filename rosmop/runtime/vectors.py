@@ -21,7 +21,7 @@ def element(values: Values, index: int, site: int) -> Any:
 
 
 def put(values: Values, index: int, value: Any, site: int) -> Any:
-    """Assign `values[index] = value`, and return the value."""
+    """`values[index] = value`."""
     if 0 <= index < len(values):
         values[index] = value
         return value
@@ -29,7 +29,6 @@ def put(values: Values, index: int, value: Any, site: int) -> Any:
 
 
 def put_slot(record: Values, slot: int, value: Any) -> Any:
-    """Assign an element, and return the assigned value."""
     record[slot] = value
     return value
 
@@ -53,7 +52,7 @@ def weighed(context: Context, values: Values, measure: Callable[[Values], int], 
 
 
 def same(left: Any, right: Any) -> bool:
-    """Whether values are equal; a NaN equals nothing, not even itself."""
+    """A NaN equals nothing, not even itself."""
     return left == right and _numbers(left)
 
 
@@ -68,13 +67,13 @@ def pop(values: Values, site: int) -> None:
 
 
 def copied(context: Context, values: Values, width: int, site: int) -> Values:
-    """Return a copy of a vector of numbers, strings or times."""
+    """Copy a vector of numbers, strings or times."""
     context.allocate(len(values) * width, site)
     return values.copy()
 
 
 def copied_deep(context: Context, values: Values, width: int, copy: Callable[..., Any], site: int) -> Values:
-    """Return a copy of a vector of vectors or messages; `copy` copies one."""
+    """Copy a vector of vectors or messages; `copy` copies one."""
     context.allocate(len(values) * width, site)
     return [copy(context, value, site) for value in values]
 
@@ -147,7 +146,7 @@ def filled_with(  # noqa: PLR0917  the arguments are C++'s
 
 
 def fixed(values: Values, count: int, site: int) -> Values:
-    """Return the values of an array of fixed length; fault if the number of elements differs."""
+    """Fault if the number of elements differs."""
     if len(values) != count:
         raise FaultError(site, f"{len(values)} elements for an array of exactly {count}")
     return values

@@ -90,10 +90,7 @@ def skip(buffer: Buffer, start: int, number: int, end: Callable[[Buffer, int], i
 def skip_inner(
     buffer: Buffer, start: int, number: int, end: Callable[[Buffer, int], int], context: Context
 ) -> int:
-    """Like `skip`, but within a skipped element.
-
-    There may be many such calls, so even a few elements are charged.
-    """
+    """Like `skip`, but within a skipped element: there may be many such calls, so even a few elements are charged."""
     context.walk(number + 1)
     return _skipped(buffer, start, number, end, context)
 
@@ -130,8 +127,8 @@ class WireMessage:
 
     Numbers are written in place, and only the replaced bytes are kept, so a large image is not copied when its stamp
     changes. `touched` has a bit for each statement (of the sites in `marks`) whose write changed bytes; it is cleared
-    after each event. `cause` is the site of the statement that dropped the message. `stopped` is the site that
-    replaced it by the safe one of its `channel` (see `EventCode.channel`).
+    after each event. `cause` is the site of the statement that dropped the message; `stopped` that which replaced it
+    by the safe one of its `channel`.
     """
 
     __slots__ = (
@@ -197,7 +194,7 @@ class WireMessage:
         self.buffer[start:end] = new  # type: ignore[index]  # it is a bytearray or a writable memoryview
 
     def splice(self, edits: list[tuple[int, int, bytes, int]]) -> None:
-        """Replace parts of the message; an edit has start, end, new bytes and bits (see `patch`)."""
+        """An edit has start, end, new bytes and bits (see `patch`)."""
         if all(len(new) == end - start for start, end, new, _ in edits):
             for start, _, new, by in edits:
                 self.patch(start, new, by)
@@ -214,7 +211,7 @@ class WireMessage:
         self.buffer = bytearray(b"".join(pieces))
 
     def stop(self, safe: SafeMessage, site: int) -> None:
-        """Replace the message by the safe one; a header keeps its `seq` and `stamp`."""
+        """A header keeps its `seq` and `stamp`."""
         first = HEAD if safe.stamped and len(self.buffer) >= HEAD else 0
         new = safe.data[first:] if first else sent(safe, self.time)
         self.splice([(first, len(self.buffer), new, 0)])
@@ -237,7 +234,7 @@ def whole(
     pending: tuple[tuple[bool, tuple[int | str, ...], Any], ...],
     site: int,
 ) -> list[Any]:
-    """Return a whole message with the fields that the action assigned; `pending`: (assigned, path, value)."""
+    """`pending` are the fields that the action assigned: (assigned, path, value)."""
     context.allocate(len(message.buffer), site)
     value: list[Any] = decode(message.buffer, 0)[0]
     for assigned, path, new in pending:

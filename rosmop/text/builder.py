@@ -1,7 +1,4 @@
-"""Build the tree of `tree.py` from lark's parse tree.
-
-Each rule of the grammar has a method. The walk is not recursive, so nesting cannot exhaust the stack.
-"""
+"""Build the tree of `tree.py` from lark's parse tree, without recursion, so nesting cannot exhaust the stack."""
 
 # Each method handles the rule of the grammar that has its name.
 
@@ -32,7 +29,7 @@ _GIVEN = re.compile(
 _DURATION = re.compile(r"(\d++(?:\.\d*+)?|\.\d++)\s*+([A-Za-z]*+)\Z")
 MIN_PERIOD_NS = 10**6
 MAX_PERIOD_NS = 10**18
-"""The longest period, about 31 years."""
+"""About 31 years."""
 
 
 class _LiteralError(Exception):

@@ -119,10 +119,7 @@ _Advice = str | Callable[[re.Match[str]], str]
 
 @dataclass(frozen=True)
 class _Shape:
-    """A construct outside the grammar; `depths` are the braces around it.
-
-    Depth 0 is outside all specifications, depth 1 in one, and depth 2 in its braces.
-    """
+    """A construct outside the grammar; `depths` are the braces around it (0: outside all specifications)."""
 
     pattern: re.Pattern[str]
     advice: _Advice

@@ -1,9 +1,8 @@
 """The grammar of ``.rv`` files, for lark's LALR(1) parser with its contextual lexer.
 
 The lexer knows which tokens may follow, so `/landshark/scan` is a topic where a topic is allowed and two divisions
-elsewhere. Inside an action, variables can have the names `event`, `service`, `safe`, `withhold` and `STOP`. A C++
-parser needs the declared types to distinguish a declaration from an expression. In this grammar, two names in a row are
-a declaration.
+elsewhere. A C++ parser needs the declared types to distinguish a declaration from an expression; here two names in a
+row are a declaration.
 """
 
 from rosmop.logics.catalogue import LOGICS

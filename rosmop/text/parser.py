@@ -1,7 +1,4 @@
-"""Parse the text of an ``.rv`` file into a tree.
-
-A file has at most `MAX_CHARACTERS`, and nests at most `MAX_DEPTH` deep. Time and memory are linear in its length.
-"""
+"""Parse the text of an ``.rv`` file into a tree, in time and memory linear in its length."""
 
 import re
 from functools import lru_cache
@@ -40,7 +37,7 @@ class _ForbiddenWordError(Exception):
 
 
 def parse(text: str, file: str) -> tree.SpecificationFile:
-    """Parse a text; `file` is its name in positions. Raises `SpecificationError`."""
+    """`file` is the text's name in positions. Raises `SpecificationError`."""
     start = Position(file, 1, 1)
     if len(text) > MAX_CHARACTERS:
         raise SpecificationError.at(
@@ -95,7 +92,7 @@ def _ended_early(text: str, offset: int) -> int | None:
 
 
 def start_of(file: str, text: str, offset: int) -> Position:
-    """Return the position of an offset; the end of the text is the position after the last non-blank character."""
+    """The end of the text is the position after the last non-blank character."""
     if offset >= len(text):
         offset = len(text.rstrip())
     return Position(file, 1, 1).within(text, offset)
@@ -128,7 +125,7 @@ def _allow(token: Token) -> Token:
 
 @lru_cache(maxsize=1)
 def _parser() -> Lark:
-    """Return the parser, which is built at the first use and keeps no state between files."""
+    """Build the parser at the first use; it keeps no state between files."""
     return Lark(
         GRAMMAR,
         start="file",

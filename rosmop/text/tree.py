@@ -1,7 +1,7 @@
 """The tree of an ``.rv`` file: frozen dataclasses, each with the position of its first character.
 
-Strings are bytes, as in C++ (a character outside ASCII is its UTF-8 bytes). Nothing is resolved: a name is the tuple
-of its parts (`std::string` is `("std", "string")`).
+Strings are bytes, as in C++. A name is the tuple of its parts (`std::string` is `("std", "string")`), and is not
+resolved.
 """
 
 from collections.abc import Iterator

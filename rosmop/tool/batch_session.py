@@ -58,12 +58,12 @@ class BatchSession:
     kept: TemporaryStore
 
     def results(self, what: str, jobs: Sequence[Job]) -> Iterator[tuple[int, Result | Failure]]:
-        """Yield results in the order in which they end, with progress by bytes."""
+        """Yield results in the order in which they end."""
         with self._progress(what, jobs) as done:
             yield from self.runner.run(jobs, done)
 
     def in_order(self, what: str, jobs: Sequence[Job]) -> Iterator[Result | Failure]:
-        """Yield results in the order of the jobs, with progress by bytes."""
+        """Yield results in the order of the jobs."""
         with self._progress(what, jobs) as done:
             yield from self.runner.in_order(jobs, done)
 

@@ -28,10 +28,7 @@ def check(
     dot: Path | None,
     svg: Path | None,
 ) -> int:
-    """Report every error and warning.
-
-    Return 0 without errors, 1 with errors. A usage error ends with 2.
-    """
+    """Return 0 without errors, 1 with errors. A usage error ends with 2."""
     if prove and find_spec("z3") is None:
         raise program.usage_error("--prove needs the package z3-solver: pip install z3-solver")
     try:

@@ -20,16 +20,13 @@ MAX_FILE = 64 << 20
 
 @dataclass(frozen=True)
 class CommandContext:
-    """The context of a command; `name` begins each message.
-
-    `write` replaces a file, or raises `OSError`.
-    """
+    """The context of a command; `name` begins each message. `write` replaces a file, or raises `OSError`."""
 
     name: str
     write: Callable[[Path, bytes | mmap], object]
 
     def read(self, path: Path) -> bytes:
-        """Read a regular file of at most `MAX_FILE` bytes. Raises `OSError`."""
+        """Raises `OSError`, also for a file that is not regular, or too long."""
         with open_regular(path) as file:
             data = file.read(MAX_FILE + 1)
         if len(data) > MAX_FILE:
@@ -37,7 +34,7 @@ class CommandContext:
         return data
 
     def read_text(self, path: Path) -> str:
-        """Read a text; line ends become LF, and invalid UTF-8 bytes surrogates. Raises `OSError`."""
+        """Make line ends LF, and invalid UTF-8 bytes surrogates. Raises `OSError`."""
         with io.TextIOWrapper(io.BytesIO(self.read(path)), "utf-8", "surrogateescape") as text:
             return text.read()
 
@@ -45,7 +42,7 @@ class CommandContext:
         typer.echo(f"{self.name}: {printable(text)}", err=True)
 
     def usage_error(self, text: str) -> typer.Exit:
-        """Report an error in the command line. The caller raises the result (exit status 2)."""
+        """The caller raises the result (exit status 2)."""
         self.warn(text)
         return typer.Exit(2)
 

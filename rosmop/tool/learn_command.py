@@ -72,7 +72,7 @@ def _surveys(session: BatchSession, topics: list[str]) -> tuple[list[tuple[int, 
 
 
 def _definitions(program: CommandContext, surveys: Sequence[Survey]) -> Definitions:
-    """Return the definitions in recordings. Rejects recordings with different definitions of one type."""
+    """Reject recordings with different definitions of one type."""
     recorded = Definitions({})
     for survey in surveys:
         own = definitions_by_type(survey.definitions)

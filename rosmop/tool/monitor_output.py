@@ -22,9 +22,7 @@ def say_finding(finding: Diagnostic, *, as_json: bool) -> None:
 def record(
     outcome: Outcome, index: int | None = None, topic: str | None = None, publisher: str = ""
 ) -> dict[str, object]:
-    """Return an outcome as data; its message is from the recording or from a monitor, and without a topic, it
-    is a tick or deadline.
-    """
+    """Return an outcome as data; without a topic, it is a tick or deadline."""
     head: dict[str, object] = {"timer": outcome.timer}
     if topic is not None:
         head = {"publisher": publisher, "topic": topic} if publisher else {"index": index, "topic": topic}
@@ -71,7 +69,7 @@ def _fault(fault: Fault) -> dict[str, object]:
 def lines(
     outcome: Outcome, index: int | None = None, topic: str | None = None, publisher: str = ""
 ) -> Iterator[str]:
-    """Yield the lines of an outcome; a message without an outcome to report has none."""
+    """Yield no lines for a message without an outcome to report."""
     seconds = f"{outcome.time / BILLION:.3f}"
     number = f"published by {publisher}:" if publisher else f"#{index}"
     head = f"{seconds} {outcome.timer}" if topic is None else f"{seconds} {number} {topic}"

@@ -22,8 +22,8 @@ def progress(
 ) -> Iterator[Callable[[int], None]]:
     """Show progress in a block; the result takes the finished amount of `total()`.
 
-    `shares_screen`: the work writes to standard output, so there is no bar if that is a terminal. `always`:
-    without a bar, print a line for each percent, with the estimated remaining time.
+    `shares_screen`: the work writes to standard output, so there is no bar if that is a terminal. `always`: without a
+    bar, print a line for each percent.
     """
     console = Console(stderr=True)
     is_bar = console.is_terminal and not (shares_screen and sys.stdout.isatty())

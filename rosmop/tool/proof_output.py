@@ -8,7 +8,7 @@ from rosmop.tool.terminal import say, say_json
 
 
 def say_proofs(monitors: MonitorSet, *, as_json: bool) -> int:
-    """Print the proofs; return the number of events whose code differs from their meaning."""
+    """Return the number of events whose code differs from their meaning."""
     different = 0
     for found in findings_of(monitors.compiled, time.monotonic):
         different += found.differs

@@ -78,10 +78,7 @@ def run_spans(
     *,
     margins: bool,
 ) -> None:
-    """Run specifications on named spans of files, in this process.
-
-    Raises `RecordingError` and `SpecificationError`.
-    """
+    """Raises `RecordingError` and `SpecificationError`."""
     for name, path, span in spans:
         recording = RecordingName(name, path.stat().st_size, "")
         job = ReplayJob(recording, specifications, topics, span, MOST_IN_ROWS, margins, strict=True)

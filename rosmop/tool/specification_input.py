@@ -25,10 +25,7 @@ _RECORDINGS = (b"#ROSBAG ", b"\x89MCAP")
 def load(
     program: CommandContext, files: list[Path], folders: list[Path], recorded: Definitions | None = None
 ) -> Compiled:
-    """Return the compiled files. Raises `SpecificationError`.
-
-    `recorded` applies to types that no file defines.
-    """
+    """`recorded` applies to types that no file defines. Raises `SpecificationError`."""
     definitions = read_definitions(program, files, folders)
     if recorded is not None:
         definitions = recorded.extended(definitions)
@@ -70,8 +67,8 @@ def topics_of(specifications: Specifications) -> dict[str, str]:
 
 
 def read_definitions(program: CommandContext, files: Sequence[Path], folders: Sequence[Path]) -> Definitions:
-    """Return the definitions of ROS, of `msg/` beside the specifications, and of the folders; later ones
-    replace earlier ones.
+    """Return the definitions of ROS, of `msg/` beside the specifications, and of the folders; later ones replace
+    earlier ones.
 
     Raises `SpecificationError` for a definition that cannot be read.
     """
@@ -109,7 +106,7 @@ def read_for_recordings(
 
 
 def definition_folders(program: CommandContext, files: Sequence[Path], folders: Sequence[Path]) -> list[Path]:
-    """Return the folders of definitions; those beside the files come before the given ones."""
+    """Return the folders beside the files before the given ones."""
     for folder in folders:
         if not folder.is_dir():
             raise program.usage_error(f"--msg: {folder} is not a folder")

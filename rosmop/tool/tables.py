@@ -16,7 +16,7 @@ def table_of(*heads: str | Column) -> Table:
 
 
 def add_row(table: Table, *cells: str) -> None:
-    """Add a row of untrusted strings: control characters are escaped, and nothing is read as markup."""
+    """Escape control characters of untrusted strings, of which nothing is read as markup."""
     table.add_row(*(Text(printable(cell)) for cell in cells))
 
 

@@ -1,7 +1,4 @@
-"""Look up message types: fields in order, their types, and constants.
-
-The error for an unknown name suggests the nearest known one.
-"""
+"""Look up message types: fields in order, their types, and constants."""
 
 import difflib
 from collections.abc import Iterable, Mapping
@@ -61,7 +58,7 @@ class MessageTypes:
         self._slots: dict[str, dict[str, FieldSlot]] = {}
 
     def definition(self, name: str) -> MessageDefinition:
-        """Return a complete and usable definition. Raises `UnknownNameError`."""
+        """Raises `UnknownNameError` unless the definition is complete and usable."""
         try:
             self.definitions.layout(name)
             return self.definitions.message(name)
@@ -74,7 +71,6 @@ class MessageTypes:
             ) from None
 
     def slots(self, name: str) -> dict[str, FieldSlot]:
-        """Return the fields by name, in the order of the definition."""
         if name not in self._slots:
             fields = self.definition(name).fields
             self._slots[name] = {
@@ -84,7 +80,7 @@ class MessageTypes:
         return self._slots[name]
 
     def slot(self, name: str, field: str) -> FieldSlot:
-        """Return a field. Raises `UnknownNameError` with the nearest name."""
+        """Raises `UnknownNameError` with the nearest name."""
         slots = self.slots(name)
         if field not in slots:
             paths = self._paths_to(name, field)
@@ -94,7 +90,7 @@ class MessageTypes:
         return slots[field]
 
     def constant(self, name: str, constant: str) -> Constant:
-        """Return a constant. Raises `UnknownNameError`."""
+        """Raises `UnknownNameError`."""
         constants = {known.name: known for known in self.definition(name).constants}
         if constant not in constants:
             raise UnknownNameError(f"{name} has no constant {shown(constant)}{nearest(constant, constants)}")

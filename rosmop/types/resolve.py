@@ -50,7 +50,7 @@ def named_type(parts: tuple[str, ...]) -> Type | None:
 
 
 def resolve(name: tree.TypeName, messages: MessageTypes) -> Type:
-    """Return the type of a name. Raises `SpecificationError`; `auto` is not resolved here."""
+    """Raises `SpecificationError`; `auto` is not resolved here."""
     if name.element is not None:
         element = resolve(name.element, messages)
         if element in (value_types.VOID, value_types.CHARACTERS):
@@ -115,7 +115,7 @@ def _meant(parts: tuple[str, ...], messages: MessageTypes) -> str:
 
 
 def record(position: Position, name: str, messages: MessageTypes) -> value_types.RecordType:
-    """Return a message type. Raises `SpecificationError`."""
+    """Raises `SpecificationError`."""
     try:
         messages.definition(name)
     except UnknownNameError as error:

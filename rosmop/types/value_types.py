@@ -1,8 +1,7 @@
 """The types of values: C++'s arithmetic types, strings, times, vectors and messages.
 
-A type is a value object, and its text is the C++ spelling. While actions run, values have these Python types: `bool`,
-`int` and `float` for numbers; bytes for strings and `char *` buffers; integer nanoseconds for times and durations;
-lists for vectors and messages. The list of a message contains its fields in the order of the definition.
+The text of a type is its C++ spelling. Values are `bool`, `int` and `float` for numbers; bytes for strings and `char
+*` buffers; integer nanoseconds for times and durations; lists for vectors, and for the fields of messages in order.
 """
 
 import msgspec
@@ -38,7 +37,7 @@ class BoolType(_Kind, frozen=True):
 
 
 class IntegerType(_Kind, frozen=True):
-    """An integer type; `name` is only for error messages, because `long` and `long long` are the same type."""
+    """`name` is only for error messages, because `long` and `long long` are the same type."""
 
     bits: int
     signed: bool
@@ -183,7 +182,6 @@ def common(left: Type, right: Type) -> Type:
 
 
 def convertible(source: Type, target: Type) -> bool:
-    """Whether a value of one type can be assigned to a variable of the other."""
     if is_number(source) and is_number(target):
         return True
     if isinstance(target, StringType | CharactersType):
