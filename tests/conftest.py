@@ -100,11 +100,9 @@ def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestR
 def pytest_configure(config: pytest.Config) -> None:
     """Give each worker of pytest-xdist a loopback of its own, as root, and let programs hear SIGINT.
 
-    A script's background process ignores SIGINT, and so does every program that it starts: a test that interrupts
-    such a program would wait for its end until the time limit.
-
-    A node that a test killed is remembered by its master with a port, which the next node on a common loopback may
-    take: it would answer for the dead node, or get its order to shut down.
+    A script's background process ignores SIGINT, and so does every program that it starts: a test that interrupts it
+    would wait until the time limit. The port of a killed node could go to the next node on a common loopback, which
+    would answer for it.
     """
     # The collected tests stay in memory: the garbage collector would scan their millions of objects again and again.
     gc.set_threshold(700, 10, 100)

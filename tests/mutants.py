@@ -1,10 +1,9 @@
 """Change the kernel in small wrong ways, and list the changes that no test of the gate finds: `make mutants N=200`.
 
-Every module of the kernel (docs/dev/architecture.md) is loaded with all its mutants inside, each switched by a
-number. A first run records which tests reach which mutant. Then each chosen mutant is switched on in a fork of this
-process, which runs only those tests, until one fails. With `--all`, it also runs tests outside the gate. `--module
-master` changes the modules whose path contains `master` instead of the kernel. A seed then chooses the same mutants
-whatever the tests reach, so that two states of the tests can be compared.
+Every module is loaded with all its mutants inside, each switched by a number. A first run records which tests reach
+which mutant; then a fork runs only those tests with the mutant on, until one fails. `--all` also runs tests outside
+the gate. `--module master` changes the modules whose path contains `master` instead of the kernel. A seed chooses the
+same mutants whatever the tests reach, so that two states of the tests can be compared.
 
 Changes without an effect are left out: None instead of False, another step of a version, a `zip` that is not strict.
 """
@@ -251,7 +250,7 @@ def _say(line: str) -> None:
 
 
 def main() -> int:
-    """Hunt, and return 0: survivors are for people to judge."""
+    """Return 0: survivors are for people to judge."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--number", type=int, default=200)
     parser.add_argument("--seed", type=int, default=1)

@@ -1,11 +1,8 @@
 """Run all tests and report each: `make nightly`, or the tests of one lane, `make nightly LANE=standby`.
 
-The gate (`make test`) runs only what cannot fail by chance. This program runs everything, with all examples of each
-property, and never stops at a failure. It writes `build/nightly/results.json`: for each test its passes, failures and
-seconds, and for each run its commit, start, end and load average. Runs of the same commit add up.
-
-Then it measures a robot's start (`benchmarks/launch.py`). A change of more than 20 % against the table in
-`benchmarks/RESULTS.md` is printed and stored as a finding, for people to look at.
+It never stops at a failure. `build/nightly/results.json` has passes, failures and seconds of each test, and commit,
+start, end and load average of each run. Runs of the same commit add up. A change of more than 20 % of a robot's start
+(`benchmarks/launch.py`) against the table in `benchmarks/RESULTS.md` is a finding, for people to look at.
 
 The exit status is 1 if a test failed that `tests/unsteady.txt` does not list, or if the robot did not start.
 """
@@ -45,7 +42,7 @@ LANES = {
     "recorder": ("recorder", "evidence", "recording"),
     "language": ("rosmop/", "tests/proofs/", "monitor", "specification", "compiler"),
 }
-"""Parts of a file's path that put it into a lane; the first lane that has one counts. All other files are in `core`."""
+"""Parts of a file's path; the first lane that has one counts. All other files are in `core`."""
 
 
 @dataclass(frozen=True)
@@ -167,7 +164,7 @@ def run_stage(stage: Stage, files: list[str]) -> tuple[list[tuple[str, str, floa
 
 
 def measure_start() -> tuple[list[str], str]:
-    """Measure a robot's start; return the findings, and what went wrong."""
+    """Return the findings, and what went wrong."""
     command = [sys.executable, "-m", "benchmarks.launch"]
     with START.open("wb") as log:
         try:

@@ -18,7 +18,6 @@ NODES = 4
 
 @pytest.fixture
 def folder() -> Iterator[Path]:
-    """Make a folder for temporary files that other users can read, unlike pytest's."""
     made = Path(tempfile.mkdtemp(prefix="rosrv-test-launch-"))
     made.chmod(0o755)
     yield made
@@ -46,7 +45,6 @@ def test_an_interrupted_launch_leaves_no_process_and_no_file(ending: signal.Sign
 
 
 def processes_of(*parts: str) -> list[str]:
-    """Return the command lines that have all of these parts."""
     lines = []
     for entry in Path("/proc").iterdir():
         try:

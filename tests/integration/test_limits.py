@@ -51,10 +51,7 @@ def ros(appliance: Appliance, hosts: tuple[Host, Host], tmp_path: Path) -> Itera
 
 
 def seconds_for(listener: Process, count: int, since: float) -> float:
-    """Return the seconds since `since` (monotonic clock) until `count` messages have arrived.
-
-    The moment is before the first message, so a busy machine can only make the time longer.
-    """
+    """The moment is before the first message, so a busy machine can only make the time longer."""
     listener.wait_for_count(count, event="received")
     return time.monotonic() - since
 

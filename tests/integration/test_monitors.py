@@ -37,7 +37,7 @@ def common_appliance() -> Iterator[Appliance]:
 
 @pytest.fixture
 def appliance(common_appliance: Appliance) -> Iterator[Appliance]:
-    """Provide the appliance as at its start: only `words`, in its initial state, and only this test's log."""
+    """Only `words`, in its initial state, and only this test's log."""
     common_appliance.ignore_earlier_records()
     yield common_appliance
     common_appliance.rosrv("monitor", "remove", "words", check=False)

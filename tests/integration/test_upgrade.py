@@ -1,7 +1,7 @@
 """The appliance is upgraded in place: it starts on the state of version 0.2.0.
 
-Version 0.2.0 wrote the state file `state-0.2.0.sql` while a publisher, a subscriber, a service and its client were
-registered. An operator loaded a policy over REST and a specification, added two tokens and revoked one of them.
+`state-0.2.0.sql` has a publisher, a subscriber, a service and its client, a policy and a specification loaded by an
+operator, and two tokens, one of them revoked.
 """
 
 import hashlib
@@ -46,7 +46,6 @@ def old_state(directory: Path, nodes: FakeNodes) -> tuple[str, str]:
 
 
 def make_secret(database: sqlite3.Connection, name: str) -> str:
-    """The repository contains no secret."""
     [token_id, salt] = database.execute("SELECT id, salt FROM token WHERE name = ?", (name,)).fetchone()
     secret = secrets.token_urlsafe(32)
     kept = hashlib.scrypt(secret.encode(), salt=salt, n=1 << 14, r=8, p=1, dklen=32, maxmem=64 << 20)

@@ -76,9 +76,8 @@ def clean_machine(
     more: tuple[str, ...] = (),
     name: str = "clean",
 ) -> Machine:
-    """Return a machine with the package's dependencies, not started; its folder contains `files` under these names.
-
-    `more` are additional Debian packages; such a machine has its own `name`.
+    """Not started; its folder contains `files` under these names. A machine with `more` Debian packages has its own
+    `name`.
     """
     depends = subprocess.run(
         ["dpkg-deb", "--field", str(package), "Depends"], capture_output=True, text=True, check=True

@@ -1,7 +1,4 @@
-"""The cloud-init example in a virtual machine that is the appliance from its first boot: docs/install.md.
-
-The example's web server and vehicle are in the same machine: it has no network card.
-"""
+"""The example of docs/install.md; its web server and vehicle are in the same machine, which has no network card."""
 
 import hashlib
 import json

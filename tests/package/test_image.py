@@ -193,10 +193,7 @@ def test_the_archive_protects_a_robot(unpacked: Path, tmp_path: Path) -> None:
 
 
 def test_two_builds_are_the_same(engine: Engine, unpacked: Path, tmp_path: Path) -> None:
-    """A build of the same commit two days later, from nothing, gives the same image, byte by byte.
-
-    It is built in another folder, with files readable for their owner only.
-    """
+    """Two days later, from nothing, in another folder, with files readable for their owner only."""
     engine.go_ahead(LATER)
     folder = elsewhere(tmp_path / "elsewhere")
     second = build_later("distribution.image", *OPTIONS, folder=folder, DOCKER_HOST=engine.address)

@@ -1,7 +1,7 @@
 """Robot and laptop of Noetic's generation beside the appliance in its container: docs/install.md.
 
 Debian's archive does not have Ubuntu. Debian 11 is as old: ROS 1.15, Python 3.9, OpenSSL 1.1.1, nftables 0.9,
-strongSwan 5.9. Each machine here is such a system, in a mount namespace and a host of the lab.
+strongSwan 5.9.
 """
 
 import json

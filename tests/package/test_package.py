@@ -1,7 +1,4 @@
-"""The Debian package on a clean Debian with systemd, in a virtual machine: install, serve, reboot, upgrade, remove.
-
-The machine has the packages that ours depends on (it has no network to fetch them) and no other part of the project.
-"""
+"""The Debian package on a clean Debian with systemd, in a virtual machine: install, serve, reboot, upgrade, remove."""
 
 import filecmp
 import json

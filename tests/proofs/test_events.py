@@ -29,8 +29,8 @@ UNDECIDED = {
 def test_every_fault_is_found_or_none(text: str) -> None:
     """z3 decides all except those of `UNDECIDED`: a mutant differs for some message, or is proved equivalent.
 
-    Mutants that leave more messages to Python count as equivalent (a narrow bound costs time, but no verdict). So do
-    mutants of unreachable or redundant code: a repeated check, the sign of a value that is never negative.
+    Mutants that leave more messages to Python count as equivalent, and so do mutants of unreachable or redundant
+    code.
     """
     told = Counter(faulty(FAULTY[text]))
     assert {kind for kind, _ in told} == {*FAULTS, "operand"}

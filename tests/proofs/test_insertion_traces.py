@@ -1,8 +1,8 @@
 """A trace of the running appliance is an execution of the model (`proofs/insertion.pml`); a tampered one is not.
 
-With rospy nodes: a monitor that stamps its revision on its messages is replaced and removed, the relay is killed, the
-policy revokes the subscription and grants it again. The trace contains the audit log's records of the topic in their
-order and, after each change, a message that was sent once the change had been answered.
+A monitor that stamps its revision on its messages is replaced and removed, the relay is killed, the policy revokes
+the subscription and grants it again. After each change the trace has a message that was sent once the change had been
+answered.
 """
 
 import re

@@ -1,9 +1,4 @@
-"""Start `rosrv up` as a user would, and read its audit log and processes.
-
-with Appliance(host, state, policy=OPEN_POLICY) as appliance:
-    ros = RosSession(appliance.master_uri, home, robot)
-    assert appliance.audit(decision="deny") == []
-"""
+"""Start `rosrv up` as a user would, and read its audit log and processes."""
 
 import contextlib
 import json
@@ -38,12 +33,10 @@ default = *
 """
 
 _FLAGS = {"event": "--event", "host": "--host"}
-"""Flags of the search for fields whose values are not globs: it is quicker than reading every record."""
+"""Fields whose search is quicker than reading every record."""
 
 
 class Appliance:
-    """A running appliance, as a context manager."""
-
     def __init__(
         self,
         host: Host | None = None,
@@ -56,10 +49,9 @@ class Appliance:
         json: bool = True,
         relays: int = 1,
     ) -> None:
-        """With `json=False` the output is for a person: no `ready`, only lines in `process`.
+        """With `json=False` the output is for a person. `settings` is the text of appliance.yaml.
 
-        `settings` is the text of appliance.yaml. `monitors` are the specifications in its folder, by name. `relays`
-        is the number of relay processes, the same on every machine.
+        `relays` is the number of relay processes, the same on every machine.
         """
         self.relays = relays
         self.host: Host = host or ThisMachine()
@@ -123,16 +115,12 @@ class Appliance:
         return self
 
     def stop(self) -> int:
-        """A clean stop takes less than five seconds."""
         return self.process.stop(with_signal=signal.SIGTERM, timeout=10) if self.process else 0
 
     def rosrv(
         self, *arguments: str, check: bool = True, state: bool = True
     ) -> subprocess.CompletedProcess[str]:
-        """Add `--state`, unless the verb does not accept it.
-
-        With `check`, raises `NoAnswerError` if it fails.
-        """
+        """With `check`, raises `NoAnswerError` if it fails."""
         done = rosrv(*arguments, *(["--state", str(self.state)] if state else []))
         if check and done.returncode:
             raise NoAnswerError(
@@ -142,15 +130,12 @@ class Appliance:
         return done
 
     def rows(self, *arguments: str) -> list[dict[str, Any]]:
-        """Return the objects that a verb prints with --json. Raises `NoAnswerError`."""
         return rows_of(self.rosrv(*arguments, "--json", check=False))
 
     def row(self, *arguments: str) -> dict[str, Any]:
-        """Return the only object that a verb prints with --json. Raises `NoAnswerError`."""
         return row_of(self.rosrv(*arguments, "--json", check=False))
 
     def ask(self, request: AdminRequest[A]) -> A:
-        """Return the result of a verb of `rosrv`, without starting a process. Raises `NoAnswerError`."""
         try:
             answer = AdminSocket(self.state).ask(request)
         except NotRunningError as error:
@@ -160,14 +145,10 @@ class Appliance:
         return answer.given()
 
     def status(self) -> dict[str, Any]:
-        """Return `rosrv status --json`; its exit status reports problems. Raises `NoAnswerError`."""
         return self.row("status")
 
     def audit(self, *flags: str, **fields: Any) -> list[dict[str, Any]]:
-        """Return the records of `rosrv audit search --json` that have these fields.
-
-        Without `--limit`, all records count, not only the newest.
-        """
+        """Without `--limit`, all records count, not only the newest."""
         whole = () if "--limit" in flags else ("--limit", "10000")
         named = [f"{flag}={fields[name]}" for name, flag in _FLAGS.items() if fields.get(name)]
         lines = self.rosrv("audit", "search", *named, *flags, *whole, "--json").stdout.splitlines()
@@ -180,7 +161,6 @@ class Appliance:
         ]
 
     def ignore_earlier_records(self) -> None:
-        """Such as those of another test."""
         self._looked_at = max(
             (record["sequence"] for record in self.audit("--limit", "1")), default=self._looked_at
         )
@@ -199,7 +179,6 @@ class Appliance:
         self.rosrv("policy", "reload")
 
     def rest(self, token: str | None = None) -> Rest:
-        """The default token is the first one; the client trusts the appliance's certificate."""
         url = str(self.ready["api"])
         certificate = None
         if url.startswith("https:"):
@@ -225,11 +204,9 @@ class Appliance:
         return eventually(told, self.story)
 
     def pids(self, role: str) -> list[int]:
-        """A process that waits for its start has 0."""
         return [row["pid"] for row in self.status()["processes"] if row["role"] == role and row["pid"]]
 
     def kill(self, role: str) -> int:
-        """Return the id of the first process of the role."""
         pid = eventually(lambda: self.pids(role), self.story)[0]
         os.kill(pid, signal.SIGKILL)
         return pid

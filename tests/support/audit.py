@@ -38,7 +38,7 @@ def decision(log: AuditLog, number: int = 0, **changes: Any) -> AuditRecord:
 
 
 def settle(log: AuditLog, seconds: float = 0.0) -> str | None:
-    """Wait until all records are on disk; return the reason if they cannot be written.
+    """Return the reason if the records cannot be written.
 
     Virtual time passes for some `seconds`: a log that could not be written tries again after half a second.
     """

@@ -1,11 +1,8 @@
 """An event loop with virtual time, so that a test waits for nothing and runs the same way each time.
 
-1. The loop and `appliance.base.clock` have one `VirtualClock`. When nothing is ready, it jumps to the next timer.
-2. `run_in_executor` and `asyncio.to_thread` run the function in the loop, in the order of the calls, without a
-   thread.
-3. If nothing is ready and there is no timer, the test would wait forever: `DeadlockError` names what each task waits
-   for.
-4. The loop has no selector. Sockets, signals, programs and calls of other threads raise `RealLoopError`.
+When nothing is ready, the clock jumps to the next timer; if there is none, `DeadlockError` names the tasks. Functions
+of `to_thread` run in the loop, in the order of the calls. Sockets, signals, programs and calls of other threads raise
+`RealLoopError`.
 """
 
 import asyncio
@@ -34,7 +31,7 @@ class RealLoopError(Exception):
 
 
 class AutojumpLoop(asyncio.BaseEventLoop):
-    """An event loop that takes its time from `machine`. Use it inside `clock.using(machine)`, as `autojump` does."""
+    """Use it inside `clock.using(machine)`, as `autojump` does."""
 
     _thread_id: int | None  # of the thread that runs the loop
 
@@ -135,7 +132,7 @@ def _place(coroutine: Any) -> str:
 
 @contextlib.contextmanager
 def autojump(machine: VirtualClock | None = None) -> Iterator[Callable[[], AutojumpLoop]]:
-    """Yield what makes loops with virtual time; `machine` is the clock of the block, or the test's own."""
+    """Yield a maker of loops; `machine` is the clock of the block, or the test's own."""
     present = clock.source()
     machine = machine or (present if isinstance(present, VirtualClock) else VirtualClock())
     with clock.using(machine):
@@ -143,6 +140,5 @@ def autojump(machine: VirtualClock | None = None) -> Iterator[Callable[[], Autoj
 
 
 def run(main: Coroutine[Any, Any, _Result]) -> _Result:
-    """Run a coroutine in virtual time, as `asyncio.run` does in real time."""
     with autojump() as new_loop, asyncio.Runner(loop_factory=new_loop) as runner:
         return runner.run(main)

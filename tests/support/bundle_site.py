@@ -1,7 +1,4 @@
-"""Run a fleet's bundles in a test: an operator's repository, and a collector that can lie about everything it serves.
-
-The collector speaks the real protocol over TLS with certificates on both sides. `lies` replaces answers by path.
-"""
+"""Run a fleet's bundles: an operator's repository, and a collector that can lie about everything it serves (`lies`)."""
 
 import datetime
 import http.server
@@ -45,7 +42,7 @@ class SupportsClose(Protocol):
 
 
 class BundleSite:
-    """An operator's repository with one group, and the collector's folder; `selection` is what it selects."""
+    """The repository has one group; `selection` is selected in it."""
 
     def __init__(self, folder: Path, now: Callable[[], datetime.datetime] | None = None) -> None:
         self.folder = folder
@@ -89,7 +86,6 @@ class BundleSite:
 
     @contextmanager
     def served(self) -> Iterator[str]:
-        """Serve the collector's protocol on the loopback, and return its URL."""
         server = _Server(("127.0.0.1", 0), _handler(self))
         server.socket = self.authority.server_context.wrap_socket(
             server.socket, server_side=True, do_handshake_on_connect=False

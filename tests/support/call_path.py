@@ -1,8 +1,7 @@
 """Print the files that one registerPublisher enters in control, in the order of the first entry, one a line.
 
-A control with a real rosmaster runs in a thread of this program, which is its supervisor and profiles all its threads.
-The callers have an address of their own on the loopback. A file counts if each of some calls enters it, and not in
-work that goes on without calls (`run_always`).
+A control with a real rosmaster runs in a thread of this program, which profiles all its threads. A file counts if
+each of some calls enters it, and not in work that goes on without calls (`run_always`).
 
     python -m tests.support.call_path FOLDER    # with a network that is only a loopback
 """
@@ -46,8 +45,6 @@ _GOES_ON = ContextVar("_GOES_ON", default=False)
 
 
 class Profiler:
-    """`entered` has the files with functions that any thread has entered while the profiler is `on`."""
-
     def __init__(self) -> None:
         self.on = False
         self.entered: dict[str, None] = {}
@@ -73,8 +70,6 @@ async def _run_always(what: str, work: Callable[[], Awaitable[object]]) -> None:
 
 
 class Control:
-    """Its relay receives, and says nothing."""
-
     def __init__(self, home: Path, profiler: Profiler) -> None:
         self.state = home / "state"
         policy = home / "policy.ini"
@@ -111,7 +106,6 @@ class Control:
             self._lifeline.send(messages.RouteFound(message.host, APPLIANCE))
 
     def recorded(self, resource: str) -> bool:
-        """The log has the record of a registration."""
         with reading(self.state / "control" / "audit.db") as log:
             question = "SELECT count(*) FROM record WHERE resource = ? AND category = 'publish'"
             return bool(log.execute(question, (resource,)).fetchone()[0])
@@ -124,7 +118,7 @@ class Control:
 
 
 class Caller(xmlrpc.client.Transport):
-    """The connection of a node on the host, which is also the API of this node: it counts the updates of publishers."""
+    """Also the API of the node: it counts the updates of publishers."""
 
     def __init__(self, name: str) -> None:
         super().__init__()

@@ -1,7 +1,4 @@
-"""Canaille, a provider of single sign-on that is not ours, on a host of a lab, with TLS.
-
-Its environment has a lock of its own: its dependencies are not ours.
-"""
+"""Canaille, a provider of single sign-on that is not ours, whose dependencies have a lock of their own."""
 
 import json
 import os
@@ -63,7 +60,6 @@ class Canaille:
 
     @contextmanager
     def running(self) -> Iterator[None]:
-        """Each time with a new key."""
         self._write_settings()
         certificate = [
             "--certfile",
@@ -114,7 +110,6 @@ ACTIVE_JWKS = [{{{key}}}]
 
 
 def sign_in(page: Page, person: str) -> None:
-    """Answer the pages of the provider, until it sends the browser back."""
     login, password = page.locator("input[name=login]"), page.locator("input[name=password]")
     login.or_(password).wait_for()
     if login.count():  # unless it knows the person, and wants a proof

@@ -14,8 +14,6 @@ from cryptography.x509.oid import NameOID
 
 @dataclass(frozen=True)
 class Certificates:
-    """The certificates are for an address and for logs.example."""
-
     ca: Path
     certificate: Path
     key: Path

@@ -1,9 +1,4 @@
-"""Run `rosrv` within the process of a test, without a new Python for each verb.
-
-done = rosrv("audit", "search", "--json", "--state", str(state)) assert done.returncode == 0
-
-tests/integration/supervisor/test_up.py and tests/integration/cli/ start the installed command.
-"""
+"""Run `rosrv` within the process of a test, without a new Python for each verb."""
 
 import contextlib
 import io

@@ -1,7 +1,6 @@
 """Connect registry, graph, revocation, liveness and reconcile loop as control connects them.
 
-Models of the relays, of `rosmaster`, of deliveries and of nodes remember their calls and give the answers that a test
-sets.
+Models of everything else remember their calls and give the answers that a test sets.
 """
 
 import asyncio
@@ -62,22 +61,16 @@ class Denied(NamedTuple):
 
 
 class Told(NamedTuple):
-    """A call that a node gets."""
-
     node: Incarnation
     call: NodeCall
 
 
 class Ended(NamedTuple):
-    """The end of a node's endpoint, or of the calls that wait for it."""
-
     what: str
     node: Incarnation
 
 
 class Record(NamedTuple):
-    """An audit record of a change of the graph."""
-
     event: str
     caller_id: str
     category: str
@@ -91,7 +84,7 @@ _OF_GRAPH = {"registered", "unregistered", "revoked", "replaced", "takeover", "n
 
 
 class Records:
-    """An audit trail that keeps (event, resource), the denied decisions, and the requests that were not understood."""
+    """Keeps (event, resource), the denied decisions, and the requests that were not understood."""
 
     def __init__(self, note: Callable[[Seen], None] = lambda _seen: None) -> None:
         self._note = note
@@ -140,8 +133,6 @@ class Records:
 
 
 class Deliveries:
-    """Deliveries to nodes: (name of the node, method, parameters)."""
-
     def __init__(self, note: Callable[[Seen], None]) -> None:
         self.told: list[tuple[str, str, tuple[Value, ...]]] = []
         self._note = note
@@ -155,8 +146,6 @@ class Deliveries:
 
 
 class RelayEnd:
-    """A relay's end of its link, which notes what it gets."""
-
     def __init__(self, note: Callable[[messages.Message], None], full: Callable[[], bool]) -> None:
         self._note = note
         self._full = full
@@ -176,8 +165,6 @@ class RelayEnd:
 
 
 class RelayPorts:
-    """`NodePorts` without sockets: the descriptor of a socket is its port."""
-
     def socket(self, port: int) -> Any:
         return SimpleNamespace(fileno=lambda: port)
 
@@ -186,8 +173,6 @@ class RelayPorts:
 
 
 class NoSpecifications:
-    """The specifications in force: none."""
-
     def statement(self, _relay: int) -> messages.SpecificationsStated:
         return messages.SpecificationsStated(0, b"", {}, restarted=False)
 
@@ -196,7 +181,7 @@ class NoSpecifications:
 
 
 class HiddenMaster:
-    """A model of `rosmaster`: its registrations with their URIs, its parameters, and every call it received."""
+    """Keeps its registrations with their URIs, its parameters, and every call it received."""
 
     def __init__(self, note: Callable[[Seen], None]) -> None:
         self._note = note
@@ -291,8 +276,6 @@ class HiddenMaster:
 
 
 class Inner:
-    """Proxy endpoints and arrivals: URIs only; an unknown incarnation is made."""
-
     def __init__(self, registry: Registry, note: Callable[[Seen], None]) -> None:
         self._registry = registry
         self._note = note
@@ -370,7 +353,7 @@ class ControlParts:
     """`reload(text)` puts another policy in force, `settle()` waits for its consequences."""
 
     def __init__(self, *, silent: float = 0.0) -> None:
-        """Make the parts; `silent` is the number of seconds without an answer until a node is lost."""
+        """After `silent` seconds without an answer a node is lost."""
         self._not_ours = asyncio.all_tasks()  # the test's own
         self.current = compile_policy(OPEN, file="policy")
         self.seen: list[Seen] = []
@@ -507,7 +490,6 @@ class ControlParts:
         return parse_response(await serve(HttpRequest(peer, "/", build_call(method, params), 0)))
 
     async def register(self, node: Incarnation, kind: Kind, resource: str, detail: str = "4001") -> None:
-        """Register as a call does, with the list of publishers or the value in its answer."""
         self.graph.registered(node, kind, resource, detail)
         if kind is Kind.SUBSCRIPTION:
             self.subscribers.list_for(node, resource)
@@ -516,12 +498,10 @@ class ControlParts:
         await self.settle()
 
     def reload(self, text: str) -> int:
-        """Put this policy in force; return the number of revocations."""
         self.current = compile_policy(text, file="policy")
         return self.enforcement.policy_changed(self.current)
 
     def start_relay(self) -> None:
-        """Attach a new relay."""
         self.relay.attach(0, cast(Any, RelayEnd(self.seen.append, lambda: self.full)))
 
     async def round(self) -> None:

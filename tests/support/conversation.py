@@ -62,8 +62,6 @@ _REGISTER = {Kind.PUBLICATION: "registerPublisher", Kind.SUBSCRIPTION: "register
 
 
 class Conversation:
-    """`policies` maps the names in `policy NAME` to texts."""
-
     def __init__(self, parts: ControlParts, policies: dict[str, str], *, only_answers: bool = False) -> None:
         self.parts = parts
         self._only_answers = only_answers
@@ -277,7 +275,7 @@ class Conversation:
     # --- as text ---
 
     def _stated(self, message: messages.Message) -> str:
-        """Return one line; empty for the port of a node, which goes before its first topic."""
+        """Return an empty text for the port of a node, which goes before its first topic."""
         for word, kind in messages.FACTS.items():
             if isinstance(message, (kind.stated, kind.withdrawn)):
                 key, *rest = (getattr(message, name) for name in kind.fields)
@@ -285,7 +283,6 @@ class Conversation:
         return ""
 
     def _shown(self, seen: Seen) -> str:
-        """Return one line; empty for what is not shown."""
         match seen:
             case Told(node, call):
                 values = " ".join(self._value(one) for one in call.parameters)

@@ -1,11 +1,7 @@
 """Make a small Debian with debootstrap, as the base of the tests' containers and virtual machines.
 
-    tree = make_base(directory, packages=["systemd-sysv", "iproute2"])
-
-The first call for a suite and package list takes a minute or two. Its result is kept in `CACHE`, for all checkouts of
-this machine, and later calls unpack it in seconds. A tree with packages is made from the tree of its suite without
-packages. The tree can fetch more packages: it has this machine's sources of Debian packages, proxy, certificate
-authorities and pip settings.
+The first call for a suite and package list takes a minute or two; its result is kept in `CACHE`. The tree can fetch
+more packages with this machine's sources, proxy, certificate authorities and pip settings.
 """
 
 import fcntl
@@ -61,10 +57,7 @@ class MachineSettings:
 
 
 def make_base(directory: Path, packages: Sequence[str] = (), *, suite: str = SUITE) -> Path:
-    """Make `directory` a Debian root file system with these packages; the caller may change it.
-
-    Needs root, debootstrap and the machine's Debian mirror. Raises `DebianBaseError`.
-    """
+    """The caller may change `directory`. Needs root and debootstrap. Raises `DebianBaseError`."""
     archive = base_archive(packages, suite=suite)
     directory.mkdir(parents=True, exist_ok=True)
     _unpack(archive, directory)
@@ -72,7 +65,6 @@ def make_base(directory: Path, packages: Sequence[str] = (), *, suite: str = SUI
 
 
 def base_archive(packages: Sequence[str] = (), *, suite: str = SUITE) -> Path:
-    """`make_base` unpacks the archive and `docker import` reads it."""
     need_root()
     need_program("debootstrap", "debootstrap")
     settings = machine_settings(suite)
@@ -130,10 +122,7 @@ def apt_settings(dump: str, proxies: Mapping[str, str]) -> str:
 
 
 def pip_settings(listed: str) -> str:
-    """Return a pip.conf from `pip config list`: indexes that are reached over the network, and trusted authorities.
-
-    Folders of this machine are left out, because the tree does not have them.
-    """
+    """Leave out folders of this machine, which the tree does not have."""
     kept = {"cert": f"/{_CERTIFICATES}"}
     for name, _, value in (line.partition("=") for line in listed.splitlines()):
         key = name.rpartition(".")[2]

@@ -1,9 +1,7 @@
 """Keep a test from what chance can decide: threads, processes, sockets, pauses and real clocks.
 
-A test of the gate must not fail by chance; tests marked `real` or `nightly` may use them. An audit hook of Python
-sees processes and sockets, in our code and in libraries. Threads, processes of multiprocessing, pauses and clocks
-have no hook in Python 3.11, so their functions are replaced; of the reads of a clock, only those by our own code
-count.
+An audit hook of Python sees processes and sockets, also in libraries. The rest has no hook in Python 3.11, so
+functions are replaced; of the reads of a clock, only those by our own code count.
 """
 
 import functools
@@ -56,7 +54,7 @@ class Watch:
 
     @contextmanager
     def watching(self) -> Iterator[list[str]]:
-        """Forbid chance in a block; yields the list of what was attempted, which is complete at the end."""
+        """Yield the list of what was attempted, which is complete at the end."""
         found: list[str] = []
         outer = self._found, self._watched
         self._found, self._watched = found, True
@@ -109,6 +107,6 @@ def callers(depth: int) -> Iterator[str]:
 
 
 def _is_harmless(event: str) -> bool:
-    """Return whether a loop makes the sockets by which threads wake it, or urllib3 looks for IPv6 when loaded."""
+    """A loop makes sockets by which threads wake it, and urllib3 looks for IPv6 when loaded."""
     makers = {"asyncio.selector_events", "urllib3.util.connection"}
     return event == "socket.__new__" and not makers.isdisjoint(itertools.islice(callers(2), 5))

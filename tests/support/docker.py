@@ -1,14 +1,7 @@
 """Run a Docker engine for the tests only, independent of other engines on the machine.
 
-    build_images()
-    with Lab("rosrv-engine") as lab, Engine(lab.host("machine", "10.79.0.1/24")) as engine:
-        engine.docker("ps")
-        compose = engine.compose(project_directory, "rosrv")
-        compose("up", "--detach")
-
-The engine runs on a host of the lab. Its bridges and rules are in the namespace of that host, not in this machine's.
-Images are built earlier, by an engine in this machine's own network that does not change it (no bridge, no rules).
-Both use the same data in the cache of this machine, so a second build is quick, also in a fresh clone.
+The engine runs on a host of the lab, whose namespace has its bridges and rules. Images are built earlier, by an
+engine in this machine's own network that does not change it. Both use the same data in the cache of this machine.
 """
 
 import contextlib
@@ -61,10 +54,7 @@ class DockerError(AssertionError):
 
 
 class Engine:
-    """A running dockerd; a context manager. With `builds`, it only builds images. `data` is its data folder.
-
-    With `clock`, the time of its containers can be changed (`go_ahead`).
-    """
+    """With `builds`, it only builds images. With `clock`, the time of its containers can be changed (`go_ahead`)."""
 
     def __init__(
         self, host: Host | None = None, *, builds: bool = False, clock: bool = False, data: Path = DATA
@@ -139,7 +129,6 @@ class Engine:
         return self
 
     def stop(self) -> None:
-        """The data of the engine stays."""
         if self._process is not None and self._process.poll() is None:
             self._process.send_signal(signal.SIGTERM)
             try:
@@ -217,8 +206,6 @@ class MachineInside:
 
 
 class Compose:
-    """`compose("up", "-d")` runs a command of docker-compose."""
-
     def __init__(
         self, engine: Engine, directory: Path, project: str, files: Sequence[str], environment: dict[str, str]
     ) -> None:
@@ -245,7 +232,7 @@ class Compose:
         return self.engine.docker("exec", self.container(service), *command, check=check, timeout=timeout)
 
     def wait_healthy(self, service: str = "appliance", timeout: float = HEALTHY_SECONDS) -> None:
-        """Wait until the health check of a service has passed since its last start."""
+        """Wait until the health check has passed since the last start."""
         container = self.container(service)
         since = self.engine.inspect(container)["State"]["StartedAt"]
         command = [
@@ -266,7 +253,6 @@ class Compose:
         raise DockerError(f"{service} is not healthy: {json.dumps(state)[:2000]}\n{self.story()}")
 
     def wait_for_log(self, service: str, text: str, *, timeout: float = 60, since: str = "0s") -> str:
-        """`since` is a time in Docker's format."""
         moment = [] if since == "0s" else ["--since", since]
         for line in self._follow(["logs", "--follow", *moment, self.container(service)], timeout):
             if text in line:
@@ -297,11 +283,9 @@ class Compose:
         return [one for one in records if all(one.get(key) == value for key, value in fields.items())]
 
     def status(self) -> dict[str, Any]:
-        """Return `rosrv status --json` in the appliance. Raises `NoAnswerError`."""
         return self.row("status")
 
     def row(self, *arguments: str, service: str = "appliance") -> dict[str, Any]:
-        """Return the only object that a verb in a container prints with --json. Raises `NoAnswerError`."""
         return row_of(self.exec(service, "rosrv", *arguments, "--json", check=False))
 
     def story(self) -> str:

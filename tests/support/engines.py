@@ -14,8 +14,6 @@ from tests.support.virtual_clock import VirtualClock
 
 
 class ByHand(InCaller):
-    """Otherwise the test calls the turns, with `let_pass`."""
-
     def __init__(self, name: str, turn: Turn, gather: float) -> None:
         self._wanted = False
         self._turning = threading.Lock()
@@ -26,7 +24,7 @@ class ByHand(InCaller):
             self._wanted = True
 
     def hurry(self) -> None:
-        """Call the turns that are due. A call during a turn, also in another thread, has them called after it."""
+        """A call during a turn, also in another thread, has the due turns called after it."""
         self._wanted = True
         while self._wanted and self._turning.acquire(blocking=False):
             try:
@@ -50,7 +48,6 @@ class Inline(ByHand):
 
 
 def let_pass(engine: AuditLog | Database, seconds: float) -> None:
-    """Let the virtual time pass, and call the turns of an engine as they become due."""
     time = clock.source()
     assert isinstance(time, VirtualClock)
     end = clock.now() + seconds

@@ -1,8 +1,6 @@
-"""Set the number of examples of a property: a sixth in each run, all in `make nightly`.
+"""A sixth of a property's examples run each time, all in `make nightly`.
 
 With `CI=true` Hypothesis derives the seed from the test; otherwise each run has a new seed.
-
-@settings(max_examples=examples(400))
 """
 
 import os

@@ -1,11 +1,7 @@
 """Fake an appliance that gives a test's answers over its admin socket and over REST, and keeps the requests.
 
-with FakeAppliance() as fake:
-    fake.answer("status", version="1.0")        # fields that are not given are empty, zero or None
-    fake.reject("monitor enable", "unknown", "no monitor is named x")
-    fake.problem(403, "refused", "for admins")  # every answer of REST
-    rosrv("status", "--state", str(fake.serve(folder)))
-    assert fake.requests == ['{"verb":"status"}']
+fake.answer("status", version="1.0")        # fields that are not given are empty, zero or None fake.reject("monitor
+enable", "unknown", "no monitor is named x") fake.problem(403, "refused", "for admins")  # every answer of REST
 """
 
 import contextlib
@@ -34,13 +30,10 @@ Answer = Callable[[dict[str, Any]], AdminAnswer[Any]]
 
 
 class FakeAppliance:
-    """Each server starts when it is first needed."""
-
     def __init__(self, context: ssl.SSLContext | None = None) -> None:
         self.requests: list[str] = []
-        """The requests in order: the JSON of the admin socket; method, path and body of REST."""
+        """The JSON of the admin socket; method, path and body of REST."""
         self.status, self.headers, self.body = 200, dict[str, str](), b"{}"
-        """The answer to every request over REST."""
         self._answers: dict[str, Answer] = {}
         self._context = context
         self._ends = contextlib.ExitStack()
@@ -62,7 +55,6 @@ class FakeAppliance:
         self.decide(verb, lambda _request: AdminAnswer(False, None, error, list(findings), trouble))
 
     def decide(self, verb: str, answer: Answer) -> None:
-        """`ConnectionResetError` closes the connection instead."""
         assert verb in _KINDS, f"{verb!r} is not one of {sorted(_KINDS)}"
         self._answers[verb] = answer
 

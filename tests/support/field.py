@@ -1,10 +1,4 @@
-"""A robot and its operator talk, a rogue host attacks, a test reads the audit log.
-
-with Field(lab, home, POLICY) as field:
-    answer = field.rogue("lookupNode", "/looker", "/voice")
-    field.recorded(event="decision", host="10.77.0.66")
-    field.unharmed()
-"""
+"""A robot and its operator talk, a rogue host attacks, a test reads the audit log."""
 
 import contextlib
 import http.client
@@ -88,7 +82,7 @@ class Field:
         return answer
 
     def raw(self, data: bytes, host: Host | None = None, port: int = 11311) -> bytes:
-        """Send bytes to the appliance and read until it closes, or until an answer is complete and nothing follows."""
+        """Read until the appliance closes, or until an answer is complete and nothing follows."""
         with self.connect(host, port) as sock:
             sock.sendall(data)
             received = b""
@@ -109,7 +103,7 @@ class Field:
         return self.trail.wait_for(lambda event: reason in (event.get("reason") or ""), **fields)
 
     def unharmed(self, messages: int = 3) -> None:
-        """Assert that talker and listener continue: every message arrives once, in order, and from the talker."""
+        """Every message arrives once, in order, and from the talker."""
         now = self.listener.mark()
         self.listener.wait_for_count(messages, since=now, event="received")
         heard = [

@@ -1,8 +1,4 @@
-"""Write the first packets of TCP connections with any source by hand, and read those that arrive.
-
-robot.run(lambda: send_syn("10.77.0.10", "10.77.0.2", 11311))
-process = attacker.popen(flood_command("10.77.0.10", "10.77.0.2", 11311, per_second=3000, seconds=5))
-"""
+"""Write the first packets of TCP connections with any source by hand, and read those that arrive."""
 
 import ipaddress
 import socket
@@ -49,10 +45,7 @@ def syn_sources(wire: socket.socket) -> list[str]:
 
 
 def flood_command(source: str, target: str, port: int, *, per_second: int, seconds: float) -> list[str]:
-    """The program sends SYNs evenly, and prints their number when it ends.
-
-    All have the same source address, and each has another ephemeral port.
-    """
+    """The program sends SYNs evenly from one address, each from another ephemeral port, and prints their number."""
     return [
         sys.executable,
         "-m",

@@ -1,9 +1,7 @@
 """Fork nodes and tools of Debian's Python from a process with rospy loaded, which is the slow part of a start.
 
-    process = Process(Forking(host), ["rostopic", "list"], env=…, label="rostopic")
-
-A fork has its own session and the host's network namespace, and rospy gets arguments and environment before it runs.
-It differs from a new process only in that the modules are already in memory. roslaunch starts its nodes itself.
+A fork has its own session and the host's network namespace, and differs from a new process only in that the modules
+are already in memory. roslaunch starts its nodes itself.
 """
 
 import atexit
@@ -46,8 +44,6 @@ class Forking:
 
 
 class Fork(subprocess.Popen[Any]):
-    """A fork with the interface of a process; the leader of its own session."""
-
     def __init__(
         self,
         arguments: list[str],

@@ -153,7 +153,6 @@ class Server:
         )
 
     async def connect(self, host: str = "127.0.0.1") -> Client:
-        """The connection is closed at the end of the test."""
         client = Client(*await asyncio.open_connection("127.0.0.1", self.port, local_addr=(host, 0)))
         self.clients.append(client)
         return client

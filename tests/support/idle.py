@@ -7,14 +7,13 @@ T = TypeVar("T")
 
 
 def idle(part: type[T]) -> T:
-    """Return an object of the class `part` that does nothing; see `idle_class`."""
     return cast(T, idle_class(part)())
 
 
 def idle_class(part: type[object]) -> Any:
     """The class has the public methods of `part`, which do nothing, and reject arguments that `part`'s reject.
 
-    So a renaming in the product fails in its tests. `part` is not instantiated: an object has no attributes.
+    So a renaming in the product fails in its tests. An object of it has no attributes.
     """
     methods = {
         name: _idle(method)

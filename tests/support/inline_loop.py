@@ -6,8 +6,6 @@ T = TypeVar("T")
 
 
 class InlineLoop(asyncio.SelectorEventLoop):
-    """An event loop whose `asyncio.to_thread` runs the function before it returns."""
-
     def run_in_executor(  # type: ignore[override]  # typeshed knows the variadic types of Python 3.11 only
         self, _executor: Any, function: Callable[..., T], *arguments: Any
     ) -> "asyncio.Future[T]":

@@ -49,7 +49,6 @@ class Visitor:
 def lying_collector(
     context: ssl.SSLContext, answer: Lie, before_tls: Lie = lambda _visitor: None
 ) -> Iterator[str]:
-    """`answer` serves a whole connection."""
     listener = socket.create_server(("127.0.0.1", 0))
     ending = threading.Event()
 

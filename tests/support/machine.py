@@ -1,11 +1,7 @@
-"""Run parts of the tests in a virtual machine (QEMU) with Debian's cloud kernel.
+"""Run parts of the tests in a virtual machine (QEMU) with Debian's cloud kernel, which ends with this process.
 
-    with Machine(directory) as machine:
-        done = machine.run("ip", "xfrm", "state", seconds=10)
-
-It has no network card. Its disk is a snapshot that is discarded at its end, unless it is given its own disk, which
-persists over restarts. KVM is used where a trial shows that it runs a guest. Otherwise QEMU emulates every instruction
-(TCG), which is five to twenty times slower. The machine ends with the process that started it.
+It has no network card. KVM is used where a trial shows that it runs a guest; otherwise QEMU emulates every
+instruction (TCG), which is five to twenty times slower.
 """
 
 import contextlib
@@ -55,10 +51,10 @@ class Done:
 
 
 class Machine:
-    """`directory` keeps its sockets and the text of its console.
+    """`directory` keeps its sockets and the text of its console. `disk` is written to; without it the machine has a
+    snapshot.
 
-    `disk` is written to; without it the machine has a snapshot of the tests' disk. `freight` writes the archive that
-    the agent unpacks before it takes orders; the default is the checkout.
+    `freight` writes the archive that the agent unpacks before it takes orders; the default is the checkout.
     """
 
     def __init__(

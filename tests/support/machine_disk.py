@@ -77,9 +77,8 @@ def machine_disk(kernel: Kernel) -> Path:
 
 
 def clean_disk(kernel: Kernel, packages: tuple[str, ...], *, name: str = "clean") -> Path:
-    """Return the image of a Debian without the project: these packages, systemd, and the agent.
-
-    For each `name` only the newest image is kept.
+    """A Debian without the project: these packages, systemd, and the agent. For each `name` only the newest image is
+    kept.
     """
     return _disk(name, kernel, (*packages, *_MACHINES_OWN), environment=False)
 
@@ -111,7 +110,6 @@ def _disk(name: str, kernel: Kernel, packages: tuple[str, ...], *, environment: 
 
 
 def checkout_archive(path: Path) -> None:
-    """Write the checkout with its uncommitted changes and compiled files as a tar archive to `path`."""
     for folder in ("appliance", "tests"):
         _compile(ROOT / folder, as_if_in=ROOT / folder)
     listed = subprocess.run(
@@ -183,7 +181,7 @@ def _too_large(_folder: str, names: list[str]) -> Iterable[str]:
 
 
 def _compile(folder: Path, *, as_if_in: Path) -> None:
-    """Compile all Python files in advance: the machine would need ten times as long, in every process."""
+    """The machine would need ten times as long, in every process."""
     command = [str(ROOT / ".venv/bin/python"), "-m", "compileall", "-q", "-j", "2"]
     done = subprocess.run(
         [*command, "-s", str(folder), "-p", str(as_if_in), str(folder)], capture_output=True, check=False
@@ -193,7 +191,6 @@ def _compile(folder: Path, *, as_if_in: Path) -> None:
 
 
 def _key(base: Path, kernel: Kernel) -> str:
-    """Return a key of all inputs of the disk. An environment is identified by its lock file."""
     parts = [base.name, kernel.release, str(ROOT), AGENT.read_text(), Path(__file__).read_text()]
     parts.append((ROOT / "requirements-dev.lock").read_text())
     parts.append((ROOT / "pyproject.toml").read_text())

@@ -1,8 +1,8 @@
-"""Ask appliances whether they answer as a ROS master, until the input ends.
+"""Ask appliances 20 times a second whether they answer as a ROS master, until the input ends.
 
     master_probe.py NAME=URI...
 
-Each is asked 20 times a second; event `answered` with its name for each answer. Refused and late calls are left out.
+Event `answered` has the name; refused and late calls are left out.
 """
 
 import http.client

@@ -10,7 +10,7 @@ from appliance.channel.messages import Message
 
 
 class MemoryChannel(Channel):
-    """One end; its `peer` gets each message in a later turn of the loop, as over a socket."""
+    """The `peer` gets each message in a later turn of the loop, as over a socket."""
 
     def __init__(self, union: Any) -> None:
         self._encode = msgspec.msgpack.Encoder().encode

@@ -41,7 +41,7 @@ class MemoryNetwork:
         return near.reader, near
 
     def feed(self, source: str, address: tuple[str, int], receiver: asyncio.BufferedProtocol) -> None:
-        """Connect, and give what the server sends to `receiver`, as an event loop does."""
+        """Give what the server sends to `receiver`, as an event loop does."""
         reader, writer = self.connect(source, address)
         task = asyncio.ensure_future(_Transport(reader, writer).feed(receiver))
         self._tasks.add(task)

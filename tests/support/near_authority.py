@@ -23,7 +23,7 @@ class NearAuthority(Authority):
     async def issue(
         self, request: bytes, name: str, days: float, *, proof: bytes = b"", former: bytes = b""
     ) -> CertificateMade:
-        """Return a certificate, or the refusal as it comes over the link; `meanwhile` runs before."""
+        """The refusal is as it comes over the link; `meanwhile` runs before."""
         self.meanwhile()
         await asyncio.sleep(0)
         try:

@@ -1,11 +1,9 @@
 """Debian's unmodified rospy and roscpp nodes, and the stock tools, started against a master.
 
-    with RosSession(master_uri, home) as ros:
-        ros.talker("rospy", "/chatter")
-        ros.listener("roscpp", "/chatter").wait_for(event="received")
+    ros.talker("rospy", "/chatter")
+    ros.listener("roscpp", "/chatter").wait_for(event="received")
 
-The programs are in `rospy_nodes/` and `roscpp_nodes/`; both kinds print the same events. The only ROS settings of a
-process are ROS_MASTER_URI and, for its own address, ROS_IP.
+The programs in `rospy_nodes/` and `roscpp_nodes/` print the same events.
 """
 
 import fcntl
@@ -48,7 +46,6 @@ class RosSession:
         return other
 
     def environment(self, host: Host) -> dict[str, str]:
-        """Return the environment of a node: of ROS, only the master and its own address."""
         kept = {
             key: value
             for key, value in os.environ.items()
@@ -90,7 +87,7 @@ class RosSession:
         return self.node(client, "talker", topic, *options, name=name)
 
     def listener(self, client: Client, topic: str, *options: str, name: str | None = None) -> Process:
-        """Subscribe to std_msgs/String; event `received` with `data` and `publisher`."""
+        """Event `received` with `data` and `publisher`."""
         return self.node(client, "listener", topic, *options, name=name)
 
     def service_server(self, client: Client, service: str, name: str | None = None) -> Process:
@@ -102,13 +99,11 @@ class RosSession:
         return self.node(client, "service_client", service, *options, name=name)
 
     def parameters(self, client: Client, *options: str, name: str | None = None) -> Process:
-        """Get, set and watch parameters by orders on the input; see the programs."""
         return self.node(client, "parameters", *options, name=name)
 
     def run(
         self, *command: str, timeout: float = LIMIT, check: bool = True, text: str | None = None
     ) -> subprocess.CompletedProcess[str]:
-        """With `check`, a failure fails the test."""
         with (
             tempfile.TemporaryFile("w+") as given,
             tempfile.TemporaryFile("w+") as out,

@@ -21,7 +21,7 @@ def own_namespace() -> Iterator[None]:
 
 @contextlib.contextmanager
 def own_loopback() -> Iterator[None]:
-    """Run a block, and the processes that it starts, with a network that is only a loopback. Needs root."""
+    """The processes of the block have a network that is only a loopback. Needs root."""
     namespace = Namespace(f"rosrv-test-loopback.{os.getpid()}").create()
     with namespace.entered():
         interfaces.set_link(Namespace.own(), "lo", up=True)

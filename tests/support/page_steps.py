@@ -25,7 +25,6 @@ class Step:
 
 
 def steps(page: str) -> list[Step]:
-    """Return the blocks of a page of `docs`, in order; fail if one is not marked."""
     text = (DOCS / page).read_text()
     found = [
         Step(one["host"], one["how"], one["script"], tuple((one["shown"] or "").splitlines()))

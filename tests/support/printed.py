@@ -15,7 +15,6 @@ def rows_of(done: subprocess.CompletedProcess[str]) -> list[dict[str, Any]]:
 
 
 def row_of(done: subprocess.CompletedProcess[str]) -> dict[str, Any]:
-    """Raises `NoAnswerError`, as `rows_of` does or for no object."""
     rows = rows_of(done)
     if not rows:
         raise NoAnswerError(f"{' '.join(done.args)}: exit status {done.returncode}\n{done.stderr}")

@@ -1,7 +1,6 @@
-"""Events are read as they are printed, and a failure shows the whole output.
+"""Programs of the tests print one JSON object per line; a test waits for the line it needs, with a limit.
 
-Programs of the tests print one JSON object per line; a test waits for the line it needs, with a limit, and never
-sleeps. Other lines (stock tools, warnings) are kept as `{"text": line}`.
+Other lines (stock tools, warnings) are kept as `{"text": line}`. A failure shows the whole output.
 """
 
 import contextlib
@@ -35,7 +34,7 @@ class ThisMachine:
 
 
 def runs(pid: int | str) -> bool:
-    """Return whether a process is running. A process that has ended and waits for its parent is not."""
+    """A process that has ended and waits for its parent does not run."""
     try:
         return Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()[0] != "Z"
     except (FileNotFoundError, ProcessLookupError):  # the second if it is reaped while it is read
@@ -93,10 +92,6 @@ class Process:
         since: int = 0,
         **fields: Any,
     ) -> Event:
-        """`since` is an index of events.
-
-        Fails with the whole output of the process after `timeout` seconds.
-        """
 
         def accepts(event: Event) -> bool:
             given = all(event.get(key) == value for key, value in fields.items())
@@ -154,7 +149,7 @@ class Process:
                 self._changed.wait(left)
 
     def mark(self) -> int:
-        """Return a position in the events: pass it as `since` to see only later events."""
+        """Pass the result as `since` to see only later events."""
         with self._changed:
             return len(self.events)
 
@@ -191,7 +186,7 @@ class Process:
         self._asked = True
 
     def stop(self, *, with_signal: int = signal.SIGINT, timeout: float = 20) -> int:
-        """The signal is followed by SIGABRT (a Python program then prints its stack) and SIGKILL to the session."""
+        """SIGABRT (a Python program then prints its stack) and SIGKILL to the session follow the signal."""
         if not self._asked:
             self.interrupt(with_signal)
         if self.running:

@@ -2,10 +2,9 @@
 
     .venv/bin/python -m tests.support.pump_fuzzer SEED BYTES    # builds it, and prints the number of each action
 
-A seed determines the order of actions. Publishers send mutated frames over real sockets; descriptors close at any time,
-also while epoll reports them; subscribers never read; the scratch area is replaced and freed; the monitors' module
-answers nonsense. The process ends with a report at the first error in memory. Exceptions that Python code could handle
-are counted.
+A seed determines the actions: mutated frames over real sockets, descriptors that close at any time, subscribers that
+never read, a scratch area that is replaced and freed, a module that answers nonsense. The first error in memory ends
+the process.
 """
 
 import contextlib
@@ -211,7 +210,7 @@ class PumpFuzzer:
         topic.keeps_large = self._random.random() < 0.5
 
     def _move(self) -> None:
-        """Replace the scratch area, and free it: by memory of the module, or by other memory, some of it unfit."""
+        """The new area is memory of the module, or other memory, some of it unfit."""
         area: Any = memoryview(bytearray(self._random.choice((2 * _SMALL, 1 << 16, 512 << 10))))
         unfit = (
             bytearray(2 * _SMALL - 1),
@@ -413,10 +412,7 @@ class PumpFuzzer:
 
 
 def fuzz(seed: int, size: int) -> str:
-    """Perform actions until `size` bytes are sent and all `OUTCOMES` are seen, at most for ten times `size` bytes.
-
-    Return what was done. Runs in the process with the sanitizers.
-    """
+    """Until `size` bytes are sent and all `OUTCOMES` are seen, at most for ten times `size` bytes."""
     appliance.relay.transport.__path__.insert(0, str(build(SANITIZED).parent))
     pump = importlib.import_module("appliance.relay.transport.pump")
     assert SANITIZED in str(pump.__file__), pump.__file__

@@ -1,9 +1,7 @@
 """Play control for a real relay process: a master for real ROS nodes, in front of a real rosmaster.
 
-Every node that registers gets a proxy endpoint (an XML-RPC server in place of its API) and a relay port. The endpoint
-answers `requestTopic` with the relay port after installing the permission, and forwards all other calls to the node.
-This is the minimum that puts a relay between unmodified nodes; it makes no decisions and protects nothing.
-Run as a program it serves until its standard input ends, for measurements:
+Every node that registers gets a proxy endpoint and a relay port. It makes no decisions and protects nothing. As a
+program it serves until its standard input ends, for measurements:
 
     python3 -m tests.support.relay_driver --master-port 11611 --rosmaster-port 11612
 """
@@ -168,9 +166,8 @@ class RelayProcess:
         return link
 
     def ping(self, number: int) -> None:
-        """Wait for two turns of the relay's main loop: all earlier messages have been carried out.
-
-        In the first turn the relay may only accept a link, without reading from it.
+        """Wait for two turns of the relay's main loop: in the first it may only accept a link, without reading from
+        it.
         """
         for answer in (Pong(number), Pong(number + 1_000_000)):
             after = len(self.lifeline.messages)
@@ -275,7 +272,6 @@ class RelayDriver:
         self.rosmaster.wait(LIMIT)
 
     def restart_control(self, *, leave_out: Callable[[Message], bool] = lambda _message: False) -> None:
-        """Connect a new control, which restates everything except the statements that `leave_out` accepts."""
         self.link.close()
         self.link = self.relay.open_link(self._received)
         self.link.send(StateBegan(7))
@@ -370,7 +366,7 @@ def call(uri: str, method: str, *arguments: Any) -> Any:
 
 
 def free_port() -> int:
-    """Return a port that is free now; only for programs that do not accept port 0 (rosmaster)."""
+    """Only for programs that do not accept port 0 (rosmaster)."""
     with socket.create_server((LOOPBACK, 0)) as sock:
         return int(sock.getsockname()[1])
 

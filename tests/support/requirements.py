@@ -1,6 +1,4 @@
-"""A missing requirement skips the test on a laptop and fails it in CI. `needs(condition, text)` is called at the head
-of a test or fixture; with `CI=true` a missing thing is a failure, so a test cannot quietly stop running.
-"""
+"""A missing requirement skips the test on a laptop and fails it in CI, so that no test quietly stops running."""
 
 import os
 import shutil

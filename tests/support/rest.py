@@ -31,8 +31,8 @@ class Answer:
 class Rest:
     """Make requests, each on a connection of its own.
 
-    After a 429 the request is repeated when the server allows it, as a good client does: requests of other tests to a
-    shared appliance must not fail this test. A test of the 429 uses `impatient()`.
+    After a 429 the request is repeated when the server allows it: requests of other tests to a shared appliance must
+    not fail this test. A test of the 429 uses `impatient()`.
     """
 
     def __init__(
@@ -100,7 +100,7 @@ class Rest:
         )
 
     def post(self, path: str, body: Any = None, *, match: str | None = None) -> Answer:
-        """POST: a string as text/plain, anything else as JSON; `match` is If-Match."""
+        """A string is text/plain, anything else JSON; `match` is If-Match."""
         headers = {} if match is None else {"If-Match": match}
         if isinstance(body, str):
             return self.request("POST", path, body.encode(), headers | {"Content-Type": "text/plain"})
@@ -108,7 +108,7 @@ class Rest:
         return self.request("POST", path, None if body is None else json.dumps(body).encode(), headers)
 
     def events(self, path: str, timeout: float = 30, **headers: str) -> Generator[dict[str, str], None, None]:
-        """Yield server-sent events as dicts of their fields; the first, `{}`, reports that the stream is open.
+        """The first event, `{}`, reports that the stream is open.
 
         Each is waited for at most `timeout` seconds: the appliance's pings keep a stream open, but not a test.
         """

@@ -1,6 +1,6 @@
 """REST in one process: the api's real gate, routes and link, and control's real link, authentication and dispatch.
 
-Only the parts of control that answer requests are models. There is no socket, no thread and no real clock.
+Only the parts of control that answer requests are models.
 """
 
 import asyncio
@@ -118,7 +118,7 @@ class Trail:
 
 
 class RestWorld:
-    """The api and control, with an empty audit trail; `asked` sends a request. The api reads the log in `state`."""
+    """The audit trail is empty; `asked` sends a request. The api reads the log in `state`."""
 
     def __init__(self, state: Path = _STATE) -> None:
         with using(VirtualClock(wall=_NOW)):
@@ -179,10 +179,7 @@ class RestWorld:
         self, method: str, target: str, body: Any = None, role: str | None = "admin", tag: str | None = None,
         *, kind: str = "text/plain",
     ) -> httpx.Response:  # fmt: skip
-        """Without a role, there is no token; the request's record is made before the return.
-
-        A body that is a text or bytes has the content type `kind`; any other is sent as JSON.
-        """
+        """Without a role, there is no token. A text or bytes has the content type `kind`; any other body is JSON."""
         headers = {} if role is None else {"Authorization": f"Bearer {self.tokens.texts[role]}"}
         headers |= {} if tag is None else {"If-Match": tag}
         given: dict[str, Any] = {"json": body}
@@ -197,7 +194,7 @@ class RestWorld:
     def bypassing(
         self, request: AdminRequest[Any], role: str, asked: ClientRequest | None = None
     ) -> dict[str, Any]:
-        """Send control an order with a token, as a compromised api would; return its only record."""
+        """As a compromised api would; return the only record of the order."""
         self.trail.records.clear()
         self.carried.orders.clear()
 

@@ -1,11 +1,7 @@
-"""Run a robot of a hundred nodes and two hundred topics; the nodes register, and topics with a rate have messages.
+"""Run a robot of a hundred nodes and two hundred topics.
 
 The nodes of one machine share one API and one listener, on addresses of the loopback (127.0.0.11 and on), so that the
-appliance sees as many hosts as the robot has machines. Messages are published and read over TCPROS, as by ROS's own
-nodes.
-
-    with Robot(appliance.master_uri) as robot:
-        robot.call("/base/planner", "registerPublisher", "/guarded", "std_msgs/String", robot.api("/base/planner"))
+appliance sees as many hosts as the robot has machines.
 """
 
 import contextlib

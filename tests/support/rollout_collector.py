@@ -38,8 +38,6 @@ def _operator(request: Request) -> str:
 
 
 class RolloutCollector:
-    """`call` runs a coroutine in the event loop; the clock is `ahead` seconds ahead."""
-
     def __init__(self, folder: Path, authority: FleetAuthority, address: str, ahead: float = 0) -> None:
         self._address = address
         self._ahead = ahead

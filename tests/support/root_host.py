@@ -1,7 +1,4 @@
-"""Make this whole machine a host of a lab: its own network namespace on the lab's Ethernet.
-
-Only for a virtual machine of the tests (tests/support/machine.py): the tests change the machine's own network.
-"""
+"""Make this whole machine, which must be a virtual machine of the tests, a host of a lab."""
 
 import contextlib
 from collections.abc import Iterator

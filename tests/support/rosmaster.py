@@ -48,7 +48,7 @@ class PlainMaster:
 
 
 def master_at(uri: str) -> Any:
-    """Return the API of a master, for a `with` (the type stubs of `xmlrpc.client` lack answers that are lists)."""
+    """The type stubs of `xmlrpc.client` lack answers that are lists."""
     return xmlrpc.client.ServerProxy(uri, allow_none=True)
 
 
@@ -76,7 +76,7 @@ def await_node(uri: str, host: Host, name: str) -> None:
 
 
 def _await(attempt: Callable[[], object], complaint: str, process: Process | None) -> None:
-    """Retry until it works: a foreign program sends no event when it is ready."""
+    """A foreign program sends no event when it is ready."""
     deadline = time.monotonic() + LIMIT
     pause = threading.Event()
     while True:

@@ -1,7 +1,7 @@
 """A host of the lab that runs a kit's own scripts, as root on a Debian machine without systemd would.
 
-It has its own network (the lab's namespace) and, in a mount namespace, its own `/etc` and `/run`; changes there are
-invisible elsewhere. With `root` it also has that system's programs. The machine that runs the test is not changed.
+It has its own network (the lab's namespace) and, in a mount namespace, its own `/etc` and `/run`. With `root` it also
+has that system's programs.
 """
 
 import contextlib
@@ -33,10 +33,7 @@ _PATIENT_LOOKS = 20  # some seconds
 
 
 class ScriptHost:
-    """A context manager; `address` is the address for ROS nodes on the host (set once it has joined).
-
-    `root` is the root of its file system, where it differs from this machine's.
-    """
+    """`address` is the address for ROS nodes on the host (set once it has joined)."""
 
     def __init__(self, host: Host, directory: Path, root: Path | None = None) -> None:
         self.outer = host
@@ -71,7 +68,7 @@ class ScriptHost:
         return found
 
     def _left(self) -> bool:
-        """Return whether the ports are free for the next host; a remaining process is terminated."""
+        """Whether the ports are free for the next host; a remaining process is terminated."""
         programs = self._programs()
         self._looks += 1
         if self._looks == _PATIENT_LOOKS:

@@ -45,7 +45,6 @@ def serving(
     own: bool = False,
     target: Incarnation | None = None,
 ) -> Handler:
-    """`own` is our own listener, `target` an endpoint."""
     gate = CallGate(policy, registry, HostLimits())
     parameters = ParameterCalls(rosmaster, mirror, subscribers, rights, offload)
     execution = Execution(

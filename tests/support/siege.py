@@ -1,11 +1,7 @@
 """Run a robot at work while two hundred addresses try to exhaust every resource.
 
-with Siege(lab, home, "relay: {connections: 3000}\\n") as siege:
-    siege.crowd.hold(siege.crowd.guests, 11311, each=500)
-    siege.works()
-
-The appliance is 10.77.0.2, the robot 10.77.0.10, its operator 10.77.0.20. A crowd on one machine has a hundred
-guest addresses, which may do anything below `/guest`, and a hundred unknown hosts, which no rule names.
+The appliance is 10.77.0.2, the robot 10.77.0.10, its operator 10.77.0.20. A crowd has a hundred guest addresses,
+which may do anything below `/guest`, and a hundred unknown hosts, which no rule names.
 """
 
 import contextlib
@@ -105,7 +101,7 @@ class Crowd:
             self.held += [sock for sock in coming if sock not in waiting]
 
     def subscribe(self, address: str, caller_id: str, publisher: str, topic: str) -> int:
-        """Request a topic as a node does, and return the relay's port, for which a permission now exists."""
+        """Return the relay's port, for which a permission now exists."""
         face = self.call(address, "lookupNode", caller_id, publisher)
         assert face[0] == 1, face
         port = int(face[2].rstrip("/").rpartition(":")[2])
@@ -201,7 +197,7 @@ class Siege:
         assert self.call("deleteParam", "/starter", "/robot")[0] == 1
 
     def works(self, *, slowest: float, messages: int = 25) -> None:
-        """Assert that no message is lost, that all calls are answered in time, and that a node can start."""
+        """No message is lost, all calls are answered in time, and a node can start."""
         heard = len(self.listener.seen(event="received"))
         took = self.calls()
         assert took < allowed(slowest), f"the robot's call took {took:.2f} s"
@@ -216,7 +212,6 @@ class Siege:
         self.unharmed(heard, messages)
 
     def unharmed(self, before: int, messages: int) -> None:
-        """Assert that the listener misses no message from number `before` on, and receives `messages` more."""
         count = max(before, len(self.listener.seen(event="received"))) + messages
         heard = self.listener.wait_for_count(count, event="received")[before:]
         assert without_gap(numbers(heard)), "messages are missing or repeated"

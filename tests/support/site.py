@@ -1,12 +1,7 @@
 """Masters that the tests of a worker share: each is lent to one test at a time, which must leave it as it was.
 
-    with masters.lend("appliance", "loopback") as site, RosSession(site.master_uri, home) as ros:
-        ...
-
-The same robot runs behind the plain ROS master and behind the appliance. Each promise about unmodified nodes is tested
-in both modes: the plain mode validates the test, and the other one shows that the robot does not notice the appliance.
-
-Tests that crash, restart or configure a master start their own.
+The same robot runs behind the plain ROS master, which validates the test, and behind the appliance, which the robot
+must not notice. Tests that crash, restart or configure a master start their own.
 """
 
 import contextlib
@@ -29,10 +24,9 @@ _ASKER = "/reset"
 
 
 class Site:
-    """A context manager; the policy is open.
+    """The policy is open. On the loopback the appliance has REST.
 
-    On the loopback the appliance has REST. In a lab the firewall is in force, and the master has the address
-    10.77.0.2, `robot` 10.77.0.10 and `ocu` 10.77.0.20.
+    In a lab the firewall is in force; the master is 10.77.0.2, `robot` 10.77.0.10 and `ocu` 10.77.0.20.
     """
 
     def __init__(self, mode: Mode, home: Path, lab: Lab | None = None) -> None:
@@ -124,7 +118,7 @@ class Site:
 
 
 class Masters:
-    """The masters of a worker: each starts when a test first needs it, and again after a test that broke it."""
+    """Each master starts when a test first needs it, and again after a test that broke it."""
 
     def __init__(self, new_home: Callable[[str], Path]) -> None:
         self._new_home = new_home
@@ -132,7 +126,6 @@ class Masters:
 
     @contextlib.contextmanager
     def lend(self, mode: Mode, place: Place) -> Iterator[Site]:
-        """Lend a master to a test, which fails if it leaves something behind; the next one then gets a new master."""
         if (mode, place) != ("plain", "loopback"):
             need_root()
         if (mode, place) not in self._running:

@@ -8,9 +8,7 @@ from tests.support.requirements import need_root
 
 @contextmanager
 def small_disk(place: Path, size: str, *options: str) -> Iterator[Path]:
-    """`size` and `options` are those of `mount -t tmpfs`. The end does not wait for open files: a process that was
-    killed a moment ago may still have one.
-    """
+    """The end does not wait for open files: a process that was killed a moment ago may still have one."""
     need_root()
     place.mkdir(exist_ok=True)
     words = ",".join([f"size={size}", *options])

@@ -46,8 +46,6 @@ class Bounded(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class LeaseBounds:
-    """With `last_fault`, each state is also followed without faults."""
-
     grants: int
     last_fault: bool = False
 
@@ -65,10 +63,7 @@ class LeaseBounds:
 
 @dataclass(frozen=True, slots=True)
 class Bounds:
-    """With `sending`, publishers send forever.
-
-    With `refusing`, there are specifications that the relay cannot take.
-    """
+    """With `sending`, publishers send forever. With `refusing`, there are specifications that the relay cannot take."""
 
     publishers: int = 1
     subscribers: int = 1
@@ -110,9 +105,7 @@ class Found:
 def search(
     folder: Path, bounds: Bounded, mutant: str = "", traced: Path | None = None, *, large: bool = False
 ) -> Found:
-    """`folder` gets the model, or its copy with a trace.
-
-    Fails when the states do not fit into memory.
+    """`folder` gets the model, or its copy with a trace. Fails when the states do not fit into memory.
 
     With `large`, the checker is compiled with optimization, which takes four seconds.
     """
@@ -147,7 +140,6 @@ Step = tuple[str, int, int]
 
 
 def accepts(folder: Path, bounds: Bounded, trace: Sequence[Step]) -> bool:
-    """Return whether an execution of the model leaves this trace; all executions are tried."""
     steps = [
         f"    kind[{place}] = {what}; first[{place}] = {one}; second[{place}] = {other};\n"
         for place, (what, one, other) in enumerate(trace)

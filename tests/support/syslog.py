@@ -1,8 +1,4 @@
-"""Receive syslog in tests: RFC 5424 parsed strictly by its grammar, over UDP, TCP and TLS.
-
-with StreamCollector() as collector:
-    collector.wait_for(lambda messages: len(messages) >= 3)
-"""
+"""Receive syslog: RFC 5424 parsed strictly by its grammar, over UDP, TCP and TLS."""
 
 import contextlib
 import re
@@ -43,7 +39,6 @@ class Message:
 
 
 def parse(data: bytes) -> Message:
-    """Parse a message of RFC 5424. Raises `AssertionError` for anything else."""
     header = _HEADER.match(data)
     assert header is not None, data
     priority = int(header[1])

@@ -103,8 +103,6 @@ def sections(*files: Path) -> list[Any]:
 
 
 class Transcript:
-    """`run` replaces the command, `more` adds actions."""
-
     def __init__(
         self, fake: FakeAppliance, run: Runner = rosrv, more: Mapping[str, Callable[..., None]] | None = None
     ) -> None:

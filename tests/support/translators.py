@@ -1,7 +1,6 @@
 """NAT rules of other programs for their guests, exactly as these programs write them.
 
-Each `Translator` is a network behind the machine (containers, virtual machines, clients of a hotspot) with the rules
-that its program passes to iptables-restore or nft.
+Each `Translator` is a network behind the machine (containers, virtual machines, clients of a hotspot).
 """
 
 import subprocess

@@ -1,7 +1,4 @@
-"""An appliance and hosts on one Ethernet: some behind tunnels, some in clear text, and an attacker.
-
-`trail` is the appliance's audit log as it is written, for tests to wait on.
-"""
+"""An appliance and hosts on one Ethernet: some behind tunnels, some in clear text, and an attacker."""
 
 import contextlib
 import json
@@ -71,10 +68,7 @@ class TunnelSite:
     def joined(
         self, kit: Path, host: Host | None = None, *, log: str = "", settings: str = ""
     ) -> Iterator[JoinedHost]:
-        """Yield a host with its tunnel up on both sides; afterwards the tunnel is down on both sides.
-
-        `settings` are added to the kit's settings of the tunnel.
-        """
+        """The tunnel is up on both sides in the block, and down on both afterwards."""
         mark = self.mark
         joined = self.join(kit, host, log=log)
         conf = joined.folder / "swanctl" / "swanctl.conf"
@@ -112,7 +106,6 @@ class TunnelSite:
         return next(str(row["state"]) for row in self.hosts() if row["name"] == name)
 
     def is_up(self, name: str = "ocu-1") -> dict[str, Any]:
-        """The host itself sees its tunnel up slightly earlier."""
         return eventually(
             lambda: next((one for one in self.hosts() if (one["name"], one["state"]) == (name, "up")), None),
             f"the tunnel of {name} is up",
@@ -122,7 +115,6 @@ class TunnelSite:
         return self.trail.wait_for(since=since, timeout=timeout, **fields)
 
     def refused(self, since: int, host: str | None = None) -> Event:
-        """Return the first refusal of a tunnel after `since`: its record, or the one that counts its repetitions."""
 
         def is_it(event: Event) -> bool:
             folded = event.get("event") == "denials folded" and event["detail"]["of"] == "tunnel refused"
@@ -135,7 +127,6 @@ class TunnelSite:
         return self.appliance.story()
 
     def rest(self) -> Rest:
-        """It uses the management network, here the attacker's machine."""
         # The kernel accepts connections before the process is ready: one answer shows that it is.
         served = self.attacker.run(partial(ssl.get_server_certificate, (MIDDLE, API), timeout=LONG))
         (self.home / "api.pem").write_text(served)
@@ -166,7 +157,6 @@ class TunnelSite:
 
 
 def left_behind(host: Host) -> dict[str, str]:
-    """Return leftovers of an appliance on its host: rules, IPsec states, routes, interfaces and addresses."""
 
     def told(*command: str) -> str:
         process = host.popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)

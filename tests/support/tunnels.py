@@ -1,8 +1,5 @@
 """A host that joins the appliance with its kit: unpacked, with its own charon, in the host's namespace.
 
-with JoinedHost(lab_host, kit, folder) as host:
-    ros = RosSession(host.master, home, host)
-
 The kit's own `join.sh` needs a machine with systemd; here the same strongSwan is given the same files.
 """
 
@@ -47,8 +44,6 @@ def need_strongswan() -> None:
 
 
 class JoinedHost:
-    """`address` is the virtual one, as `RosSession` needs it."""
-
     def __init__(
         self,
         host: Host,
@@ -58,9 +53,8 @@ class JoinedHost:
         log: str = "",
         programs: Path | None = None,
     ) -> None:
-        """Unpack the kit into `directory`, which must be new; `log` is added to charon's log settings (`chd = 4`).
-
-        Programs in `programs` are found first.
+        """`directory` must be new; `log` is added to charon's log settings (`chd = 4`). Programs in `programs` are
+        found first.
         """
         self.outer = host
         self.log = log
@@ -115,7 +109,6 @@ class JoinedHost:
         )
 
     def wait_until_replaced(self) -> None:
-        """Wait until `keep.sh` has ended the first tunnel."""
         assert self.charon is not None
         first = self.charon.wait_for(lambda event: _established(event) is not None)
         self.charon.wait_for_text(f"vici terminate IKE_SA #{_established(first)}")

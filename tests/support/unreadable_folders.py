@@ -9,7 +9,6 @@ import pytest
 
 
 def make_unreadable(folder: Path, patch: pytest.MonkeyPatch) -> None:
-    """Have this process refuse to list a folder, as the kernel refuses it to a user without the right."""
 
     def refusing(listed: Any) -> Any:
         def list_folder(path: Any = ".") -> Any:

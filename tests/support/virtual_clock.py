@@ -6,10 +6,7 @@ _SECOND = 1_000_000_000
 
 
 class VirtualClock:
-    """All readings in nanoseconds; `wall` is the system time, and begins at the present one if it is not given.
-
-    `advance` moves all three clocks together, as time does; `set_wall` sets the system time alone, as people do.
-    """
+    """All readings in nanoseconds; `wall` is the system time, and begins at the present one if it is not given."""
 
     def __init__(self, *, wall: float | None = None, now: float = 1000.0) -> None:
         self._now = round(now * _SECOND)

@@ -1,9 +1,4 @@
-"""Wait for changes without an event, such as a number in a status or a record that is written later.
-
-eventually(lambda: appliance.audit("--event", "node lost"), "the loss is recorded")
-
-Where there is an event (a line that a program prints, a message on a channel), a test waits for that instead.
-"""
+"""Wait for changes without an event, such as a number in a status or a record that is written later."""
 
 import os
 import threading
@@ -24,10 +19,7 @@ class NoAnswerError(AssertionError):
 def eventually(
     condition: Callable[[], T | None], what: str | Callable[[], str], seconds: float = 2 * LIMIT
 ) -> T:
-    """Return the first true answer of `condition`; fail with `what` after `seconds`, which are generous.
-
-    `what` describes the expected event; a function is called only on failure. `NoAnswerError` means: not yet.
-    """
+    """Fail with `what`, perhaps a function, after `seconds`, which are generous. `NoAnswerError` means: not yet."""
     deadline, pause, moment = time.monotonic() + seconds, threading.Event(), 0.02
     while True:
         found, why = _tried(condition)
@@ -48,7 +40,7 @@ def _tried(condition: Callable[[], T | None]) -> tuple[T | None, str]:
 
 
 def allowed(seconds: float) -> float:
-    """Return the time limit on this machine, with its present load, for work that takes `seconds` on an idle one.
+    """Return the time limit, with the present load, for work that takes `seconds` on an idle machine.
 
     Only for an upper bound that the product promises; if an event shows the promise, wait for the event.
     """

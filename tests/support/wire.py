@@ -55,7 +55,7 @@ class Frame:
 
     @property
     def returned(self) -> "Frame | None":
-        """Return the beginning of the packet that an ICMP error quotes, as a frame; None for other packets."""
+        """Return the beginning of the packet that an ICMP error quotes; None for other packets."""
         if self.protocol != socket.IPPROTO_ICMP or self.data[self.header] != _UNREACHABLE:
             return None
         return Frame(self.data[:14] + self.data[self.header + 8 :])
@@ -67,10 +67,7 @@ class Frame:
         return self.data[start + 8 : start + length]
 
     def with_payload(self, payload: bytes) -> bytes:
-        """Return the frame of a UDP packet with another payload of the same length.
-
-        It has no UDP checksum: the kernel leaves that to the hardware, so a captured frame has none yet.
-        """
+        """The kernel leaves the UDP checksum to the hardware, so a captured frame has none."""
         start = self.header
         head = self.data[: start + 6] + bytes(2)
         assert len(payload) == len(self.udp_payload)
@@ -89,8 +86,6 @@ class Frame:
 
 
 class Capture:
-    """Captures both directions during the block."""
-
     def __init__(self, namespace: Namespace, interface: str = INTERFACE) -> None:
         self.frames: list[Frame] = []
         self._changed = threading.Condition()
@@ -148,7 +143,6 @@ def send_frames(host: Host, frames: list[bytes]) -> None:
 
 
 def udp_packet(source: tuple[str, int], destination: tuple[str, int], payload: bytes) -> bytes:
-    """UDP's checksum is missing."""
     udp = (
         source[1].to_bytes(2)
         + destination[1].to_bytes(2)
@@ -169,7 +163,6 @@ def _checksum(header: bytes) -> bytes:
 
 
 def connect(host: Host, source: str, target: str, port: int = 11311) -> str:
-    """Returns `connected`, `refused` or `nothing`."""
 
     def work() -> str:
         with socket.socket() as client:

@@ -30,7 +30,6 @@ def machine() -> None:
 
 @pytest.fixture
 def temporary() -> Iterator[Path]:
-    """Requires at the end that no file is left."""
     folder = Path(tempfile.mkdtemp(prefix="demo-"))
     folder.chmod(0o755)
     yield folder
@@ -115,7 +114,6 @@ def test_demo_without_space(tmp_path: Path) -> None:
 
 
 def test_demo_without_root() -> None:
-    """Without root, an error says so before anything starts."""
     command = ["/usr/bin/setpriv", "--reuid=65534", "--regid=65534", "--clear-groups", ROSRV, "demo"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT, check=False)
     assert done.returncode == 1

@@ -1,7 +1,6 @@
 """The Ansible role and the cloud-init example, run by their own programs in a Debian made for the test.
 
-Ansible carries out the role there: apt installs a package, and the real `rosrv` checks files before they are put in
-place. systemd is replaced by a program that logs its calls, and `selftest` is only logged.
+systemd is replaced by a program that logs its calls, and `selftest` is only logged.
 """
 
 import json
@@ -104,7 +103,6 @@ class Robot:
         path.chmod(0o755 if executable else 0o644)
 
     def play(self, **given: object) -> tuple[subprocess.CompletedProcess[str], list[str]]:
-        """Returns the calls of systemd and `rosrv`."""
         asked = self.tree / "srv/asked"
         asked.write_text("")
         settings = {

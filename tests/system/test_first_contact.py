@@ -37,8 +37,6 @@ DEMO_SECONDS: Final = 600  # for one that hangs
 
 @dataclass(frozen=True)
 class Way:
-    """Owner and mode of the home, the umask, and the name of the checkout."""
-
     owner: int = 0
     mode: int = 0o700
     umask: int = 0o022
@@ -56,8 +54,6 @@ WAYS: Final = {
 
 @dataclass(frozen=True)
 class Checkout:
-    """`path` is the path by which the owner uses it."""
-
     home: Path
     path: Path
 

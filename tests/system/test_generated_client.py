@@ -1,7 +1,6 @@
 """A client generated from the contract, as an integrator makes one, calls every operation and parses every answer.
 
-The generator has its own environment (`generated-client.lock`): its dependencies are not ours. Bodies are the
-contract's examples; hosts are enrolled, and one of them sends requests through its tunnel.
+The generator's dependencies are not ours (`generated-client.lock`). Bodies are the contract's examples.
 """
 
 import base64
@@ -85,10 +84,7 @@ Done = dict[str, Any]  # operation -> type of its parsed answer
 
 @dataclass(frozen=True)
 class Call:
-    """A call of an operation: arguments, and changes of the contract's example of the body.
-
-    Both are made from earlier answers. `inside`: by a host through its tunnel.
-    """
+    """Arguments and changes of the example are made from earlier answers. `inside`: by a host through its tunnel."""
 
     arguments: Callable[[Done], dict[str, Any]] = lambda _done: {}
     body: Callable[[Done], dict[str, Any]] = lambda _done: {}
@@ -166,10 +162,7 @@ REFUSED: dict[str, dict[str, Any]] = {
     "make_own_ticket": {}, "plan_guard": {}, "approve": {"number": 48213}, "approval_refuse": {"number": 48213},
     "end_sessions": {"name": "alice"}, "sign_out": {"session": "0" * 12},
 }  # fmt: skip
-"""Operations on a second appliance, an alarm, a group, a guard, a door, a call or a session that does not exist.
-
-They return the promised problem.
-"""
+"""Operations on things that do not exist, which return the promised problem."""
 
 ELSEWHERE = {"begin_sign_on", "complete_sign_on", "new_guard", "set_guard", "check_driver", "add_door"}
 """Operations that need a provider, a guard's topics or a door: the tests of these features call them."""
@@ -222,7 +215,7 @@ class Client:
         )
 
     def ask(self, *call: Any) -> Any:
-        """Returns status, type of the parsed answer, parsed answer, raw JSON."""
+        """Return status, type of the parsed answer, parsed answer, raw JSON."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         with contextlib.suppress(BrokenPipeError):
@@ -249,7 +242,6 @@ def generate(generator: Path, contract: Any, folder: Path) -> None:
 
 
 def same(read: Any, said: Any) -> bool:
-    """Timestamps have fewer digits."""
     if isinstance(read, dict) and isinstance(said, dict):
         return read.keys() == said.keys() and all(same(read[name], said[name]) for name in said)
     if isinstance(read, list) and isinstance(said, list):
@@ -298,7 +290,6 @@ def kit_of(done: Done, folder: Path) -> Path:
 
 
 def asked(client: Client, token: str, operation: dict[str, Any], call: Call, done: Done) -> Any:
-    """The answer must be as the contract promises."""
     arguments = call.arguments(done)
     if any(one["name"] == "If-Match" for one in operation.get("parameters", ())):
         arguments = arguments | {"if_match": "*"}
@@ -324,7 +315,6 @@ def asked(client: Client, token: str, operation: dict[str, Any], call: Call, don
 
 
 def body_of(operation: dict[str, Any], changes: dict[str, Any]) -> tuple[str, dict[str, Any]] | None:
-    """None if the operation has no body."""
     if "requestBody" not in operation:
         return None
     kind = kind_of(operation["requestBody"]["content"]["application/json"])

@@ -1,7 +1,4 @@
-"""Monitors learnt from drives of the simulated LandShark judge other drives and injected faults.
-
-The test computes for 15 seconds, and so is not in `make test`; the learning itself is tested in rosmop/tests/learn.
-"""
+"""Monitors learnt from drives of the simulated LandShark judge other drives and injected faults."""
 
 from benchmarks.learning import KINDS, judge
 

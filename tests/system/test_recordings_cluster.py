@@ -101,9 +101,8 @@ class Cluster:
 
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[Cluster]:
-    """The folder has a short name, because Ray's sockets have long ones.
-
-    Some of Ray's processes listen on all addresses, whatever is asked: here there is only a loopback.
+    """The folder has a short name, because Ray's sockets have long ones. Some processes listen on all addresses, so
+    here there is only a loopback.
     """
     needs(find_spec("ray"), "Ray: pip install 'rosmop[ray]'")
     need_root()

@@ -53,8 +53,8 @@ def fuzz(rest: Rest, directory: Path, *flags: str) -> subprocess.CompletedProces
 
 
 def test_the_contract_is_true(appliance: Appliance, tmp_path: Path) -> None:
-    """No answer is a server error, or has a status, type, header or form outside the contract; requests that break the
-    contract are refused; every operation needs a token; and no process was restarted.
+    """No answer is a server error, or outside the contract; requests that break the contract are refused; every
+    operation needs a token; and no process was restarted.
 
     Not covered: acceptance of every well-formed request, because a schema cannot define a valid policy; the stream,
     which does not end; the revocation of a token, because the fuzzer would revoke its own; and a new door, which

@@ -59,7 +59,6 @@ class Keeper:
             process.stop(with_signal=signal.SIGTERM)  # rsyslog ignores SIGINT
 
     def lines(self) -> list[str]:
-        """rsyslog may be in the middle of a line."""
         text = self.file.read_text(errors="replace") if self.file.exists() else ""
         return text.rpartition("\n")[0].splitlines()
 

@@ -1,5 +1,3 @@
-"""The event loop of asynchronous unit tests: in virtual time, unless chance may decide a test."""
-
 from collections.abc import Iterator
 from typing import Any
 

@@ -60,7 +60,6 @@ def test_each_right_has_its_reason_beside_it() -> None:
 
 
 def environment(**outside: str) -> dict[str, str]:
-    """The variables are in `.env`."""
     told = yaml.safe_load((ROOT / "compose.yaml").read_text())["services"]["appliance"]["environment"]
     return {
         key: re.sub(r"\$\{(\w+):-(.*?)\}", lambda found: outside.get(found[1], found[2]), value)

@@ -42,7 +42,6 @@ _NO_CODE = {
 
 
 def _lines(path: str) -> int:
-    """Without blank lines, comments and docstrings."""
     lines: set[int] = set()
     statement: list[tokenize.TokenInfo] = []
     with (ROOT / "appliance" / path).open("rb") as file:

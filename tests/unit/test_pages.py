@@ -73,14 +73,12 @@ def test_generated_pages_are_current(module: ModuleType) -> None:
     "page", ["docs/dev/architecture.md", "docs/reference/compatibility.md", "CONTRIBUTING.md"]
 )
 def test_modules_that_are_named_are_there(page: str) -> None:
-    """The file exists under the name that the page gives, so that a newcomer finds it."""
     names = re.findall(r"\b(?:[a-z_]+/)+[a-z_]+\.(?:py|sh|js|rv|toml|yaml)\b", (ROOT / page).read_text())
     folders = (ROOT, ROOT / "appliance", ROOT / "appliance" / "api" / "console")
     assert [name for name in names if not any((folder / name).exists() for folder in folders)] == []
 
 
 def test_the_path_of_a_call_counts_its_files() -> None:
-    """The number of each step, and their sum in the sentence above."""
     page = (ROOT / "docs/dev/architecture.md").read_text()
     [path] = re.findall(r"^## The path of one registerPublisher\n(.*?)^`", page, re.DOTALL | re.MULTILINE)
     steps_of_path = re.findall(r"^\|[^|]+\|(.*`.*)\| (\d+) \|$", path, re.MULTILINE)
@@ -92,7 +90,6 @@ def test_the_path_of_a_call_counts_its_files() -> None:
 
 
 def test_the_sandbox_of_each_process_is_in_the_architecture() -> None:
-    """Its user, its kind of system calls, its sockets, and whether it uses TCP."""
     page = (ROOT / "docs/dev/architecture.md").read_text().split("\n## Sandbox", 1)[1]
     rows = re.findall(
         r"^\| (\w+) \| `([\w-]+)` \| (\w+) \| ([^|]+) \| ([^|]+), ([^|]+) \|", page, re.MULTILINE
@@ -107,7 +104,7 @@ def test_the_sandbox_of_each_process_is_in_the_architecture() -> None:
 
 
 def test_the_state_directory_is_described() -> None:
-    """An operator looks up what a folder holds before they remove it, or wonder what a backup lacks."""
+    """An operator looks up a folder before they remove it, or wonder what a backup lacks."""
     page = (ROOT / "docs/reference/processes.md").read_text()
     table = page.split("\n## The state directory", 1)[1].split("\n## ", 1)[0]
     folders = {
@@ -119,7 +116,6 @@ def test_the_state_directory_is_described() -> None:
 
 
 def test_settings_that_pages_name_exist() -> None:
-    """A page names a setting by its path in `appliance.yaml`; pages of the collector name its own."""
     sections = {name: kind for name, kind in get_type_hints(Settings).items() if is_dataclass(kind)}
     files = {"audit.pub", "firewall.translations"}  # of the state directory, and of the status
     pages = [page for page in WITH_LINKS[:-1] if "fleet" not in page.name]
@@ -138,7 +134,7 @@ def test_tests_that_pages_name_are_there(page: Path) -> None:
 
 
 def test_tests_that_the_assurance_names_are_there() -> None:
-    """Each `file.py::test` is a test of that file, so that no promise loses its proof."""
+    """Otherwise a promise would lose its proof."""
     named = re.findall(r"([\w/]+\.py)::(test_\w+)", (ROOT / "docs/dev/assurance.md").read_text())
     texts = {file: [one.read_text() for one in (ROOT / "tests").rglob(Path(file).name)] for file, _ in named}
     assert named
@@ -153,7 +149,6 @@ def test_every_operation_of_rest_is_on_its_page() -> None:
 
 @pytest.mark.parametrize("page", WITH_LINKS[:-1], ids=lambda page: page.name)
 def test_commands_of_pages_exist(page: Path) -> None:
-    """Each `rosrv` command of a page, the CHANGELOG excepted, exists with the options that the page gives it."""
     options = {
         name: {one for each in verb.params for one in (*each.opts, "--help")} for name, verb in commands()
     }
@@ -188,7 +183,6 @@ OTHERS = {
     "--device": "docker run", "--global": "pipx", "--pip-args": "pipx",
     "--runtime-env-agent-port": "ray",
 }  # fmt: skip
-"""Options of other programs that pages name alone."""
 
 
 def test_options_that_pages_name_alone_exist() -> None:
@@ -251,7 +245,6 @@ def _exists(call: str, options: dict[str, set[str]]) -> bool:
 
 
 def test_the_quickstart_is_quick() -> None:
-    """Five steps, one denied call, and at most 250 words; marks for its test do not count."""
     text = (ROOT / "docs/quickstart.md").read_text()
     words = re.sub(r"<!--.*?-->|^```.*$", "", text, flags=re.MULTILINE).split()
     denied = [step for step in steps("quickstart.md") if step.how == "fails"]
@@ -259,7 +252,6 @@ def test_the_quickstart_is_quick() -> None:
 
 
 def test_the_changelog_is_short() -> None:
-    """The next release has at most 40 bullets of three lines, after upgrade notes of at most 12 lines."""
     section = re.split(r"^## ", (ROOT / "CHANGELOG.md").read_text(), flags=re.MULTILINE)[1]
     notes, bullets = section.split("### Security")[0], re.findall(r"^- (?:.|\n  )*", section, re.MULTILINE)
     assert 0 < len(bullets) <= 40
@@ -280,7 +272,6 @@ def test_file_names_of_pages_and_examples_have_no_version(page: Path) -> None:
 
 
 def test_sizes_have_one_bound_on_the_settings_page() -> None:
-    """Integers and sizes with a unit are one kind of value, so their bounds are not joined."""
     assert "size above 0" in settings_page.page()
     assert "size with a unit or integer" not in settings_page.page()
 

@@ -1,7 +1,7 @@
 """No regular expression holds the interpreter for long, whatever text it gets.
 
-Python matches a pattern in one call, during which no other thread runs. A pattern that backtracks over text from a peer
-therefore stops the appliance for all hosts, also if its time is linear: 8 MB of spaces took a second.
+No other thread runs during a match. A pattern that backtracks over text from a peer therefore stops the appliance for
+all hosts, also if its time is linear: 8 MB of spaces took a second.
 """
 
 import ast
@@ -72,8 +72,6 @@ _AT_ITS_PLACE = {"match", "fullmatch"}
 
 
 class Pattern(NamedTuple):
-    """`anywhere`: it is not only matched at one place."""
-
     name: str
     pattern: str | bytes
     flags: int
@@ -89,7 +87,6 @@ def files() -> Iterator[Path]:
 
 
 def patterns_of(path: Path) -> Iterator[Pattern]:
-    """Constants of the module, constants in calls, and those of msgspec."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
     module = ".".join(path.relative_to(ROOT).with_suffix("").parts).removeprefix("fleet.")
     used = _methods(tree)
@@ -108,7 +105,6 @@ def patterns_of(path: Path) -> Iterator[Pattern]:
 
 
 def _constants(tree: ast.Module, module: str) -> Iterator[tuple[str, str | bytes, int]]:
-    """Imports the module only if a pattern is made of parts."""
     compiled = [call for call in _calls(tree, "re") if _function(call) == "compile"]
     plain: dict[ast.expr, str] = {
         node.value: node.targets[0].id
@@ -145,7 +141,6 @@ def _function(call: ast.Call) -> str:
 
 
 def _methods(tree: ast.Module) -> dict[str, set[str]]:
-    """The name is "" if the pattern has another name there."""
     found: dict[str, set[str]] = {}
     for node in ast.walk(tree):
         if isinstance(node, ast.Attribute) and node.attr in _FUNCTIONS - {"split"}:
@@ -185,7 +180,7 @@ def test_no_pattern_has_many_steps() -> None:
     ],
 )
 def test_backtracking_is_found(pattern: str) -> None:
-    """Leading, nested and consecutive repeats are rejected, and possessive ones that Python 3.11 matches wrongly."""
+    """Python 3.11 matches some possessive repeats wrongly."""
     assert steps(pattern, 0, UNLIMITED, anywhere=False) > MOST_STEPS
 
 

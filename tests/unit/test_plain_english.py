@@ -1,7 +1,6 @@
 """Pages, docstrings and comments are written in plain English: one word for one thing, and none of the habits below.
 
-Pages are checked as a whole; `test_source_rules.py` checks Python files by their docstrings, comments and names of
-tests. Code, quoted output and generated pages are left out.
+`test_source_rules.py` checks Python files. Code, quoted output and generated pages are left out.
 """
 
 import ast
@@ -18,7 +17,6 @@ FOLDERS = (
     "appliance/", "rosmop/", "rosmop/tests/", "roswire/", "examples/", "benchmarks/", "distribution/", "fleet/",
     "tests/",
 )  # fmt: skip
-"""The folders whose Python files and pages are checked."""
 GENERATED = ("metrics.md", "audit-events.md")
 STRING_OR_COMMENT = re.compile(
     r'''"""(?:\\.|[^\\])*?"""|'{3}(?:\\.|[^\\])*?'{3}|"(?:\\.|[^"\\\n])*"|'(?:\\.|[^'\\\n])*'|[#][^\n]*''',
@@ -99,7 +97,6 @@ def bad_habits(prose: str) -> Iterator[tuple[int, str]]:
 
 
 def said_in(source: str, nodes: Sequence[ast.AST]) -> str:
-    """Return the docstrings, comments and names of tests of a Python file, each on its line."""
     lines = [""] * (source.count("\n") + 2)
     for node in nodes:
         match node:

@@ -1,7 +1,7 @@
 """Rules on the source, in one pass over all files: each is parsed once, and every rule sees its nodes.
 
-A row of `RULES` has the folders that it applies to, the function that yields what it sees in a file, the function that
-judges this over all files, and sources that the rule must find and must not find.
+A row of `RULES` has the folders, the function that yields what it sees in a file, the function that judges this over
+all files, and sources that the rule must find and must not find.
 """
 
 import ast
@@ -314,7 +314,7 @@ WALL_CLOCK = {
         "features/topics/topic_verbs.py", "features/recorder/recorder_input.py", "features/recorder/record_verbs.py",
     ],
 }  # fmt: skip
-"""The files that read the wall clock, by purpose. Add a file only if it has one of these purposes."""
+"""Add a file only if it has one of these purposes."""
 DIRECT = {
     "appliance/base/clock.py": "offers the clocks of the operating system to the rest",
     "appliance/features/standby/witness.py": "is copied to a machine without the appliance",
@@ -379,7 +379,6 @@ def lost_cancellations(source: Source) -> Iterator[tuple[int, str]]:
 
 
 def printed(source: Source) -> Iterator[tuple[int, str]]:
-    """An f-string has a gap for each value."""
     for node in source.nodes:
         match node:
             case ast.Constant(value=str(text)):
@@ -408,7 +407,6 @@ def habits(source: Source) -> Iterator[tuple[int, str]]:
 
 
 def shown_habits(source: Source) -> Iterator[tuple[int, str]]:
-    """The texts are errors, help and descriptions of fields."""
     parts = {id(part) for node in source.nodes if isinstance(node, ast.JoinedStr) for part in node.values}
     for node in source.nodes:
         match node:

@@ -1,6 +1,6 @@
 """Transcripts: a line at the margin is an action, the indented lines below it are its effects.
 
-A file has several transcripts, separated by an empty line; the title of each, after `# `, states its promise.
+The title of each, after `# `, states its promise; an empty line ends it.
 """
 
 from collections.abc import Awaitable, Callable
@@ -14,7 +14,6 @@ def transcripts(file: Path) -> dict[str, list[str]]:
 
 
 async def played(written: list[str], say: Callable[[str], Awaitable[list[str]]]) -> list[str]:
-    """Equal repeated effects are on one line."""
     lines: list[str] = []
     for action in written:
         if not action.startswith(" "):

@@ -1,7 +1,6 @@
 """A simulated appliance: the product's control process, and models of its supervisor and of its relay.
 
-The supervisor keeps the listening sockets, starts ended processes again, and connects control with the relay. The
-relay decides with the product's own grant table. Its connections are rows, which carry messages at any time.
+The relay decides with the product's own grant table. Its connections are rows, which carry messages at any time.
 """
 
 from collections.abc import Iterator
@@ -34,8 +33,6 @@ _RESTART_SECONDS = (0.2, 0.5, 1.5)
 
 
 class Connection(NamedTuple):
-    """A connection at the relay: `kind` is "topic" or "service"."""
-
     key: str
     kind: str
     resource: str
@@ -195,7 +192,7 @@ class Appliance:
         return self.supervisor.alive and self.watch.active
 
     def crash(self) -> None:
-        """Lose all processes; the disk keeps what was written. The machine starts again after some time."""
+        """The disk keeps what was written. The machine starts again after some time."""
         lease = [self.lease] if self.lease is not None else []
         for process in (self.control, self.relay.process, self.rosmaster.process, self.supervisor, *lease):
             if process is not None:
@@ -237,17 +234,14 @@ class Appliance:
                 process.paused = paused
 
     def _end_lapse(self) -> None:
-        """Become passive, because a process ended that would start again unpaused."""
         self.watch.died("control", serves_robot=True)
 
     def pause_lease(self, seconds: float) -> None:
-        """Let the process `lease` run no callback for some seconds."""
         if self.lease is not None:
             self.lease.paused = True
             self.world.loop.outside.call(seconds, setattr, self.lease, "paused", False)
 
     def _passivate(self) -> None:
-        """Each process starts again, passive."""
         self.world.say(f"{self.address} is passive")
         self.sockets.clear()
         self.restart_rosmaster()

@@ -1,8 +1,7 @@
 """The store and the audit log without threads, and what the kernel does with the files of a killed process.
 
-A turn of an engine comes a short time after it is wanted. A kill comes between two turns: the files then have what was
-written, as after `kill -9`, and the kernel closes them. No write is lost that was not synced: the machine keeps its
-power.
+A kill comes between two turns of an engine: the files then have what was written, as after `kill -9`. No write is
+lost that was not synced: the machine keeps its power.
 """
 
 import os
@@ -20,8 +19,6 @@ _LEAST_SECONDS = 0.0005
 
 
 class EngineSteps:
-    """Calls the turns of an engine as steps of its process."""
-
     def __init__(self, name: str, turn: Turn, gather: float) -> None:
         self._at_once = name == "store"  # which makes `Database.query` wait, and so the whole process
         self._turn = turn
@@ -70,7 +67,7 @@ class WorldDatabase(Database):
 
 
 def files() -> tuple[Any, Any]:
-    """Return the modules `os` and `sqlite3`, whose open files end with their process."""
+    """The open files of these `os` and `sqlite3` end with their process."""
 
     def opened(*given: Any, **named: Any) -> int:
         descriptor = os.open(*given, **named)

@@ -1,9 +1,8 @@
 """Run the processes of a simulated world in one event loop with virtual time.
 
 Time advances only when no callback is ready. Callbacks of one process keep their order, as asyncio promises; which
-process runs next is chosen by the seed. A killed process runs no further callback, so that its `finally` blocks do not
-run either. Each machine has a clock that may be ahead and may run faster or slower; the timers of its processes follow
-this clock.
+process runs next is chosen by the seed. A killed process runs no further callback, so its `finally` blocks do not run
+either. The timers of a process follow its machine's clock, which may be ahead and faster or slower.
 """
 
 import asyncio
@@ -31,7 +30,7 @@ class BrokenPromiseError(AssertionError):
 
 @dataclass(eq=False)
 class Machine:
-    """A computer with its own clocks: `ahead` of the world's time in seconds, and `speed` times as fast."""
+    """Its clock is `ahead` of the world's time in seconds, and `speed` times as fast."""
 
     name: str
     loop: "WorldLoop"
@@ -55,7 +54,7 @@ class Machine:
 
 @dataclass(eq=False)
 class Process:
-    """A process on a machine; `ends` are called when it is killed, as the kernel closes its files and connections."""
+    """`ends` are called when it is killed, as the kernel closes its files and connections."""
 
     name: str
     machine: Machine
@@ -79,7 +78,6 @@ class Process:
         return self.context.copy().run(act, *given)
 
     def call(self, seconds: float, act: Callable[..., object], *given: Any) -> None:
-        """The seconds are those of the world's time."""
         loop = self.machine.loop
         loop.at(loop.present + seconds, act, given, self.context.copy())
 
@@ -91,7 +89,6 @@ class Process:
                 happen()
 
     def kill(self) -> None:
-        """The process runs no further callback."""
         if self.alive:
             self.alive = False
             self.ready.clear()
@@ -107,8 +104,6 @@ def present_process() -> Process:
 
 
 class WorldLoop(asyncio.BaseEventLoop):
-    """The loop. `present` is the time of the world in seconds."""
-
     def __init__(self, random: Random) -> None:
         super().__init__()
         self.present = 0.0
@@ -133,7 +128,6 @@ class WorldLoop(asyncio.BaseEventLoop):
         return super().call_at(when, callback, *args, context=context)
 
     def run_in_executor(self, _executor: Any, func: Callable[..., T], *args: Any) -> asyncio.Future[T]:  # type: ignore[override]  # no executor
-        """After a short time, in place of a thread."""
         future: asyncio.Future[T] = self.create_future()
 
         def run() -> None:
@@ -179,7 +173,6 @@ class WorldLoop(asyncio.BaseEventLoop):
     def _process_events(self, event_list: Any) -> None: ...
 
     def _run_once(self) -> None:
-        """Run some callbacks of one process; if none is ready, advance to the next timer."""
         self.steps += 1
         scheduled: list[asyncio.TimerHandle] = self._scheduled  # type: ignore[attr-defined]  # asyncio's own
         ready: deque[asyncio.Handle] = self._ready  # type: ignore[attr-defined]  # typeshed leaves it out

@@ -36,7 +36,6 @@ from tests.world.world import World, run
 
 
 def _nothing(*_given: Any, **_named: Any) -> Any:
-    """Do nothing; of a number, none."""
     return 0
 
 
@@ -56,7 +55,7 @@ def _without_grants(self: RelayControl, index: int, channel: Any) -> None:
 
 
 def _not_stated(kind: type[Any], *, withdrawn: bool = False) -> Callable[..., None]:
-    """Return the relay's sink, which leaves out the facts of a kind, or their withdrawals."""
+    """Leave out the facts of a kind, or their withdrawals."""
 
     def state(self: RelayControl, post: Any, node: Incarnation, fact: Any, wanted: Any) -> None:
         if not (isinstance(fact, kind) and (wanted is None) is withdrawn):
@@ -158,7 +157,6 @@ def instead_of(place: Any, name: str, other: object) -> Iterator[None]:
 
 
 def first_broken(mutant: str, seeds: Sequence[int]) -> tuple[int, str] | None:
-    """Returns the seed and the broken promise."""
     kind = World if mutant in MUTANTS else PairWorld
     with instead_of(*(MUTANTS | PAIR_MUTANTS)[mutant]):
         for seed in seeds:

@@ -1,7 +1,7 @@
 """The simulated network: HTTP exchanges between hosts, and links between the processes of one machine.
 
-Each message takes a random time. Between two hosts the network may be cut: then a request or its answer is lost, and
-the caller waits until its time limit. A killed process refuses connections, and breaks off those that it served.
+Each message takes a random time. If the network is cut, a request or its answer is lost, and the caller waits until
+its time limit. A killed process refuses connections, and breaks off those that it served.
 """
 
 import asyncio
@@ -33,8 +33,6 @@ class _Served:
 
 
 class Network:
-    """The servers by their addresses, and the pairs of hosts that are cut off from each other."""
-
     def __init__(self, loop: WorldLoop) -> None:
         self.loop = loop
         self._random: Random = loop.random
@@ -68,7 +66,6 @@ class Network:
                 self._later(self._fail, future, ConnectionResetError("the connection ended"))
 
     async def exchange(self, address: Address, body: bytes, seconds: float, source: str) -> bytes:
-        """Raises `OSError` and `TimeoutError`, as the product's client does."""
         future: asyncio.Future[bytes] = self.loop.create_future()
         self._later(self._arrive, address, body, source, future)
         try:
@@ -122,8 +119,6 @@ class Network:
 
 @dataclass(eq=False)
 class LinkEnd:
-    """One end of a link between two processes of a machine, in place of `Channel`. Messages keep their order."""
-
     process: Process
     other: "LinkEnd" = field(init=False)
     closed: bool = False

@@ -30,8 +30,6 @@ _STALL_SECONDS = (0.8, 1.1, 1.6, 3.0, 12.0)
 
 
 class PairWorld(World):
-    """Two appliances; `appliance` is the one that became active last."""
-
     pauses = (0.0, 0.05, 0.5, 2.0, 5.0)
     settles = 80.0
 
@@ -86,7 +84,6 @@ class PairWorld(World):
         return self.robot.translated(address) if address[0] == APPLIANCE else address
 
     def _reaches(self, source: str, target: str) -> bool:
-        """Packets of nodes pass the robot's firewall."""
         ends = {source, target}
         if frozenset(ends) in self.network.cut:
             return False
@@ -106,13 +103,12 @@ class PairWorld(World):
         self.appliance = appliance
 
     async def find_out(self) -> None:
-        """Leave it open which policy is in force: a takeover may still change it."""
+        """A takeover may still change the policy in force."""
 
     def control_ready(self, appliance: Appliance) -> None:
         self.loop.outside.start(self._check_policy(appliance))
 
     async def _check_policy(self, appliance: Appliance) -> str | None:
-        """None unless the appliance answers as the active one."""
         possible = self.possible
         answer = await self.order(admin.PolicyWanted())
         if answer is None or self.appliance is not appliance or self.possible != possible:

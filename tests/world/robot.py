@@ -68,6 +68,5 @@ class Robot:
         return f"ip saddr {address} drop" not in self._rules
 
     def translated(self, address: Address) -> Address | None:
-        """None: packets to the fixed address go nowhere."""
         found = re.search(r"dnat to (\S+)", self._rules)
         return (found[1].rstrip(";"), address[1]) if found else None

@@ -1,8 +1,8 @@
 """Scripted ROS nodes, and a model of `rosmaster`.
 
-Nodes behave as rospy and roscpp do: they take a list of publishers, ask each new one, connect to the given port, retry
-broken connections, repeat a call whose outcome is unknown, and end on a shutdown request. They take no update of a
-topic while their own registering call for it is under way: this race exists with a plain ROS master as well.
+Nodes behave as rospy and roscpp do: they connect to each new publisher, retry broken connections, repeat a call whose
+outcome is unknown, and end on a shutdown request. They take no update of a topic while their own registering call for
+it is under way: this race exists with a plain ROS master as well.
 """
 
 import asyncio
@@ -26,15 +26,11 @@ _NOBODY_KNOWS = "not come back", "does not answer"  # in the answer to a call th
 
 @dataclass(eq=False)
 class Subscription:
-    """A node's state for a topic: its list of publishers, and the port that it got from each."""
-
     known: list[str] = field(default_factory=list)
     ports: dict[str, int] = field(default_factory=dict)
 
 
 class Node:
-    """`superseded`: another node has registered its name."""
-
     def __init__(self, world: "World", process: Process, name: str, port: int) -> None:
         self.world = world
         self.process = process
@@ -78,7 +74,6 @@ class Node:
     # --- calls ---
 
     async def call(self, uri: str, method: str, *params: Value) -> list[Any]:
-        """Raises one of `LOST`."""
         there = parse_node_uri(uri)
         body = build_call(method, (self.name, *params))
         answer = await self.world.network.exchange((there.host, there.port), body, _CALL_SECONDS, self.host)
@@ -88,7 +83,6 @@ class Node:
             return [-1, str(error), 0]
 
     def register(self, method: str, resource: str) -> None:
-        """Repeats the call while its outcome is unknown."""
         if (method, resource) not in self.calling:
             self.calling.add((method, resource))
             self.process.start(self._register(method, resource))

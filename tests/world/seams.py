@@ -1,7 +1,6 @@
 """Where the product meets the world: what replaces sockets, threads, and random numbers.
 
-Everything else in a world is the product's own code. A descriptor is the object itself: a listening socket or an end of
-a link, which messages carry to other processes.
+A descriptor is the object itself: a listening socket or an end of a link, which messages carry to other processes.
 """
 
 import asyncio
@@ -54,7 +53,7 @@ class Socket:
 
 
 class _Server:
-    """`HttpServer`: the network passes each request on. Its limits are not part of the world."""
+    """The network passes each request on. The limits of `HttpServer` are not part of the world."""
 
     def __init__(self, network: Network, sock: Socket, handler: Handler, **limits: Any) -> None:
         self._network = network
@@ -76,8 +75,6 @@ class _Server:
 
 
 class _AdminServer:
-    """The admin socket: operators' orders reach the machine's `administration`."""
-
     def __init__(self, administration: Any) -> None:
         self._administration = administration
 
@@ -113,7 +110,6 @@ class _Listener:
         self._sender = sender
 
     async def run(self, listening: Socket) -> None:
-        """Send to the standby that connected last, until cancelled."""
         await self._streams.serve(listening.address[1], self._serve)
 
     async def _serve(self, reader: Any, writer: Any) -> None:

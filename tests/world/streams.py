@@ -1,7 +1,7 @@
 """Connections of bytes, and datagrams, between machines: the replication, and the messages of the lease.
 
 While two machines are cut off from each other, the bytes of a connection wait, as TCP sends them again, and datagrams
-are lost. The end of a process ends its connections.
+are lost.
 """
 
 import asyncio
@@ -37,7 +37,6 @@ class StreamEnd:
             self._later(self._deliver)
 
     async def drain(self) -> None:
-        """Raises `OSError` if the connection has ended."""
         if self.closed or self.other.closed:
             raise ConnectionResetError("the connection ended")
         await asyncio.sleep(0)
@@ -66,7 +65,6 @@ class StreamEnd:
             self._later(self._deliver)
 
     def take(self, data: bytes) -> None:
-        """Empty `data` means the end."""
         if self.process.alive and not self.reader.at_eof():
             self.process.run(self.reader.feed_data if data else self._eof, data)
 
@@ -146,7 +144,6 @@ class DatagramSocket:
         self._streams.send(data, self._address, target)
 
     def recvfrom(self, _size: int) -> tuple[bytes, Address]:
-        """Raises `BlockingIOError`."""
         if not self._waiting:
             raise BlockingIOError
         return self._waiting.popleft()

@@ -51,7 +51,7 @@ POLICY = (
 
 
 class Policy:
-    """A policy, and as an oracle the hosts that it lets publish, subscribe and call; those not listed are allowed."""
+    """As an oracle, the hosts that it lets publish, subscribe and call; those not listed are allowed."""
 
     def __init__(self, publish: dict[str, str] | None = None, use: dict[str, str] | None = None) -> None:
         self.publish = {one: set(hosts.split()) for one, hosts in (publish or {}).items()}
@@ -97,7 +97,7 @@ _ORDER_SECONDS = (0.0, 0.001, 0.01)
 
 
 class World:
-    """The whole state of one history. `pauses` are the seconds between two events, `settles` those after the last."""
+    """`pauses` are the seconds between two events, `settles` those after the last."""
 
     pauses: tuple[float, ...] = (0.0, 0.001, 0.05, 0.5, 3.0, 30.0)
     settles = 150.0
@@ -146,7 +146,6 @@ class World:
         return Machine(name, self.loop, self.random.uniform(0, 1000), 1 + self.random.uniform(-0.01, 0.01))
 
     def process(self, name: str, machine: Machine) -> Process:
-        """Its end breaks off its connections."""
         process = Process(name, machine)
         process.ends.append(lambda: self.network.broken(process))
         self.processes.append(process)
@@ -164,7 +163,6 @@ class World:
         self.errors.append(BrokenPromiseError(text))
 
     def logged(self, _logger: object, level: str, event: MutableMapping[str, Any]) -> NoReturn:
-        """A fault is a broken promise."""
         text = ", ".join(f"{key}={value!r}" for key, value in event.items())
         if level == "critical":
             self.fail(f"fault: {text}")
@@ -194,7 +192,7 @@ class World:
         return (connection.host, connection.caller_id) == (node.host, node.name)
 
     def takes_name(self, node: Node) -> None:
-        """Mark the node that had this name as superseded. If it hangs it goes on; the next caller decides its state."""
+        """If the superseded node hangs it goes on; the next caller decides its state."""
         for other in self.nodes:
             if other.name == node.name and other is not node:
                 other.superseded = True
@@ -209,7 +207,7 @@ class World:
             self.decided("lookupService", grant.service, grant.host, grant.caller_id)
 
     def decided(self, call: str, resource: str, host: str, name: str) -> None:
-        """Assert that the log has the decision that allowed a call; without `strict`, a crash may lose it."""
+        """The log has the decision that allowed a call; without `strict`, a crash may lose it."""
         if self.strict and not self._recorded(
             "event = 'decision' AND decision = 'allow' AND host = ? AND resource = ? AND caller_id = ?",
             host, resource, name,
@@ -229,7 +227,7 @@ class World:
         return [path for path in paths if path.exists()]
 
     def sees(self, node: Node, uris: list[str]) -> None:
-        """Assert that nodes get ports of the appliance only: others would bypass it."""
+        """Nodes get ports of the appliance only: others would bypass it."""
         for uri in uris:
             if f"//{APPLIANCE}:" not in uri and uri != node.api:
                 self.fail(f"{node} was told {uri}, which bypasses the relay")
@@ -275,7 +273,7 @@ class World:
             self.fail(f"{connection} carries messages, which no policy allows")
 
     def check(self) -> None:
-        """Assert that the relay has only what a policy allows that may be in force."""
+        """The relay has only what a policy allows that may be in force."""
         relay = self.appliance.relay
         if not relay.process.alive:
             return
@@ -286,7 +284,7 @@ class World:
                 self.fail(f"the relay has {grant}, which no policy allows")
 
     def interrupted(self, connection: Connection) -> None:
-        """Assert that a restart of control ends no connection that all policies allow which may be in force."""
+        """A restart of control ends no connection that all policies allow which may be in force."""
         parts = self.appliance.parts
         publisher = parts and parts.core.registry.by_key(connection.key)
         if not publisher or publisher.life is not Life.LIVE or connection.kind != "topic":
@@ -372,7 +370,6 @@ class World:
             await self.find_out()
 
     async def find_out(self) -> None:
-        """After a kill of control during a reload."""
         while len(self.possible) > 1:
             await asyncio.sleep(_AGAIN_SECONDS)
             await self._learn()
@@ -621,10 +618,6 @@ def _dropped(_logger: object, _level: str, _event: MutableMapping[str, Any]) -> 
 def run(
     seed: int, say: Callable[[str], object] = lambda _line: None, kind: "type[World] | None" = None
 ) -> None:
-    """`kind` None: one appliance.
-
-    Raises `BrokenPromiseError`.
-    """
     shared = Path("/dev/shm")
     folder = Path(tempfile.mkdtemp(prefix="world-", dir=shared if shared.is_dir() else None))
     before = structlog.get_config()

@@ -1,10 +1,6 @@
 """Node APIs that tests register: one path for each node and life; the master's calls are recorded.
 
-    with FakeNodes() as nodes:
-        master.registerPublisher("/talker", "/chatter", "std_msgs/String", nodes.uri("talker"))
-        nodes.calls("talker", "publisherUpdate")
-
-They answer as real nodes do, so that the appliance's liveness checks find them alive.
+They answer as real nodes do, so that the appliance's liveness checks, which do not count as calls, find them alive.
 """
 
 import os
@@ -76,10 +72,7 @@ class FakeNodes:
             return [one.params[1:] for one in self._calls if (one.node, one.method) == (node, method)]
 
     def wait_until(self, wanted: Callable[[], bool], *, timeout: float = LIMIT) -> bool:
-        """`wanted()` is tested after each call; return False after `timeout` seconds without a call.
-
-        Liveness checks do not count as calls.
-        """
+        """`wanted()` is tested after each call; return False after `timeout` seconds without a call."""
         with self._changed:
             while not wanted():
                 before = self._told

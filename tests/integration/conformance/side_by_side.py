@@ -1,10 +1,7 @@
 """Make the same Master API call to a plain ROS master and to RVMaster, and make their answers comparable.
 
-    answers = both.call("registerPublisher", "/talker", "/chatter", "std_msgs/String", Api("talker"))
-    assert differences(answers) == []
-
-Only URIs and ids may differ by design, and only these are replaced here: each URI becomes the name of its node. `Api`
-and `ServiceApi` stand for URIs of fake nodes; each master has its own fake nodes.
+Only URIs and ids may differ by design: each URI becomes the name of its node. `Api` and `ServiceApi` stand for URIs
+of fake nodes; each master has its own.
 """
 
 import itertools
@@ -158,10 +155,7 @@ def differences(answers: Answers) -> list[str]:
 
 
 def same(one: Any, other: Any) -> bool:
-    """Return whether both are equal, including types and the order of keys.
-
-    `1` differs from `True` and `1.0`; `nan` equals `nan`.
-    """
+    """`1` differs from `True` and `1.0`; `nan` equals `nan`."""
     if type(one) is not type(other):
         return False
     if isinstance(one, dict):

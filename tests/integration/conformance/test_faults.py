@@ -1,6 +1,5 @@
 """A process of the appliance dies or hangs while a robot works, and no node has to be restarted.
 
-Every subscriber receives every publisher, every client calls every service, and both libraries watch parameters.
 After each fault all traffic resumes (`pytest -rP` prints the gap), no registration or parameter is missing, and the
 audit log is complete.
 """
@@ -106,7 +105,7 @@ def _later(name: str, number: int, event: dict[str, Any]) -> bool:
 
 
 def _ask_until_answered(asker: Process) -> None:
-    """Repeat a call until it is answered: the call in progress may fail, the next ones must not."""
+    """The call in progress may fail, the next ones must not."""
     deadline = time.monotonic() + LIMIT
     while True:
         mark = asker.mark()
@@ -157,7 +156,6 @@ def _wait_for_another_rosout(robot: RobotAtWork, old: str) -> None:
 
 
 def processes(robot: RobotAtWork) -> dict[str, int]:
-    """Return the process of each role. Raises `NoAnswerError` while control is away."""
     return {row["role"]: row["pid"] for row in robot.appliance.status()["processes"] if row["pid"]}
 
 

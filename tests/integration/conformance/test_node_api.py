@@ -1,7 +1,6 @@
 """A rospy node gives the answers to the calls in `conversations/node_api.txt`, behind either master.
 
-Differences by design: URIs and process ids (only their form is compared), the numbers of connections, and the
-text about an invalid parameter, as in `side_by_side`.
+Differences by design are those of `side_by_side`, process ids and the numbers of connections.
 """
 
 import re
@@ -26,9 +25,7 @@ _CONVERSATIONS = conversations_of(_TEXT.read_text(encoding="utf-8")).conversatio
 
 @pytest.fixture(scope="module")
 def pair(masters: Masters, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, str]]:
-    """One node is registered at a plain master, the other at the appliance. Each publishes /chatter and subscribes to
-    /heard.
-    """
+    """One node is registered at a plain master, the other at the appliance."""
     with (
         masters.lend("plain", "loopback") as plain,
         masters.lend("appliance", "loopback") as appliance,
@@ -75,7 +72,7 @@ def test_answers_are_those_of_rospy(pair: tuple[str, str], title: str) -> None:
 
 @pytest.mark.parametrize("method", ["getPid", "getBusInfo", "getBusStats"])
 def test_connection_information(pair: tuple[str, str], method: str) -> None:
-    """The value differs or changes at any time, so only its form is compared, with code and text."""
+    """The value changes at any time, so only its form is compared."""
     answers = asked(pair, (method, TESTER))
     assert answers.plain[:2] == answers.appliance[:2]
     assert len(answers.plain) == len(answers.appliance) == 3

@@ -1,6 +1,6 @@
 """Attacks that only the wire shows; `tests/unit/master/conversations/attacks.txt` has the attacks by calls.
 
-After each attack the robot's talker and its operator's listener still run (the fixture checks this).
+After each attack the robot's talker and its operator's listener still run.
 """
 
 import contextlib
@@ -64,10 +64,7 @@ def graph(battlefield: Field) -> None:
 
 @pytest.fixture(autouse=True)
 def no_hidden_port_is_revealed(field: Field) -> Iterator[None]:
-    """Assert that the answers to the rogue contain no hidden port.
-
-    Ports of `rosmaster`, of master-side endpoints and of real nodes are hidden.
-    """
+    """Ports of `rosmaster`, of master-side endpoints and of real nodes are hidden."""
     since = len(field.answers)
     yield
     hidden = {port for address, port in field.middle.run(_listening) if address == LOOPBACK}
@@ -154,7 +151,6 @@ def header(**fields: str) -> bytes:
 
 
 def relay_port(field: Field) -> int:
-    """The port has a permission for `/taker`."""
     code, _text, protocol = field.rogue(
         "requestTopic", "/taker", "/shared/talk", TCPROS, uri=outer(field, "/shared_voice")
     )
@@ -299,10 +295,7 @@ def bomb(connection: socket.socket, _request: bytes) -> None:
     "behave", [silent, endless, twice, rubbish, redirect, drip, bomb], ids=lambda one: one.__name__
 )
 def test_misbehaving_node(field: Field, behave: Any) -> None:
-    """A misbehaving node of the rogue harms only itself: its callers get a well-formed answer.
-
-    If the node gives no answer, they get a closed connection, as from a node that does not exist.
-    """
+    """Its callers get a well-formed answer, or a closed connection, as from a node that does not exist."""
     before = field.memory()
     with Impostor(field.attacker, behave) as node:
         name, topic = f"/liar_{behave.__name__}", f"/shared/liar_{behave.__name__}"

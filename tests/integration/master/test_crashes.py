@@ -62,7 +62,7 @@ class Burst:
         self.node.__exit__(*exc)
 
     def _unregister(self) -> None:
-        """Unregister all nodes: later, control would find them dead, and unregister them during another test."""
+        """Control would later find them dead, and unregister them during another test."""
         with xmlrpc.client.ServerProxy(self._field.master) as server:
             calls: Any = xmlrpc.client.MultiCall(server)
             for name in self.registered:

@@ -1,6 +1,5 @@
-"""Malformed and huge requests to RVMaster or a node's endpoint are rejected and recorded, and affect no other.
-
-`tests/unit/rpc/test_refused_requests.py` and `tests/unit/roswire/test_xmlrpc.py` have all malformed HTTP and XML-RPC.
+"""`tests/unit/rpc/test_refused_requests.py` and `tests/unit/roswire/test_xmlrpc.py` have all malformed HTTP and
+XML-RPC.
 """
 
 import re

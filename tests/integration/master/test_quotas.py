@@ -1,8 +1,7 @@
 """Two hundred addresses take as much as they can of every limited resource, and the robot does not notice.
 
 Each test attacks a row of docs/reference/quotas.md. A hundred guests may do everything below `/guest`; a hundred
-unknown hosts may do nothing. During the attack the robot publishes, calls services and the master, and starts a node,
-and the policy is reloaded.
+unknown hosts may do nothing.
 """
 
 import contextlib

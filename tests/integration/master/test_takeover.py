@@ -33,7 +33,7 @@ class Pair:
     topic: str
 
     def talker(self, host: Host) -> Process:
-        """Start the voice on a host; `ready` is set when its constructor returns, whatever the master answered."""
+        """`ready` is set when the constructor returns, whatever the master answered."""
         return self.ros.on(host).talker("rospy", self.topic, "--text", host.name, name=self.voice[1:])
 
 
@@ -70,10 +70,7 @@ def deleted(pair: Pair, voice: Process) -> None:
 
 @pytest.mark.parametrize("away", [unplugged, dropped, deleted])
 def test_a_vanished_machine_releases_its_names(pair: Pair, away: Callable[[Pair, Process], None]) -> None:
-    """After a loss of cable, power or container, the node on the other machine is heard at its first attempt.
-
-    This holds even before the silent node counts as lost.
-    """
+    """The node on the other machine is heard at its first attempt, even before the silent node counts as lost."""
     voice = pair.talker(pair.first)
     pair.ear.wait_for(event="received")
     away(pair, voice)

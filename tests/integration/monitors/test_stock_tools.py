@@ -42,7 +42,6 @@ _CALLS = (
 
 @pytest.fixture(scope="module")
 def field() -> Iterator[tuple[Appliance, Host]]:
-    """The monitor `gate` publishes /alarm; the robot is 10.77.0.10."""
     need_root()
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     with Lab("rosrv-test") as lab:

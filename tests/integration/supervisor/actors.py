@@ -1,7 +1,6 @@
 """Small processes that follow the protocol of the real ones, so that the supervisor can be tested alone.
 
-Each prints its messages as one JSON object per line. The actor for control keeps one listening socket and answers
-each connection with its process id.
+Each prints its messages as JSON. The actor for control answers each connection with its process id.
 """
 
 import asyncio

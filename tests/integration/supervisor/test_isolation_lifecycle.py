@@ -114,7 +114,6 @@ def test_removed_rules_are_restored(host: Host, isolation: ContainerIsolation, h
 def test_a_check_does_not_restore_rules_after_the_end(
     host: Host, isolation: ContainerIsolation, hidden: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The end waits for a check that runs."""
     isolation.build()
     firewall = isolation.firewall
     assert firewall is not None

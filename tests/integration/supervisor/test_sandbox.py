@@ -1,6 +1,6 @@
 """The sandbox of each process, tested from inside as the role's user, with the settings of the role's row.
 
-The same user makes the same attempts without a sandbox, which shows that the sandbox causes the refusals.
+The same attempts without a sandbox show that the sandbox causes the refusals.
 """
 
 import json
@@ -68,7 +68,7 @@ PROGRAMS = {"rosmaster", "rosout", "charon"}
 
 @pytest.fixture(scope="module")
 def place() -> Iterator["Place"]:
-    """Provide a state directory, two listening ports, and a file that every user may read and write."""
+    """A state directory, two listening ports, and a file that every user may read and write."""
     need_root()
     needs(landlock.version() >= landlock.SIGNALS, "a kernel with Landlock 6")
     # pytest's folder is closed to the users of the processes

@@ -59,7 +59,6 @@ def test_a_process_reads_only_its_own_files(appliance: Appliance, role: str) -> 
 
 
 def test_the_hidden_files_exist(appliance: Appliance) -> None:
-    """Otherwise the test above would be meaningless."""
     for name in ("signer/ca.key", "signer/audit.key", "api/key.pem", "control/state.db", *LOG):
         assert (appliance.state / name).is_file(), name
 

@@ -54,10 +54,7 @@ def up(directory: Path, *more: str) -> Iterator[Process]:
 
 
 def refusal(directory: Path, *more: str, before: tuple[str, ...] = ()) -> str:
-    """Return the standard error; standard output must be empty.
-
-    `before` is a program, with its arguments, that runs the start.
-    """
+    """Standard output must be empty. `before` is a program, with its arguments, that runs the start."""
     done = subprocess.run(
         [*before, *command(directory, *more)],
         env=ENVIRONMENT,

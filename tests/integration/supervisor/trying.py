@@ -96,7 +96,6 @@ def _connect(port: int) -> None:
 
 
 def _call(name: str) -> str:
-    """Make a system call without arguments; a call that this machine lacks is not tried."""
     number = ctypes.CDLL(LIBRARY).seccomp_syscall_resolve_name(name.encode())
     if number < 0:
         return "not there"

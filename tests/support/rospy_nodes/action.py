@@ -12,7 +12,7 @@ HEARD = "/feedback_heard"  # the client's last feedback; 0 once it knows its goa
 
 
 def serve():
-    """Count up to each goal. actionlib drops feedback that overtakes the goal or is overtaken by the result."""
+    """actionlib drops feedback that overtakes the goal or is overtaken by the result."""
 
     def until(reached):
         while not reached() and not rospy.is_shutdown():

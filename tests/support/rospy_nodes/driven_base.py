@@ -1,7 +1,7 @@
 """A base on /cmd_vel with odometry on /odom: driven_base.py TIMEOUT.
 
-It obeys a command for TIMEOUT seconds (0: until the next one). Events: `moves` and `stands` with the speed that a
-command changes, and `silent` if no command came for 0.3 s.
+It obeys a command for TIMEOUT seconds (0: until the next one). Events: `moves` and `stands` with a changed speed, and
+`silent` if no command came for 0.3 s.
 """
 
 import sys
@@ -14,8 +14,6 @@ from report import init_node, report
 
 
 class Base:
-    """The base's speed, and when the last command came."""
-
     def __init__(self, timeout):
         self.timeout = timeout
         self.speed = 0.0
@@ -44,7 +42,6 @@ class Base:
 
 
 def main():
-    """Drive until terminated."""
     init_node("driven_base")
     base = Base(float(rospy.myargv()[1]))
     rospy.Subscriber("/cmd_vel", Twist, base.obey, tcp_nodelay=True)

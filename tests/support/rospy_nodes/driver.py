@@ -6,7 +6,6 @@ from report import init_node, report
 
 
 def main():
-    """Drive until terminated."""
     init_node("driver")
     publisher = rospy.Publisher("/cmd_vel", Twist, queue_size=10, tcp_nodelay=True)
     report("ready", name=rospy.get_name(), uri=rospy.get_node_uri())

@@ -1,7 +1,7 @@
 """Load rospy in Debian's Python, and fork for each program that `tests/support/forks.py` orders.
 
-An order is a message with the program, its environment and folder, and with five descriptors: its standard input,
-output and error, its network namespace, and a socket for its process id and later for its exit status.
+An order has the program, its environment and folder, and five descriptors: standard input, output and error, network
+namespace, and a socket for its process id and later for its exit status.
 """
 
 import contextlib

@@ -5,15 +5,14 @@ import rospy
 
 
 def report(event, **fields):
-    """Print one event with one write and no lock, because a signal handler may interrupt another report."""
+    """One write and no lock, because a signal handler may interrupt another report."""
     os.write(1, (json.dumps({"event": event, **fields}) + "\n").encode())
 
 
 def init_node(name):
     """Start a node that ends as soon as it has unregistered when it is interrupted.
 
-    rospy itself goes on for another half second. In that time one of its threads polls the closed server without a
-    pause, which takes more processor time than all of the node's work.
+    rospy itself goes on for half a second, in which a thread polls the closed server without a pause.
     """
     rospy.init_node(name)
     rospy.core.add_shutdown_hook(_end)  # the last hook: rospy's own hooks have closed its connections

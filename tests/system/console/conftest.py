@@ -79,7 +79,6 @@ def token(appliance: Appliance) -> Callable[..., str]:
 
 @pytest.fixture
 def opened(browser: Browser, appliance: Appliance) -> Iterator[Callable[..., Reader]]:
-    """The default token is the first, an admin's."""
     with ExitStack() as stack:
 
         def open_window(token: str | None = None, **look: Any) -> Reader:

@@ -1,8 +1,7 @@
 """Make the console's pictures in docs/pictures: `python -m tests.system.console.pictures [MINUTES]`, as root.
 
-The first pictures show an appliance with a robot of a hundred nodes; an operator's machine tries to command the arm.
-The README's picture shows this robot after MINUTES (an hour). The others show the demonstration and its attacker.
-The browser has 1280 by 800 pixels and light colours.
+The README's picture shows a robot of a hundred nodes after MINUTES (an hour), whose arm an operator's machine tries
+to command. Others show the demonstration and its attacker.
 """
 
 import base64
@@ -146,7 +145,6 @@ def _robot(reader: Reader) -> None:
 
 
 def _work(robot: Robot, minutes: float) -> None:
-    """Let nodes read parameters at a varying rate; every half minute an intruder tries to command the arm."""
     end = time.monotonic() + 60 * minutes
     intruders = itertools.cycle(_UNKNOWN_NODES)
     for second in itertools.count():

@@ -1,9 +1,5 @@
 """Use the console in a real browser, and check that the page does nothing that it must not do.
 
-    with Reader(browser, appliance, token) as reader:
-        reader.go("audit")
-        reader.page.get_by_role("button", name="Verify").click()
-
 Leaving the block fails if the page requested anything from another host, violated its own content security policy,
 raised a script error, or set a cookie.
 """
@@ -36,8 +32,6 @@ _BROWSER_MESSAGES = ("Failed to load resource", "net::ERR_")
 
 
 class Reader:
-    """A browser window with a width and a theme; without a token it shows the sign-in page."""
-
     def __init__(
         self,
         browser: Browser,
@@ -98,7 +92,6 @@ class Reader:
         wait_until(self.page, "document.documentElement.scrollWidth <= innerWidth")
 
     def axe(self) -> list[str]:
-        """axe-core checks WCAG 2.2 AA and best practices."""
         self.settle()
         found = Axe().run(
             self.page,

@@ -30,8 +30,8 @@ def refused(appliance: Appliance, attempt: Callable[..., Any]) -> None:
 @pytest.mark.parametrize("theme", ["light", "dark"])
 @pytest.mark.parametrize("width", [1440, 390])
 def test_axe_finds_nothing(theme: str, width: int, opened: Callable[..., Reader]) -> None:
-    """Every view, dark and light, wide and narrow, with a record, an error and a dialog open: no violation; and no
-    view is wider than its window.
+    """Every view, dark and light, wide and narrow, with a record, an error and a dialog open; none is wider than its
+    window.
     """
     reader = opened(theme=theme, width=width)
     found: dict[str, list[str]] = {}

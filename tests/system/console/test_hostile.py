@@ -16,7 +16,6 @@ LONG = "/" + "n" * 10_000
 
 @pytest.fixture(autouse=True)
 def sent(appliance: Appliance, attempt: Callable[..., Any]) -> None:
-    """Try each hostile text as the name of a node and of a topic; wait until all of it is recorded."""
     for name in (MARKUP, REORDERING, INVISIBLE, CONTROL, LONG):
         attempt("registerPublisher", name, "/guarded", "std_msgs/String", "http://127.0.0.1:1/")
         attempt("registerPublisher", "/somebody", name, "std_msgs/String", "http://127.0.0.1:1/")

@@ -30,7 +30,6 @@ def appliance(tmp_path: Path) -> Iterator[Appliance]:
 
 @pytest.fixture
 def inside(appliance: Appliance, playwright: Playwright, chromium: str, tmp_path: Path) -> Iterator[Browser]:
-    """Start a browser on that host, because the console is served on its loopback only."""
     host = appliance.host
     assert isinstance(host, Host)
     program = tmp_path / "chromium"

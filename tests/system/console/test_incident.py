@@ -214,7 +214,6 @@ def test_a_viewer_sees_which_role_may_read_messages(
 def test_a_monitor_in_shadow_mode_says_what_it_would_drop_and_is_promoted(
     appliance: Appliance, opened: Callable[..., Reader], tmp_path: Path
 ) -> None:
-    """In shadow mode the monitor counts what it would have dropped, and drops nothing."""
     appliance.rosrv("monitor", "disable", "hush")
     page = opened().go("monitors/hush", heading="hush")
     press(page.get_by_role("button", name="Try"))

@@ -1,4 +1,4 @@
-"""People sign in to the console at a provider that is not ours: canaille, with an authority of its own."""
+"""The provider is not ours: canaille, with an authority of its own."""
 
 import re
 from collections.abc import Callable, Iterator

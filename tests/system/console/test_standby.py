@@ -80,7 +80,6 @@ def tokens(site: StandbySite) -> dict[str, str]:
 def remote_browser(
     site: StandbySite, chromium: str, playwright: Playwright, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[Browser]:
-    """The robot itself cannot reach the standby."""
     host = site.lab.host("browser", "10.79.0.30/24")
     program = tmp_path_factory.mktemp("browser") / "chromium"
     program.write_text(f'#!/bin/sh\nexec ip netns exec {host.namespace.name} {chromium} "$@"\n')
@@ -92,10 +91,7 @@ def remote_browser(
 
 @pytest.fixture
 def pair(site: StandbySite, remote_browser: Browser, tokens: dict[str, str]) -> Iterator[PairConsoles]:
-    """Return the consoles, with `a` active; the windows are closed and checked after the test.
-
-    A machine that starves the lease for a second makes `b` active.
-    """
+    """A machine that starves the lease for a second makes `b` active, so `a` is made active before each test."""
     if site.holder() != "a":
         site.promote(site.holder())
         site.until_taken_over("a")
@@ -168,7 +164,7 @@ def test_a_standby_that_could_not_start_is_shown_on_both(pair: PairConsoles) -> 
 
 
 def _listener() -> socket.socket | None:
-    """Listen on the port of the ROS master; None while the check of the takeover listens there, for a moment."""
+    """None while the check of the takeover listens there, for a moment."""
     try:
         return socket.create_server(("0.0.0.0", 11311))
     except OSError as error:
@@ -178,7 +174,6 @@ def _listener() -> socket.socket | None:
 
 
 def test_only_admins_switch_over(pair: PairConsoles) -> None:
-    """It opens no dialog for an operator."""
     page = pair.open("a", "operator").go("now")
     button = panel(page).get_by_role("button", name="Switch over…")
     expect(button).to_have_attribute("aria-disabled", "true")
@@ -188,8 +183,8 @@ def test_only_admins_switch_over(pair: PairConsoles) -> None:
 
 
 def test_a_switchover_leads_to_the_other_console_and_back(pair: PairConsoles) -> None:
-    """After the order, the page becomes that of a standby; the same token opens the other console. On the way back
-    the first page is live again without a reload, with unsaved work.
+    """The same token opens the other console. On the way back the first page is live without a reload, with unsaved
+    work.
     """
     reader = pair.open("a", "admin")
     page = reader.go("policy")

@@ -106,7 +106,6 @@ def test_a_person_sees_and_drives_the_robot_through_their_own_door(
 
 
 def drive(page: Page, base: Process) -> None:
-    """Each end of a hold stops the robot."""
     own = page.get_by_role("region", name="Your door")
     pad = own.get_by_role("application")
     own.get_by_label("Commands").fill("/cmd_vel")
@@ -139,7 +138,6 @@ def stopped(base: Process) -> bool:
 
 
 def _last(base: Process) -> list[float]:
-    """`rostopic echo -p` prints the time first."""
     texts = [str(event.get("text", "")) for event in base.events]
     lines = [text for text in texts if re.fullmatch(r"\d+(,-?[\d.e-]+){6}", text)]
     return [float(number) for number in lines[-1].split(",")[1:]] if lines else [0.0]

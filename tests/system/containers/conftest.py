@@ -31,7 +31,6 @@ def images() -> None:
 
 @pytest.fixture(scope="module")
 def site(images: None) -> Iterator[Site]:
-    """The engine's data is for one engine, so it ends with the module."""
     with Lab("rosrv-engine") as lab:
         machine, laptop = lab.host("machine", "10.79.0.1/24"), lab.host("laptop", "10.79.0.50/24")
         with Engine(machine) as engine:

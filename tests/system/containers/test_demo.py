@@ -28,7 +28,7 @@ HELPERS = {"tini", "python", "sh", "cat", "nft"}
 
 @pytest.fixture(scope="module")
 def attacks(demo: Compose) -> dict[str, dict[str, Any]]:
-    """Return the visitor's attempts, once all are made and the operator has driven, aimed and fired."""
+    """All are made, and the operator has driven, aimed and fired."""
     demo.wait_for_log("ocu", '"fired"', timeout=120)
     demo.wait_for_log("visitor", LAST_ATTACK, timeout=180)
     lines = demo("logs", "--no-color", "visitor").stdout.splitlines()
@@ -136,7 +136,6 @@ def test_only_documented_ports_are_published(site: Site, demo: Compose) -> None:
 def test_this_machine_reaches_the_console_and_the_laptop_does_not(
     site: Site, demo: Compose, tmp_path: Path
 ) -> None:
-    """On the machine, 127.0.0.1:8443 answers the first token over TLS; hosts on its network cannot connect."""
     token = demo.exec("appliance", "cat", "/var/lib/rosrv/first-token").stdout.strip()
     certificate = tmp_path / "certificate.pem"
 

@@ -47,14 +47,12 @@ def with_doors(policy: str) -> str:
 
 
 def documented_override() -> str:
-    """Return the file that the page shows for an agent on this machine."""
     page = (ROOT / "docs" / "doors.md").read_text()
     return page.partition("```yaml\n")[2].partition("```")[0]
 
 
 @pytest.fixture(scope="module")
 def doors(site: Site, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Compose]:
-    """Run the robot beside the appliance, with a door for a person and two for agents."""
     folder: Path = project(tmp_path_factory.mktemp("project"))
     policy = folder / "policies" / "containers.ini"
     policy.write_text(with_doors(policy.read_text()))
@@ -100,7 +98,6 @@ def opened(url: str, origin: str | None = None) -> ClientConnection:
 
 
 def answer(client: ClientConnection, topic: str) -> Any:
-    """Return the first frame after a subscription, which then ends."""
     client.send(json.dumps({"op": "subscribe", "topic": topic, "id": topic}))
     frame = json.loads(client.recv(SECONDS))
     client.send(json.dumps({"op": "unsubscribe", "topic": topic, "id": topic}))

@@ -1,7 +1,7 @@
-"""docs/fleet.md, followed command by command: from nothing to a collector in containers and twenty robots.
+"""docs/fleet.md, followed command by command, then the collector's backup, restore, upgrade and retention.
 
-Then the collector's backup, restore, upgrade and retention. Three robots are real appliances, and a later one
-is an appliance in a container. The others have a real log, a real key, `rosrv fleet join` and the appliance's pusher.
+Three robots are real appliances, and a later one is an appliance in a container. The others have a real log, a real
+key, `rosrv fleet join` and the appliance's pusher.
 """
 
 import json
@@ -63,8 +63,6 @@ except psycopg.OperationalError as error:
 
 @dataclass(frozen=True)
 class Walk:
-    """The machine is that of the collector."""
-
     folder: Path
     machine: Host
     compose: Compose
@@ -73,7 +71,6 @@ class Walk:
     contained: dict[str, Compose]
 
     def run(self, block: str, folder: str = "") -> str:
-        """The images are built before."""
         environment = {
             "PATH": f"{self.folder}/bin:{Path(ROSRV).parent}:{os.environ['PATH']}",
             "HOME": str(self.folder), "DOCKER_HOST": self.compose.engine.address, "COMPOSE_HTTP_TIMEOUT": "120",
@@ -108,7 +105,6 @@ class Walk:
         return set(self.compose.exec("collector", *find).stdout.split())
 
     def proofs(self) -> dict[str, int]:
-        """The last proven record of each robot."""
         found = map(json.loads, self.fleet("verify", "--json").splitlines())
         return {proof["robot"]: proof["last"] for proof in found if proof["ok"] and not proof["missing"]}
 

@@ -19,7 +19,6 @@ STOP_SECONDS = 5.0
 
 @pytest.fixture
 def talking(site: Site, tmp_path: Path) -> Iterator[Compose]:
-    """Robot and operator are connected."""
     compose = site.engine.compose(project(tmp_path), "life")
     try:
         compose("--profile", "demo", "up", "--detach", "--no-build", "landshark", "ocu")
@@ -36,10 +35,9 @@ def drives_on(compose: Compose) -> None:
 
 
 def test_a_stop_is_clean_and_quick(alone: Compose) -> None:
-    """`docker stop` ends it cleanly, on an idle machine within five seconds.
+    """On an idle machine within five seconds. Processes that need more than 3.3 s are killed.
 
-    Processes that need more than 3.3 s are killed. As this limit does not grow with the load of the machine, only one
-    stop of three must need no kill.
+    As this limit does not grow with the load of the machine, only one stop of three must need no kill.
     """
     assert any("SIGKILL" not in log_of_a_stop(alone) for _attempt in range(3)), alone.story()
 

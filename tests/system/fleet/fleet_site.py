@@ -102,7 +102,6 @@ class FleetSite:
         self.stop(signal.SIGKILL)
 
     def get(self, path: str, token: str | None = "", **parameters: Any) -> httpx.Response:
-        """The default token is a viewer's."""
         headers = {} if token is None else {"Authorization": f"Bearer {token or self.token}"}
         with self.client() as client:
             return client.get(path, headers=headers, params=parameters)
@@ -183,7 +182,6 @@ class FleetRobot:
         self.log.request_signatures()
 
     def rewind(self, number: int) -> None:
-        """As an old copy of the log would be."""
         with sqlite3.connect(self.log_file) as log:
             (sequence,) = log.execute(
                 "SELECT sequence FROM checkpoint WHERE number = ?", (number,)

@@ -6,7 +6,6 @@ from tests.unit.features.evidence.conftest import Control
 
 
 def incident(robot: FleetRobot, place: Path, bag: bytes = b"") -> Path:
-    """The messages of a recording are `bag`."""
     control = Control(robot.log)
     control.load_policy(7, "[Nodes]\ndefault = *\n")
     control.load_specifications(2, {"a.rv": "a() { }"})

@@ -1,4 +1,4 @@
-"""A private PostgreSQL 15 for tests: a cluster in a temporary folder, on a Unix socket only, as user postgres."""
+"""A cluster of PostgreSQL 15 in a temporary folder, on a Unix socket only, as user postgres."""
 
 import contextlib
 import os
@@ -35,7 +35,6 @@ class PostgresCluster:
         return f"host={self.folder} user=postgres dbname={name}"
 
     def make(self) -> None:
-        """Its files need not survive a power cut."""
         command = [
             _PROGRAMS / "initdb",
             "--auth=trust",

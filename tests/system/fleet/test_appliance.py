@@ -21,7 +21,6 @@ PUSHER = (61023, 61014)  # its user, in the group that may read the log
 
 
 def pushing(site: FleetSite, folder: Path) -> dict[str, Any]:
-    """The files are readable by the appliance's user."""
     assert site.data is not None
     own = make_certificates(folder / "fleet", authority="authority of arm1")
     shutil.copy(site.server.ca, folder / "fleet" / "collector-ca.pem")

@@ -177,7 +177,6 @@ def strict(database: str, tmp_path: Path) -> Iterator[FleetSite]:
 
 @pytest.fixture
 def hasty(database: str, tmp_path: Path) -> Iterator[FleetSite]:
-    """Its short limits of time suffice for honest clients."""
     limits = {"upload_seconds": 10.0, "header_seconds": 10.0}
     with running(FleetSite(tmp_path / "site", database, limits)) as found:
         yield found
@@ -281,8 +280,6 @@ def test_a_collector_with_another_key_is_not_believed(site: FleetSite, make_robo
 
 
 class _Busy(CollectorConnection):
-    """It asks every robot to wait for ten minutes."""
-
     def get(self, path: str, longest: int = 0) -> bytes:
         raise CollectorError(f"not now: {path} {longest}", 503, 600.0)
 

@@ -25,8 +25,6 @@ POLICY = (
 
 
 class Operator:
-    """Uses the command `rosrv-fleet` only."""
-
     def __init__(self, site: FleetSite, folder: Path) -> None:
         self._site = site
         self.repository = folder / "repository"

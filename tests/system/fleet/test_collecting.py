@@ -147,7 +147,6 @@ def test_a_search_needs_a_token(shared: FleetSite) -> None:
 
 
 def test_the_command_line_searches(shared: FleetSite) -> None:
-    """`rosrv-fleet search` takes the words of `rosrv audit search`, and prints records of all robots."""
     lines = shared.run("search", "--topic", "/cmd_1*", "--limit", "1000", "--json").stdout.splitlines()
     assert len(lines) == 55
     assert shared.run("search", "--since", "soon", status=2).stderr.startswith(

@@ -29,7 +29,6 @@ def _connect(site: FleetSite, source: str = "127.0.0.1") -> socket.socket:
 
 
 def _is_closed(connection: socket.socket) -> bool:
-    """Waits up to a second."""
     connection.settimeout(1.0)
     try:
         return connection.recv(1) == b""

@@ -29,7 +29,6 @@ _MARKUP = "<script>document.title='owned'</script><b id=owned>"
 
 @contextmanager
 def opened_page(width: int = 1280, theme: Literal["light", "dark"] = "light") -> Iterator[Page]:
-    """An error in the page's console fails the test."""
     program = need_program("chromium", "chromium")
     with sync_playwright() as playwright:
         browser: Browser = playwright.chromium.launch(executable_path=program, args=["--no-sandbox"])
@@ -108,8 +107,6 @@ def test_a_wrong_token_is_refused(site: FleetSite) -> None:
 
 
 class RolloutSite:
-    """Two rollouts of a group whose robots only report."""
-
     def __init__(self, site: FleetSite, folder: Path, make_robot: MakeRobot) -> None:
         self.site = site
         self.operator = Operator(site, folder / "operator")
@@ -124,7 +121,6 @@ class RolloutSite:
         return self.operator.token.read_text().strip()
 
     def start(self) -> None:
-        """Robots are not silent while a slow browser works."""
         wanted = {"bundle": BUNDLE, "gates": {"healthy_seconds": 600, "silent_seconds": 3600}}
         with self.site.client() as client:
             header = {"Authorization": f"Bearer {self.token}"}
@@ -221,7 +217,7 @@ PAGES = {
 
 
 def test_axe_finds_nothing(rollouts: RolloutSite) -> None:
-    """On every page axe finds nothing, also in the dark; at 200 % and 400 % zoom no page is wider than the window."""
+    """Also in the dark; at 200 % and 400 % zoom no page is wider than the window."""
     robot = rollouts.robots[0]
     robot.record(
         10, reason="no rule of the policy names 10.0.0.5, which registers /a_publisher_with_a_long_name"

@@ -33,7 +33,6 @@ class Carrier:
             return client.post("/v1/evidence", params={"robot": robot}, content=bundle, headers=headers)
 
     def stored(self) -> list[dict[str, Any]]:
-        """Fails if an unfinished upload is on the disk."""
         assert list(self.incoming.iterdir()) == []
         return list(self.site.get("/v1/evidence").json())
 
@@ -247,7 +246,7 @@ def test_a_bundle_of_a_rewritten_log_is_refused(
 
 
 def test_sizes_have_limits(site: FleetSite, make_robot: MakeRobot, tmp_path: Path) -> None:
-    """Each limit is named in the refusal: that of one bundle, and that of all bundles of a robot."""
+    """One limit is for a bundle, the other for all bundles of a robot."""
     operator, robot = Operator(site, tmp_path / "operator"), make_robot("arm1")
     first, second = (incident(robot, tmp_path / f"{number}.zip") for number in (1, 2))
     robot_bytes = first.stat().st_size + second.stat().st_size - 1

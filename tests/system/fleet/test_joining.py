@@ -51,7 +51,6 @@ def state_of(robot: FleetRobot) -> Path:
 
 
 def join(robot: FleetRobot, file: Path, status: int = 0) -> str:
-    """Standard error comes last in the output."""
     done = rosrv("fleet", "join", str(file), "--state", str(state_of(robot)))
     assert done.returncode == status, done.stdout + done.stderr
     return done.stdout + done.stderr
@@ -141,7 +140,7 @@ def test_an_expired_invitation_is_refused(inviting: FleetSite, make_robot: MakeR
 
 
 def test_one_of_two_wins(inviting: FleetSite, make_robot: MakeRobot, tmp_path: Path) -> None:
-    """If twenty requests with one token arrive at the same time, one enrols the robot."""
+    """Twenty requests with one token arrive at the same time."""
     robot = make_robot("arm1", enrolled=False)
     file = invite(inviting, "arm1", tmp_path / "arm1.json")
     requests = [request_of(robot, file) for _ in range(20)]
@@ -182,7 +181,7 @@ def _joins(site: FleetSite) -> list[str]:
 
 @contextlib.contextmanager
 def without_answers(port: int, answered: Callable[[], bool]) -> Iterator[int]:
-    """Forward a connection to a port of the loopback, except what comes back after the TLS handshake; yield the port.
+    """Forward a connection to a port of the loopback, except what comes back after the TLS handshake.
 
     End the connection with the first bytes that come back when `answered`: those before are TLS tickets.
     """
@@ -275,7 +274,7 @@ def test_guessing_has_to_wait(inviting: FleetSite, make_robot: MakeRobot, tmp_pa
 
 
 def test_a_second_join_renews(inviting: FleetSite, make_robot: MakeRobot, tmp_path: Path) -> None:
-    """With a new invitation a robot replaces its certificate; one with another log key cannot take its name."""
+    """A robot with another log key cannot take its name."""
     robot, other = make_robot("arm1", enrolled=False), make_robot("other", enrolled=False)
     join(robot, invite(inviting, "arm1", tmp_path / "first.json"))
     earlier = (state_of(robot) / "joined" / "robot.pem").read_text()

@@ -85,7 +85,6 @@ def _more_than(site: FleetSite, count: int) -> bool:
 
 
 def _check_receipts(site: FleetSite, robot: FleetRobot) -> None:
-    """Fail if the collector signed a receipt for a segment that is not stored."""
     assert site.data is not None
     store = SegmentStore(site.data, 1)
     lines = (robot.folder / "state" / "receipts.ndjson").read_bytes().splitlines()

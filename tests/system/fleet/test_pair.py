@@ -105,7 +105,6 @@ def _configure(site: StandbySite, operator: Operator) -> None:
 
 
 def _bundles(site: StandbySite, name: str) -> tuple[str, bool] | None:
-    """None until an appliance has verified the metadata."""
     state = site.appliances[name].status()["bundles"]
     return None if state["checked"] is None else (state["in_force"], state["changed"])
 

@@ -131,7 +131,6 @@ def test_an_unfinished_removal_is_finished(site: FleetSite, make_robot: MakeRobo
 
 
 def test_a_removed_segment_is_not_accepted_again(site: FleetSite, make_robot: MakeRobot) -> None:
-    """A robot gets no receipt for a segment that retention has removed: it would not be stored."""
     robot = make_robot("arm1")
     _aged(site, robot, [50, 0])
     _restart_with_retention(site)

@@ -33,8 +33,6 @@ RINGS = (Ring("canary", ["r-0", "r-1"]), Ring("half", [], 50), Ring("rest", [], 
 
 @dataclass
 class Robot:
-    """A function judges bundles instead of control."""
-
     name: str
     poller: Poller
     judge: Callable[[BundleOffered], str]
@@ -55,8 +53,6 @@ class Robot:
 
 
 class Fleet:
-    """`poll` lets several robots poll at a time."""
-
     def __init__(self, site: RobotSite, running: RolloutCollector, folder: Path) -> None:
         self.site, self.collector, self.folder = site, running, folder
         self.robots: dict[str, Robot] = {}
@@ -110,7 +106,6 @@ class Fleet:
         return dict(answer.json())
 
     def state(self) -> dict[str, Any]:
-        """Raises `NoAnswerError` until the collector returns a rollout."""
         answer = self.operator.get(f"/v1/rollouts/{SITE}/{GROUP}")
         found = answer.json()["rollout"] if answer.status_code == 200 else None
         if found is None:

@@ -38,7 +38,6 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TunnelSite]:
 
 @pytest.fixture(scope="module")
 def kit(site: TunnelSite) -> Path:
-    """The policy trusts `ocu-1`."""
     return site.kit()
 
 
@@ -49,7 +48,6 @@ def other(site: TunnelSite) -> Host:
 
 @pytest.fixture(scope="module")
 def others_kit(site: TunnelSite) -> Path:
-    """`ocu-2` is enrolled, but without rights."""
     return site.kit("add", "ocu-2")
 
 
@@ -69,7 +67,6 @@ class Datagrams:
         return self._arrived.get(timeout=LIMIT)
 
     def first_of(self, word: bytes, send: Callable[[bytes], None]) -> str:
-        """No other datagrams may arrive."""
         for number in range(int(LIMIT)):
             send(b"%s %d" % (word, number))
             with contextlib.suppress(queue.Empty):
@@ -113,7 +110,6 @@ def esp_is_charons(site: TunnelSite) -> bool:
 
 @contextlib.contextmanager
 def deaf(host: Host) -> Iterator[None]:
-    """Arriving packets are still captured on the wire."""
     table = "add table ip hold; add chain ip hold in { type filter hook prerouting priority -400; };"
     _nft(host, table + "add rule ip hold in udp dport 4500 drop")
     try:
@@ -128,9 +124,7 @@ def _nft(host: Host, command: str) -> None:
 
 
 def test_replayed_packets_are_refused(site: TunnelSite, kit: Path, datagrams: Datagrams) -> None:
-    """A replayed or changed packet of a tunnel does not arrive a second time, from any source; the log counts the
-    replays, where charon sees them.
-    """
+    """It does not arrive a second time, from any source; the log counts the replays, where charon sees them."""
     before = site.mark
     with site.joined(kit) as joined, Capture(lab_host(site).namespace) as wire:
         send(joined, datagrams.port, b"first")
@@ -239,9 +233,7 @@ def test_the_name_must_match_the_certificate(
 
 
 def test_a_trusted_address_without_a_tunnel_is_denied(site: TunnelSite, kit: Path) -> None:
-    """The trusted host itself is refused in clear text: under its own address by the policy, under its virtual
-    one by the firewall.
-    """
+    """Under its own address by the policy, under its virtual one by the firewall."""
     with site.joined(kit) as joined:
         virtual = joined.address
     interfaces.add_address(site.ocu.namespace, INTERFACE, f"{virtual}/32")
@@ -389,7 +381,6 @@ def _throw_garbage(host: Host) -> None:
 
 
 def _begin_handshakes(host: Host, first: Frame, count: int) -> None:
-    """Each packet has another address and SPI."""
     start = first.header
     frames = []
     for number in range(count):

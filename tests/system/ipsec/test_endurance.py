@@ -96,7 +96,6 @@ def restarted(site: TunnelSite, how: int) -> Iterator[None]:
 
 @pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGKILL])
 def test_both_ends_restart(site: TunnelSite, how: int) -> None:
-    """The tunnel returns in whatever order the ends restart."""
     kit = site.kit()
     host = site.join(kit)
     with host:

@@ -1,7 +1,7 @@
 """A host enrols with a one-time token, using the kit's own scripts: join, renew, leave.
 
-The laptop is a network namespace with its own /etc and /run, without systemd. Before the tunnel is up, REST is
-reached from the management network.
+The laptop is a network namespace without systemd. Before the tunnel is up, REST is reached from the management
+network.
 """
 
 import contextlib
@@ -343,7 +343,7 @@ def endless(laptop: ScriptHost, commands: str) -> Iterator[None]:
 
 
 def test_revocation_while_rekeying(site: TunnelSite, laptop: ScriptHost, tmp_path: Path) -> None:
-    """A host that rekeys without pause is out within a second of its revocation, and stays out."""
+    """It is out within a second of its revocation, and stays out."""
     script = tmp_path / "join.sh"
     joined = laptop.run("sh", str(script), awaited(site, "other", script))
     laptop.address = re.findall(r"ROS_IP=(\S+)", joined.stdout)[0]

@@ -17,9 +17,7 @@ _FIRST = 1 << 70  # as long as the authority's serial numbers
 
 
 def test_tunnels_work_with_thousands_of_revoked_certificates(tmp_path: Path) -> None:
-    """With 2,000 of an enrolled host and 3,000 of others revoked, the latest certificate opens the tunnel, the last
-    does not.
-    """
+    """The latest certificate of a host with 2,000 revoked ones opens the tunnel, the last does not."""
     need_root()
     need_strongswan()
     with Lab("rosrv-list") as lab, TunnelSite(lab, tmp_path) as site:
@@ -45,7 +43,6 @@ def test_tunnels_work_with_thousands_of_revoked_certificates(tmp_path: Path) -> 
 
 
 def revoke_many(state: Path) -> None:
-    """As if hosts had renewed their certificates for months."""
     now = time.time()
     names = ["ocu-1"] * 2_000 + ["gone"] * 3_000
     rows = [

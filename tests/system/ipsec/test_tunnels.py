@@ -26,7 +26,6 @@ from tests.support.waiting import allowed
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TunnelSite]:
-    """At first no host is enrolled."""
     need_root()
     need_strongswan()
     with Lab("rosrv-ipsec") as lab, TunnelSite(lab, tmp_path_factory.mktemp("ipsec")) as one:

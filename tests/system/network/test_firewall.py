@@ -89,7 +89,6 @@ def settings(port: int, **others: Any) -> FirewallSettings:
 
 
 def ruleset(host: Host) -> str:
-    """Counters are left out."""
     commands = ("nft -s list ruleset", "iptables-legacy-save -t filter", "ip6tables-legacy-save -t filter")
     outputs = []
     for command in commands:
@@ -273,7 +272,7 @@ def test_hosts_without_a_bucket_have_one_common_limit(
 
 
 def flood(host: Host, address: str, servers: tuple[socket.socket, ...], rounds: int) -> int:
-    """Returns how many succeeded at the first attempt; a second takes 1 s."""
+    """Return how many succeeded at the first attempt; a second takes 1 s."""
     with contextlib.ExitStack() as stack, host.entered():
         for server in servers * rounds:
             target = (address, server.getsockname()[1])
@@ -282,7 +281,6 @@ def flood(host: Host, address: str, servers: tuple[socket.socket, ...], rounds: 
 
 
 def waiting(server: socket.socket, host: Host) -> int:
-    """Closes the connections; returns the number of the host's."""
     server.settimeout(0.3)
     found = 0
     with contextlib.suppress(TimeoutError):

@@ -32,9 +32,8 @@ def _machine() -> None:
 
 
 def calls_during(flood: "subprocess.Popen[str]", robot: Host, server: socket.socket) -> list[bool]:
-    """Returns whether the flood delayed each call; an unanswered call raises.
-
-    A delayed call has sent a packet again; without that, the machine was busy.
+    """Return whether the flood delayed each call: only such a call has sent a packet again. An unanswered call
+    raises.
     """
     address, pause = server.getsockname()[:2], threading.Event()
     delayed = []
@@ -52,7 +51,7 @@ def calls_during(flood: "subprocess.Popen[str]", robot: Host, server: socket.soc
 
 
 def repeated_packets(connection: socket.socket) -> int:
-    """The number is `tcpi_total_retrans` of `struct tcp_info` (linux/tcp.h)."""
+    """`tcpi_total_retrans` of `struct tcp_info` (linux/tcp.h)."""
     return int.from_bytes(
         connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, 104)[100:], sys.byteorder
     )
@@ -70,10 +69,10 @@ def accepted(server: socket.socket, port: int) -> socket.socket:
 
 
 def unharmed(robot: Host, attacker: Host, protected: Host, ports: tuple[int, ...], backlog: int) -> None:
-    """Flood each port under the robot's address, on both families; assert that the robot's calls are answered at once.
+    """Flood each port under the robot's address, on both families; the robot's calls are answered at once.
 
-    A forged half-open connection on the port that the robot then chooses delays that call by a second, after which its
-    packet is sent again. Up to a hundredth of the calls may be delayed in this way.
+    A forged half-open connection on the port that the robot then chooses delays that call by a second. Up to a
+    hundredth of the calls may be delayed in this way.
     """
     for target, named in ((protected.address, robot.address), (protected.address6, robot.address6)):
         for port in ports:

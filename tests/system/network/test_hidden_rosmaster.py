@@ -63,7 +63,6 @@ def master(host: Host, tmp_path: Path) -> "Iterator[subprocess.Popen[str]]":
 
 
 def wait_until_listening(host: Host, process: "subprocess.Popen[str]") -> None:
-    """Waits at most half a minute."""
     for _ in range(300):
         with host.entered(), socket.socket() as client:
             if client.connect_ex(("127.0.0.1", PORT)) == 0:

@@ -100,9 +100,7 @@ def test_source_addresses_are_preserved_in_the_namespace(bare: Host, node: Host,
 
 @pytest.mark.parametrize("wildcard", ["0.0.0.0", "::"])
 def test_a_continuous_tunnel_follows_the_rules(bare: Host, node: Host, tmp_path: Path, wildcard: str) -> None:
-    """The connection tracker remembers the destination of UDP packets; it forgets when the appliance starts or
-    stops.
-    """
+    """The connection tracker forgets the destination of UDP packets when the appliance starts or stops."""
     family = socket.AF_INET6 if ":" in wildcard else socket.AF_INET
     target = (bare.address6 if ":" in wildcard else bare.address, 4500)
     # a NAT rule such as a container engine's: the connection tracker then remembers every conversation
@@ -266,9 +264,7 @@ def test_the_subnet_conflicts_with_no_route(bare: Host, tmp_path: Path) -> None:
 
 
 def test_a_foreign_namespace_or_interface_is_not_taken(bare: Host, tmp_path: Path) -> None:
-    """A namespace or interface with our name but without a record is not touched, and the error says how to remove
-    it.
-    """
+    """Without a record it is not touched, and the error says how to remove it."""
     wanted = settings(tmp_path)
     foreign = Namespace(wanted.name).create()
     try:

@@ -29,7 +29,7 @@ def gateway(lab: Lab) -> Host:
 
 
 def protect(host: Host, *arguments: str, status: int = 0, **environment: str) -> str:
-    """Returns the error output if the command is to fail."""
+    """Return the error output if the command is to fail."""
     process = host.popen(
         [sys.executable, "-c", COMMAND, *arguments],
         stdout=subprocess.PIPE,
@@ -217,7 +217,7 @@ def test_an_unroutable_network_is_not_reported_as_open(attacker: Host, address: 
 
 
 def test_a_machine_cannot_check_itself(robot: Host) -> None:
-    """From the machine itself everything is open by design, so a check there is an error, not a finding."""
+    """From the machine itself everything is open by design."""
     for address in (robot.address, robot.address6, "localhost"):
         assert "run the check on another machine" in protect(robot, "--check", address, status=2)
 

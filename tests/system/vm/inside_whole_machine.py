@@ -1,7 +1,4 @@
-"""The appliance, and the machine of a trusted host, in the virtual machine.
-
-The tests change the network of the machine itself, so they never run anywhere else.
-"""
+"""The appliance, and the machine of a trusted host, in the virtual machine, whose own network the tests change."""
 
 import subprocess
 from collections.abc import Iterator
@@ -131,7 +128,6 @@ def test_a_host_joins_and_leaves_by_its_kit(lab: Lab, tmp_path: Path) -> None:
 
 
 def listening() -> set[int]:
-    """Nodes listen in the local port range."""
     first = int(Path("/proc/sys/net/ipv4/ip_local_port_range").read_text(encoding="ascii").split()[0])
     rows = map(str.split, told("ss", "-Hltn").splitlines())
     return {port for row in rows if (port := int(row[3].rpartition(":")[2])) >= first}

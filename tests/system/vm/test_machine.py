@@ -1,7 +1,4 @@
-"""The appliance in a virtual machine with Debian's own kernel: promises that no namespace can show.
-
-Each test here runs tests *in* the machine: `inside_*.py`, and those of other folders that depend on the kernel.
-"""
+"""Promises that no namespace can show: each test runs tests *in* the machine, with Debian's own kernel."""
 
 from collections.abc import Iterator
 
@@ -55,6 +52,6 @@ def test_the_firewall_in_debians_kernel(machine: Machine) -> None:
 
 
 def test_the_machine_is_alone(machine: Machine) -> None:
-    """The machine runs Debian's cloud kernel and has no network card, so the tests' effects stay inside."""
+    """It has no network card, so the tests' effects stay inside."""
     assert machine.run("uname", "-r").output.strip().endswith("cloud-amd64")
     assert machine.run("ls", "/sys/class/net").output.split() == ["lo"]

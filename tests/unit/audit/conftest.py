@@ -17,8 +17,6 @@ MakeLog = Callable[..., AuditLog]
 
 
 class Notary:
-    """The clock is `ago` nanoseconds behind."""
-
     def __init__(self, directory: Path) -> None:
         directory.mkdir()
         self.directory = directory
@@ -35,7 +33,6 @@ class Notary:
             self._signed.approve(text)
 
     def approve(self, checkpoint: bytes, newest: bytes) -> bytes:
-        """Raises `RemovalRefusedError`."""
         return RemovalApprover(self._signed, self.kept, clock=self._now).approve(checkpoint, newest)
 
 
@@ -63,10 +60,7 @@ def key() -> Ed25519PrivateKey:
 
 @pytest.fixture
 def make_log(path: Path, key: Ed25519PrivateKey, notary: Notary) -> Iterator[MakeLog]:
-    """Return a function that opens logs at `path` with signatures and closes them after the test.
-
-    The signer uses the retention that the log is opened with.
-    """
+    """The logs are closed after the test. The signer uses the retention that the log is opened with."""
     logs: list[AuditLog] = []  # the open log
     made: list[AuditLog] = []
     public = key.public_key().public_bytes_raw()

@@ -14,8 +14,6 @@ BEGIN = 20_000 * DAY
 
 @dataclass
 class Machine:
-    """A machine with a clock: `true` is the real time, `wrong` is the clock's error."""
-
     path: Path
     true: int = BEGIN
     wrong: int = 0

@@ -167,7 +167,7 @@ def test_writing_to_standard_output_keeps_the_order(tmp_path: Path) -> None:
 
 
 def test_a_file_gets_its_owner_before_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """If a writer is killed or may not change the owner, it leaves no file that the owner cannot read."""
+    """A killed writer leaves no file that the owner cannot read."""
     need_root()
     file = tmp_path / "policy.ini"
     file.write_text("before")

@@ -12,8 +12,6 @@ _LIMIT = 60
 
 
 class Engine:
-    """It ends with the first turn after `close`."""
-
     def __init__(self, *dues: float) -> None:
         self.turns: queue.Queue[float] = queue.Queue()
         self.closed = False

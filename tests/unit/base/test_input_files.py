@@ -44,7 +44,6 @@ VERBS = [
 
 
 def folder(place: Path) -> None:
-    """Make a folder with a named pipe instead of a definition."""
     (place / "p").mkdir(parents=True)
     os.mkfifo(place / "p" / "T.msg")
 

@@ -31,7 +31,6 @@ _SECOND = 1_000_000_000
     ],
 )
 def test_times(text: str, moment: int) -> None:
-    """Durations count back from now; dates without a zone are UTC; nanoseconds are exact."""
     assert parse_timestamp(text, _NOW) == moment
 
 

@@ -74,7 +74,6 @@ def test_rest_explains_valid_parameters(app: FastAPI) -> None:  # noqa: F811  th
 
 
 def test_rest_explains_valid_bodies(app: FastAPI) -> None:  # noqa: F811  the fixture
-    """Covers each field of every body, including nested ones."""
     told: set[str] = set()
     for dependant in _dependants(app):
         for reads in [one.call for one in dependant.dependencies if hasattr(one.call, "kind")]:

@@ -21,5 +21,4 @@ from appliance.base.varying_numbers import without_numbers
     ],
 )
 def test_only_values_are_replaced(text: str, words: str) -> None:
-    """A number that names a thing stays, so different things stay different."""
     assert without_numbers(text) == words

@@ -2,10 +2,6 @@ from appliance.channel.operations import CHANGES, OPERATIONS
 
 
 def test_changes_are_for_operators_and_admins() -> None:
-    """Each change needs one of these roles, makes messages for investigators, or opens the caller's own door.
-
-    Some requests for these roles change nothing, such as a kit, a query or a check.
-    """
     listed = {one.request for one in OPERATIONS if one.role in ("operator", "admin")}
     reads = {str(request.__struct_config__.tag) for request in listed - CHANGES}
     assert reads - {"sso list", "host kit"} == {"token list", "topic look", "monitor try"}

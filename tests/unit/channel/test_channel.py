@@ -18,7 +18,6 @@ Pair = tuple[Channel, Channel]
 
 @pytest.fixture
 def pair() -> Iterator[Pair]:
-    """The second end accepts messages of at most 1,000 bytes."""
     one, other = socket.socketpair()
     ends = Channel(one, Lifeline, limit=300_000), Channel(other, Lifeline, longest=1000)
     yield ends
@@ -95,7 +94,7 @@ def test_a_message_must_come_with_its_descriptors(pair: Pair) -> None:
 
 
 def test_foreign_data_is_rejected(pair: Pair) -> None:
-    """A message of another link, garbage, and an overlong message (even before it is complete) are errors."""
+    """An overlong message is an error even before it is complete."""
     for frame, reason in (
         (_frame(msgspec.msgpack.encode(StateBegan(1))), "Invalid value"),
         (_frame(b"\xc1"), "malformed"),

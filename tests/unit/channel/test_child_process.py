@@ -23,8 +23,6 @@ pytestmark = pytest.mark.nightly
 
 
 class Bench:
-    """A child that answers each question with its number; `heard` collects the supervisor's messages."""
-
     def __init__(self) -> None:
         ours, theirs = socket.socketpair()
         self.lifeline, self.heard = Channel(ours, Lifeline), asyncio.Queue[Any]()
@@ -45,7 +43,6 @@ class Bench:
         self.links += 1
 
     def link(self, role: str = "control") -> tuple[Channel, asyncio.Queue[Any]]:
-        """A closed link is received as None."""
         ours, theirs = socket.socketpair()
         self.lifeline.send(LinkOpened(role=role, index=0), (theirs.fileno(),))
         theirs.close()

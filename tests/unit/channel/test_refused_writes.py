@@ -21,8 +21,6 @@ TEMPORARY = [errno.ETOOMANYREFS, errno.ENOBUFS, errno.ENOMEM]
 
 
 class Socket:
-    """A socket of which the kernel refuses each write with `refusal`, unless it is 0."""
-
     def __init__(self) -> None:
         self.refusal = 0
         self.attempts = 0
@@ -61,8 +59,6 @@ class Socket:
 
 
 class Loop:
-    """The part of both kinds of loops that a link uses. `run()` calls the timers that are due by now."""
-
     def __init__(self) -> None:
         self.events = READ
         self.timers: list[tuple[float, Callable[..., None]]] = []

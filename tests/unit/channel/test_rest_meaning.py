@@ -57,7 +57,6 @@ def request_of(call: RestCall, if_match: str) -> ClientRequest:
 )
 @given(data=st.data())
 def test_an_order_means_itself(operation: Operation, data: st.DataObject) -> None:
-    """The request for an order is read as this order, for the revision that If-Match names."""
     order = data.draw(orders(operation))
     call = call_of(order, operation)
     if not operation.is_change or "expected" not in operation.fields():

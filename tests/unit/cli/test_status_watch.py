@@ -56,8 +56,6 @@ def serving(tmp_path: Path) -> Iterator[Callable[..., FakeAppliance]]:
 
 
 class Terminal:
-    """`shown` has all that was written to it."""
-
     def __init__(self, columns: int, lines: int, state: Path, seconds: str) -> None:
         self._ours, theirs = pty.openpty()
         self._size(columns, lines)

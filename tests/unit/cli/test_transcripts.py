@@ -1,7 +1,4 @@
-"""`rosrv` as its users see it: the transcripts (`*.txt`) of this folder and of features' folders.
-
-Their form: `tests/support/transcript.py`.
-"""
+"""`tests/support/transcript.py` defines the form of the transcripts (`*.txt`), also of features' folders."""
 
 import functools
 from collections.abc import Callable, Iterator

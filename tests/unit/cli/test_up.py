@@ -18,8 +18,6 @@ READY = ControlReady("http://127.0.0.1:11311", 1, "http://127.0.0.1:2", 3, 4, "s
 
 
 class Full(io.StringIO):
-    """Standard output on a full disk."""
-
     def flush(self) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 

@@ -189,7 +189,6 @@ def test_a_mistake_about_two_keys_names_one_that_was_set() -> None:
 
 
 def test_the_variable_of_a_flag_with_another_key() -> None:
-    """`ROSRV_RELAY` is the variable of `--relay`; as a table, or with a key's name, it sets the section `relay`."""
     assert (
         resolve(None, {"ROSRV_RELAY": "monitored", "ROSRV_MEDIATION": "monitored"}, {}).relaying
         == "monitored"

@@ -67,5 +67,4 @@ def test_a_build_has_its_commit_and_the_hash_of_its_list(
     ],
 )
 def test_licences_of_debian_packages(text: str, licences: list[str]) -> None:
-    """A package's licence is read from Debian's format or recognised by its common name; otherwise it is missing."""
     assert inventory.debian_licences(text) == licences

@@ -132,7 +132,7 @@ def test_an_empty_endpoint_is_unset() -> None:
 
 
 def test_rules_of_annotated_keys_are_enforced() -> None:
-    """A rule must be inside the annotation of an annotated type: pydantic ignores a rule beside the annotation."""
+    """pydantic ignores a rule beside the annotation of an annotated type."""
 
     def sections(section: Any) -> Iterator[Any]:
         yield section

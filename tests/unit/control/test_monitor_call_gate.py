@@ -14,8 +14,6 @@ ALLOWED = "[Commands]\nlookupService = 127.0.0.1\n[Clients]\n/arm = 127.0.0.1\n"
 
 
 class Control:
-    """`granted` has the grants as `host caller service`."""
-
     strict = False
 
     def __init__(
@@ -70,7 +68,7 @@ def test_an_allowed_call_is_recorded_and_granted() -> None:
     [("0.0.0.0", "127.0.0.1"), ("::", "127.0.0.1"), ("10.0.0.9", "10.0.0.9"), ("::1", "::1")],
 )
 def test_the_client_is_the_address_that_a_relay_connects_from(listen: str, host: str) -> None:
-    """A relay that listens on one address cannot be reached on the loopback, and sees this address as the client."""
+    """A relay that listens on one address cannot be reached on the loopback."""
     assert own_host(listen) == host
     control = Control(ALLOWED.replace("127.0.0.1", host), host=host)
     assert control.answer() == MonitorCallAnswered(7, host, 4711, "/rosrv", "")

@@ -26,8 +26,6 @@ def fail(reason: str) -> None:
 
 
 class Ports(idle_class(ProxyEndpoints)):  # type: ignore[misc]  # it is made
-    """All ports can be bound again after a restart."""
-
     async def reopen(self, _incarnation: Incarnation) -> None:
         """Act as `ProxyEndpoints`."""
 

@@ -27,8 +27,6 @@ def answer(unsigned char[::1] place):
 
 
 class Checkout:
-    """It has the program that builds, and its own source."""
-
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.source = folder / SOURCE

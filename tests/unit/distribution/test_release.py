@@ -12,7 +12,6 @@ pytestmark = pytest.mark.nightly
 
 @pytest.fixture
 def released(tmp_path: Path) -> Path:
-    """Two signed files; key.pem and public.pem are beside the folder."""
     folder = tmp_path / "dist"
     folder.mkdir()
     (folder / "rosrv_0.2.0_amd64.deb").write_bytes(b"a package")
@@ -28,7 +27,6 @@ def released(tmp_path: Path) -> Path:
 
 
 def checks(folder: Path) -> bool:
-    """The two commands of docs/install.md, openssl and coreutils."""
     signature = folder.parent / "signature"
     decoded = subprocess.run(
         ["base64", "--decode", "SHA256SUMS.sig"], cwd=folder, capture_output=True, check=False

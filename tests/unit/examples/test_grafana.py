@@ -77,6 +77,6 @@ def test_options_are_complete(panel: dict[str, Any]) -> None:
 
 
 def test_the_data_source_is_a_variable() -> None:
-    """The data source and the appliance are chosen in the dashboard's header, so it can be imported unchanged."""
+    """The dashboard can be imported unchanged."""
     assert [one["name"] for one in DASHBOARD["templating"]["list"]] == ["source", "instance"]
     assert {panel["datasource"]["uid"] for panel in PANELS} == {"${source}"}

@@ -18,7 +18,6 @@ RIGHT = FIRST.replace("positions:angles", "position:angles")
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """`my-monitors` has the LandShark's message."""
     shutil.copytree(MONITORS / "msg", tmp_path / "my-monitors" / "msg")
     monkeypatch.chdir(tmp_path)
     return tmp_path / "my-monitors"

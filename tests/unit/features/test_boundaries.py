@@ -1,4 +1,4 @@
-"""Features can be removed: neither the core nor its tests know one, and the rest works without it."""
+"""Neither the core nor its tests know a feature, and the rest works without it."""
 
 import re
 import shutil
@@ -46,7 +46,6 @@ def test_no_other_test_imports_a_feature(name: str) -> None:
 
 
 def without(name: str, copy: Path) -> None:
-    """Leaves out the feature's folders and its lines in the tables."""
     files = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, check=True).stdout
     for file in filter(None, files.decode().split("\0")):
         if f"/features/{name}/" not in file and (ROOT / file).is_file():

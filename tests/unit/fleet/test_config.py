@@ -45,7 +45,6 @@ def test_a_wrong_configuration_is_refused(text: str, why: str, tmp_path: Path) -
 
 
 def test_an_unreadable_file_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The error names the user that must read the file, who is another one in the container, and the command."""
     file = tmp_path / "fleet.yaml"
 
     def refuse(_path: Path, encoding: str | None = None) -> str:

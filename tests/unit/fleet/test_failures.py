@@ -29,8 +29,6 @@ _DEFECT = "a defect of rosrv-fleet, please report it: RuntimeError: unforeseen"
 
 
 class _Defect:
-    """Before the second error, it calls `second`."""
-
     def __init__(self, second: Callable[[], object]) -> None:
         self._second = second
         self.calls = 0
@@ -120,7 +118,7 @@ def test_rollouts_continue(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_tracebacks_show_no_values(capfd: pytest.CaptureFixture[str]) -> None:
-    """A value of a local variable may be a key; the log shows only lines of code."""
+    """A value of a local variable may be a key."""
     earlier = structlog.get_config()
     try:
         configure_log()

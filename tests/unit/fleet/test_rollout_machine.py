@@ -103,7 +103,6 @@ def test_healthy_robots_finish_a_rollout() -> None:
     ],
 )
 def test_a_bad_canary_stops(sick: RobotSeen, word: str) -> None:
-    """One canary that refuses, denies more, fails or is silent stops the rollout, with the reason."""
     known = {robot: RobotSeen(0, OLD, denials=4) for robot in ROBOTS}
     rollout = advanced(begun(), known, 0)
     assert rollout.ring == 0
@@ -166,7 +165,7 @@ def test_a_canary_ring_without_robots_stops_after_its_time() -> None:
     ids=["right", "beside a right name", "later", "percent"],
 )
 def test_rings_fit_the_enrolled_robots(rings: list[Ring], fault: str) -> None:
-    """A name that is not enrolled in the group is a typing error; a first ring without robots would never be taken."""
+    """A first ring without robots would never be taken."""
     found = fault_of_rings(begun(Terms(0, rings)), ROBOTS)
     assert fault in found
     assert bool(found) == bool(fault)

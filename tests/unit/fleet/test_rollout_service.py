@@ -28,8 +28,6 @@ _ROLLOUT = BundleRollout(
 
 
 class _Memory(RolloutStore):
-    """`meddle` is called before the rollout is replaced."""
-
     def __init__(self) -> None:
         super().__init__(IndexDatabase("", connections=1, statement_seconds=1.0))
         self.stored = StoredRollout(1, _ROLLOUT)
@@ -81,7 +79,6 @@ class _Calls:
         return work(*arguments)
 
     async def during(self, tick: Coroutine[Any, Any, None], other: Coroutine[Any, Any, object]) -> None:
-        """`other` does all that it can while the call waits."""
         ticking = asyncio.create_task(tick)
         await self.began.wait()
         beside = asyncio.create_task(other)
@@ -93,7 +90,6 @@ class _Calls:
 
 @pytest.fixture
 def store() -> _Memory:
-    """Healthy; the first ring is open since 1000 s."""
     return _Memory()
 
 

@@ -14,7 +14,6 @@ _HOSTILE = "'; DROP TABLE record; -- %s"
 
 @given(glob=st.text("ab]^[*?-\\.$", max_size=8), text=st.text("ab]^[-\\.$\n", max_size=6))
 def test_a_glob_matches_what_sqlite_matches(glob: str, text: str) -> None:
-    """The regular expression matches the same texts as SQLite's GLOB; sets that SQLite cannot end are refused."""
     try:
         pattern = re.compile(regex_of(glob), re.DOTALL)
     except (FilterError, re.error):

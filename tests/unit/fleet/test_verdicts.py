@@ -57,8 +57,6 @@ Lines = list[bytes]
 
 
 class Site(NamedTuple):
-    """A log, and what was made from it: the signer's memory, copies of checkpoints, segments, evidence."""
-
     log: Path
     key: Ed25519PrivateKey
     copies: list[SignedCheckpoint]
@@ -137,7 +135,6 @@ def segment(path: Path, number: int) -> Lines:
 
 @pytest.fixture(scope="module")
 def sites(tmp_path_factory: pytest.TempPathFactory) -> tuple[Site, Site]:
-    """Return two sites with different keys; tests change copies."""
     folder = tmp_path_factory.mktemp("sites")
     with clock.using(VirtualClock(wall=1_800_000_000)):
         return made(folder / "own", 1), made(folder / "other", 2)
@@ -151,7 +148,6 @@ def edited(line: bytes, **fields: object) -> bytes:
 
 
 def checkpoints(change: Callable[[dict[str, Any]], dict[str, Any]]) -> Callable[[Lines, Lines], Lines]:
-    """Return an attack that changes the last checkpoint, in the header of a segment as well."""
 
     def changed(value: Any, number: int) -> Any:
         if isinstance(value, dict):
@@ -246,7 +242,6 @@ REMOVALS: dict[str, Callable[[Site, Removal], dict[str, object]]] = {
 
 
 def remove(site: Site, log: Path, proof: Callable[[Site, Removal], dict[str, object]]) -> None:
-    """Remove the oldest records as retention does, and record a proof."""
     writer = ChainWriter(log, 0)
     gone = writer.removable(1, signed=True)
     assert gone is not None
@@ -272,7 +267,6 @@ STORES: dict[str, Callable[[Site, Site], dict[int, Lines]]] = {
 
 
 def rewritten(site: Site, log: Path) -> None:
-    """Write the history of a log again, with valid hashes and signatures."""
     write_anew(log, site.key, log.with_name("rewritten"), "UPDATE record SET host = 'x' WHERE sequence = 15")
 
 
@@ -296,7 +290,6 @@ def of_segment(site: Site, lines: Lines) -> Iterator[str]:
 
 
 def of_store(site: Site, folder: Path, changes: dict[int, Lines], further: Lines = []) -> Iterator[str]:  # noqa: B006  never changed
-    """Prove a log from its segments in a store, whose files are changed."""
     store = SegmentStore(folder, 0)
     for number, lines in enumerate([*site.segments, *([further] if further else [])], 1):
         upload = folder / f"{number}.gz"

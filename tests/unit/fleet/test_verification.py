@@ -23,10 +23,7 @@ _OLD = 1_500_000_000 * 10**9
 
 
 class _Store(SegmentStore):
-    """A store of which segments are removed while they are listed.
-
-    `remove` is called once, after a proof has the names of the files, or with `listed=False` before it has them.
-    """
+    """`remove` is called once, after a proof has the names of the files, or with `listed=False` before it has them."""
 
     remove: Callable[[], object] = staticmethod(bool)
     listed = True
@@ -40,7 +37,6 @@ class _Store(SegmentStore):
 
 @pytest.fixture
 def store(make_log: MakeLog, path: Path, tmp_path: Path) -> _Store:
-    """All but the last segment are old."""
     log, found = make_log(checkpoint_every=10), _Store(tmp_path / "data", 0)
     for number in range(50):
         log.record(decision(log, number))

@@ -68,7 +68,6 @@ def test_contents_survive_an_archive(more: dict[str, bytes]) -> None:
     ],
 )  # fmt: skip
 def test_other_archives_are_rejected(archive: bytes) -> None:
-    """Links, devices, folders, foreign or repeated names, unusual headers, trailing or missing data are rejected."""
     with pytest.raises(BundleArchiveError):
         unpack(archive)
 

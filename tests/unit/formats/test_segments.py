@@ -33,7 +33,6 @@ def public(key: Ed25519PrivateKey) -> bytes:
 
 @pytest.fixture
 def segments(make_log: MakeLog, path: Path) -> list[bytes]:
-    """The last checkpoint, of the log's end, is not signed."""
     log = make_log(checkpoint_every=5)
     fill(log, 21)
     assert len(signed_checkpoints(path)) == 4

@@ -34,7 +34,6 @@ def missed(count: int) -> messages.ForwardingReported:
 
 @pytest.fixture
 def controls() -> list[Control]:
-    """The current one is last; the list is empty at first."""
     return []
 
 

@@ -123,7 +123,7 @@ def test_a_full_list_says_when_it_has_space_again(store: StateStore, tmp_path: P
 
 
 def test_longer_serial_numbers_fit(store: StateStore, tmp_path: Path) -> None:
-    """The list has space for fewer serial numbers of 160 bits, as in older certificates."""
+    """Older certificates have serial numbers of 160 bits."""
     revoked = RevokedCertificates(store.hosts)
     for number in range(3_000):
         revoked.add("", f"{(1 << 158) + number:x}", time.time() + DAY)

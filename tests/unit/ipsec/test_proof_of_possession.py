@@ -11,7 +11,6 @@ from appliance.ipsec.requests import make_key, signing_request
 
 
 def sign(key: bytes, request: bytes) -> bytes:
-    """As `openssl pkeyutl -sign -rawin -digest sha384` does."""
     private = load_pem_private_key(key, None)
     assert isinstance(private, ec.EllipticCurvePrivateKey)
     return private.sign(request, ec.ECDSA(hashes.SHA384()))

@@ -12,8 +12,6 @@ _STEP = 100  # records of a checkpoint
 
 
 class Desk:
-    """Ten checkpoints were signed a day after each other."""
-
     def __init__(self, directory: Path, kept: RetentionLimits) -> None:
         self.now = 1000 * _DAY
         self.signed = CheckpointMemory(directory, clock=lambda: self.now)
@@ -24,7 +22,6 @@ class Desk:
             self.now += _DAY
 
     def text(self, *, removed: int | None, time: int = 1, number: int | None = None) -> bytes:
-        """The time is wrong, as control chose it: 1970."""
         number = number or len(self.texts) + 1
         previous = hashlib.sha256(self.texts[-1]).hexdigest() if self.texts else "0" * 64
         version, line = (1, "") if removed is None else (2, f"removed {removed}\n")

@@ -30,7 +30,6 @@ def test_each_follows_the_one_before(tmp_path: Path) -> None:
 
 
 def test_asked_again(tmp_path: Path) -> None:
-    """A checkpoint whose signature was lost on the way is signed again, if it is the same."""
     first = checkpoint(1)
     second = checkpoint(2, digest(first))
     signed = CheckpointMemory(tmp_path, wall_ns)
@@ -66,7 +65,7 @@ def test_refused(tmp_path: Path, text: bytes, reason: str) -> None:
 
 
 def test_logs_are_separate_and_bounded(tmp_path: Path) -> None:
-    """Each log has its own history; control cannot fill the signer's disk with invented logs."""
+    """Control cannot fill the signer's disk with invented logs."""
     signed = CheckpointMemory(tmp_path, wall_ns)
     for number in range(MOST_LOGS):
         signed.approve(checkpoint(1, log=f"{number:032x}"))

@@ -165,7 +165,6 @@ def test_garbage_on_the_link_does_not_end_it(signer: SignerProcess) -> None:
     ids=["readable", "rubbish", "missing"],
 )
 def test_damaged_key(tmp_path: Path, damage: Any, reason: str) -> None:
-    """A key that was damaged, opened to others or lost is an error in words, and is never replaced."""
     first = SignerProcess(tmp_path)
     hear(first.lifeline)
     first.end()

@@ -1,7 +1,6 @@
-"""Conversations of nodes with RVMaster as text, with the effects of each line; no socket is opened.
+"""`tests/support/conversation.py` defines the form of `conversations/*.txt`.
 
-`conversations/*.txt` have them: a line at the margin is an action, the indented lines below it are its effects
-(`tests/support/conversation.py` describes the form). With `TRANSCRIPTS=write` a test writes the effects to its file.
+With `TRANSCRIPTS=write` a test writes the effects to its file.
 """
 
 import os

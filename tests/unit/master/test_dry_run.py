@@ -29,7 +29,6 @@ Row = tuple[str, str, str, str]
 
 
 def sections(keys: tuple[str, ...], verbs: tuple[str, ...] = ("",)) -> st.SearchStrategy[dict[str, str]]:
-    """A line has keys and their hosts."""
     written = [verb + key for verb in verbs for key in (*keys, "default")]
     who = st.sampled_from(["", "*", *HOSTS, " ".join(HOSTS)])
     return st.dictionaries(st.sampled_from(written), who, max_size=4)
@@ -88,7 +87,6 @@ def held(world: ControlParts) -> set[Row]:
 async def taken(
     policy: str, registrations: frozenset[Any], grants: frozenset[Any], tree: dict[str, Any]
 ) -> tuple[set[Row], set[Row], int]:
-    """Returns the dry run's list, the losses by the reload that follows, and the number that the reload reports."""
     world = await ControlParts.begun()
     world.parameters = mirror(tree)
     nodes: dict[tuple[str, str], Incarnation] = {}

@@ -246,7 +246,7 @@ async def test_a_reading_key_changes_nothing(world: World, token: str, api: Api)
 async def test_bare_tokens_are_accepted_by_configuration_only(
     world: World, token: str, *, require_proof: bool
 ) -> None:
-    """A script's bare token is proof enough, unless api_require_proof is on; then it still opens the views."""
+    """With api_require_proof, a bare token still opens the views."""
     await world.store.settled()
     world.begin(require_proof=require_proof)
     api = Api(world)

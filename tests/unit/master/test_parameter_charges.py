@@ -51,8 +51,6 @@ def charged(there: ParameterMirror) -> dict[Address, int]:
 
 
 class Ledger:
-    """Every namespace and value with its owner, in a simple and slow dictionary."""
-
     def __init__(self) -> None:
         self.owners: dict[tuple[str, ...], Address] = {(): APPLIANCE}
 

@@ -1,6 +1,6 @@
 """The gate, `explain`, the cases, `diff`, `grant` and revocation agree on each call.
 
-Each rule includes or excludes a host. `NEEDS` lists the rights for each call again, by section, as docs/policy.md does.
+`NEEDS` lists the rights for each call again, by section, as docs/policy.md does.
 """
 
 import ipaddress
@@ -86,7 +86,6 @@ SAID = {category: verb for verb, category in VERBS.items()}
 
 
 def text_of(granted: frozenset[str], missing: frozenset[str], keyed: bool) -> str:
-    """Return a policy that grants this host the rights in these sections; `missing` sections are left out."""
     lines: dict[str, list[str]] = {}
     for section in SECTIONS:
         verb = f"{section} " if section in {"read", "write"} else ""
@@ -120,13 +119,11 @@ def gate_says(policy: Policy, call: RosCall[Any], tree: Tree) -> Decision:
 
 
 def needed(call: RosCall[Any], missing: frozenset[str]) -> list[str]:
-    """Return the sections that must grant the call, according to `NEEDS`."""
     free = EXTENSIONS & (missing | ({"read", "write"} if {"read", "write"} & missing else set()))
     return [section for section in NEEDS.get(call.name, ("Commands",)) if section not in free]
 
 
 def deeds(call: RosCall[Any]) -> list[Request]:
-    """Return the requests by which a person would ask about the call: its action, and its parameter if any."""
     found = [
         Request(
             HOST, NAME, call.category, THING if call.category is not Category.COMMAND else call.policy_name
@@ -195,7 +192,7 @@ POLICIES = st.fixed_dictionaries(
 
 
 def granted_by(decision: Decision) -> bool:
-    """Return whether the rules grant the request; audit-only mode allows denied requests."""
+    """Audit-only mode allows denied requests."""
     return decision.allowed and not decision.would_deny
 
 

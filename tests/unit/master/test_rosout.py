@@ -11,8 +11,6 @@ LINE = MonitorEvent("log", "gate", "key", "/chatter", 1_700_000_000_250_000_000,
 
 
 class Desk:
-    """A Rosout whose clock only moves when a test sets it."""
-
     def __init__(self) -> None:
         self.now = 10.0
         self.sent: list[OwnPublished] = []

@@ -15,7 +15,6 @@ pytestmark = pytest.mark.nightly
 
 
 def answers(monkeypatch: pytest.MonkeyPatch, status: int) -> list[list[str]]:
-    """Let `ip` end with this status; return the commands it received."""
     given: list[list[str]] = []
 
     def run(command: list[str], **_options: object) -> "subprocess.CompletedProcess[str]":

@@ -55,5 +55,4 @@ def test_a_port_is_needed() -> None:
 
 
 def test_the_interface_name_fits() -> None:
-    """A long appliance name still gives an interface name that the kernel accepts."""
     assert len(IsolationSettings(ports=SETTINGS.ports, name="a-rather-long-name").link) <= 15

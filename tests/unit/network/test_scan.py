@@ -36,8 +36,6 @@ def test_few_file_descriptors_make_a_scan_slower_without_an_error() -> None:
 
 
 class Stuck(socket.socket):
-    """A socket whose connection fails at once, before any packet is sent."""
-
     number = errno.ENETUNREACH
 
     def connect_ex(self, _address: object) -> int:

@@ -75,7 +75,7 @@ def test_a_denial_goes_before_a_missing_approval() -> None:
 
 
 def test_each_right_that_asks_needs_its_own_approval() -> None:
-    """A write of `/arm/x` also replaces the value of `/arm`, so an approval of one of them is not enough."""
+    """A write of `/arm/x` also replaces the value of `/arm`."""
     text = TEXT.replace("write /arm/**", "write /arm = ask agent-1\nwrite /arm/**")
     request = Request(AGENT, "/it", Category.COMMAND, "setParam")
     rights = rights_of_call(request, "setParam", "/arm/x", value=1, tree={"arm": 5})

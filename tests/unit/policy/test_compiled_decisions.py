@@ -1,7 +1,4 @@
-"""The compiled policy is compared with a naive decider written from the documentation.
-
-The naive decider tries every rule on every request, and shares no code with the policy.
-"""
+"""The compiled policy is compared with a naive decider written from the documentation."""
 
 import fnmatch
 import ipaddress
@@ -47,7 +44,6 @@ def rank(key: str) -> tuple[int, int, int]:
 def decide_slowly(
     rules: Rules, groups: dict[str, list[str]], section: str, host: str, name: str
 ) -> bool | None:
-    """Return whether a request is allowed; None if the policy lacks the section."""
     mine = [(key, words) for its, key, words in rules if its == section]
     if not mine:
         return None
@@ -74,7 +70,7 @@ NAME = st.lists(st.sampled_from([*NAMES, "arms"]), min_size=1, max_size=4).map(l
 
 @st.composite
 def policies(draw: st.DrawFn) -> tuple[Rules, dict[str, list[str]]]:
-    """Draw rules and groups; a group names only later groups, so that no group contains itself."""
+    """A group names only later groups, so that no group contains itself."""
     leaves = st.lists(WORDS.filter(lambda word: not word.startswith("g")), max_size=2, unique=True)
     groups = {
         f"g{n}": draw(leaves) + ([f"g{n + 1}"] if n < 2 and draw(st.booleans()) else []) for n in range(3)

@@ -80,7 +80,6 @@ def test_a_new_key_keeps_the_hosts_of_the_deciding_rule() -> None:
 
 
 def test_a_host_is_named_by_its_group_or_certificate() -> None:
-    """A host is named by its own group, by its certificate or as the robot; otherwise by its address."""
     grouped = "[Groups]\nocu = 10.0.0.9\nall = 10.0.0.9 10.0.0.1\n" + BASE
     assert changed(grouped, "subscribe", "/z") == ["/z = ocu"]
     assert changed(BASE, "subscribe", "/z", "10.0.0.77") == ["/z = host:laptop"]

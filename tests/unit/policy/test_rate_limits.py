@@ -53,7 +53,6 @@ def policy(*lines: str):  # type: ignore[no-untyped-def]  # what compile_policy 
 def test_a_limit_is_for_messages_or_bytes_of_hosts(
     line: str, part: LimitScope, host: ipaddress.IPv4Address, rate: Rate
 ) -> None:
-    """A limit is in messages or bytes a second, for all hosts unless it names some; the strictest clause wins."""
     assert policy(line).limit(part, "/camera/front/image", host) == rate
 
 
@@ -80,7 +79,6 @@ def test_a_mistake_is_reported_with_its_place(line: str, place: str, text: str) 
 
 
 def test_the_number_of_limits_is_bounded() -> None:
-    """A policy has at most 1,000 limits, so that reading them takes a bounded time."""
     with pytest.raises(PolicyError, match="more than 1000 limits"):
         policy(*(f"/a{number}* = topic 1 Hz" for number in range(1001)))
 

@@ -58,5 +58,4 @@ def few_descriptors() -> Iterator[None]:
 
 
 def test_where_the_system_allows_fewer_connections_have_half(few_descriptors: None) -> None:
-    """A bound above half of the allowed descriptors is lowered to half, so that no process runs out of them."""
     assert [connections_within(wanted) for wanted in (100, 4096)] == [100, 500]

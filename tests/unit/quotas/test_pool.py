@@ -8,7 +8,6 @@ UNKNOWN, NAMED, REGISTERED = QuotaClass
 
 
 def pool(quota_classes: dict[str, QuotaClass], bounds: Bounds) -> Pool[str]:
-    """Return a pool of connections; hosts that are not in `quota_classes` are unknown."""
     return Pool("connections", bounds, lambda host: quota_classes.get(host, UNKNOWN))
 
 

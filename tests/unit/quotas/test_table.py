@@ -19,7 +19,6 @@ def test_every_row_is_on_the_page() -> None:
 
 
 def test_each_row_is_attacked_by_a_test_that_exists() -> None:
-    """Every row names an existing test; without one, the row would be an unchecked claim."""
     for row in all_rows():
         assert row.shown_by, row.thing
         for place in row.shown_by:

@@ -52,7 +52,6 @@ class Dialogue:
         self.peers: dict[str, Peer] = {}
 
     def say(self, line: str) -> None:
-        """Carry out one step. Raises `AssertionError` if it does not happen."""
         who, *words = shlex.split(line)
         step = getattr(self, f"_{who}", None)
         if step is not None:

@@ -2,9 +2,8 @@
 
     .venv/bin/python -m tests.unit.relay.pump_comparison SEED BATCHES
 
-A seed determines random batches of two publishers, subscribers that come, go and read late, monitors that are loaded
-and switched, broken connections and frames. Both relays must send each subscriber the same bytes, count the same
-messages and effects of monitors, and keep the same state of monitors.
+A seed determines random batches, subscribers, monitors, broken connections and frames. Both relays must send each
+subscriber the same bytes, count the same messages and effects of monitors, and keep the same state of monitors.
 """
 
 import contextlib
@@ -93,7 +92,6 @@ class ComparedRelay(Monitored):
                 self.engine.topics["k", topic].tap(_nothing, latched=False)
 
     def until(self, condition: Callable[[], Any], seconds: float = LIMIT) -> Any:
-        """The method of `World` waits for events in each turn."""
         for _ in range(20):
             self.loop.turn(0)
             found = condition()
@@ -160,7 +158,6 @@ class ComparedRelay(Monitored):
         return {"counted": dict(self.counted), "rows": rows}
 
     def recovered(self, statement: SpecificationsStated) -> list[bytes]:
-        """Times are left out."""
         left = StateKeeper(self.given, self.memory).recovered()
         monitors = Loader.load(statement, str)
         if left is None or isinstance(monitors, list):
@@ -174,8 +171,6 @@ def _nothing(_batch: Batch) -> None:
 
 
 class PumpComparison:
-    """Two relays, and random steps with both; `passed` counts the batches by path."""
-
     def __init__(self, seed: int) -> None:
         self._random = Random(seed)  # noqa: S311  repeats a run
         self.both = ComparedRelay(pumped=True), ComparedRelay(pumped=False)
@@ -275,7 +270,6 @@ class PumpComparison:
                 self._served(side, topic)
 
     def _served(self, side: ComparedRelay, topic: str) -> None:
-        """Subscribers may have left."""
         there = [*self._slow.values(), *self._fast.values()].count(topic)
         side.until(lambda: len(side.engine.topics["k", topic].members) == there)
 

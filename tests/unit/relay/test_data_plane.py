@@ -1,7 +1,4 @@
-"""The whole relay as transcripts: control's messages, the peers' bytes, and the answers.
-
-The engine runs in the test's own thread; every step lets the loop turn until the expected event has happened.
-"""
+"""The whole relay as transcripts: control's messages, the peers' bytes, and the answers."""
 
 import contextlib
 import random
@@ -79,7 +76,6 @@ def test_dialogue(title: str) -> None:
 
 @pytest.fixture
 def world(request: pytest.FixtureRequest) -> Iterator[World]:
-    """Tests marked `impatient` get short limits."""
     world = World(getattr(request, "param", LIMITS))
     yield world
     world.close()
@@ -256,7 +252,7 @@ def test_a_publisher_that_cannot_be_reached_is_asked_for_again(world: World) -> 
 
 
 def test_a_publisher_that_always_closes_is_waited_for_ever_longer_until_it_stays(world: World) -> None:
-    """An answered header does not reset the delay: otherwise the relay would retry ten times a second."""
+    """Otherwise the relay would retry ten times a second after each answered header."""
     world.connect(encode_header(ASK))
     waits = []
     for _ in range(6):
@@ -287,7 +283,7 @@ def test_a_publisher_that_always_closes_is_waited_for_ever_longer_until_it_stays
 
 @pytest.mark.parametrize("host", ["robot.local", "", "10.0.0", "127.0.0.1\0"])
 def test_a_publisher_is_only_looked_for_at_an_address(world: World, host: str) -> None:
-    """The relay never looks up a name, which would block all peers."""
+    """Looking up a name would block all peers."""
     world.connect(encode_header(ASK))
     world.hears(UpstreamWanted)
     world.state(UpstreamFound("k", "/chatter", host, 1))

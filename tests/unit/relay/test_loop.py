@@ -57,8 +57,6 @@ def test_stop_ends_run_after_the_turn(loop: EventLoop) -> None:
 
 
 class Costs:
-    """Handlers have known costs; `order` lists the payers in the order they were served."""
-
     def __init__(self) -> None:
         self.used = 0
         self.loop = EventLoop(lambda: self.used)
@@ -83,7 +81,6 @@ class Costs:
         return ours
 
     def turns_until(self, condition: Callable[[], object]) -> int:
-        """At most a thousand turns; returns their number."""
         for turns in range(1000):
             if condition():
                 return turns

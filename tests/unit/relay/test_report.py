@@ -50,7 +50,6 @@ def control() -> Iterator[Control]:
 
 @pytest.fixture
 def reporter(control: Control) -> Reporter:
-    """It sends at most three refusals one by one."""
     reporter = Reporter(replace(RelayLimits(), refusals=3))
     reporter.attach(control.link)
     return reporter

@@ -39,14 +39,12 @@ LATCHED = HEADER | {"latching": "1"}
 
 @pytest.fixture
 def world() -> Iterator[World]:
-    """A relay with 64 MiB, 16 of them for latched messages; `/talker` and `/listener` belong to the robot."""
     world = World(SMALL_RELAY)
     yield world
     world.close()
 
 
 def publish(world: World, number: int, host: str, header: dict[str, str] = HEADER) -> tuple[Peer, Peer]:
-    """The publisher is on its own host. Returns publisher and subscriber."""
     key, listening = f"guest{number}", world.listen()
     world.state(NodePlaced(key, f"/guest{number}", host), listening)
     world.state(PublicationPlaced(key, "/chatter", "*"))
@@ -164,7 +162,7 @@ def test_headers_of_unknown_hosts_leave_room_for_the_robots(world: World) -> Non
 
 
 def test_headers_of_publishers_and_servers_count_while_they_are_connected(world: World) -> None:
-    """Peers choose the length of their headers and the relay stores them, so their memory counts for the host."""
+    """Peers choose the length of their headers and the relay stores them."""
     share = world.engine.memory.frames.of("10.9.9.9")
     publisher, _subscriber = publish(world, 1, "10.9.9.9", HEADER | {"message_definition": "x" * 60_000})
     assert 60_000 < share.used < 61_000

@@ -64,7 +64,6 @@ def test_a_topic_without_subscribers_is_tapped(world: World) -> None:
 
 
 def test_the_latched_message_comes_first(world: World) -> None:
-    """A tap shows the messages that a new subscriber would get."""
     subscriber = world.connect(encode_header(ASK))
     publisher = world.upstream(TOLD | {"latching": "1"})
     world.gets_header(subscriber)

@@ -46,7 +46,6 @@ LIMITS = replace(
 IMPATIENT = replace(LIMITS, header_seconds=0.3, grant_seconds=0.1, connect_seconds=1.0, service_seconds=1.0)
 """For tests of these limits only: a busy machine may take longer for any step."""
 UNHURRIED = replace(LIMITS, linger=3600.0)
-"""For tests that something does not wait for a later subscriber."""
 HEADER = {
     "callerid": "/talker",
     "type": "std_msgs/String",
@@ -59,8 +58,6 @@ CALL = {"callerid": "/client", "service": "/mode", "md5sum": "*"}
 
 
 class Peer:
-    """Its socket never blocks."""
-
     def __init__(self, sock: socket.socket) -> None:
         sock.setblocking(False)
         self.sock = sock
@@ -68,7 +65,6 @@ class Peer:
         self.ended = False
 
     def send(self, data: bytes) -> None:
-        """Does not wait until all bytes are sent."""
         self.sock.send(data)
 
     def read(self) -> None:
@@ -83,7 +79,6 @@ class Peer:
             self.ended = not data
 
     def header(self) -> dict[str, str] | None:
-        """Removes the header from the received bytes once it is complete."""
         parser = HeaderParser()
         fields = parser.feed(bytes(self.data))
         if fields is not None:
@@ -104,7 +99,7 @@ class HeldWork:
 
 
 class WorldLoop(EventLoop):
-    """A loop that does the work beside it at its next turn, without a thread, and not while the test `holds` it."""
+    """Does the work beside it at its next turn, without a thread, and not while the test `holds` it."""
 
     holds = False
 
@@ -192,7 +187,6 @@ class World:
         return peer
 
     def push(self, peer: Peer, data: bytes) -> None:
-        """Send all bytes from the peer, as fast as the relay reads them."""
         rest = memoryview(data)
         while rest:
             try:
@@ -223,7 +217,6 @@ class World:
         return fields
 
     def gets(self, peer: Peer, data: bytes) -> None:
-        """The peer must have received exactly these bytes."""
 
         def whole() -> bool:
             peer.read()
@@ -242,7 +235,6 @@ class World:
         return bytes(peer.data)
 
     def upstream(self, header: dict[str, str] = HEADER, md5sum: str = "*") -> Peer:
-        """Answers the relay's request with this header."""
         self.hears(UpstreamWanted, key="k", topic="/chatter")
         self.state(UpstreamFound("k", "/chatter", LOOPBACK, self.publisher.getsockname()[1]))
         peer = self.accept(self.publisher)

@@ -16,7 +16,6 @@ PACKAGES = (
 
 @pytest.fixture(scope="session")
 def genpy_types() -> dict[str, dict[str, Any]]:
-    """Each class has md5sum, full text, a serialised example and its values."""
     script = Path(__file__).with_name("genpy_messages.py")
     ran = subprocess.run(["/usr/bin/python3", str(script), *PACKAGES], check=True, capture_output=True)
     types: dict[str, dict[str, Any]] = json.loads(ran.stdout)

@@ -1,7 +1,4 @@
-"""Print every installed message and service class as one JSON object; Debian's Python runs this file.
-
-For each type: kind, md5sum, full text, and, for messages, a serialised example with its values by path.
-"""
+"""Print every installed message and service class as one JSON object; Debian's Python runs this file."""
 
 import importlib
 import json

@@ -12,7 +12,6 @@ Values = dict[str, Any]
 
 
 def read(layout: MessageLayout, data: bytes, position: int) -> tuple[Values, int]:
-    """By the layout alone; returns the values by path, and the end position."""
     values: Values = {}
     for part in layout.parts:
         match part:
@@ -62,13 +61,11 @@ def read_string(data: bytes, position: int) -> tuple[str, int]:
 
 
 def primitive(type_name: str, data: bytes, position: int) -> Any:
-    """A time is a list of seconds and nanoseconds."""
     values = struct.unpack_from("<" + PRIMITIVES[type_name][0], data, position)
     return list(values) if len(values) > 1 else values[0]
 
 
 def nested(values: Values) -> Values:
-    """The result has genpy's structure."""
     result: Values = {}
     for path, value in values.items():
         *outer, last = path.split(".")
@@ -138,7 +135,6 @@ def test_places_find_fields_by_path(standard: Definitions) -> None:
 
 
 def test_arrays_of_every_kind() -> None:
-    """Fixed arrays of fixed elements are leaves; all other arrays are separate parts."""
     definitions = Definitions.from_files(
         {
             "a/A.msg": "B[2] b\nint16[3] i\nstring[2] s\nC[2] c\nuint8[] d\nB[] e\ntime[] t",

@@ -21,7 +21,6 @@ NAME_LIKE = st.text(alphabet="aZ0_/~.- :\n\u00e9\u0430", max_size=12)
 
 @pytest.fixture(scope="module")
 def rosmaster() -> Iterator[Oracle]:
-    """Return the result of rosgraph's resolve_name and rosmaster's topic validator."""
     script = Path(__file__).with_name("rosgraph_names.py")
     with subprocess.Popen(
         ["/usr/bin/python3", str(script)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
@@ -71,7 +70,6 @@ def test_resolve_parameter_agrees_with_rosmaster(rosmaster: Oracle, name: str, c
 @settings(max_examples=examples(500))
 @given(name=st.from_regex(r"[A-Za-z/~][A-Za-z0-9_/]{0,12}", fullmatch=True), caller_id=NODE_IDS)
 def test_every_ros_name_resolves(rosmaster: Oracle, name: str, caller_id: str) -> None:
-    """No name of the ROS grammar is refused, except names of the global namespace."""
     resolved = rosmaster(name, caller_id)[0]
     assert names.resolve_namespace(name, caller_id) == resolved
     if resolved != "/":
@@ -155,7 +153,6 @@ def test_a_name_may_not_grow_too_long() -> None:
 
 
 def test_namespace_variant_allows_the_root() -> None:
-    """`/` is a namespace and a parameter tree, but cannot be published."""
     assert names.resolve_namespace("/", "/talker") == "/"
     assert names.resolve_namespace("//", "/talker") == "/"
     assert names.resolve_parameter("/", "/talker") == "/"

@@ -63,7 +63,7 @@ def test_value_may_hold_equal_signs_and_be_empty() -> None:
 
 
 def test_message_definitions_keep_their_bytes() -> None:
-    """A definition with Latin-1 comments, as roscpp sends it, is passed on unchanged."""
+    """roscpp sends Latin-1 comments."""
     raw = header(b"message_definition=# 20 \xb0C\nfloat64 t", b"topic=/a")
     fields = HeaderParser().feed(raw)
     assert fields is not None

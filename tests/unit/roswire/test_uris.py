@@ -22,7 +22,6 @@ from tests.unit.roswire.tables import rows
     ],
 )
 def test_node_uris_as_ros_writes_them(text: str, expected: NodeUri) -> None:
-    """Host names, IPv4 and IPv6 addresses (in brackets, or as rospy writes them) with a port are node URIs."""
     assert parse_node_uri(text) == expected
 
 
@@ -41,7 +40,6 @@ def test_refused_node_uris_say_why(text: str, complaint: str) -> None:
 
 
 def test_service_uris() -> None:
-    """A service URI is rosrpc://host:port, with nothing after it."""
     assert parse_service_uri("rosrpc://robot:4321") == NodeUri("rosrpc", "robot", 4321, "")
     assert parse_service_uri("rosrpc://[::1]:4321/") == NodeUri("rosrpc", "::1", 4321, "")
     with pytest.raises(InvalidUriError, match="has a path"):

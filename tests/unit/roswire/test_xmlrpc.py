@@ -59,7 +59,7 @@ def python_loads(body: bytes) -> tuple[tuple[Any, ...], str | None]:
 
 
 def without_bare_returns(value: Value) -> Value:
-    """Return `value` after xmlrpc.client wrote it: a bare `\r` is then read as a line feed."""
+    """Return `value` after xmlrpc.client wrote it: a bare `` is then read as a line feed."""
     match value:
         case str():
             return value.replace("\r\n", "\n").replace("\r", "\n")
@@ -135,7 +135,7 @@ ROSCPP_CALL = (
 
 
 def test_roscpp_calls_are_read() -> None:
-    """Strings without a type, as XmlRpc++ writes them, are read as strings."""
+    """XmlRpc++ writes strings without a type."""
     expected = ("/listener", "/chatter", "std_msgs/String", "http://h:4567/")
     assert parse_call(ROSCPP_CALL) == MethodCall("registerSubscriber", expected)
 
@@ -219,7 +219,6 @@ def test_calls_without_parameters() -> None:
     ],
 )
 def test_declarations_that_are_read(declaration: str, body: bytes) -> None:
-    """UTF-8 is the default; ASCII and Latin-1 may be declared."""
     assert parse_call(declaration.encode() + call("<value>@</value>").replace(b"@", body)).params == (
         "\u00e9",
     )
@@ -284,13 +283,11 @@ def test_invalid_xml_rpc_is_refused(body: bytes, text: str) -> None:
     ],
 )
 def test_answers_that_are_refused(body: bytes) -> None:
-    """An answer must be one value, or a fault with a code and a text."""
     with pytest.raises(ProtocolError):
         parse_response(body)
 
 
 def test_limits_hold() -> None:
-    """Size, count, depth, length of strings and parts are limited; the limit itself is allowed."""
     limits = XmlRpcLimits(body=2000, elements=4, depth=2, string=5, parts=2)
     array = "<value><array><data>{}</data></array></value>".format
     assert read(array(array("<value/>")), limits) == [[""]]
@@ -424,7 +421,7 @@ def test_random_bytes_are_refused(data: bytes) -> None:
     ],
 )
 def test_values_without_a_notation_are_errors(value: object, text: str) -> None:
-    """A value that XML-RPC cannot express is an error of the sending program, and never gives bad XML."""
+    """Such a value is an error of the sending program."""
     with pytest.raises(EncodingError, match=text):
         build_response(value)  # type: ignore[arg-type]  # the test is a value of a wrong type
     with pytest.raises(EncodingError, match=text):

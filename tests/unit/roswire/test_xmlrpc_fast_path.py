@@ -24,7 +24,6 @@ ROSCPP = (
 
 
 def walked(body: bytes, root: str, limits: XmlRpcLimits) -> tuple[str, list[Value]] | None:
-    """None if the general parser rejects the document."""
     try:
         document = XmlRpcDocument(body, limits, root)
     except PeerError:
@@ -172,7 +171,6 @@ def test_an_invalid_document_takes_linear_time(piece: bytes, before: bytes) -> N
 
 
 def spoilt(before: bytes, piece: bytes, size: int) -> list[bytes]:
-    """The documents match until their last byte."""
     some = piece * (size // 32 // len(piece))
     whole = dumped(["a"], None).partition(b"<value>")[0] + before + some + b"<"
     texts = [whole, whole.replace(b"<methodResponse>", b"<methodCall><methodName>m</methodName>")]

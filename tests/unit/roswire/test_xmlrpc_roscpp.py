@@ -17,7 +17,6 @@ Peer = Callable[[bytes], MethodCall]
 
 @pytest.fixture(scope="module")
 def roscpp(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Peer]:
-    """Give roscpp's library an answer, and return the call that it writes with the answer's value."""
     compiler, config = need_program("g++", "g++"), need_program("pkg-config", "pkg-config")
     program = tmp_path_factory.mktemp("xmlrpcpp") / "peer"
     flags = subprocess.run(

@@ -47,7 +47,6 @@ def test_the_program_sends_hosts_of_the_networks_to_the_first_socket(
 
 
 def test_more_networks_than_a_program_has_room_for() -> None:
-    """No host is put behind others because of a policy that names too many networks."""
     many = [ipaddress.ip_network(f"10.{number >> 8}.{number & 255}.0/24") for number in range(1000)]
     assert choose(first_for(many[:200]), ipaddress.ip_address("192.0.2.1")) == SECOND
     assert choose(first_for(many), ipaddress.ip_address("192.0.2.1")) == FIRST
@@ -62,7 +61,6 @@ class Port:
         self.queues.second.settimeout(WAIT)
 
     def accepts(self, source: str, by: socket.socket) -> None:
-        """The connection must come out of this socket."""
         target = (source if ":" in source else "127.0.0.1", self.first.getsockname()[1])
         other = self.queues.second if by is self.first else self.first
         with socket.create_connection(target, WAIT, source_address=(source, 0)):

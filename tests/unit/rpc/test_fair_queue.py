@@ -20,7 +20,6 @@ def slots(whole: int, host: int) -> Turns[Address]:
 
 
 async def test_turns_go_round() -> None:
-    """When all slots are taken, hosts get the next ones in turn, however many requests one of them has waiting."""
     turns, order = slots(1, 1), []
 
     async def request(host: Any) -> None:

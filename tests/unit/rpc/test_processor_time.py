@@ -16,8 +16,6 @@ PIECE = TURN_SECONDS / 4
 
 
 class Loop:
-    """Only `spend` moves its clock."""
-
     def __init__(self) -> None:
         self.now = 0.0
         self.order: list[Address] = []
@@ -32,7 +30,6 @@ class Loop:
         return run
 
     async def all(self) -> None:
-        """Notes what each turn took."""
         while self.time.waiting:
             before = self.now
             await asyncio.sleep(0)
@@ -120,7 +117,7 @@ def test_no_host_saves_time_and_debts_stay() -> None:
 
 
 def test_a_charge_costs_the_same_for_any_number_of_hosts() -> None:
-    """Each host of a flood has a new address, so all owe; charging one does not look at all others each time."""
+    """Each host of a flood has a new address, so all owe."""
     looked_at = 0
 
     class Host(int):

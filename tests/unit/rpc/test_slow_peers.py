@@ -27,7 +27,6 @@ pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
     "beginning", [b"", b"POST /", b"POST / HTTP/1.1\r\nHost: m\r\nX: "], ids=["silent", "line", "head"]
 )
 async def test_slowloris(beginning: bytes) -> None:
-    """A connection whose request head does not come, or comes a byte a time, ends after `head_seconds`."""
 
     async def drip(client: Client) -> None:
         with contextlib.suppress(ConnectionError):
@@ -208,7 +207,6 @@ async def test_requests_behind_one_that_is_served_are_not_read() -> None:
 
 
 async def test_gone_before_its_turn() -> None:
-    """A request whose connection is gone before it was its turn is not served and holds nothing."""
     release = asyncio.Event()
 
     async def handler(_request: HttpRequest) -> bytes:

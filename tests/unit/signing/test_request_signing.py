@@ -42,7 +42,6 @@ def stated(challenge: str = "60.000.abc.def", **parts: object) -> bytes:
 
 
 def test_the_vectors() -> None:
-    """Keys, statement and proof equal those of another implementation for the same token and request."""
     assert reading_key(TOKEN) == READING
     assert reading_id(READING) == "5c0f3d2b9a11"
     assert keys_of(TOKEN).verifying.hex() == VERIFYING

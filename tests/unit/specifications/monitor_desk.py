@@ -137,7 +137,6 @@ class WaitingManager(SpecificationManager):
     desk: Desk
 
     async def roll_back(self, request: admin.MonitorRollback, who: str) -> Replacement:
-        """Wait, unless an operator ordered it."""
         if who != UNCONFIRMED:
             return await super().roll_back(request, who)
         await self.desk.limit_ends.wait()
@@ -147,15 +146,12 @@ class WaitingManager(SpecificationManager):
 
 
 class Taking:
-    """One relay, which accepts everything, refuses it with the findings of the desk, or is away."""
-
     monitors: WaitingManager
 
     def __init__(self, desk: Desk) -> None:
         self.desk = desk
 
     def send(self, message: messages.Message, relay: int) -> bool:
-        """The answer comes in the next turn of the loop."""
         if self.desk.away:
             return False
         self.desk.sent.append(message)

@@ -79,7 +79,6 @@ def test_a_fresh_start_is_balanced_and_kept() -> None:
 
 
 def test_a_specification_goes_to_the_relay_of_its_topics() -> None:
-    """No topic moves if all its topics are on one relay; otherwise as few as possible move."""
     allocation = Allocation(4)
     here = {f"/t{number}": allocation.of(TOPIC, f"/t{number}") for number in range(64)}
     assert set(here.values()) == {0, 1, 2, 3}

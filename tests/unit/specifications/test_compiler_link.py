@@ -19,8 +19,6 @@ pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
 
 
 class Scene:
-    """Control's end, and a compiler that starts when called; the next of `acts` handles its question."""
-
     def __init__(self, *acts: Callable[[Channel, Any], None]) -> None:
         self.calls = 0
         self._acts = list(acts)
@@ -108,8 +106,6 @@ async def test_a_silent_or_missing_compiler_is_not_waited_for(
 
 
 class Told:
-    """Works without end on a dry run, and answers everything else."""
-
     def __init__(self) -> None:
         self.heard: asyncio.Queue[Any] = asyncio.Queue()
 

@@ -33,7 +33,6 @@ def test_a_fitting_type_is_not_a_finding() -> None:
 
 
 def test_a_topic_that_monitors_publish_has_one_type() -> None:
-    """A monitor that would publish another type than a node does is a conflict at the statement, unless forced."""
     live = LIVE | {"/alarm": {"/siren": LiveType("std_msgs/Bool")}}
     conflicts, warnings = judged(live)
     assert warnings == []
@@ -100,7 +99,7 @@ def held(
 
 
 def test_a_change_that_holds_a_topic_with_traffic_needs_consent() -> None:
-    """The robot would get no command, not even a stop, so the operator decides before, not after."""
+    """The robot would get no command, not even a stop."""
     what = (
         "deadman loses its state, because its text, or a definition, changes, and then holds /cmd_vel:"
         " it drops every message"

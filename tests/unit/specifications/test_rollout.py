@@ -44,8 +44,6 @@ def files_of(message: messages.SpecificationsStated) -> list[str]:
 
 
 class Fleet:
-    """Two relays and the calls to them, in order; `answer(relay, statement)` returns a relay's answer."""
-
     def __init__(self, trail: AuditTrail) -> None:
         self.rollout = Rollout(
             Allocation(2), trail, "drop", lambda checked: dict.fromkeys(checked.monitors, True), self, slices=1000,
@@ -87,8 +85,6 @@ class Fleet:
 
 
 class World:
-    """Two relays with the monitors `a` and `b`, one on each, and their topics carried."""
-
     def __init__(self, home: Path) -> None:
         self.log = open_log(home / "audit.db")
         self.trail = RecordingTrail(self.log)

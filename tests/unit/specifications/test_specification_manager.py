@@ -362,7 +362,6 @@ async def test_a_first_start_leaves_out_a_file_that_it_cannot_parse(desk: Desk) 
 
 
 async def test_a_load_or_removal_of_others_leaves_a_broken_file_as_the_start_left_it(desk: Desk) -> None:
-    """A monitor with an error holds its topics still, the alarms of unusable files stay, and the answer names both."""
     broken = {"code": "code() { event e() /x std_msgs/String '{}' { missing = 1; } }", "text": "nonsense"}
     for name, text in broken.items():
         (desk.folder / f"{name}.rv").write_text(text)

@@ -24,7 +24,6 @@ def connection() -> Iterator[sqlite3.Connection]:
 
 
 def apply(connection: sqlite3.Connection, change: Change) -> list[str]:
-    """Returns the names after the change."""
     arrived = msgspec.msgpack.decode(msgspec.msgpack.encode(change), type=Change)
     tables = Tables(SCHEMA)
     tables.check(arrived)

@@ -50,7 +50,6 @@ class Keeper(Revisions[MonitorRevisionRow]):
 
 @pytest.fixture
 def keeper(tmp_path: Path) -> Iterator[Keeper]:
-    """It has the revisions 4, 5 and 7."""
     store = StateStore(tmp_path, failed=pytest.fail, kind=InlineDatabase)
     keeper = Keeper(store)
     for number in (4, 5, 7):
@@ -103,8 +102,6 @@ async def test_only_a_start_of_the_appliance_reads_the_disk_in_place_of_its_revi
 
 
 class Returning(Keeper):
-    """Revisions that go back when the disk takes it, at the third attempt."""
-
     attempts = 0
 
     async def _go_back(self, revision: int) -> None:

@@ -42,7 +42,6 @@ def leave_behind(directory: Path, changes: Sequence[Encoded]) -> None:
 
 
 def killed_after(work: Callable[[StateStore], None], directory: Path) -> None:
-    """The writer thread writes nothing after the kill."""
     child = os.fork()
     if not child:
         try:

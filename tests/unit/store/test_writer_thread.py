@@ -375,7 +375,6 @@ def leave_behind(path: Path, *changes: Encoded) -> None:
 
 
 def names_after_start(tmp_path: Path) -> list[str]:
-    """The file of changes under way must be empty."""
     database = Database(tmp_path / "state.db", SCHEMA, failed=pytest.fail, drive=ByHand)
     names = [name for (name,) in database.query("SELECT name FROM thing ORDER BY name")]
     database.close()
@@ -579,8 +578,6 @@ def test_a_copy_is_of_one_moment_and_leaves_no_file(tmp_path: Path) -> None:
 
 
 class _Gate:
-    """Operations on one file: a write waits until another thread closes the file, or is about to."""
-
     def __init__(self) -> None:
         self.writing, self.closing = threading.Event(), threading.Event()
         self._lock = threading.Lock()

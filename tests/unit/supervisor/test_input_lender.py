@@ -44,7 +44,6 @@ assert context.get_ca_certs()
 
 @pytest.fixture
 def home(tmp_path: Path) -> Path:
-    """Mode 0700; a policy, a folder of specifications, and another file."""
     need_root()
     (tmp_path / "monitors/msg/p").mkdir(parents=True)
     for name in ("robot.ini", "robot.ini.sig", "monitors/m.rv", "monitors/msg/p/T.msg", ".ssh_key"):

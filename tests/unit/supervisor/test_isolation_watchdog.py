@@ -15,8 +15,6 @@ pytestmark = pytest.mark.anyio
 
 
 class Surroundings(NoIsolation):
-    """An enclosure where the test chooses the findings of a probe."""
-
     kind = "container"
     probes = True
 
@@ -36,7 +34,6 @@ class Surroundings(NoIsolation):
         return finding
 
     def control_ready(self, inner_port: int, own_port: int) -> None:
-        """Fail for port 0 and 1."""
         if inner_port == 0:
             raise NetworkError("the kernel says no")
         if inner_port == 1:

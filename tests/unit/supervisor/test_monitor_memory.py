@@ -10,7 +10,6 @@ WRITTEN = b"rosrvMS1\x01"
 
 
 def given(memory: MonitorMemory, index: int) -> list[tuple[StateGiven, bytes]]:
-    """Returns the first bytes of each file too."""
     found = memory.messages_for("relay", index)
     return [(message, os.pread(descriptor, 16, 0)) for message, descriptor in found]
 

@@ -36,7 +36,6 @@ def test_an_address_of_another_machine_is_an_error() -> None:
 
 
 def test_the_first_free_port() -> None:
-    """A port with a listener, or with connections of its last owner, is skipped."""
     with socket.create_server(("127.0.0.1", 0)) as listener:
         port = listener.getsockname()[1]
         assert first_free(range(port, port + 20)) > port

@@ -55,7 +55,6 @@ print(json.dumps({
 
 @pytest.fixture
 def home(tmp_path: Path) -> Path:
-    """A program, a state with the folders of two users, and files that are closed to others."""
     need_root()
     home = tmp_path / "home"
     for folder in ("x y/appliance", "state/relay", "state/control"):

@@ -9,7 +9,6 @@ from appliance.supervisor.relay_entry import limits_of
 
 
 def test_every_key_reaches_the_relay(tmp_path: Path) -> None:
-    """Each key of the section `relay` sets a limit of the relay, and has the same default."""
     written = tmp_path / "config.json"
     keys = {field.name for field in fields(Relay)}
     assert keys <= {field.name for field in fields(RelayLimits)}

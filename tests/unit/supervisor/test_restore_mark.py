@@ -7,7 +7,7 @@ from appliance.supervisor.restore_mark import refuse_half_restored, set_mark
 
 
 def test_a_marked_directory_is_refused(tmp_path: Path) -> None:
-    """Until the restore ends, the error says how to continue; a second restore cannot set its own mark."""
+    """The error says how to continue; a second restore cannot set its own mark."""
     refuse_half_restored(tmp_path)
     mark = set_mark(tmp_path)
     with pytest.raises(StartError, match="remove this folder, and run `rosrv restore` again"):
@@ -19,5 +19,4 @@ def test_a_marked_directory_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_missing_directory_is_not_marked(tmp_path: Path) -> None:
-    """It counts as new, so an appliance may start on it."""
     refuse_half_restored(tmp_path / "new")

@@ -30,7 +30,7 @@ def test_rosmaster_runs_no_code_of_its_home() -> None:
 
 @pytest.mark.nightly
 def test_rosmaster_logs_warnings_and_no_calls(tmp_path: Path) -> None:
-    """Logging each call would cost rosmaster half of its time; its warnings are still logged."""
+    """Logging each call would cost rosmaster half of its time."""
     role = BY_NAME["rosmaster"]
     assert role.program is not None
     says = (
@@ -62,7 +62,7 @@ def test_a_missing_rosmaster_is_an_error_that_says_what_to_install(tmp_path: Pat
 
 
 def test_links_are_between_roles_and_go_both_ways() -> None:
-    """A restart of either end renews the link, so the rows of both roles name it."""
+    """A restart of either end renews the link."""
     for role in ROLES:
         for other in role.links:
             assert role.name in BY_NAME[other].links
@@ -78,7 +78,6 @@ def test_the_compiler_has_only_its_link() -> None:
 
 
 def test_rows_are_consistent() -> None:
-    """Each role has a user of the design, and runs our code or a foreign program. No two of ours share a part."""
     assert all(role.user in NUMERIC_IDS for role in ROLES)
     assert all((role.entry is None) != (role.program is None) for role in ROLES)
     assert all(callable(pkgutil.resolve_name(role.entry)) for role in ROLES if role.entry is not None)

@@ -46,7 +46,6 @@ HERE = Path("/bin/true")
 
 @pytest.mark.nightly
 def test_only_sockets_of_granted_families_can_be_opened() -> None:
-    """A process that may open only Unix sockets cannot open network sockets, nor can its child programs."""
     done = subprocess.run(
         [sys.executable, "-c", _PROGRAM % _CHILD], capture_output=True, text=True, check=True
     )

@@ -20,7 +20,6 @@ class Crowd:
         self.done: list[tuple[str, str]] = []
 
     def add(self, name: str, ends_by: str, *, is_program: bool = False, last: bool = False) -> None:
-        """The process ends on `Stop`, on a signal of this name, or never."""
         role = Role(name=name, user="rosrv", part=name, outlives_control=last)
         slot = ProcessSlot(role, 0)
         slot.process = cast(ProcessHandle, Process(self, slot, ends_by, is_program=is_program))
@@ -78,7 +77,7 @@ def test_a_process_that_does_not_end_is_killed(crowd: Crowd) -> None:
 
 
 def test_an_unkillable_process_does_not_delay_the_end(crowd: Crowd) -> None:
-    """A process that even the kernel cannot end (a broken disk) is left, and the others are ended."""
+    """Even the kernel cannot end it (a broken disk)."""
     crowd.add("control", "never")
     crowd.add("rosmaster", "Stop", last=True)
     done = crowd.end()

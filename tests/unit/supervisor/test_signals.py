@@ -1,4 +1,4 @@
-"""Tests of `appliance.supervisor.signals`: signals that arrive during operations which must be completed.
+"""Signals that arrive during operations which must be completed.
 
 Each test runs a separate process: a signal to a thread of the test runner would end the runner.
 """

@@ -75,7 +75,7 @@ def test_a_deadlock_names_what_the_tasks_wait_for() -> None:
 
 
 def test_a_poll_without_end_fails() -> None:
-    """A condition that never comes true would otherwise be looked at for ever, for no time passes."""
+    """No time passes, so the condition would be looked at for ever."""
 
     async def poll() -> None:
         while True:

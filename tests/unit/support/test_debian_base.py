@@ -21,7 +21,6 @@ def test_a_machine_without_the_suite_has_no_lines_for_it() -> None:
 
 
 def test_apt_fetches_through_the_machines_proxy() -> None:
-    """The proxy of apt's configuration is kept; otherwise the proxy of the environment is used."""
     told = (
         'Acquire::http::Proxy "http://apt-proxy.example:3142";\nAcquire::Languages "none";\nAPT::Color "1";\n'
     )

@@ -47,7 +47,6 @@ def test_a_deterministic_test_may_not_depend_on_chance(act: Callable[[], object]
 
 
 def test_every_test_file_runs_at_night_in_one_stage() -> None:
-    """A new folder of tests without a stage would be an error; every lane and stage has tests."""
     stages = files_of_stages()
     files = [file for named in stages.values() for file in named]
     assert len(files) == len(set(files)) > 500

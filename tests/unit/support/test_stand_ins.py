@@ -60,7 +60,6 @@ def private(tree: ast.Module) -> Iterator[str]:
 
 
 def answers_anything(tree: ast.Module) -> Iterator[str]:
-    """Yields classes that invent attributes, and mocks of the standard library."""
     for node in ast.walk(tree):
         match node:
             case ast.FunctionDef(name="__getattr__" | "__getattribute__"):

@@ -27,7 +27,7 @@ def test_a_flood_holds_a_minute_of_seconds() -> None:
 
 
 def test_only_denials_count_as_denied() -> None:
-    """Allowed requests do not count as denials; requests that an audit-only policy would deny do not count either."""
+    """Requests that an audit-only policy would deny do not count."""
     meter = Meter()
     for outcome in ("deny", "allow", "would deny", "deny"):
         meter.decided("publish", outcome, 0.001, "10.0.0.1")

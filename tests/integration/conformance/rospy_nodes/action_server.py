@@ -10,7 +10,6 @@ from report import init_node, report
 
 
 def main():
-    """A goal over 100 continues until it is cancelled."""
     init_node("action_server")
 
     def work(goal):

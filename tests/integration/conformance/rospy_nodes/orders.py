@@ -35,7 +35,7 @@ class Orders:
         self.subscribers.pop(told["topic"]).unregister()
 
     def abandoned(self, told):
-        """Wait until the topic has no connection: rospy mistakes a publisher that returns earlier for the old one."""
+        """rospy mistakes a publisher that returns before the topic has no connection for the old one."""
         subscriber = self.subscribers[told["topic"]]
         for _ in range(3000):
             if not subscriber.get_num_connections():

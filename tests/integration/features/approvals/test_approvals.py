@@ -139,7 +139,6 @@ def published(publish: dict[str, Any]) -> bool:
 
 
 def refused(publish: dict[str, Any]) -> str:
-    """Return the last refusal in two seconds."""
     text = ""
     with connect(AGENT) as client:
         client.send(json.dumps({"op": "advertise", "topic": "/cmd_vel", "type": "geometry_msgs/Twist"}))

@@ -69,7 +69,6 @@ def appliance(common_lab: Lab) -> Iterator[Appliance]:
 
 
 def stuck_client() -> socket.socket:
-    """It reads nothing after the handshake."""
     client = socket.create_connection(("10.77.0.2", 9091), SECONDS)
     client.sendall(HANDSHAKE)
     assert b" 101 " in client.recv(1000)
@@ -130,7 +129,7 @@ def test_an_agent_hears_publishes_and_calls_within_its_rights(
 def test_large_messages_for_clients_that_read_nothing_take_bounded_memory(
     appliance: Appliance, common_robot: Host, tmp_path: Path
 ) -> None:
-    """Each client reads nothing of a message of 30 MB, and wants no other; together, the messages have 600 MB."""
+    """Each client reads nothing of a message of 30 MB; together, the messages have 600 MB."""
     program = tmp_path / "large.py"
     program.write_text(LARGE)
     with RosSession(appliance.master_uri, tmp_path, common_robot) as ros, ExitStack() as stack:
@@ -159,9 +158,8 @@ def test_large_messages_for_clients_that_read_nothing_take_bounded_memory(
 def test_a_ticket_opens_the_door_of_a_person_until_it_is_over(
     appliance: Appliance, common_robot: Host, tmp_path: Path
 ) -> None:
-    """The secret is in no record. A wrong ticket is refused, and the connection ends with its ticket.
-
-    It also ends if the control that passed it on has died.
+    """The secret is in no record. The connection ends with its ticket, also if the control that passed it on has
+    died.
     """
     appliance.rosrv("door", "add", "alice")
     made = appliance.rosrv("door", "ticket", "alice", "--for", "8s").stdout.strip()

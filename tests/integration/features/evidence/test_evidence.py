@@ -43,7 +43,7 @@ def cast(answer: Any) -> list[Any]:
 
 
 def proved(bundle: Path, key: Path) -> str:
-    """Return the output of the bundle's own verifier, run by the system's Python without an environment."""
+    """The bundle's own verifier runs by the system's Python without an environment."""
     with zipfile.ZipFile(bundle) as archive:
         program = archive.read("verify.py")
     command = ["/usr/bin/python3", "-I", "-", str(bundle), "--key", str(key)]

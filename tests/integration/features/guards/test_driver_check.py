@@ -1,5 +1,3 @@
-"""`rosrv guard check-driver` measures a real base, and ends also if a process dies during the check."""
-
 import signal
 import subprocess
 from collections.abc import Callable, Iterator
@@ -23,7 +21,7 @@ LIMIT = 4
 
 @pytest.fixture(scope="module")
 def guarded(common_lab: Lab) -> Iterator[Appliance]:
-    """An appliance with a deadman, whose reports come from a real relay."""
+    """The reports of the deadman come from a real relay."""
     deadman = text_of(Guard("deadman", PRESETS["deadman"]))
     host = common_lab.host("guarded", "10.77.0.5/24")
     with Appliance(host, options=("--api", "off"), monitors={"deadman": deadman}) as running:
@@ -42,7 +40,6 @@ def guards(appliance: Appliance) -> list[str]:
 
 
 def outcome_in_log(appliance: Appliance, outcome: str) -> dict[str, Any]:
-    """Return the detail of the record of a check with this outcome."""
 
     def found() -> list[dict[str, Any]]:
         details = [one["detail"] for one in appliance.audit("--event", "driver checked")]

@@ -47,7 +47,6 @@ class Renewing:
             self.renewed += self._peer.ask("renew", self.epoch).ok
 
     def end(self) -> None:
-        """An appliance without power makes no release."""
         self._ended.set()
         self._thread.join()
 

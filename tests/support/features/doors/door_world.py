@@ -166,7 +166,7 @@ class DoorWorld:
 
 @asynccontextmanager
 async def door_world() -> AsyncIterator[DoorWorld]:
-    """Yield a door; at the end it is closed, and no task of it remains and no memory is held."""
+    """At the end the door is closed, and no task of it remains and no memory is held."""
     before = asyncio.all_tasks()
     world = DoorWorld()
     await world.start()

@@ -1,6 +1,6 @@
 """A door on real sockets; run the module with MASTER_URI ADDRESS PORT [FILE.srv …], and it serves until killed.
 
-It is assembled as the door process will be: each connection comes as a descriptor from another part, which listens.
+Each connection comes as a descriptor from another part, which listens, as in the door process.
 """
 
 import asyncio

@@ -25,7 +25,7 @@ BEGAN = 1_767_225_600 * SECOND  # 2026-01-01T00:00:00Z
 
 
 class World:
-    """The time that passes for both appliances, in nanoseconds since the epoch."""
+    """The time for both appliances, in nanoseconds since the epoch."""
 
     def __init__(self) -> None:
         self.now = BEGAN
@@ -87,7 +87,7 @@ class Member:
 
     @asynccontextmanager
     async def active(self, epoch: int, *, sealed: bool = True) -> AsyncIterator[None]:
-        """Take over, wait until the takeover is `sealed`, and stay active for the block."""
+        """Wait until the takeover is `sealed`, and stay active for the block."""
         with self.timed():
             await self.recorder.took_over(epoch)
         following = asyncio.create_task(self.recorder.follow())

@@ -138,7 +138,7 @@ class StandbySide:
 
 
 class CuttingProxy:
-    """A proxy between the two, which closes a connection after a random number of bytes, often in a frame."""
+    """Closes a connection after a random number of bytes, often in a frame."""
 
     def __init__(self, port: Callable[[], int], chosen: random.Random) -> None:
         self.cutting = True

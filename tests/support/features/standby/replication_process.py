@@ -2,9 +2,9 @@
 
 python -m tests.support.features.standby.replication_process SIDE DIRECTORY PORT DESCRIPTOR
 
-The active side makes random changes without end, and prints the number of each mark that is acknowledged. After a line
-on standard input it makes no further changes; when the standby has all of them, it prints `equal`. It takes its
-listening socket (DESCRIPTOR) from its parent, so its port stays the same.
+The active side makes random changes, and prints the number of each mark that is acknowledged. After a line on
+standard input it stops, and prints `equal` when the standby has all changes. The listening socket (DESCRIPTOR) is its
+parent's, so its port stays the same.
 """
 
 import asyncio

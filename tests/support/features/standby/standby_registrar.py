@@ -2,9 +2,9 @@
 
     standby_registrar.py MASTER_URI OWN_ADDRESS
 
-Each call is repeated until it is answered, as a careful node does; event `acknowledged` with the number of answered
-calls and the time of the monotonic clock. For a line `check` on the input it compares the master's state with all
-answers; event `checked` with the differences. After a line `time` it reports each call, otherwise each 20th.
+Each call is repeated until it is answered; event `acknowledged` has the number of answered calls and the time of the
+monotonic clock. A line `check` on the input compares the master's state with all answers; event `checked` has the
+differences. After a line `time` it reports each call, otherwise each 20th.
 """
 
 import http.client
@@ -40,7 +40,7 @@ class Registrar:
         self.parameters: dict[str, int] = {}
         self.topics: set[str] = set()
         self.longest = 0.0
-        """The longest time of a call, in seconds, since it was last reported."""
+        """The longest time of a call, in seconds, since the last report."""
         self._proxy = xmlrpc.client.ServerProxy(master, Transport())
 
     def call(self, method: str, *arguments: Any) -> Any:

@@ -98,7 +98,6 @@ class StandbyRobot:
             assert "False" in ros.run("rosservice", "call", "/negate_roscpp", "true").stdout
 
     def admitted(self) -> set[str]:
-        """The robot's firewall translates the fixed address to them."""
         rules = self.site.robot.run(
             lambda: (
                 subprocess.run(

@@ -63,7 +63,6 @@ class StandbySite:
         options: tuple[str, ...] = (),
         **more: Any,
     ) -> None:
-        """`lease_folder` is where the witness keeps the lease (default: `home`)."""
         self.lab, self.home = lab, home
         self.robot = lab.host("robot", f"{ROBOT}/24")
         members, settings, follower = memberships(lease_folder or home)
@@ -89,7 +88,6 @@ class StandbySite:
             self.appliances[name] = one
 
     def command(self, *words: str, settings: Path | None = None) -> list[str]:
-        """As on a robot without the product."""
         program = (
             f"import sys; sys.path.insert(0, {str(self.home)!r}); import witness;"
             f" witness.BOOT_ID = {str(self.home / 'boot')!r}; sys.exit(witness.main(sys.argv[1:]))"
@@ -131,7 +129,7 @@ class StandbySite:
         self.start_witness()
 
     def start(self, name: str) -> Process:
-        """Start an appliance; return when it could take over or is active, and its process."""
+        """Return when the appliance could take over or is active."""
         one = self.appliances[name]
         one.process = Process(one.host, self._up(one), env=dict(os.environ), label=f"rosrv up {name}")
         one.process.wait_for(lambda event: event.get("event") in {"standby", "ready"}, timeout=2 * LIMIT)
@@ -181,7 +179,6 @@ class StandbySite:
         eventually(lambda: self.holder() == name, self.story)
 
     def pids(self, name: str, role: str = "") -> list[int]:
-        """With a role, only those of that role."""
         one = self.appliances[name].process
         assert one is not None
         title = b"/usr/bin/rosmaster\0" if role == "rosmaster" else f"rosrv: {role}".encode()

@@ -170,7 +170,6 @@ class Site:
 
 
 def write_settings(path: Path, settings: dict[str, object]) -> None:
-    """Only the owner can read the file."""
     path.write_text(json.dumps(settings))
     path.chmod(0o600)
 
@@ -182,7 +181,6 @@ def forged(source: str, payload: bytes) -> bytes:
 
 
 def seconds_until_reset(connections: list[socket.socket]) -> float:
-    """Return the time until all are reset; none of them sends."""
     begun = time.monotonic()
     for connection in connections:
         connection.settimeout(LIMIT)

@@ -86,8 +86,6 @@ def slowest_answer(robot: StandbyRobot, since: float) -> float:
 
 
 class Liar:
-    """A client with the standby's certificate and its address."""
-
     def __init__(self, site: StandbySite, folder: Path, *, certificate: bool = True) -> None:
         _, self.name = site.pair()
         self.host: Host = site.lab.hosts[self.name]
@@ -117,7 +115,6 @@ class Liar:
 
 @contextlib.contextmanager
 def standby_replaced(site: StandbySite, folder: Path) -> Iterator[Liar]:
-    """The real standby starts again afterwards."""
     active, passive = site.pair()
     site.signal(passive, signal.SIGKILL)
     eventually(lambda: site.in_sync() == {active}, site.story)
@@ -146,7 +143,6 @@ def test_a_standby_that_lies(site: StandbySite, robot: StandbyRobot, tmp_path: P
 
 
 async def lied(link: ReplicationLink[Any], lie: Callable[[str], Any]) -> bool:
-    """Returns whether the link ended."""
     await link.send(Stored(0, "", 0))
     begin = await link.receive(10)
     while not isinstance(await link.receive(10), SnapshotEnd):
@@ -204,7 +200,6 @@ def connects(address: str) -> bool:
 
 
 def record(site: StandbySite, number: int) -> list[bytes]:
-    """The datagrams have their Ethernet headers."""
 
     def listen() -> list[bytes]:
         found: list[bytes] = []

@@ -12,10 +12,7 @@ _FAULTS = 20
 
 
 def test_random_faults_break_no_promise() -> None:
-    """The robot is soon served again, by one appliance; no subscription ends, and operators learn the state at once.
-
-    The seed of a failure is the number in its message: `python -m benchmarks.pair_faults --faults 20 --seed NUMBER`.
-    """
+    """The seed of a failure is in its message: `python -m benchmarks.pair_faults --faults 20 --seed NUMBER`."""
     need_root()
     need_program("nft", "nftables")
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")

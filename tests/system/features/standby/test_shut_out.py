@@ -25,7 +25,6 @@ def nothing_is_lost(site: StandbySite, robot: StandbyRobot) -> Iterator[None]:
 
 @pytest.mark.parametrize("seconds", [0.4, 1.5, 4.0])
 def test_nodes_are_back_soon(site: StandbySite, robot: StandbyRobot, seconds: float) -> None:
-    """After the boot's rules were in force for a moment, topics and services work within three seconds."""
     site.stop_witness()
     with Process(site.robot, site.command("shut"), env=dict(os.environ), label="shut") as shut:
         assert shut.wait() == 0, shut.story()

@@ -1,7 +1,6 @@
 """A standby that could not serve: both appliances report it, it does not claim, and recovers automatically.
 
-The standby `b` has keys of the site, which `a` does not know. All tests of the file use the same appliances; each
-brings the policy that it needs into force, so it also passes alone.
+The standby `b` has keys of the site, which `a` does not know. Each test brings the policy that it needs into force.
 """
 
 from collections.abc import Iterator
@@ -46,7 +45,6 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StandbySite]:
 
 
 def until_obstacle(site: StandbySite, words: str, *names: str) -> None:
-    """Without words: until `b` can take over."""
 
     def reported(name: str) -> bool:
         done = site.appliances[name].rosrv("standby", "status", "--json", check=False)
@@ -71,9 +69,8 @@ def make_ready(site: StandbySite) -> None:
 
 
 def test_other_site_keys(site: StandbySite) -> None:
-    """Both appliances give the reason, a switchover is refused with it, and a power cut of the active one waits for it.
-
-    The first signed policy makes the standby ready.
+    """A switchover is refused with the reason, and a power cut of the active one waits for it. The first signed
+    policy makes the standby ready.
     """
     load(site, f"{OPEN_POLICY}# unsigned\n", "")
     until_obstacle(site, NO_SIGNATURE, "a", "b")

@@ -30,7 +30,7 @@ ROLES = ("control", "relay", "rosmaster", "signer", "api", "lease")
 
 
 def orders(site: StandbySite, name: str) -> list[Any]:
-    """Return the orders of operators: policies, specifications, tokens. A takeover moves the ends of tokens."""
+    """Policies, specifications, tokens. A takeover moves the ends of tokens."""
     one = site.appliances[name]
     monitors = one.ask(admin.MonitorsWanted(True))
     return [
@@ -110,7 +110,6 @@ def request(site: StandbySite, name: str, method: str) -> socket.socket:
 
 
 def answer_to(sock: socket.socket) -> bytes:
-    """Empty if the connection ends without an answer."""
     with sock:
         try:
             return sock.recv(4096)
@@ -130,8 +129,8 @@ def test_a_cut_between_the_appliances(site: StandbySite, robot: StandbyRobot) ->
 def test_a_lapse_of_the_lease(site: StandbySite, robot: StandbyRobot) -> None:
     """Nothing serves until the lease is renewed; then all goes on in the same epoch, with the same processes.
 
-    Without the standby no other appliance can claim, however long the process of the lease is paused. During
-    the pause, operators learn the reason within seconds, over the socket, REST and the health check of a container.
+    Without the standby no other appliance can claim. During the pause, operators learn the reason within seconds,
+    over the socket, REST and the health check of a container.
     """
     active, passive = site.pair()
     rest = rest_of(site.appliances[active], site.appliances["a"].token)
@@ -151,7 +150,6 @@ def test_a_lapse_of_the_lease(site: StandbySite, robot: StandbyRobot) -> None:
 
 
 def rest_of(one: Appliance, token: str) -> Callable[[str], Answer]:
-    """The api has served once, which loads its routes."""
     assert isinstance(one.host, Host)
     host = one.host
     rest = Rest(REST, token, one.state / "api" / "certificate.pem")

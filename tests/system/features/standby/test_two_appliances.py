@@ -51,8 +51,6 @@ WAITS = "new certificates wait, because the key of the hosts' authority is on th
 
 
 class TunnelledStandbySite:
-    """`a` is active."""
-
     def __init__(self, lab: Lab, home: Path, **more: Any) -> None:
         self.home = home
         self.site = StandbySite(lab, home, policy=POLICY, options=("--api", "off"), **more)
@@ -315,7 +313,6 @@ def test_an_appliance_without_a_lease_has_no_tunnels(tmp_path_factory: pytest.Te
 
 
 def open_tunnel_parts(host: Host) -> list[str]:
-    """Return the parts of open tunnels on a host: processes, sockets, IPsec states and policies, interfaces."""
     commands = [f"/proc/{pid}/comm" for pid in host.namespace.processes()]
     found = [name for path in commands for name in read(path) if name.startswith("charon")]
     found += [line for line in told(host, "ss", "-Hlun").splitlines() if re.search(r":(500|4500)\b", line)]

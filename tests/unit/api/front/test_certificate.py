@@ -14,7 +14,6 @@ NOW = datetime.datetime.now(datetime.UTC)
 
 
 def shake_hands(context: ssl.SSLContext, certificate: Path, name: str) -> str | None:
-    """Return the TLS version agreed with a client that trusts only this certificate, or the reason for the failure."""
     here, there = socket.socketpair()
 
     def serve() -> None:
@@ -75,7 +74,7 @@ def test_a_recreated_container_keeps_it(tmp_path: Path, monkeypatch: pytest.Monk
 def test_it_is_renewed_for_a_new_name_or_before_it_expires(
     tmp_path: Path, names: list[str], days: int
 ) -> None:
-    """A new address or a near expiry makes a new certificate with the same key, so that pins stay valid."""
+    """The key stays, so that pins stay valid."""
     tls_context(tmp_path, ["10.1.2.3"], NOW)
     first, pin = (tmp_path / CERTIFICATE).read_bytes(), pin_of(tmp_path)
     tls_context(tmp_path, names, NOW + datetime.timedelta(days=days))
@@ -114,7 +113,7 @@ def test_a_pin_is_the_hash_of_the_key(tmp_path: Path) -> None:
 
 
 def test_an_unusable_certificate_is_an_error(tmp_path: Path) -> None:
-    """A damaged certificate is not silently replaced, because a host may have pinned it."""
+    """A host may have pinned it, so it is not silently replaced."""
     tls_context(tmp_path, [], NOW)
     (tmp_path / CERTIFICATE).write_text("-----BEGIN CERTIFICATE-----\nnonsense\n-----END CERTIFICATE-----\n")
     with pytest.raises(

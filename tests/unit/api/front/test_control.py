@@ -29,8 +29,6 @@ pytestmark = pytest.mark.anyio
 
 
 class Control:
-    """Control's end of the link: collects messages, and answers when the test says so."""
-
     def __init__(self, link: ControlLink, ends: list[Channel]) -> None:
         api, self.channel = memory_link(ApiLink)
         ends += [api, self.channel]

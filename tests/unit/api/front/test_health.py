@@ -52,7 +52,6 @@ class Probed:
 
 @contextlib.asynccontextmanager
 async def sampled(probed: Probed) -> AsyncIterator[None]:
-    """The first sample exists when the block begins."""
     async with asyncio.timeout(30):
         task = asyncio.create_task(probed.history.run())
         await probed.history.after(0)

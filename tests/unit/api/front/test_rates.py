@@ -33,7 +33,6 @@ def test_memory_is_bounded(peers: list[int]) -> None:
 
 
 def test_addresses_of_one_peer() -> None:
-    """A peer is an IPv4 address (also when mapped), the /64 of an IPv6 address, or any other text unchanged."""
     assert peer_key("10.0.0.1") == "10.0.0.1"
     assert peer_key("::ffff:10.0.0.1") == "10.0.0.1"
     assert peer_key("2001:db8::1") == peer_key("2001:db8::ffff:2") != peer_key("2001:db8:0:1::1")

@@ -42,7 +42,6 @@ def app(monkeypatch: pytest.MonkeyPatch) -> FastAPI:
 
 
 def posted(app: FastAPI, sent: Any) -> httpx.Response:
-    """A text is sent unchanged."""
     content = sent if isinstance(sent, str) else json.dumps(sent)
     return requested(app, "POST", "/", content=content, headers={"content-type": "application/json"})
 

@@ -17,7 +17,6 @@ def bearer(name: str, role: TokenRole = "viewer") -> Bearer:
 
 
 def taken(streams: Streams, who: Bearer, peer: str, most: int = 100) -> list[Callable[[], None]]:
-    """Returns the functions that release the slots."""
     places: list[Callable[[], None]] = []
     try:
         while len(places) < most:

@@ -46,7 +46,6 @@ def test_a_wrong_method_lists_the_valid_ones(app: FastAPI, contract: dict[str, A
 
 
 def test_times_have_units(contract: dict[str, Any]) -> None:
-    """Every field that holds a time has its unit in its name or its description, unless it is a whole number."""
     without, seen = [], 0
     for kind, schema in contract["components"]["schemas"].items():
         for name, of in schema.get("properties", {}).items():

@@ -166,7 +166,6 @@ def world() -> RestWorld:
 
 
 def sample(operation: Operation) -> tuple[str, str, Any]:
-    """A request that is not in `REQUESTS` is the command line's."""
     parts = operation.path.split("/")
     for method, target, body in REQUESTS:
         given = target.partition("?")[0].split("/")
@@ -395,7 +394,6 @@ def test_hostile_json_is_rejected(path: str, body: bytes) -> None:
 
 
 def require_problem(answer: httpx.Response, status: int, kind: str) -> None:
-    """Fail unless an answer is a problem document (RFC 9457) of this kind with an explanation."""
     assert answer.headers["content-type"] == "application/problem+json"
     document = json.loads(answer.text)
     assert (document["type"], document["status"]) == (f"{PROBLEM}{kind}", status)
@@ -449,7 +447,7 @@ BY_HAND = {
     },
     "operator": {"GET /v1/audit/verify", "GET /v1/hosts/{name}/kit"},
 }  # fmt: skip
-"""The routes that have no row, or a row without a name, by their least role; evidence is for all but viewers."""
+"""The routes without a row or a name, by their least role; evidence is for all but viewers."""
 
 
 def served() -> Iterator[tuple[str, Any]]:
@@ -494,7 +492,6 @@ def test_every_order_has_its_way() -> None:
 
 @pytest.mark.parametrize(("method", "target", "body"), REQUESTS, ids=IDS)
 def test_no_field_of_an_order_can_be_another(method: str, target: str, body: Any) -> None:
-    """The appliance itself fills in some fields."""
     made = ordered(method, target, body, '"7"')
     assert made.asked is not None
     body = body if isinstance(body, dict) else {}

@@ -23,8 +23,6 @@ def test_round_trip() -> None:
 
 
 class Ended(msgspec.Struct):
-    """A struct whose fields are not in alphabetical order."""
-
     publications: int = 1
     connections: int = 2
 
@@ -82,9 +80,7 @@ def test_fields_of_a_wrong_type(fields: dict[str, Any]) -> None:
 
 
 def test_small_details_survive_large_ones() -> None:
-    """Names that do not fit are omitted, and the record names the field; a load of many files keeps its revision and
-    hash.
-    """
+    """A load of many files keeps its revision and hash; the record names the omitted fields."""
     names = [f"monitor_{number}" * 20 for number in range(1000)]
     detail = {
         "sha256": "a" * 64,

@@ -20,7 +20,6 @@ _RESERVE = 16 << 20
 
 @pytest.fixture
 def disk(tmp_path: Path) -> Iterator[Path]:
-    """Mount a file system of 32 MiB: each batch of records needs space, and a busy machine makes many small ones."""
     with small_disk(tmp_path / "disk", "32m") as place:
         yield place
 

@@ -16,7 +16,6 @@ _numbers = itertools.count(1)
 def make_folder(
     seconds: float = 10.0, keys: int = 4096, keys_per_host: int = 256, unknown: int = 8
 ) -> RecordFolder:
-    """Return a folder of records with limits of kinds, whose summaries are called s1, s2, ..."""
     ids = itertools.count(1)
     bounds = Bounds(keys, min(keys_per_host, keys), min(unknown, keys), 0)
     settings = FoldSettings(seconds=seconds, kinds=bounds, read_kinds=bounds)
@@ -61,8 +60,6 @@ def test_summaries_continue_with_the_repetitions() -> None:
 
 
 class Interrupted(dict[Any, Any]):
-    """A dictionary that lets another thread work after each look into it."""
-
     def __init__(self, here: dict[Any, Any], others_work: Callable[[], object]) -> None:
         super().__init__(here)
         self._others_work = others_work
@@ -221,7 +218,7 @@ def test_zero_seconds_records_everything() -> None:
 
 
 def test_would_deny_is_never_folded() -> None:
-    """Every `would deny` is recorded in full, like every allow: a policy can be learned from them."""
+    """A policy can be learned from them, as from every allow."""
     folder = RecordFolder(FoldSettings(), lambda: "0" * 20, lambda: 0)
     record = denial(decision="would deny")
     assert [list(folder.offer(record, 0.0)) for _ in range(3)] == [[record]] * 3

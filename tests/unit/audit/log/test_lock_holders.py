@@ -1,4 +1,4 @@
-"""Find the process that blocks the log: a real process holds SQLite's locks, as a reader may."""
+"""A real process holds SQLite's locks, as a reader may."""
 
 import fcntl
 import struct
@@ -30,7 +30,6 @@ sys.stdin.read()
 
 @contextmanager
 def holding(file: Path, byte: int) -> Iterator[int]:
-    """Start a process that holds a shared lock on one byte of a file, as a reader may; return its id."""
     command = [sys.executable, "-c", _HOLD, str(file), str(byte)]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None

@@ -109,7 +109,7 @@ def test_a_defect_is_a_failure(path: Path, time: VirtualClock, monkeypatch: pyte
 
 
 def test_many_waiters_share_commits(make_log: MakeLog, path: Path) -> None:
-    """A hundred concurrent requests in strict mode each get their answer after their own record is on disk."""
+    """Each gets its answer only after its own record is on disk."""
     log = make_log(durability="strict")
 
     async def request(number: int) -> None:
@@ -125,7 +125,7 @@ def test_many_waiters_share_commits(make_log: MakeLog, path: Path) -> None:
 
 
 def test_a_reopened_log_continues(make_log: MakeLog, path: Path) -> None:
-    """A reopened log continues its chain and its ids, even with the clock set back."""
+    """Ids continue, even with the clock set back."""
     first = make_log(clock=lambda: 2_000_000_000_000_000_000)
     first.record(decision(first))
     assert first.close() is None

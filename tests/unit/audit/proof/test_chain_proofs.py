@@ -30,7 +30,6 @@ OLD_LOG = Path(__file__).with_name("log-0.1.0.db.xz")
 
 @pytest.fixture
 def log(make_log: MakeLog, path: Path) -> Path:
-    """A seal every fifty records, a denial every ten."""
     log = make_log(checkpoint_every=50, checkpoint_seconds=3600)
     for number in range(200):
         verdict = "deny" if number % 10 == 3 else "allow"
@@ -98,7 +97,6 @@ def test_an_export_after_retention_is_proved(
 
 @pytest.mark.nightly
 def test_a_log_of_version_0_1_0(path: Path, tmp_path: Path) -> None:
-    """A whole export of such a log is proved; for a filtered export the result says that it cannot be proved."""
     path.write_bytes(lzma.decompress(OLD_LOG.read_bytes()))
     old_key = read_public_key(OLD_LOG.with_name("log-0.1.0.pub"))
     proven, findings = checked(path, tmp_path, old_key)

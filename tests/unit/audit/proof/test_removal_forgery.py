@@ -50,7 +50,6 @@ def forge(path: Path, proof: dict[str, object] | None = None) -> RemovedRange:
 
 @pytest.fixture
 def fresh(make_log: MakeLog, path: Path) -> Path:
-    """Seconds old, with a denial at its beginning and retention off."""
     log = make_log(checkpoint_every=20)
     log.record(decision(log, decision="deny", host="10.0.0.66"))
     for number in range(100):
@@ -136,7 +135,6 @@ def test_the_signer_refuses_removals_beyond_its_settings(
 
 @pytest.fixture
 def old(path: Path) -> Path:
-    """Written by version 0.1.0, opened by 0.2.0, with a removal by retention."""
     path.write_bytes(lzma.decompress(OLD_LOG.read_bytes()))
     path.with_name("audit.pub").write_bytes(OLD_LOG.with_name("log-0.1.0.pub").read_bytes())
     return path
@@ -161,7 +159,7 @@ def test_an_old_log_is_valid_with_a_note(old: Path) -> None:
 
 
 def test_an_old_log_is_continued(old: Path) -> None:
-    """This version continues the log; after its first checkpoint, every further removal must be signed."""
+    """After the first checkpoint of this version, every further removal must be signed."""
     log = AuditLog(old, drive=ByHand, checkpoint_every=10)
     for number in range(50):
         log.record(decision(log, number))

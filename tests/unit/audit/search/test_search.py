@@ -18,7 +18,6 @@ _BEGIN = 1_700_000_000 * _SECOND
 
 @pytest.fixture
 def log(make_log: MakeLog) -> AuditLog:
-    """Ordinary decisions a second apart, and some that differ."""
     log = make_log(checkpoint_seconds=3600)
     for number in range(100):
         log.record(decision(log, number, time=_BEGIN + number * _SECOND))
@@ -41,7 +40,6 @@ def log(make_log: MakeLog) -> AuditLog:
 
 
 def sequences(path: Path, wanted: Filter, **arguments: Any) -> list[int]:
-    """Less two: the log's own first record is 1."""
     return [entry.sequence - 2 for entry in search(path, wanted, **arguments).entries]
 
 

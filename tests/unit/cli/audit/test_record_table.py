@@ -65,7 +65,6 @@ def test_a_table_of_records_has_the_author_of_a_change(
 def test_a_narrow_terminal_has_the_reason_below(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """At 80 columns a column of reasons would be six characters wide; lines continue beside the number."""
     show_on_terminal(monkeypatch, 80)
     denied = AuditRecord(
         id="0" * 20, time=0, event="decision", decision="deny", host="10.77.0.66", caller_id="/tablet",

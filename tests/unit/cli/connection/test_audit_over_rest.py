@@ -17,8 +17,6 @@ END = 'data: {"reason": "the token has expired"}'
 
 
 class Answer:
-    """The connection breaks after the last line unless `ends` is set."""
-
     def __init__(self, lines: list[str], *, breaks: bool) -> None:
         self._lines = lines
         self._breaks = breaks
@@ -30,8 +28,6 @@ class Answer:
 
 
 class Rest:
-    """Other requests get an empty log."""
-
     url = "https://robot"
 
     def __init__(self, *answers: Answer | Exception) -> None:

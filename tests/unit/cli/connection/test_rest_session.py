@@ -12,7 +12,6 @@ pytestmark = pytest.mark.nightly
 
 
 def certificate(path: Path, address: str = "127.0.0.1", days: int = 2) -> ssl.SSLContext:
-    """Write a self-signed certificate for an address; return the context that serves it."""
     now = datetime.datetime.now(datetime.UTC)
     key = self_signed(path, address, now - datetime.timedelta(days=10), now + datetime.timedelta(days=days))
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)

@@ -32,7 +32,6 @@ def record(fields: dict[str, bytes], data: bytes) -> bytes:
 
 
 def bag(place: Path, chunks: list[tuple[str, bytes, list[tuple[int, int]]]]) -> Path:
-    """Each chunk: compression, packed bytes, and its messages' seconds and offsets."""
     out = bytearray(b"#ROSBAG V2.0\n" + bytes(4096))
     infos = b""
     for compression, packed, entries in chunks:

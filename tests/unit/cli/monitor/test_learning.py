@@ -53,7 +53,6 @@ def test_coverage_lists_what_never_happened(drive: str) -> None:
 
 @pytest.mark.nightly
 def test_a_type_with_several_definitions_is_rejected(tmp_path: Path) -> None:
-    """Messages read by another definition would give wrong conditions."""
     bags = [tmp_path / "a.bag", tmp_path / "b.bag"]
     for bag, text in zip(bags, ("int32 data", "int32 other"), strict=True):
         with Writer(bag) as writer:

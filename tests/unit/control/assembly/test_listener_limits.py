@@ -72,7 +72,6 @@ def test_hosts_of_a_wildcard_share_processor_time() -> None:
 
 @pytest.fixture
 def everybodys(tmp_path: Path) -> Iterator[ListenerLimits]:
-    """The policy names `ROBOT` and admits all others by `*`; one of the others is registered."""
     policy = compile_policy("[Nodes]\ndefault = 10.0.0.1\n/guest/** = *\n", file="a.ini")
     log = open_log(tmp_path / "audit.db")
     trail = AuditTrail(log, strict=False, deny_when_failed=False, details=lambda *_: {})

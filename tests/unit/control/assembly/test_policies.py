@@ -43,8 +43,6 @@ async def at_once() -> None: ...
 
 
 class Appliance:
-    """The policy file and the store; each `started()` is one run of control."""
-
     def __init__(self, directory: Path) -> None:
         self.state = directory / "state"
         self.state.mkdir()
@@ -343,7 +341,6 @@ async def test_the_loop_does_not_wait_for_the_disk(tmp_path: Path, monkeypatch: 
 
 
 async def unsigned(policies: Policies, change: Callable[[], Awaitable[object]]) -> str:
-    """The policy in force stays."""
     before = policies.revision, policies.current.text
     with pytest.raises(PolicyRefusedError) as refused:
         await change()
@@ -417,7 +414,6 @@ async def test_the_same_text_posted_twice_is_one_revision(tmp_path: Path) -> Non
 
 
 async def test_a_change_for_an_earlier_revision_is_refused(tmp_path: Path) -> None:
-    """Two engineers cannot overwrite each other's changes, whichever way they change the policy."""
     with Appliance(tmp_path).started() as policies:
         seen = policies.revision
         await policies.load(PolicyLoad(OTHER, expected=seen), "alice")

@@ -32,7 +32,6 @@ def test_it_follows_the_receipts(tmp_path: Path) -> None:
 
 
 def test_without_the_setting_it_allows_any_record(tmp_path: Path) -> None:
-    """Reports of the pusher limit nothing unless retention waits."""
     free = floor(tmp_path, waits=False)
     free.received(812)
     assert free.through() == _ANY

@@ -25,8 +25,6 @@ _LIMIT_SECONDS = 30
 
 
 class Supervisor:
-    """`asked` lists the hosts whose routes control requested."""
-
     def __init__(self, sock: socket.socket) -> None:
         self.asked: list[str] = []
         self._channel = Channel(sock, Lifeline)

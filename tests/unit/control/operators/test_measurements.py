@@ -22,7 +22,7 @@ def test_sums_by_name() -> None:
 
 
 def test_counters_begin_at_zero() -> None:
-    """A counter exists with value 0 before its first event, so that Prometheus sees the first event as an increase."""
+    """Otherwise Prometheus would not see the first event as an increase."""
     counts = from_zero({("fault", "safe"): 2}, [("fault", "safe"), ("drop", "safe")])
     assert counts == {("fault", "safe"): 2, ("drop", "safe"): 0}
 
@@ -76,7 +76,7 @@ def test_a_publishers_md5sum_is_known_once_a_relay_has_seen_its_header() -> None
 
 
 def test_a_topic_moves_for_a_minute_after_its_last_message() -> None:
-    """For the first minute of control it counts as moving, because an earlier control may have seen messages."""
+    """An earlier control may have seen messages, so it counts as moving in the first minute."""
     registry = Registry()
     registry.add(Incarnation("k", "/n", ipaddress.ip_address("10.0.0.5"), API, str(API), "10.0.0.1", 1, 2))
     counted = RelayTraffic(cast(Any, None), registry, 1, lambda _node, _topic: None)

@@ -21,8 +21,6 @@ BAD = {**GOOD, "rosmaster": "being rebuilt"}
 
 
 class Robot:
-    """The ROS master is being rebuilt at first; the state survives `restart`."""
-
     def __init__(self, state: Path) -> None:
         self.state = state
         self.fields = BAD

@@ -76,7 +76,6 @@ class Site:
             await self.replaced.wait()
 
     async def stop(self, host: str, topics: set[str], _why: str) -> None:
-        """Its messages already no longer pass."""
         assert not any(
             (address_of(host), Category.PUBLISH, topic) in self.orders.approved() for topic in topics
         )
@@ -112,7 +111,6 @@ class Site:
         return (await self.orders.approve_call(wanted)).refused
 
     def publish(self, topic: str, category: Category = Category.PUBLISH) -> str:
-        """Returns the refusal."""
         decision = self.policy.decide(Request(AGENT, "/it", category, topic))
         return (
             ""

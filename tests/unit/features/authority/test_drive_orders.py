@@ -36,8 +36,6 @@ lease base = {LEASE:g}s
 
 
 class Site:
-    """Two relays, five hosts and a group. A relay applies an order some turns of the loop after control sent it."""
-
     def __init__(self, chance: random.Random, time: VirtualClock) -> None:
         self.time = time
         self.chance = chance
@@ -74,7 +72,6 @@ class Site:
         return 0
 
     async def carried_out(self, topics: Iterable[str] | None) -> None:
-        """Checks after each order that at most one host is let through."""
         while self.hanging and (topics is None or self.hanging.intersection(topics)):
             await asyncio.sleep(0)
         while any(self.ordered):

@@ -14,7 +14,6 @@ NOTHING = "nothing is restored"
 
 
 def refused(file: Path, state: Path, words: str) -> None:
-    """The restore leaves nothing behind."""
     with pytest.raises(BackupError, match=words):
         restore(file, state)
     assert not state.exists()
@@ -47,7 +46,7 @@ def test_only_files_are_accepted(tmp_path: Path, kind: bytes) -> None:
 
 
 def test_sparse_files_are_rejected(tmp_path: Path) -> None:
-    """Reject a header of a hundred bytes that would unpack to a file of gigabytes."""
+    """A header of a hundred bytes would unpack to a file of gigabytes."""
     sparse = bytearray(header("api/hole", kind=tarfile.GNUTYPE_SPARSE))
     sparse[483:495] = b"%011o\0" % (4 << 30)
     sparse[148:156] = b" " * 8
@@ -59,7 +58,7 @@ def test_sparse_files_are_rejected(tmp_path: Path) -> None:
     "kind", [tarfile.XHDTYPE, tarfile.XGLTYPE, tarfile.GNUTYPE_LONGNAME, tarfile.GNUTYPE_LONGLINK]
 )
 def test_extended_headers_are_rejected(tmp_path: Path, kind: bytes) -> None:
-    """A backup has no extended headers; a header could hold gigabytes, or name a file twice."""
+    """A header could hold gigabytes, or name a file twice."""
     text = b"20 path=api/x\0yyyyy\n".ljust(512, b"\0")
     refused(
         archive(tmp_path / "evil", header("x", 20, kind), text, header("api/x")), tmp_path / "state", NOTHING
@@ -77,7 +76,7 @@ def test_a_duplicate_name_is_rejected(tmp_path: Path) -> None:
 
 
 def test_too_many_files_are_rejected(tmp_path: Path) -> None:
-    """A backup has a handful of files; a million of them would fill the disk with names."""
+    """They would fill the disk with names."""
     many = b"".join(header(f"api/{number}") for number in range(10_001))
     refused(archive(tmp_path / "evil", many), tmp_path / "state", "more than 10000 files")
 

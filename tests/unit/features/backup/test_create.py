@@ -29,7 +29,6 @@ from tests.support.small_disk import small_disk
 
 @pytest.fixture
 def state(tmp_path: Path) -> Path:
-    """The signer has signed one checkpoint more than the state has."""
     state = tmp_path / "state"
     for part in ("control", "signer", "api", "ipsec", "run", "rosmaster/log"):
         (state / part).mkdir(parents=True)
@@ -62,7 +61,6 @@ def state(tmp_path: Path) -> Path:
 
 
 def test_a_backup_is_restored(state: Path, tmp_path: Path) -> None:
-    """Run-time state is left out; the restored log verifies."""
     file, other = tmp_path / "backup.tar.gz", tmp_path / "other"
     assert not verify(state / "control" / "audit.db", signer=state / "signer").ok
     names = back_up(state, file)
@@ -139,7 +137,7 @@ def test_a_missing_state_directory_is_an_error(tmp_path: Path) -> None:
 
 @pytest.mark.nightly
 def test_an_unreadable_part_is_an_error(state: Path, tmp_path: Path) -> None:
-    """A backup without the keys would be useless: an unreadable part is an error, and no file is left."""
+    """A backup without the keys would be useless, so no file is left."""
     need_root()
     file = Path(tempfile.mkdtemp(prefix="rosrv-backup-test-"))
     file.chmod(0o777)
@@ -211,7 +209,7 @@ def test_a_file_of_another_user_is_refused(state: Path, tmp_path: Path) -> None:
 
 
 def test_a_sparse_file_is_refused(state: Path, tmp_path: Path) -> None:
-    """A file full of holes cannot fill the disk or the backup's memory."""
+    """It cannot fill the disk or the backup's memory."""
     with (state / "api" / "hole").open("wb") as file:
         file.truncate(1 << 40)
     with pytest.raises(BackupError, match="api/hole has 1099511627776 bytes"):

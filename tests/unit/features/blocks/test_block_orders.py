@@ -66,8 +66,6 @@ class Clock:
 
 
 class Control(ControlParts):
-    """A test may start it again on the same state."""
-
     def __init__(self, state: Path, clock: Clock, connected: list[set[str]], text: str = OPEN) -> None:
         super().__init__()
         state.mkdir(exist_ok=True)
@@ -107,7 +105,6 @@ class Control(ControlParts):
         return [row.address for row in (await self.orders.listed(HostBlocks())).blocks]
 
     def denial(self, host: str, text: str = "") -> str | None:
-        """None if the host may publish."""
         decision = self.current.decide(Request(address_of(host), "/node", Category.PUBLISH, "/scan"))
         return None if decision.allowed else decision.reason
 

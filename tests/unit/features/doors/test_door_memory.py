@@ -12,7 +12,6 @@ _MIB = 1 << 20
 
 
 def fill(memory: ClientMemory) -> tuple[ViewerQueue[str], FragmentStore]:
-    """A client that reads nothing gets messages, replies and fragments until each is refused."""
     queue, fragments = ViewerQueue[str](memory=memory), FragmentStore(8 * _MIB, memory)
     queue.configure("/image", depth=1000, interval=0.0)
     with pytest.raises(OperationError):

@@ -113,7 +113,6 @@ def test_the_process_of_another_door_ends_and_its_successor_serves(
 
 @pytest.mark.anyio
 async def test_the_process_of_a_removed_door_gets_nothing_of_the_next_one(bench: Bench) -> None:
-    """Whatever it asks for, and although the next door has its slot."""
     bench.hears(NEW)
     bench.processes.end(bench.rows.pop())
     bench.rows.append(ALICE._replace(name="bob", added=2.0))

@@ -37,7 +37,6 @@ async def next_op(client: WebSocketClient, op: str) -> Any:
 def sees(
     world: DoorWorld, *, topics: dict[str, tuple[str, str]], services: dict[str, str] | None = None
 ) -> None:
-    """The types and publishers of topics, the providers of services."""
     world.master.answers["getSystemState"] = [
         [[topic, [node]] for topic, (_kind, node) in topics.items()],
         [["/cmd_vel", ["/base"]]],
@@ -319,7 +318,6 @@ def text_frame(foxglove: Foxglove) -> str | None:
 
 
 def viewer(**limits: int) -> tuple[Foxglove, ViewerQueue[int | str]]:
-    """The connection has announced the channel 1."""
     queue: ViewerQueue[int | str] = ViewerQueue()
     foxglove = Foxglove("/door_alice", FoxgloveLimits(**limits), queue)
     graph = VisibleGraph({"/t": ["/n"]}, {}, {}, {"/t": "a/B"})

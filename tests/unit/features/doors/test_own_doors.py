@@ -12,7 +12,6 @@ from tests.support.virtual_clock import VirtualClock
 
 
 def people(**groups: tuple[str, ...]) -> Any:
-    """The names are without `sso:`."""
     rows = [SimpleNamespace(id=name, name=f"sso:{name}") for name in groups]
     return SimpleNamespace(rows=lambda: rows, of=lambda one: SimpleNamespace(groups=groups[one]))
 

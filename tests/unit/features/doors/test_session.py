@@ -1,5 +1,3 @@
-"""A door in virtual time."""
-
 import asyncio
 import base64
 import json
@@ -538,7 +536,7 @@ async def test_a_message_that_has_no_room_in_its_encoding_is_refused_in_words() 
 async def test_a_frame_that_is_too_large_even_inflated_ends_the_connection(
     deflate: bool, frame: str | bytes, code: int
 ) -> None:
-    """The door reads the rest of the frame: unread bytes would reset the connection before the closing frame."""
+    """Unread bytes would reset the connection before the closing frame."""
     async with door_world() as world:
         client = await world.client(deflate=deflate)
         client.send(frame)

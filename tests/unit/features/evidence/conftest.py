@@ -114,7 +114,6 @@ class Control:
         assert settle(self.log) is None
 
     def record(self, folder: Path, bag: bytes, **about: Any) -> RecordingSelection:
-        """The recording ends now, and has its own folder."""
         digest = hashlib.sha256(bag).hexdigest()
         recording = example(
             Recording, id="ab" * 10, began=self.begun, ended=wall_ns(), sha256=digest, **about
@@ -165,7 +164,6 @@ class Control:
 
 @pytest.fixture
 def control(make_log: MakeLog) -> Control:
-    """Its policy and specifications were loaded before the exported time."""
     running = Control(make_log(checkpoint_every=12, checkpoint_seconds=3600))
     running.load_policy(6, "[Nodes]\nold = *\n")
     running.load_policy(7, "[Nodes]\ndefault = *\né = *\n")

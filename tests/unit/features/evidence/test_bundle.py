@@ -261,7 +261,6 @@ def test_a_cut_or_damaged_file_is_never_valid(bundle: Path, tmp_path: Path, revi
 
 
 def _longer(place: Path) -> bytes:
-    """The last member's size is four bytes too large; no tool unpacks such a bundle."""
     with zipfile.ZipFile(place) as archive:
         last, end, whole = archive.infolist()[-1], archive.start_dir, place.read_bytes()
     whole = whole[:end] + b"evil" + whole[end:]
@@ -394,7 +393,7 @@ def test_a_zip_bomb_is_not_unpacked(
 @pytest.mark.nightly
 @pytest.mark.parametrize("runs", [[[1, 5], [3, 9]], [[5, 9], [1, 3]], [[4, 3]], [[1, 3], [4, 9]]])
 def test_runs_are_in_order(bundle: Path, tmp_path: Path, reviewer: Reviewer, runs: list[Any]) -> None:
-    """Overlapping, touching or descending runs are rejected, because lookups use binary search."""
+    """Lookups use binary search, so overlapping, touching or descending runs are rejected."""
     members = members_of(bundle)
     manifest = {**json.loads(members["manifest.json"]), "runs": runs}
     members["manifest.json"] = json.dumps(manifest).encode()
@@ -427,7 +426,6 @@ def test_many_runs_take_few_steps() -> None:
 
 
 def resealed(members: Members) -> Members:
-    """A forger's bundle: its manifest has matching hashes."""
     manifest = json.loads(members["manifest.json"])
     for name, about in manifest["members"].items():
         data = members[name]

@@ -1,4 +1,4 @@
-"""`rosrv evidence export`: a bundle gets its final name only when it is complete."""
+"""A bundle gets its final name only when it is complete."""
 
 import re
 import stat

@@ -32,7 +32,7 @@ __all__ = ["MakeLog", "Notary", "key", "make_log", "notary", "path"]  # fixtures
 
 _SECONDS = 0.4
 Client = Callable[[str], str]
-"""Gets the URL of a collector, makes one step, and returns the reported trouble."""
+"""Makes one step with the URL of a collector, and returns the reported trouble."""
 
 
 def drips_the_handshake(visitor: Visitor) -> None:
@@ -193,10 +193,6 @@ def connected(authority: FleetAuthority, answer: Lie) -> Iterator[CollectorConne
 
 
 def timely(client: Client, url: str, reason: str, patch: pytest.MonkeyPatch) -> None:
-    """Require that a step ends in time, and that its trouble is the expected one.
-
-    The deadline of an exchange is short if the collector would hold the client.
-    """
     if "takes more than" in reason:
         patch.setattr(connection, "_EXCHANGE_SECONDS", _SECONDS)
     began = time.monotonic()

@@ -16,7 +16,6 @@ _KILLED, _DONE, _FULL = 9, 0, 7
 
 @pytest.fixture
 def site(tmp_path: Path) -> Iterator[tuple[RobotSite, str]]:
-    """The robot knows the first of two bundles."""
     site = RobotSite(tmp_path / "site")
     site.add()
     with site.served() as url:
@@ -25,7 +24,6 @@ def site(tmp_path: Path) -> Iterator[tuple[RobotSite, str]]:
 
 
 def poll(robot: VerifiedBundles) -> str:
-    """Returns the bundle that a robot would take at this poll."""
     robot.refresh()
     selected = robot.selected()
     assert selected is not None
@@ -46,7 +44,6 @@ def in_child(work: Callable[[], None]) -> int:
 
 
 def killed_at(step: int, folder: Path) -> None:
-    """Ends this process without cleanup."""
     left = [step]
 
     def hook(event: str, arguments: tuple[object, ...]) -> None:

@@ -23,8 +23,6 @@ from tests.unit.features.conftest import MakeLog
 
 
 class Collector(CollectorConnection):
-    """Keeps the pushed numbers; the test replaces its answers."""
-
     is_open = True
 
     def __init__(self, log: Path) -> None:
@@ -108,7 +106,7 @@ def test_a_head_with_wrong_hashes_ends_the_search(collector: Collector, make: Ma
 
 
 def test_a_head_without_a_receipt_does_not_count(collector: Collector, make: Make) -> None:
-    """A collector that claims to have a segment must sign a receipt for it before retention may rely on it."""
+    """Retention may rely on a segment only with a signed receipt."""
     newest = signed_checkpoints(collector.log, 0, 100)[-1]
     collector.head = lambda _upto: {"number": newest.number, "hashes": [collector.hash_of(newest.number)]}
     pusher = make()
@@ -182,7 +180,7 @@ def test_a_full_disk_is_reported_and_passes(
 
 
 def test_a_wait_of_a_year_is_an_hour(collector: Collector, make: Make) -> None:
-    """A collector cannot silence a robot for longer than about an hour with Retry-After."""
+    """Retry-After cannot silence a robot for longer."""
     collector.refusal = CollectorError("later", 503, 365 * 86_400.0)
     assert make().step() == 3600.0
 

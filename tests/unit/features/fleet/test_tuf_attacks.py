@@ -37,7 +37,6 @@ class Field:
         self.robot = site.robot(url, folder / "robot")
 
     def poll(self, robot: VerifiedBundles | None = None) -> VerifiedBundle | None:
-        """Returns the bundle that a robot would take at this poll."""
         asker = robot or self.robot
         asker.refresh()
         selected = asker.selected()
@@ -178,7 +177,7 @@ def test_endless_data_is_cut(field: Field) -> None:
 
 
 def test_slow_retrieval_is_cut(field: Field, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A collector that sends a byte now and then is given up at the deadline of the exchange."""
+    """A collector that sends a byte now and then is given up at the deadline."""
     monkeypatch.setattr(connection, "_EXCHANGE_SECONDS", 0.3)
 
     def slow(handler: http.server.BaseHTTPRequestHandler) -> None:

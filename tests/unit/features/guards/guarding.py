@@ -42,8 +42,6 @@ def _part(text: str) -> bytes:
 
 
 class Guarded:
-    """`base` has each command that passes, with its time in milliseconds."""
-
     def __init__(self, preset: str, types: dict[str, str] | None = None, **values: object) -> None:
         wanted = {name: str(value).lower() for name, value in values.items()}
         chosen = {**PRESETS, DRIVER_CHECK.name: DRIVER_CHECK}[preset]
@@ -74,7 +72,6 @@ class Guarded:
         return outcome
 
     def drive(self, data: bytes, at: int, node: str = "/a") -> tuple[float, ...]:
-        """Returns the velocities that the base gets."""
         outcome = self.tell("command", data, at, node)
         return () if outcome.result == "dropped" else legs_of(bytes(outcome.buffer))
 

@@ -1,5 +1,3 @@
-"""Control begins one check of a driver at a time, reads its outcome, and removes its monitor in every case."""
-
 from types import SimpleNamespace
 from typing import Any
 
@@ -21,8 +19,6 @@ BEGIN = DriverCheckBegin("/cmd_vel", "/odom", 2.0, 30.0)
 
 
 class Manager:
-    """Specifications in force, which a load and a removal change; it keeps the orders that it gets."""
-
     confirm_by: float | None = None
     enabled = True
 
@@ -56,8 +52,6 @@ class Manager:
 
 
 class Site:
-    """The checks of one control; `said` are the audit records."""
-
     def __init__(self, manager: Manager) -> None:
         self.said: list[tuple[str, str, dict[str, Any]]] = []
         self.pid = 7

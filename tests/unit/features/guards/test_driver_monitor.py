@@ -1,5 +1,3 @@
-"""The monitor of `rosrv guard check-driver` withholds motions once, for a bounded time, and lets every stop through."""
-
 import math
 import re
 from itertools import pairwise, product
@@ -22,8 +20,6 @@ def odometry(v: float, turn: float = 0.0) -> bytes:
 
 
 class Drive(Guarded):
-    """A base behind the monitor, driven 20 times a second; its driver stops it `timeout` ms after a command."""
-
     def __init__(self, timeout: float = math.inf) -> None:
         self.lines: list[tuple[str, float]] = []
         self.passing: list[tuple[int, bytes]] = []
@@ -46,7 +42,6 @@ class Drive(Guarded):
         return legs_of(data)[0] if self.at - at <= self.timeout else 0.0
 
     def longest_gap(self) -> int:
-        """Return the longest time without a command for the base, in milliseconds."""
         return max(b - a for a, b in pairwise([0, *(at for at, _data in self.got), self.at]))
 
     def receive(self, outcome: Outcome, at: int) -> None:
@@ -115,7 +110,6 @@ def test_a_node_that_falls_silent_during_the_measurement_does_not_disturb_it() -
 
 
 def test_any_trace_withholds_for_a_bounded_time_and_no_stop() -> None:
-    """In random drives with silences, stops and NaN the base gets every stop, and waits once."""
     random = seeded(11)
     for _trace in range(examples(200)):
         base = Drive(random.choice((100, 700, math.inf)))

@@ -21,8 +21,6 @@ FENCE = Guard("fence", PRESETS["fence"], types=TYPES, values={"polygon": "0,0 1,
 
 
 class Manager:
-    """A fence and a monitor that is not a guard; it keeps the orders that it gets."""
-
     revision, tag, shadow, off = 2, "2.0", False, False
 
     def __init__(self) -> None:
@@ -201,7 +199,7 @@ async def test_a_monitor_that_is_not_a_guard_is_unknown(orders: GuardOrders) -> 
 async def test_a_new_guard_is_in_shadow_mode_or_in_force(
     manager: Manager, orders: GuardOrders, shadow: bool
 ) -> None:
-    """Also where new monitors are disabled (`enable: none`, as in the package): it would stop nothing."""
+    """Where new monitors are disabled (`enable: none`, as in the package), it would stop nothing."""
     request = guard_requests.GuardNew("speed", {"command": "/c"}, {"vMax": "0.3"}, {"command": TYPES["command"]},
                                       shadow=shadow, confirm_within=300.0)  # fmt: skip
     await orders.new(request, "eve")

@@ -157,7 +157,6 @@ def depth(x: float, y: float) -> float:
 
 
 def simulated(guard: Guarded, random: Any, x: float, y: float, turned: float) -> list[float]:
-    """4 s, also with NaN; returns the depth at each step of 10 ms."""
     depths, x_speed, y_speed, turning, at = [], 0.0, 0.0, 0.0, 0
     for step in range(400):
         at += 10
@@ -249,7 +248,6 @@ def test_a_fence_by_satellites_is_in_metres_from_its_origin() -> None:
 
 
 def scan(ranges: list[float], start: float = -math.pi) -> bytes:
-    """The range is 0.1 to 10 m."""
     step = 2 * math.pi / max(len(ranges), 1)
     return message("sensor_msgs/LaserScan", angle_min=start, angle_increment=step, range_min=0.1, range_max=10.0,
                    ranges=ranges)  # fmt: skip

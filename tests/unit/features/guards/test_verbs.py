@@ -80,7 +80,6 @@ FENCE = Guard("fence", PRESETS["fence"], types={"command": "geometry_msgs/Twist"
 
 
 def run(verb: Any, robot: Robot, *arguments: Any, **options: Any) -> Any:
-    """Returns the verb's only order, or None."""
     verb.function(robot, *arguments, **options)
     return robot.orders[0] if robot.orders else None
 
@@ -124,7 +123,6 @@ def test_a_name_that_is_taken_is_refused(tmp_path: Path) -> None:
 
 
 def test_json_changes_no_less(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Each change is a line of JSON, and the folder is written and emptied as without it."""
     robot = Robot(tmp_path, FENCE)
     robot.as_json = True
     run(verbs.new, robot, "speed", "/cmd_vel")
@@ -140,7 +138,7 @@ def test_json_changes_no_less(tmp_path: Path, capsys: pytest.CaptureFixture[str]
 
 @pytest.mark.parametrize("new", [True, False])
 def test_json_refuses_no_less(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, new: bool) -> None:
-    """A plan that would be refused ends with status 1, and is not replayed. Other plans are replayed."""
+    """A plan that would be refused is not replayed."""
     robot, replayed = Robot(tmp_path, FENCE), list[str]()
     robot.as_json = True
     monkeypatch.setattr(verbs, "_replay", lambda _robot, row, _text, _since: replayed.append(row.name))
@@ -157,7 +155,7 @@ def test_json_refuses_no_less(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, n
 def test_a_plan_holds_without_the_flight_recorder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, status: int
 ) -> None:
-    """It is off in a new appliance; a mistake still ends the verb."""
+    """The recorder is off in a new appliance; a mistake still ends the verb."""
 
     def replay(*_given: Any, **_options: Any) -> None:
         raise typer.Exit(status)
@@ -221,7 +219,6 @@ def test_a_constant_is_set_and_a_polygon_is_loaded(tmp_path: Path) -> None:
 
 
 def test_a_guard_is_brought_into_force_and_removed(tmp_path: Path) -> None:
-    """Its file goes with it, unless the removal may roll back; a monitor that is not a guard is not touched."""
     robot = Robot(tmp_path, FENCE)
     (tmp_path / "fence.rv").write_text("x")
     order = run(verbs.enforce, robot, "fence", confirm_within="5m")

@@ -180,7 +180,6 @@ def speed(v: float) -> bytes:
 
 
 def test_two_sources_agree_for_a_number_of_messages() -> None:
-    """Each change of the verdict needs this number in a row; both sources must be heard."""
     random = seeded(9)
     for _trace in TRACES:
         guard, at, others, other_at, mine_at = Guarded("agree", samples=3), 0, math.nan, -math.inf, -math.inf
@@ -225,7 +224,6 @@ def test_an_interlock_needs_battery_position_and_check(
 
 
 def trajectory(names: list[str], *points: tuple[float, list[float]]) -> bytes:
-    """For each point its seconds and positions."""
     point = STORE.types["trajectory_msgs/msg/JointTrajectoryPoint"]
     duration = STORE.types["builtin_interfaces/msg/Duration"]
     empty = np.array([], dtype=np.float64)
@@ -260,7 +258,6 @@ JOINTS = ["elbow", "wrist"]
     ],
 )
 def test_a_trajectory_keeps_the_limits_of_its_joints(points: Any, passes: bool) -> None:
-    """Positions by name, increasing times, velocities between points; otherwise the arm gets an empty trajectory."""
     guard = Guarded("joints", limits="elbow:-1.5..1.5 wrist:-2..2")
     for names, good in ((JOINTS, passes), (["elbow", "unknown"], passes and not points)):
         outcome = guard.tell("command", trajectory(names, *points), 1)

@@ -11,7 +11,6 @@ from appliance.quotas.pool import Bounds, Pool, QuotaClass
 
 
 def used(state: Path, memory: dict[int, dict[str, int]]) -> dict[str, LimitUse]:
-    """Three nodes of two hosts, and relays with this memory."""
     pool: Pool[str] = Pool("ports", Bounds(100, 75, 10, 0), lambda _host: QuotaClass.REGISTERED)
     pool.charge("10.0.0.9/32", 40)
     pool.charge("10.0.0.8/32", 2)

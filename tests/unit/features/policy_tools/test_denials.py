@@ -43,7 +43,6 @@ def denied(event: str, reason: str = "because", **fields: object) -> AuditRecord
 
 
 def revoked(decision: Decision, category: str, call: str) -> tuple[str, str, dict[str, Any]]:
-    """Return the event, reason and fields that a revocation records."""
     made: list[tuple[str, str, dict[str, Any]]] = []
     trail = SimpleNamespace(happened=lambda event, reason, **fields: made.append((event, reason, fields)))
     graph = RosGraph(idle(Registry), idle(Grants), cast(Any, trail))
@@ -134,7 +133,6 @@ def test_a_connection_without_a_grant() -> None:
 
 
 def test_a_name_that_another_host_has() -> None:
-    """The change is the option that allows a takeover at once, whether or not its section or another value exists."""
     held = f"/it is held by a running node on 10.0.0.1 (or at once with {AT_ONCE})"
     all_may = "[Nodes]\ndefault = *\n[Publishers]\n/x = *\n"
     for options, line in {
@@ -150,10 +148,6 @@ def test_a_name_that_another_host_has() -> None:
 
 
 def test_repetitions_and_limits() -> None:
-    """A record of repetitions is explained like one denial, of several kinds like the first kind.
-
-    A limit names its line.
-    """
     one = {"scope": "kind", "of": "decision", "recorded_id": "7"}
     assert allowing(why(denied("denials folded", detail=one))) == [
         "/x = 10.0.0.1 10.0.0.9",

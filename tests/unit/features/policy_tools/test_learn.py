@@ -49,7 +49,6 @@ def test_only_observed_requests_are_granted() -> None:
 
 
 def test_a_search_for_a_parameter_may_find_it_the_next_time() -> None:
-    """Every parameter that `searchParam` tries is granted."""
     learned = learn([
         seen("10.0.0.1", Category.COMMAND, "searchParam", node="/arm/driver", call="searchParam", key="tf_prefix")
     ])  # fmt: skip
@@ -113,7 +112,7 @@ def test_a_parameter_call_needs_the_call_and_the_key() -> None:
 
 
 def test_the_robot_is_called_robot() -> None:
-    """The robot's address is written as the group `robot`, so that the policy also holds at another address."""
+    """With the group, the policy also holds at another address."""
     learned = learn(
         [seen("192.0.2.10", Category.PUBLISH, "/a"), seen("10.0.0.1", Category.PUBLISH, "/a")], [ROBOT]
     )
@@ -151,7 +150,6 @@ def test_a_parameter_is_left_out_where_the_one_above_says_the_same() -> None:
      (Category.PUBLISH, "/a\n[Commands]\ndefault = *"), (Category.PUBLISH, "/a = *  #"), (Category.NODE, "/é")],
 )  # fmt: skip
 def test_text_of_unknown_hosts_never_becomes_a_rule(category: Category, resource: str) -> None:
-    """Requests that cannot be granted are omitted and counted; no text of a peer is copied into the policy."""
     learned = learn([seen("10.0.0.1", category, resource), seen("10.0.0.1", Category.PUBLISH, "/ok")])
     assert (learned.requests, learned.left_out) == (1, 1)
     assert resource not in learned.text
@@ -197,7 +195,6 @@ def test_a_host_that_did_nothing_may_do_nothing(observations: list[Observation],
 
 
 def test_a_right_that_needed_an_approval_is_learned_behind_ask() -> None:
-    """Only the right that was approved is behind `ask`."""
     request = Request(HOSTS[0], "/it", Category.PUBLISH, "/cmd_vel")
     learned = learn([Observation(request, "registerPublisher", asked=True)]).text
     assert "/cmd_vel = ask 10.0.0.1" in learned

@@ -26,7 +26,6 @@ def read(path: Path) -> list[tuple[str, int, bytes]]:
 
 
 def test_read_by_rosbags(tmp_path: Path) -> None:
-    """Messages of several chunks come back in the order of their times, with type and definition."""
     bag = BagWriter(tmp_path / "a.bag", {})
     chatter, other = bag.connect(HEADER), bag.connect(HEADER | {"topic": "/other"})
     bag.write([BagMessage(chatter, 5 * SECOND + 3, body(b"late")), BagMessage(other, SECOND, body(b"first"))])

@@ -15,7 +15,6 @@ pytestmark = pytest.mark.nightly
 
 @pytest.fixture
 def disk(tmp_path: Path) -> Iterator[Path]:
-    """4 MiB and a few files."""
     with small_disk(tmp_path / "recordings", "4m", "nr_inodes=64") as place:
         yield place
 

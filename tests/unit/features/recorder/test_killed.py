@@ -27,7 +27,6 @@ _KILLED = 9
 
 
 def _life(scene: Scene) -> None:
-    """Makes a recording, notes it, records the memory, removes by order, and records again."""
 
     def order() -> Trigger:
         return Trigger(scene.clock.now + SECOND, "order", "r", "eve")
@@ -48,7 +47,6 @@ def _life(scene: Scene) -> None:
 
 
 def _killed_at(scene: Scene, operation: int) -> bool:
-    """Returns whether the child process was killed before this change of a file or folder."""
     child = os.fork()
     if not child:
         done = count(1)
@@ -71,7 +69,6 @@ def _killed_at(scene: Scene, operation: int) -> bool:
 
 
 def _read_both_ways(bag: Path, target: Path) -> int:
-    """The number of messages on /chatter is the same in the bag and as MCAP."""
     with Reader(bag) as reader:
         rows = [(one.topic, time, bytes(data)) for one, time, data in reader.messages()]
     target.write_bytes(b"".join(as_mcap(bag)).replace(b"ros1", b"ros2"))

@@ -67,7 +67,6 @@ class Scene:
         self.stream.write(memoryview(frame(body)), 1, self.said)
 
     def happen(self, event: str = "message dropped", **fields: Any) -> str:
-        """Returns the record's id."""
         record = decision(self.log, event=event, decision=None, time=self.clock.now, **fields)
         self.log.record(record)
         settle(self.log)

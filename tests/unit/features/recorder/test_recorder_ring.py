@@ -54,7 +54,6 @@ def test_messages_dropped_by_monitors_are_recorded(memory: int) -> None:
 
 @pytest.mark.parametrize("never", [("/chatter",), ("/ch?tter",), ("std_msgs/*",), ("std_msgs/String",)])
 def test_excluded_topics_are_not_recorded(memory: int, never: tuple[str, ...]) -> None:
-    """A topic is excluded by its name, by its type, or because no glob of `topics` matches."""
     header = {"type": "std_msgs/String", "md5sum": "*", "callerid": "/talker"}
     stream = given(memory, never=never).open("/chatter", "10.0.0.1", header)
     assert stream is not None

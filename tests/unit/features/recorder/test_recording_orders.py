@@ -28,8 +28,6 @@ KEPT = Recording(
 
 
 class Trail:
-    """`written` records, and whether they can be written."""
-
     def __init__(self) -> None:
         self.events: list[tuple[str, dict[str, Any]]] = []
         self.failure: str | None = None
@@ -205,7 +203,6 @@ async def test_an_open_recording_is_listed(scene: Scene) -> None:
 
 @pytest.mark.nightly
 async def test_a_fetch_needs_a_record(scene: Scene) -> None:
-    """While the audit log cannot be written a fetch is refused."""
     recorder = scene.attach(lambda _message: [])
     recorder.send(recorder_link.RecordingsStated([KEPT]))
     await told(scene, lambda: bool(cast(Any, scene.orders.state()).recordings))
@@ -257,7 +254,7 @@ async def test_the_memory_can_be_fetched_and_is_not_listed() -> None:
 
 @pytest.mark.nightly
 async def test_more_topics_than_a_record_can_name_are_rejected(scene: Scene) -> None:
-    """The record of a fetch must name every topic that is read; if the names do not fit, the fetch is rejected."""
+    """The record of a fetch must name every topic that is read."""
     recorder = scene.attach(lambda _message: [])
     recorder.send(recorder_link.RecordingsStated([KEPT]))
     await told(scene, lambda: bool(cast(Any, scene.orders.state()).recordings))

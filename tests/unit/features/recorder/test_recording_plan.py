@@ -20,7 +20,6 @@ NAMES = {"127.0.0.1": ROBOT, GUEST: GUEST, "10.0.0.7": "10.0.0.7", "10.0.0.8": "
 
 
 def made(**rules: object) -> RecordingPlan:
-    """Hosts without a name are unknown."""
     ids = count(1)
     every: dict[str, Any] = {"enabled": True, "per_hour": 6, "before": 60, "after": 10} | rules
     return RecordingPlan(
@@ -65,7 +64,6 @@ def test_a_guests_flood_leaves_the_robot_its_recording(dropped: Callable[..., di
 
 
 def test_unknown_hosts_are_one(dropped: Callable[..., dict[str, str]]) -> None:
-    """Two hundred unknown addresses get as many recordings as one of them."""
     plan = made(longest=80)
     said = [dropped(plan, f"10.9.0.{number}", NOW + number * 15 * SECOND) for number in range(200)]
     assert len({row["recording"] for row in said if "recording" in row}) == 6
@@ -78,7 +76,6 @@ def test_a_monitor_that_keeps_dropping_prolongs_one_recording(dropped: Callable[
 
 
 def test_recordings_of_a_host_do_not_overlap() -> None:
-    """A recording whose memory would overlap the previous one begins at the previous one's end."""
     rules = RecorderRules(before=60, after=10, longest=600)
     first = span(rules, NOW, 0)
     assert (first.began, first.ends) == (NOW - 60 * SECOND, NOW + 10 * SECOND)

@@ -9,7 +9,7 @@ from appliance.features.recorder.recording_requests import RecordingOfMemory
 
 @pytest.mark.parametrize("text", ["1h", "yesterday", "2026-13-01"])
 def test_an_order_has_no_relative_date(text: str) -> None:
-    """A relative date such as `1h` would give control and the api different times."""
+    """`1h` would give control and the api different times."""
     body = json.dumps({"since": text}).encode()
     asked = ClientRequest("10.0.0.1", "POST", "/v1/recordings/memory", "", "application/json", "", body)
     with pytest.raises(NoOrderError, match=rf"body.since: '{text}' is not a date"):

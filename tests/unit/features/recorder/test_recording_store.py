@@ -50,7 +50,6 @@ def cleared(store: RecordingStore, now: int = 0, *, room: bool = False) -> list[
 
 
 def room_for(store: RecordingStore, charged_to: str) -> tuple[list[tuple[Recording, str]], str]:
-    """Returns what is removed for this host, and the reason if there is still not enough room."""
     gone: list[tuple[Recording, str]] = []
     while True:
         kept, why = store.in_the_way(charged_to)
@@ -92,7 +91,7 @@ def test_a_noted_recording_is_reported_once(tmp_path: Path) -> None:
 
 
 def test_the_kind_with_most_bytes_makes_room(tmp_path: Path) -> None:
-    """The oldest of the kind with the most bytes is removed, so that a flood of drops removes no other recording."""
+    """A flood of drops removes no other recording."""
     store = RecordingStore(tmp_path, disk=64 * MIB, seconds=None, clock=wall_ns)
     put(store, recording(1, "order", 8 * MIB))
     put(store, recording(2, "fault", 8 * MIB))
@@ -146,7 +145,7 @@ def test_a_guest_has_no_recording_if_the_robot_uses_all(tmp_path: Path) -> None:
 
 
 def test_descriptions_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Control receives all recordings in one message, however many topics they have."""
+    """Control receives all recordings in one message."""
     monkeypatch.setattr("appliance.features.recorder.recording_store._MOST_DESCRIBED", 1000)
     store = RecordingStore(tmp_path, disk=64 * MIB, seconds=None, clock=wall_ns)
     for number in range(1, 9):
@@ -158,7 +157,6 @@ def test_descriptions_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 
 def test_old_recordings_are_removed(tmp_path: Path) -> None:
-    """The age clock decides."""
     age = 1000 * SECOND
 
     def make() -> RecordingStore:

@@ -70,7 +70,6 @@ def memory() -> memoryview:
 
 
 def test_read_as_written(memory: memoryview) -> None:
-    """Each message is read once, with its time and number, and the header of its connection with its host."""
     stream = opened(ring(memory, Clock(7)))
     reader = RingReader(memory)
     stream.write(memoryview(frame(b"one") + frame(b"two")), 2, 1)
@@ -85,7 +84,6 @@ def test_read_as_written(memory: memoryview) -> None:
 
 
 def test_records_across_blocks(memory: memoryview) -> None:
-    """Records of every size around the size of a block are read unchanged, at once and in pieces."""
     block = geometry(SMALLEST).block
     bodies = [
         bytes([size % 251]) * size for size in (*range(block - 80, block + 9), 3 * block, 0, 5 * block + 1)
@@ -222,7 +220,7 @@ def test_headers_end_with_their_streams(memory: memoryview) -> None:
 
 
 def test_the_next_writer_continues(memory: memoryview) -> None:
-    """A new writer keeps the messages of the last one, and displaces them first when space is short."""
+    """A new writer displaces the messages of the last one first."""
     opened(ring(memory)).write(memoryview(frame(b"before")), 1, 1)
     clock = Clock(100)
     writer = ring(memory, clock)

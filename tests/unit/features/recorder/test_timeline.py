@@ -31,7 +31,6 @@ def record(number: int, **fields: Any) -> bytes:
 
 @pytest.fixture
 def bag(tmp_path: Path) -> Path:
-    """Two publishers of /chatter, ten messages a second each, in overlapping chunks, and events."""
     path = tmp_path / "a.bag"
     writer = BagWriter(path, {})
     first = writer.connect(HEADER)
@@ -149,7 +148,6 @@ def test_the_chosen_message_of_a_record_is_the_one_that_it_is_about(tmp_path: Pa
 
 
 def test_pages_of_one_moment_end(tmp_path: Path) -> None:
-    """Messages of the same time also have an order, so the pages have each of them once."""
     writer = BagWriter(tmp_path / "a.bag", {})
     number = writer.connect(HEADER)
     writer.write(BagMessage(number, BEGAN, body(b"%d" % step)) for step in range(9))
@@ -175,7 +173,7 @@ def test_an_impossible_date_is_refused(text: str) -> None:
 
 
 def test_publishers_cannot_forge_events(tmp_path: Path) -> None:
-    """A node's message on the recorder's own topic counts as a message, not as an event."""
+    """A node's message on the recorder's own topic counts as a message."""
     writer = BagWriter(tmp_path / "a.bag", {})
     forger = writer.connect(RECORDS | {"host": "10.0.0.66"})
     writer.write([BagMessage(forger, BEGAN, record(1, event="message dropped", severity="alarm"))])

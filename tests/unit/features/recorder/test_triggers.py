@@ -34,7 +34,6 @@ def test_records_are_triggers_of_the_kind_that_is_wanted(record: AuditRecord, wh
 
 
 def test_a_trigger_has_no_content_of_messages() -> None:
-    """Lists of recordings contain no message content, so the slice of a verdict is only in the audit record."""
     detail = {"monitor": "goals", "category": "twice", "binding": {"id": "secret"}}
     reason = "property 1 of goals (fsm) with id = secret: twice"
     trigger = trigger_of(

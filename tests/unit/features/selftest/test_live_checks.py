@@ -17,8 +17,6 @@ NOT_OURS = SimpleNamespace(sequence=6, record=SimpleNamespace(caller_id="/joy", 
 
 
 class Log:
-    """It answers searches in turn as the test says."""
-
     def __init__(self) -> None:
         self.answers: list[Any] = []
         self.searches = 0

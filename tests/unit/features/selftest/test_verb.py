@@ -44,7 +44,6 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Place]:
 
 @pytest.mark.nightly
 def test_a_valid_setup_passes(place: Place) -> None:
-    """The exit status is 0 and every check has a result; as root the kernel test ran and left nothing changed."""
     need_root()
     status, found = place.run()
     assert status == 0, found
@@ -99,7 +98,6 @@ def test_a_crashing_check_is_a_finding() -> None:
 
 
 def certificate(state: Path, days: int) -> None:
-    """The certificate ends after `days` and an hour."""
     now = datetime.datetime.now(datetime.UTC)
     (state / "api").mkdir(parents=True, exist_ok=True)
     (state / "lock").write_text("")

@@ -41,8 +41,6 @@ def _person(
 
 
 class World:
-    """The process of single sign-on answers what the test says."""
-
     def __init__(self, home: Path) -> None:
         self.records: list[tuple[str, dict[str, Any]]] = []
         trail = SimpleNamespace(

@@ -1,4 +1,4 @@
-"""Mutants of the rules of the lease: the product's source with one change, which the simulation must find.
+"""Mutants of the rules of the lease, which the simulation must find.
 
 Histories seldom show a replayed request, a late order, or a smaller epoch of the witness; `test_lease.py` and
 `test_witness.py` have a test of each.
@@ -97,7 +97,6 @@ def first_seed(product: Product, faults: tuple[str, ...], histories: int) -> int
 
 
 def main(arguments: list[str]) -> int:
-    """Returns 1 if a mutant is not found."""
     missing = 0
     for name, mutant in MUTANTS.items():
         with tempfile.TemporaryDirectory() as folder:

@@ -2,19 +2,15 @@
 
     python -m tests.unit.features.standby.simulation SEED HISTORIES [--trace]
 
-A history is a random sequence of faults in virtual time: partitions of each link, in one or both directions, losses,
-duplicates, delays, pauses for minutes, crashes, restarts, reboots of the robot, power cuts of all three, a full disk,
-a failing firewall, flapping links, planned switchovers. Each process has a clock with its own speed. After every step
-these promises are checked:
+A history is a random sequence of faults of links, processes, disks and power in virtual time; each process has a
+clock with its own speed. After every step these promises are checked:
 
 1. The robot admits at most one appliance, and translates its fixed address only to that one.
 2. At most one appliance is active.
 3. Each appliance that becomes active has every acknowledged write, and a greater epoch than all before.
 4. A grant is answered only when the robot admits its holder.
-5. Within ten seconds after the last fault, one appliance is active and admitted, and both are in sync. In some
-   histories one link stays cut. Then one is active and admitted if an appliance in sync reaches the robot.
-
-The same seed gives the same history. With `--trace` each event is printed.
+5. Within ten seconds after the last fault, one appliance is active and admitted, and both are in sync. If one link
+   stays cut, one is active and admitted if an appliance in sync reaches the robot.
 """
 
 import argparse
@@ -113,7 +109,6 @@ class Host:
             self._wake(self.life, self._timer)
 
     def crash(self) -> None:
-        """Only the disk remains."""
         if self.up:
             self.up = False
             self.inbox.clear()
@@ -122,11 +117,9 @@ class Host:
             self.history.trace(f"crashed {self.name}")
 
     def pause(self, seconds: float) -> None:
-        """Datagrams wait in its socket."""
         self.paused_until = max(self.paused_until, self.history.now + seconds)
 
     def take(self, sender: str, message: Any) -> None:
-        """The message is kept until the process runs."""
         if self.running:
             self.received(sender, message)
         elif self.up and len(self.inbox) < _INBOX:
@@ -461,7 +454,6 @@ class History:
             self.at(delay, lambda: None if net.cut else self.hosts[receiver].take(sender, message))
 
     def run(self) -> "History":
-        """Raises `Violation`."""
         for host in self.hosts.values():
             self.at(self.random.uniform(0, 0.5), host.start)
         self._client()
@@ -626,7 +618,6 @@ class History:
 
 
 def main(arguments: list[str]) -> int:
-    """Returns the number of histories that broke a promise, at most 1."""
     parser = argparse.ArgumentParser(description="Simulate the lease of two appliances.")
     parser.add_argument("seed", type=int)
     parser.add_argument("histories", type=int)

@@ -36,8 +36,6 @@ FOLLOWERS = {"arm": AppliancePeer("10.0.0.20", KEY)}
 
 
 class Robot:
-    """Both have one clock; a test carries their datagrams."""
-
     def __init__(self, epoch: int = 0) -> None:
         self.now = 100.0
         self.robot_admits: list[str] = []
@@ -87,7 +85,6 @@ class Robot:
         return self.gate.answer(datagram or self.follower.request(), address)
 
     def look(self) -> str:
-        """Returns the appliance that the follower admits after one request and its answer."""
         answer = self.answer()
         assert answer is not None
         self.follower.receive(answer)
@@ -95,7 +92,6 @@ class Robot:
 
 
 def following(holder: str = "a") -> Robot:
-    """The first answer has the witness's nonce only."""
     robot = Robot()
     robot.claim(holder)
     assert robot.look() == ""
@@ -356,7 +352,6 @@ class RandomHistory:
         )
 
     def send(self, datagram: bytes, *, answer: bool) -> None:
-        """Most datagrams arrive at once."""
         chosen = self.random.random()
         for _ in range(0 if chosen < 0.1 else 2 if chosen > 0.9 else 1):
             delay = self.random.uniform(0, 2) if self.random.random() < 0.2 else 0.01

@@ -1,5 +1,3 @@
-"""The state of monitors passes from one appliance to the other if nothing changed it since, or as a fresh copy."""
-
 import asyncio
 from collections.abc import Iterator
 from pathlib import Path
@@ -49,10 +47,6 @@ class Pairs:
         self.copy_age: float | None = 1.0
 
     def active(self, name: str, *, taken: bool = True) -> tuple[str, tuple[bytes, ...]]:
-        """Returns why the state is lost, and what was left.
-
-        `taken`: its relays have it.
-        """
         self.epoch += 1
         state, settle = inherited_state(
             self.members[name]._replace(epoch=self.epoch, copy_age=self.copy_age), self.store
@@ -75,7 +69,7 @@ class Pairs:
 
 
 class Relays:
-    """None: the relay does not answer."""
+    """With None the relay does not answer."""
 
     def __init__(self, *contents: bytes | None) -> None:
         self.contents = contents

@@ -21,9 +21,8 @@ pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
 async def test_a_lapse_of_the_lease_stops_what_serves_the_robot(
     tmp_path: Path, end: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A renewal in the same epoch lets it go on. Otherwise it is killed, also if a process ends in the meantime.
-
-    The api goes on, and hears of the pause, so that it can answer operators.
+    """A renewal in the same epoch lets it go on; otherwise it is killed. The api goes on, so that it can answer
+    operators.
     """
     roles = (
         CONTROL,

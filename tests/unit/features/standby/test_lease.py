@@ -49,7 +49,6 @@ class Lease:
         return found
 
     def answered(self, request: WitnessRequest, **answer: object) -> Outgoing:
-        """The lease is granted by default."""
         return self.lease.answered(request, answer_of(**answer))
 
     def active(self) -> bool:

@@ -141,7 +141,7 @@ def test_a_late_report_of_an_active_appliance_stops_it_at_once() -> None:
 
 
 def test_a_new_epoch_ends_the_state_of_the_old_one() -> None:
-    """Another appliance may have been active in between, so no process may keep its memory."""
+    """Another appliance may have been active in between."""
 
     async def work(role: Role) -> None:
         role.watch.held(clock.since_boot() + 60, 5)

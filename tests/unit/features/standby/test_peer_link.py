@@ -21,7 +21,6 @@ def ends() -> tuple[PeerChannel, PeerChannel]:
 
 @pytest.mark.parametrize("message", ALL)
 def test_each_message_arrives(message: PeerMessage) -> None:
-    """As the kind that it was sent as: the kinds have different authentication codes."""
     here, there = ends()
     assert there.read(here.write(message)) == message
 

@@ -58,8 +58,6 @@ class Store:
 
 
 class Pair:
-    """Every message waits in a queue of the test."""
-
     def __init__(self, folder: Path, patch: pytest.MonkeyPatch, machine: VirtualClock) -> None:
         self.machine = machine
         patch.setattr(replication, "replication_context", lambda *_, **__: None)

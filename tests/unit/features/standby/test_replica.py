@@ -36,12 +36,10 @@ def thing(name: str) -> Put:
 
 
 def changes(*made: Change, epoch: int = 3, history: str = "h", first: int = 8) -> Changes:
-    """They follow the snapshot, unless they lie."""
     return Changes(epoch, history, first, list(made))
 
 
 def begun(tmp_path: Path) -> Replica:
-    """It has the row `old`, at epoch 3 and number 7 of the history `h`."""
     replica = Replica(tmp_path / "state.db", SCHEMA, failed=pytest.fail, largest=1 << 20)
     for message in (BEGIN, SnapshotRows([thing("old")]), SnapshotEnd(1)):
         replica.take(message)

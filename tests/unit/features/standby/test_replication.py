@@ -176,7 +176,6 @@ async def connected(directory: Path, active: ActiveSide) -> AsyncIterator[Replic
 
 
 async def take_snapshot(link: ReplicationLink[FromActive]) -> SnapshotBegin:
-    """The stored state is of another history."""
     begin = await link.receive(10)
     assert isinstance(begin, SnapshotBegin)
     await link.send(Stored(0, "other", 1))
@@ -407,7 +406,6 @@ async def pair_of_streams() -> tuple[Streams, Streams]:
 
 
 async def pair_of_links() -> tuple[asyncio.StreamReader, asyncio.StreamWriter, asyncio.StreamWriter]:
-    """Returns a reader, the writer whose bytes it reads, and the reader's own writer."""
     (reader, writer), (_, other) = await pair_of_streams()
     return reader, other, writer
 
@@ -687,7 +685,7 @@ async def test_an_introduction_is_not_an_acknowledgement(tmp_path: Path) -> None
     ids=["a line of swanctl.conf", "no address", "a shell command", "no fingerprint", "a long request"],
 )
 async def test_an_introduction_cannot_write_into_hosts_files(bad: dict[str, str | bytes]) -> None:
-    """Hosts run scripts with these values, so only the characters of addresses and pins are accepted."""
+    """Hosts run scripts with these values."""
     fields = msgspec.structs.asdict(INTRODUCTION) | bad
     with pytest.raises(msgspec.ValidationError):
         msgspec.msgpack.decode(msgspec.msgpack.encode(Introduction(**fields)), type=Introduction)

@@ -15,7 +15,6 @@ SECRET = b"correct horse"
 
 @pytest.fixture
 def folders(tmp_path: Path) -> tuple[Path, Path]:
-    """The second directory does not exist yet."""
     (tmp_path / "a").mkdir()
     return tmp_path / "a", tmp_path / "b"
 

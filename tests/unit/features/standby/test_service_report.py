@@ -40,7 +40,7 @@ def control(tmp_path: Path) -> Control:
 
 
 def test_a_full_disk_is_an_obstacle(control: Control, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The log can be written for some time, but hosts already wait; a standby with this disk could not take over."""
+    """Hosts already wait, and a standby with this disk could not take over."""
     report = control.report()
     monkeypatch.setattr("os.statvfs", lambda _folder: SimpleNamespace(f_bavail=1023, f_frsize=4096))
     assert "4190208 bytes are free" in report.now().obstacle
@@ -62,7 +62,6 @@ def test_a_log_that_fails_is_an_obstacle_only_if_nothing_is_granted_then(control
 def test_damage_that_is_repaired_in_time_is_not_reported(
     broken: tuple[str, str, str], control: Control
 ) -> None:
-    """Relays start again, and the firewall is written again; if not, another appliance should serve."""
     part, field, value = broken
     machine = VirtualClock()
     with clock.using(machine):

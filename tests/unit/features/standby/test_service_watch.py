@@ -11,7 +11,6 @@ from appliance.features.standby.service_watch import (
 
 
 def serving() -> ServiceWatch:
-    """Active at 100 s, serves from 102 s on."""
     watch = ServiceWatch()
     assert watch.fault(100.0, active=True) == ""
     watch.linked()

@@ -15,13 +15,6 @@ pytestmark = pytest.mark.anyio
 
 
 class Pair:
-    """`a` is the active appliance.
-
-    `did` has what happened, in order.
-
-    `refusal` is the reason against a switchover.
-    """
-
     def __init__(self, role: str) -> None:
         self.role = role
         self.refusal = ""
@@ -49,7 +42,7 @@ class Pair:
 
 
 async def test_the_order_is_on_disk_before_the_switchover() -> None:
-    """The record names the operator; it is written first, because the switchover ends the process."""
+    """The switchover ends the process, and the record names the operator."""
     pair = Pair("active")
     after = await pair.orders().promote(standby_requests.StandbyPromote(), "alice")
     assert after.role == "standby"

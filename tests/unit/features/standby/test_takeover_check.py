@@ -33,8 +33,6 @@ SECONDS = 60
 
 
 class Standby:
-    """`store` writes its state as the replication does."""
-
     def __init__(self, home: Path) -> None:
         self.home = home
         (home / "control").mkdir()
@@ -64,7 +62,6 @@ class Standby:
         compiler: SpecificationCompiler | None = None,
         **settings: Any,
     ) -> AsyncIterator["Checked"]:
-        """The check repeats itself after `again` seconds."""
         await self.store.settled()
         given: dict[str, Any] = {
             "listen": "127.0.0.1:0",
@@ -183,7 +180,6 @@ async def test_a_monitor_to_enable_that_does_not_exist(standby: Standby) -> None
 
 
 async def test_a_port_in_use(standby: Standby) -> None:
-    """The port is free again once its user has ended, and the check does not keep it."""
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         async with standby.checked(again=0.05, listen=f"127.0.0.1:{port}") as checked:
@@ -200,8 +196,6 @@ async def test_a_damaged_certificate(standby: Standby) -> None:
 
 
 class OwnCompiler(SpecificationCompiler):
-    """It counts the questions."""
-
     questions = 0
 
     async def _asked(self, question: Callable[[int], Any], **_: Any) -> Any:

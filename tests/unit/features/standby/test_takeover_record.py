@@ -17,7 +17,6 @@ pytestmark = pytest.mark.nightly
 
 
 def records(member: Member, event: str) -> list[dict[str, Any]]:
-    """`reason` is added to the details."""
     found = search(member.path, Filter(event=event), newest_first=False).entries
     return [{**one.record.detail, "reason": one.record.reason} for one in found]
 
@@ -30,7 +29,6 @@ def after(tmp_path: Path, story: Callable[[Member, Member], Awaitable[None]]) ->
 
 
 async def sealed_by_b(a: Member, b: Member) -> SignedCheckpoint:
-    """The records of `b`, which is active, are replicated to `a`."""
     async with b.active(1):
         await b.decide(3, 1)
         await b.sealed()
@@ -126,7 +124,7 @@ def test_a_restart_within_an_epoch_repeats_no_record(tmp_path: Path) -> None:
 
 
 def test_the_own_log_knows_the_takeover_before(tmp_path: Path) -> None:
-    """If the state lacks the last takeover, because a crash came first, the own log's last one is named."""
+    """A crash may come before the state has the last takeover."""
 
     async def story(a: Member, _b: Member) -> None:
         await a.recorder.took_over(5)

@@ -1,6 +1,5 @@
-"""Tests of verifying two logs and the takeovers between them.
-
-The attacker is root on one appliance, with its signing key and its signer's memory: each forged log alone is valid.
+"""The attacker is root on one appliance, with its signing key and its signer's memory: each forged log alone is
+valid.
 """
 
 import shutil
@@ -58,7 +57,6 @@ def build(folder: Path, story: Story) -> Pair:
 
 @pytest.fixture(scope="module")
 def honest(tmp_path_factory: pytest.TempPathFactory) -> Pair:
-    """Tests change copies."""
     return build(tmp_path_factory.mktemp("honest"), four_takeovers)
 
 
@@ -76,7 +74,6 @@ def verified(a: Path, b: Path) -> PairVerification:
 
 
 def found(pair: Pair) -> list[tuple[Kind, int]]:
-    """Both logs are valid on their own."""
     result = verified(pair.a, pair.b)
     assert [log.findings for log in result.logs] == [[], []]
     turned = verified(pair.b, pair.a)
@@ -146,7 +143,7 @@ def test_a_standby_that_was_never_active_has_no_log(pair: Pair, tmp_path: Path) 
 
 
 def test_the_tail_is_counted(pair: Pair) -> None:
-    """The tail has the records after the named checkpoint until the next takeover; later checkpoints seal it."""
+    """Later checkpoints seal the records after the named one, until the next takeover."""
     second, third = verified(pair.a, pair.b).takeovers[1:3]
     ((next_takeover,),) = read(pair.a, "SELECT max(sequence) FROM record WHERE event = 'took over'")
     assert second.tail == next_takeover - 1 - second.through >= 5
@@ -240,7 +237,6 @@ def test_the_tail_reaches_beyond_an_unsealed_takeover(tmp_path: Path) -> None:
 
 
 def test_the_findings_are_limited(pair: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A forged log cannot make an endless result."""
     pair.forge_b(removing(2))
     assert len(verified(pair.a, pair.b).findings) > 1
     monkeypatch.setattr("appliance.features.standby.takeover_verification._MOST_FINDINGS", 1)
@@ -447,7 +443,6 @@ def test_an_older_copy(pair: Pair, tmp_path: Path) -> None:
 
 
 def overlapping(folder: Path, both: float, *, lasting: float = 60, clock_set: str = "") -> Pair:
-    """Appliance a decides for `both` seconds while b is active for `lasting` seconds."""
 
     async def story(a: Member, b: Member, world: World) -> None:
         async with a.active(1):
@@ -503,7 +498,6 @@ def test_a_clock_that_was_set_proves_no_overlap(tmp_path: Path, who: str) -> Non
     ],
 )
 def test_decisions_after_a_hand_over(tmp_path: Path, seconds: float, event: str, findings: list[Any]) -> None:
-    """Decisions long after a hand-over are found, unless a failed hand-over or a change of the clock is recorded."""
 
     async def story(a: Member, b: Member, _world: World) -> None:
         async with a.active(1):

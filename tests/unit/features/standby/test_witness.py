@@ -48,13 +48,11 @@ class Robot:
         self.gate = WitnessGate(self.witness, PEERS, "nonce")
 
     def save(self, record: LeaseRecord) -> None:
-        """Fails if the disk is full."""
         if self.disk_full:
             raise WitnessError("the disk is full")
         self.disk = record
 
     def admit(self, name: str) -> None:
-        """This fails if the firewall does."""
         if self.firewall_fails:
             raise WitnessError("nft: no")
         self.admits.append(name)
@@ -112,7 +110,6 @@ def test_a_released_lease_is_granted_at_once() -> None:
 
 
 def test_an_epoch_never_falls() -> None:
-    """An old epoch of the holder is refused; a witness that knows less than an appliance grants nothing."""
     robot = granted().expired()
     assert robot.asks("a", "claim", 2) == ""
     assert robot.asks("a", "renew", 2) == "a holds epoch 3"

@@ -30,15 +30,12 @@ _DAY = 86_400_000_000_000
 
 
 class Kept:
-    """Fails when the test says so."""
-
     def __init__(self) -> None:
         self.lines: list[bytes] = []
         self.failing = 0
         self.torn = False
 
     def send(self, messages: Sequence[bytes]) -> None:
-        """With `torn`, stores only the first half and fails."""
         if self.torn:
             self.lines += messages[: len(messages) // 2]
             raise ConnectionResetError("cut in the middle")
@@ -122,7 +119,6 @@ def test_a_failed_batch_is_sent_again(make_log: MakeLog, path: Path, kept: Kept)
 
 
 def test_the_interval_is_bounded(make_log: MakeLog, path: Path, kept: Kept) -> None:
-    """However long the receiver is down, the next attempt comes within half a minute."""
     record(make_log(), 1)
     kept.failing = 50
     one = forwarder(path, kept)

@@ -84,7 +84,6 @@ def test_a_receiver_that_reads_nothing_is_an_error(monkeypatch: pytest.MonkeyPat
 
 @pytest.mark.nightly
 def test_tls_checks_the_receiver(certificates: Certificates) -> None:
-    """The name may also be the receiver's address."""
     with StreamCollector(context=server_context(certificates)) as collector:
         for name in (None, "logs.example"):
             receiver = StreamReceiver(
@@ -109,7 +108,7 @@ def test_a_wrong_certificate_gets_nothing(certificates: Certificates, tmp_path: 
 
 @pytest.mark.nightly
 def test_tls_with_client_certificates(certificates: Certificates, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The receiver accepts our certificate; without one, its refusal is an error although TLS 1.3 reports it late."""
+    """Without one, the receiver's refusal is an error although TLS 1.3 reports it late."""
     monkeypatch.setattr("appliance.features.syslog.receiver._OBJECTION_SECONDS", LIMIT)
     with StreamCollector(context=server_context(certificates, clients=True)) as collector:
         receiver = StreamReceiver(

@@ -38,7 +38,6 @@ def test_gaps_of_the_log_are_reported() -> None:
 
 
 def counted(sequence: int, scope: str, event: str, **fields: Any) -> LogEntry:
-    """The record was repeated two seconds earlier."""
     first = entry(sequence - 2, event, host="10.0.0.9", caller_id="/n", **fields).record
     state = new_state(structs.replace(first, folds=True), scope)
     state.count_in(first)
@@ -46,7 +45,7 @@ def counted(sequence: int, scope: str, event: str, **fields: Any) -> LogEntry:
 
 
 def test_registrations_that_were_only_counted_are_reported() -> None:
-    """A host above its budget cannot hide a publication: the log counts it, and the answer refers to the count."""
+    """A host above its budget cannot hide a publication."""
     topic = {"category": "publication", "resource": "/a"}
     log = [
         entry(1, "log begun"),

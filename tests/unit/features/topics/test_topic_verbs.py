@@ -13,7 +13,6 @@ DEFINITIONS = Definitions.from_files(
 
 
 def scan(length: int) -> dict[str, object]:
-    """720 ranges and a picture of 921,600 bytes, of which `length` bytes are there."""
     whole = (720).to_bytes(4, "little") + b"\0" * 2880 + (921_600).to_bytes(4, "little") + b"\1" * 921_600
     fields = read_fields(DEFINITIONS, "a/Scan", (whole + b"\0" * 4 + b"\7")[:length])
     assert fields is not None

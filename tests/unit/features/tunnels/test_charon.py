@@ -64,7 +64,6 @@ class StandIn:
                     connection.sendall(struct.pack("!I", len(answer)) + answer)
 
     def ended(self, by: str) -> list[str]:
-        """Since the last call, by their `ike` (name) or `ike-id`."""
         asked, self.asked = self.asked, []
         return [body[by].decode() for name, body in asked if name == "terminate" and by in body]
 
@@ -79,7 +78,6 @@ def pem_of(count: int) -> bytes:
 
 
 def stated(count: int) -> TunnelsStated:
-    """`count` is the size of the list."""
     return TunnelsStated(1, "kernel", "10.113.11.1", b"authority", b"certificate", pem_of(count), [])
 
 

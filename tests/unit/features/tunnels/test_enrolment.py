@@ -246,7 +246,7 @@ async def test_addresses_are_given_in_order_and_kept(bench: Bench) -> None:
 async def test_an_unavailable_name_or_address_is_refused(
     bench: Bench, name: str, address: str | None, why: str
 ) -> None:
-    """The appliance's name is reserved, and case does not distinguish names, as in IKE. An address must be free."""
+    """The appliance's name is reserved, and case does not distinguish names, as in IKE."""
     await bench.add("laptop")
     with pytest.raises(HostRefusedError, match=why):
         await bench.hosts.add(
@@ -255,7 +255,7 @@ async def test_an_unavailable_name_or_address_is_refused(
 
 
 def test_without_a_firewall_no_name_stands_for_an_address(tmp_path: Path) -> None:
-    """If the supervisor cannot keep clear text out, no host can be enrolled, and enrolled hosts lose their names."""
+    """The supervisor cannot keep clear text out then."""
 
     async def enrol(bench: Bench) -> None:
         await bench.add("a")
@@ -294,7 +294,6 @@ async def test_a_revoked_host_leaves_the_policy_first(bench: Bench) -> None:
 
 
 async def test_a_new_certificate_revokes_the_one_before(bench: Bench) -> None:
-    """The address stays; an enrolled name cannot be enrolled again."""
     first = await bench.add("a")
     with pytest.raises(HostRefusedError, match="rosrv host kit a"):
         await bench.add("a")
@@ -404,7 +403,6 @@ async def test_revoked_while_a_certificate_is_made(bench: Bench, how: str) -> No
 
 
 async def test_a_host_renews_itself(bench: Bench) -> None:
-    """In its tunnel and with its key; both certificates are valid until the host reports the new one in place."""
     key = make_key()
     first = await bench.add("a", key=key)
     request = request_of("a")
@@ -528,7 +526,6 @@ async def test_a_full_list_replaces_no_certificate(bench: Bench, monkeypatch: py
 
 
 async def test_a_change_for_another_state_is_refused(bench: Bench) -> None:
-    """Two engineers cannot overwrite each other: the revision grows with every change, also over restarts."""
     seen = (await bench.hosts.listed(HostList())).revision
     await bench.add("a")
     for late in (
@@ -706,15 +703,11 @@ def test_a_full_disk_during_enrolment_names_the_way_out(
 
 
 class Waiting(StoredAuthority):
-    """The other of two appliances has the key."""
-
     async def obstacle(self) -> str:
         return "new certificates wait"
 
 
 class Two(Appliances):
-    """`row` is the other appliance once it has introduced itself."""
-
     paired = True
     row: ApplianceRow | None = None
 

@@ -1,7 +1,6 @@
-"""Tests of the kit's `join.sh`: which certificate is in place when it has run again.
+"""The part of the kit's `join.sh` that decides which certificate stays, on a folder in the place of `/etc/swanctl`.
 
-The part of the script that decides runs as it is, on a folder of its own in the place of `/etc/swanctl`; `openssl` is
-the real one, with the spelling of the version that is tested.
+`openssl` is the real one, with the spelling of the version that is tested.
 """
 
 import os
@@ -61,7 +60,7 @@ class Machine:
 
 @pytest.mark.parametrize("openssl", SPELLINGS)
 def test_a_renewed_certificate_stays(tmp_path: Path, openssl: str) -> None:
-    """join.sh run again leaves the later certificate of this name in place, however openssl writes a name."""
+    """When join.sh runs again, this holds however openssl writes a name."""
     machine = Machine(tmp_path, SPELLINGS[openssl])
     machine.put("kit", "laptop", 10)
     machine.put("etc", "laptop", 20)

@@ -42,7 +42,6 @@ class Conversation:
         self._busy.clear()
 
     def seen(self) -> list[TunnelSeen]:
-        """Notes whether the configuration is in progress."""
         if self._busy.is_set():
             self.interrupted.set()
         return []
@@ -57,7 +56,7 @@ class Bench(process.TunnelProcess):
 
 @pytest.mark.nightly
 async def test_charon_gets_one_request_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A query of the tunnels waits for the configuration: otherwise each would read the other's answers."""
+    """Otherwise a query and the configuration would read each other's answers."""
     monkeypatch.setattr(process, "REPORT_SECONDS", 0.01)
     (ours, theirs), (lifeline, child) = socket.socketpair(), socket.socketpair()
     own, supervisor, link = (
@@ -87,8 +86,6 @@ async def test_charon_gets_one_request_at_a_time(tmp_path: Path, monkeypatch: py
 
 
 class Opening(Conversation):
-    """A stand-in for charon: a tunnel opens while charon makes its first list, so that the list lacks it."""
-
     tunnel = TunnelSeen("laptop", "10.88.0.9", 1, 0, 0)
 
     def __init__(self) -> None:

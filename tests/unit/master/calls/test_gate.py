@@ -1,5 +1,3 @@
-"""The gate decides on names in use, on the appliance's own names and services, and on limits."""
-
 import ipaddress
 from typing import Any
 
@@ -22,7 +20,6 @@ API = "http://127.0.0.1:4000/"
 
 
 def held(name: str, host: str, *, own: bool) -> Registry:
-    """With `own`, it is the appliance's node."""
     registry = Registry()
     address, uri = ipaddress.ip_address(host), parse_node_uri(API)
     node = Incarnation("key", name, address, uri, API, host, 19001, 19002, own=own)

@@ -19,8 +19,6 @@ TOPICS, CONNECTIONS = 200, 300
 
 
 class Counted(dict[Any, Any]):
-    """Counts how often a connection is read."""
-
     looks = 0
 
     def values(self) -> Any:

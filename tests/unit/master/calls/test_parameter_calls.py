@@ -60,7 +60,6 @@ STEP = st.one_of(st.tuples(st.just("set"), KEY, VALUE), st.tuples(st.just("delet
 
 @pytest.fixture(scope="module")
 def oracle() -> Any:
-    """Debian's Python runs rosmaster's own code."""
     with subprocess.Popen(
         [PYTHON, "-c", ORACLE], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as process:
@@ -105,8 +104,6 @@ def test_key_and_value_together_are_bounded_in_depth() -> None:
 
 
 class OrderedServer:
-    """It has the requests that reached the ROS master."""
-
     def __init__(self, there: ParameterMirror) -> None:
         self.tree = mirror()
         self.requests: list[list[str]] = []

@@ -52,8 +52,6 @@ write /arm/max = adm
 
 
 class Trail(Records):
-    """Decisions as (call, key or resource, decision)."""
-
     def __init__(self) -> None:
         super().__init__()
         self.decisions: list[tuple[str, str, Decision]] = []
@@ -66,8 +64,6 @@ class Trail(Records):
 
 
 class Site:
-    """Calls of the ROS master wait for `go`."""
-
     def __init__(self, rules: str = LIMITED, tree: Any = None, *, bytes_limit: int = 64 << 20) -> None:
         self.policy_text = POLICY + rules
         self.policy = compile_policy(self.policy_text, file="test.ini")
@@ -158,7 +154,6 @@ def told(answers: list[Any]) -> list[int]:
 
 
 async def held(site: Site, parts: list[Value]) -> "asyncio.Task[Any]":
-    """The ROS master answers the first run after `site.go`."""
     site.go.clear()
     asked = asyncio.create_task(site.ask(OPERATOR, "system.multicall", parts))
     await others()

@@ -32,10 +32,6 @@ PARTS: list[Value] = [{"methodName": "setParam", "params": []}, {"methodName": "
 def test_a_record_names_what_was_asked_for(
     method: str, params: tuple[Value, ...], record: tuple[Any, ...]
 ) -> None:
-    """The record has category, resource (with keys resolved), claimed name, and the first parts of a multicall.
-
-    Wrong arguments still give the call and its caller; an unknown method has no category of its own.
-    """
     assert tuple(asked_for(PEER, build_call(method, params))) == record
 
 

@@ -30,7 +30,6 @@ async def write(turns: KeyTurns, keys: Sequence[str], order: list[str], go: asyn
     ],
 )
 async def test_overlapping_writes_wait(first: list[str], second: list[str], waits: bool) -> None:
-    """The second write waits if a key of one write equals or contains a key of the other."""
     turns, inside, go = KeyTurns(), asyncio.Event(), asyncio.Event()
 
     async def before() -> None:
@@ -52,7 +51,6 @@ async def test_overlapping_writes_wait(first: list[str], second: list[str], wait
 
 
 async def test_first_come_first_served() -> None:
-    """A write of the whole tree waits for earlier writes, and later writes wait for it: no write overtakes another."""
     turns, order, go = KeyTurns(), list[str](), asyncio.Event()
     tasks = [asyncio.create_task(write(turns, [key], order, go)) for key in ("/a", "/", "/b")]
     for _ in range(5):

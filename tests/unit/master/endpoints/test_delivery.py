@@ -17,8 +17,6 @@ LONG = [f"http://10.0.0.1:{19001 + number}/" for number in range(500)]
 
 
 class Node:
-    """It answers once `answers` is set, and fails while `fails`."""
-
     def __init__(self) -> None:
         self.answers = asyncio.Event()
         self.fails = False

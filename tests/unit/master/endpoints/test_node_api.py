@@ -26,7 +26,6 @@ class Street(ControlParts):
         self.deliveries = cast(Any, self.delivery)
 
     async def two_at_one_address(self) -> tuple[Incarnation, Incarnation]:
-        """Both have registered."""
         await self.round()
         first, second = self.node("/first", 1), self.node("/second", 1)
         await self.register(first, Kind.SUBSCRIPTION, "/t")
@@ -106,7 +105,7 @@ async def test_programs_that_serve_two_nodes_with_one_api(telling: NodeCall) -> 
 
 
 async def test_a_connection_is_kept_for_the_next_call_but_not_to_find_out_whether_a_node_is_there() -> None:
-    """A process that is gone, or whose machine is off, must not be taken for a silent one on its old connection."""
+    """A process that is gone must not be taken for a silent one on its old connection."""
     street = Street()
     made: list[tuple[str, int]] = []
     closed: list[str] = []

@@ -15,9 +15,8 @@ class Told:
 
 
 def test_ports_are_closed_once() -> None:
-    """A node is closed when it is replaced and again when it is forgotten; its ports are closed only the first time.
-
-    By the second time, another node may have these ports.
+    """A node is closed when it is replaced and again when it is forgotten. By then, another node may have these
+    ports.
     """
     places, server = Told(), Told()
     faces = ProxyEndpoints(cast(Any, None), cast(Any, places), *[cast(Any, None)] * 3)

@@ -66,8 +66,6 @@ def policy(*limits: str, nodes: str = "default = 10.0.0.5") -> Policy:
 
 
 class World:
-    """Two relays; /left and the service /serve belong to the first, /right to the second."""
-
     def __init__(self, grants: Bounds = GRANTS.bounds) -> None:
         self.records: list[tuple[str, str, dict[str, Any]]] = []
         self.lost: list[int] = []

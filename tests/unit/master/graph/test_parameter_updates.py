@@ -40,7 +40,6 @@ SUBSCRIBED = st.lists(st.tuples(CALLER, KEY), max_size=8, unique=True)
 
 @pytest.fixture(scope="module")
 def oracle() -> Any:
-    """rosmaster's `compute_param_updates`, run by the interpreter that rosmaster is installed for."""
     with subprocess.Popen(
         [PYTHON, "-c", ORACLE], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as process:

@@ -102,7 +102,6 @@ def test_the_node_that_was_lost_first_makes_room() -> None:
 
 
 def test_a_node_without_registrations_makes_room_first() -> None:
-    """A node without registrations is dropped before a lost one, even for another host, unless it is calling now."""
     registry = Registry()
     lost, idle, busy = incarnation(0), incarnation(2), incarnation(4)
     for one in (lost, idle, busy):

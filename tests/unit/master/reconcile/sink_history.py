@@ -70,8 +70,6 @@ def history(seed: int) -> list[Step]:
 
 
 class SlowNodes(Deliveries):
-    """Deliveries that wait until they `arrive`."""
-
     def __init__(self, note: Callable[[Seen], None]) -> None:
         super().__init__(note)
         self.waiting: list[Told] = []
@@ -90,8 +88,6 @@ class SlowNodes(Deliveries):
 
 
 class StrictMaster(HiddenMaster):
-    """A ROS master that notes registrations that it has already."""
-
     def __init__(self, note: Callable[[Seen], None]) -> None:
         super().__init__(note)
         self.repeated: list[tuple[Value, ...]] = []
@@ -177,7 +173,7 @@ class History(ControlParts):
                 self.graph.forgotten(node)
 
     def _register(self, node: Incarnation, kind: Kind, topic: str) -> None:
-        """Register as a call does. Earlier calls arrive before the answer, whose value is not sent again."""
+        """Earlier calls arrive before the answer, whose value is not sent again."""
         if kind not in {Kind.SUBSCRIPTION, Kind.PARAMETER}:
             self.graph.registered(node, kind, topic, "4001")
             return
@@ -199,7 +195,6 @@ class History(ControlParts):
         return {} if present is None else present
 
     async def _check_reminded(self) -> None:
-        """Nodes get each list once more from a new ROS master."""
         self.slow.arrive()
         before = len(self.seen)
         self.hidden.restart()
@@ -222,7 +217,6 @@ class History(ControlParts):
         await check_quiet(self)
 
     def at_relay(self) -> dict[Any, messages.Message]:
-        """Return the facts of the present relay. A node takes its facts with it."""
         facts: dict[Any, messages.Message] = {}
         for message in self.seen:
             if isinstance(message, messages.StateBegan):
@@ -238,7 +232,6 @@ class History(ControlParts):
         return facts
 
     def told(self) -> dict[tuple[str, str], dict[str, Value]]:
-        """Return the last value of each topic or parameter that each node got, in an answer or a call."""
         told: dict[tuple[str, str], dict[str, Value]] = {}
         for seen in self.seen:
             if isinstance(seen, Told):
@@ -308,7 +301,6 @@ def check_nodes(world: History) -> None:
 
 
 async def check_quiet(world: History) -> None:
-    """A change that changes nothing is stated to no sink."""
     for node in world.registry.live():
         world.registry.mark(node)
     before = len(world.seen)
@@ -365,7 +357,6 @@ def live(steps: list[Step]) -> None:
 
 
 def shortest(steps: list[Step]) -> list[Step]:
-    """Leave out the steps of a history without which it also fails."""
     size = len(steps) // 2
     while size:
         for begin in range(len(steps) - size, -1, -size):

@@ -17,8 +17,6 @@ _NODES = 4
 
 
 class FewPorts:
-    """Stands in for `NodePorts`: two ports for each of `_NODES` nodes."""
-
     def __init__(self, registry: Registry) -> None:
         self._registry = registry
 
@@ -31,16 +29,12 @@ class FewPorts:
 
 
 class SlowFaces:
-    """They open only after some turns of the event loop."""
-
     async def open(self, _incarnation: Incarnation) -> None:
         for _turn in range(3):
             await asyncio.sleep(0)
 
 
 class NoFaces:
-    """The control has run out of file descriptors."""
-
     async def open(self, incarnation: Incarnation) -> None:
         raise NoPortError(f"no proxy endpoint for {incarnation.name}: Too many open files")
 
@@ -135,8 +129,6 @@ async def test_a_node_that_reaches_another_address_gets_its_lists_with_it(
 
 
 class Listening:
-    """A listening socket, and the server of a proxy endpoint on it."""
-
     def __init__(self, _host: str, port: int) -> None:
         self.port = port
 
@@ -156,7 +148,6 @@ NAMING = compile_policy("", file="a.ini")
 
 
 async def world_with_ports(monkeypatch: pytest.MonkeyPatch) -> tuple[ControlParts, NodePorts]:
-    """Return a world whose nodes have ports in a range for `_NODES` nodes."""
     monkeypatch.setattr(node_ports, "listen", Listening)
     world = await ControlParts.begun()
     places = NodePorts(
@@ -193,7 +184,6 @@ async def test_a_refused_node_keeps_no_ports(monkeypatch: pytest.MonkeyPatch) ->
 
 
 async def test_a_node_beyond_a_limit_takes_the_ports_of_one_node(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The ports of a node that was evicted for the limit of its host are used before another node is evicted."""
     world, places = await world_with_ports(monkeypatch)
     monkeypatch.setattr(world.registry, "_most_of_host", _NODES - 1)
     for number in range(_NODES - 1):

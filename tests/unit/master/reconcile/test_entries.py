@@ -16,8 +16,6 @@ def uri(number: int = 1) -> str:
 
 
 class Requests:
-    """`held` delays the requests, and `failure` replaces their answers."""
-
     def __init__(self, world: ControlParts) -> None:
         self._hidden = world.hidden
         self.methods: list[str] = []
@@ -54,7 +52,6 @@ def changes(world: ControlParts) -> list[tuple[Any, Any]]:
 
 
 async def test_many_changes_go_in_order_in_few_requests() -> None:
-    """A registration that ends before the ROS master got it is never sent."""
     world, requests = await started()
     node = world.node("/n")
     for number in range(200):

@@ -15,8 +15,6 @@ HOST = ipaddress.ip_address("10.0.0.5")
 
 
 class Told:
-    """Subscribers of which `/ear` is absent for a number of checks."""
-
     def __init__(self, absent_for: int) -> None:
         self.absent_for = absent_for
         self.reminded: list[tuple[str, str, list[str]]] = []
@@ -42,7 +40,6 @@ def node(registry: Registry, name: str, kind: Kind) -> Incarnation:
 async def test_reminded_until_back(
     monkeypatch: pytest.MonkeyPatch, absent_for: int, reminded: int, renewed: int
 ) -> None:
-    """Absent nodes are reminded to connect again, a limited number of times; returned nodes get no reminder."""
     monkeypatch.setattr(reminders, "_PAUSES", (0.0,) * 8)
     registry = Registry()
     node(registry, "/ear", Kind.SUBSCRIPTION)

@@ -182,11 +182,9 @@ FAULTS = {
     ),
     "an address is not noted": Fault(Registry, "reached_at", "self.mark(incarnation)", "pass"),
 }  # fmt: skip
-"""Among them each branch of a wanted state, each comparison, and each start with nothing stated."""
 
 
 def faulty(fault: Fault) -> Any:
-    """Return the function with its fault."""
     function = inspect.unwrap(getattr(fault.place, fault.name))
     source = textwrap.dedent(inspect.getsource(function))
     assert source.count(fault.text) == 1, f"{fault.name} has {fault.text!r} {source.count(fault.text)} times"

@@ -118,7 +118,6 @@ async def test_a_relay_gets_what_it_could_not_take_as_soon_as_it_reads() -> None
 
 @pytest.mark.anyio
 async def test_an_order_reaches_a_relay_that_does_not_read() -> None:
-    """Its answer comes when the relay reads again, or another relay has its state."""
     world = await ControlParts.begun()
     world.full = True
     order = asyncio.ensure_future(world.relay.carried_out())

@@ -13,7 +13,7 @@ pytestmark = pytest.mark.anyio
 
 
 async def test_the_next_control_repeats_the_news_of_a_lost_topic() -> None:
-    """If control died before the update, the next control sends it; else subscribers would keep the old publisher."""
+    """Else subscribers would keep the old publisher."""
     world = await ControlParts.begun()
     node = world.node("/ear")
     await world.register(node, Kind.SUBSCRIPTION, "/secret")

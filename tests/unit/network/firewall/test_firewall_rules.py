@@ -53,7 +53,7 @@ def test_no_other_machine_uses_or_reaches_the_own_network() -> None:
 
 
 def test_the_rules_only_ever_refuse() -> None:
-    """No rule in the appliance's namespace accepts a packet, so none overrides another firewall."""
+    """No accepted packet overrides another firewall."""
     refusing = {PacketVerdict.RETURN, PacketVerdict.RESET, PacketVerdict.DROP}
     assert {rule.verdict for rule in appliance_rules(FULL)} == refusing | {PacketVerdict.COUNTED}
 
@@ -117,7 +117,7 @@ def test_the_rest_port_is_limited_before_its_networks_pass() -> None:
 
 
 def test_purposes_tell_rules_of_a_chain_apart() -> None:
-    """No two rules of a chain have the same purpose, because counters are matched by purpose."""
+    """Counters are matched by purpose."""
     keys = [(rule.chain, rule.purpose) for rule in appliance_rules(FULL)]
     assert len(keys) == len(set(keys))
 
@@ -319,7 +319,7 @@ def test_replication_and_lease_are_for_the_other_appliance() -> None:
 
 @pytest.mark.parametrize("name", [one.name for one in fields(PacketRule)])
 def test_both_back_ends_translate_each_condition(name: str) -> None:
-    """No back end ignores a condition, which would match more packets; iptables rejects rules in other chains."""
+    """An ignored condition would match more packets; iptables rejects rules in other chains."""
     if name in ("purpose", "verdict", "chain"):
         return
     rule, value = CONDITIONS[name]

@@ -98,7 +98,6 @@ def test_a_rate_limit_has_one_set_for_each_family() -> None:
 
 
 def listed(rules: tuple[PacketRule, ...], *, without: int | None = None) -> str:
-    """Leave out the rule `without`."""
     bodies = [one["add"]["rule"] for one in render(rules) if "rule" in one["add"]]
     jumps = [body for body in bodies if "comment" not in body]
     kept = [

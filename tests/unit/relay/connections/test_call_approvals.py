@@ -10,8 +10,6 @@ from roswire.tcpros import encode_frame, encode_service_error, encode_service_re
 
 
 class Relay:
-    """One client of a service, and control's end of the link."""
-
     def __init__(self, *, asks: bool = True) -> None:
         self.asks = asks
         self.later: list[Any] = []

@@ -21,7 +21,6 @@ class Conversation:
         )
 
     def ask(self, data: bytes) -> None:
-        """Send bytes as a client that has read everything."""
         self.exchange.from_client(data)
         self.exchange.advance()
 

@@ -28,8 +28,6 @@ def wanted(monitor: str = "react") -> Published:
 
 
 class Calls:
-    """Calls without a relay: `sent` are the questions to control, `failed` the faults."""
-
     def __init__(self, *, connected: bool = True) -> None:
         self.quiet, self.loop = QuietMonitors(), Timers()
         self.quiet.load(REACT)

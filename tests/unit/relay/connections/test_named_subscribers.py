@@ -50,7 +50,6 @@ def presences(loop: EventLoop) -> Iterator[NamedSubscribers]:
 
 
 def turn_until(loop: EventLoop, done: Callable[[], bool]) -> None:
-    """Let the loop turn until the condition holds."""
     deadline = time.monotonic() + 30
     while not done():
         assert time.monotonic() < deadline, "it did not happen"

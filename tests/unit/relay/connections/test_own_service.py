@@ -24,8 +24,6 @@ CALL = {"callerid": "/client", "service": "/rosrv/record_now", "md5sum": "*"}
 
 
 class Scene(World):
-    """/client may call the appliance's service from two hosts."""
-
     def __init__(self, limits: RelayLimits = LIMITS) -> None:
         super().__init__(limits)
         self.port = self.listen()
@@ -60,7 +58,6 @@ def test_the_header_is_that_of_the_type() -> None:
 
 
 def test_control_answers_a_call(scene: Scene) -> None:
-    """Control gets caller and host; the client gets its answer, on a persistent connection also the next one."""
     client = scene.client(persistent="1")
     assert scene.hears(ConnectionOpened, resource=CALL["service"]).host == LOOPBACK
     client.send(encode_frame(b""))

@@ -24,8 +24,6 @@ def batch(*texts: bytes) -> Batch:
 
 
 class RecordedUpstream(Upstream):
-    """A publisher's connection that records the topic's requests."""
-
     def __init__(self) -> None:
         self.asked: list[str] = []
         self.announced: tuple[list[str], str] = ([], "")
@@ -50,8 +48,6 @@ class RecordedUpstream(Upstream):
 
 
 class RecordedMember:
-    """A subscriber that accepts everything until the test makes it slow."""
-
     def __init__(self, *, fits: bool = True, caller_id: str = "/listener", host: str = "10.0.0.2") -> None:
         self.caller_id = caller_id
         self.host = host
@@ -127,7 +123,6 @@ class Story:
         self.topic.upstream = self.upstream
 
     def receive(self, frames: Batch, late: float = 0.0) -> None:
-        """Receive these frames, read from the publisher this many seconds ago."""
         self.topic.received(frames, self.now - late)
 
     def join(self, caller_id: str = "/listener") -> RecordedMember:
@@ -270,8 +265,6 @@ def test_messages_of_monitors_are_counted() -> None:
 
 
 class _Recorder:
-    """A sink with one stream."""
-
     keeps = True
 
     def __init__(self) -> None:
@@ -616,8 +609,6 @@ def test_a_withdrawn_topic_cuts_served_and_waiting_subscribers() -> None:
 
 
 class LeavingMember(RecordedMember):
-    """A subscriber that leaves when it is cut, as a real one does."""
-
     topic: RelayedTopic
 
     def cut(self, reason: str) -> None:

@@ -7,7 +7,6 @@ from tests.support.relay_memory import share
 
 
 def replay(memory: HostMemory, now: float = 0.0) -> StartupReplay:
-    """A connection to a new publisher has opened, for monitors only."""
     made = StartupReplay(memory, now)
     made.opened(now, alone=True)
     return made

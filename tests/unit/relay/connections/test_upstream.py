@@ -22,8 +22,6 @@ class Timer:
 
 @dataclass
 class Relay:
-    """A relay's context, loop and reporter, as far as a connection that is not open needs them."""
-
     topic = "/chatter"
     key = "k"
     host = "10.0.0.2"

@@ -196,7 +196,7 @@ class MonitoredDialogue(Dialogue):
 
 
 def _text(word: str) -> str:
-    """Return the named specification; `NAME|old|new` replaces text, and `hold:` in front makes it hold its topics."""
+    """`NAME|old|new` replaces text, and `hold:` in front makes the specification hold its topics."""
     name, *change = word.removeprefix("hold:").split("|")
     text = SPECIFICATIONS.get(name, name)
     text = text.replace(*change) if change else text  # type: ignore[arg-type]  # two texts

@@ -47,11 +47,6 @@ class Reports:
 
 
 class QuietMonitors:
-    """An interceptor whose specifications are loaded at once.
-
-    `published` has what its monitors publish, and `called` the services that they call.
-    """
-
     def __init__(self, publish: Callable[[str, bytes], None] | None = None) -> None:
         self.reports = Reports()
         self.published: list[tuple[str, bytes]] = []

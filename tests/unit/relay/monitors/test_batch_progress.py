@@ -110,7 +110,6 @@ class Monitored:
         return left.messages, bytes(left.view), bytes(left.keep_last().view)
 
     def _asked(self, traffic: Traffic, client: str) -> tuple[int, bytes, bytes]:
-        """The same as `through`, one by one, with errors for refused ones."""
         service, part = traffic.topic.split()
         judged = [
             self.interceptor.judge(ObservationPoint("key", service, "10.0.0.7", client), part, body)
@@ -134,7 +133,7 @@ class Monitored:
         return self.interceptor.observer.rows(self.set, self.interceptor.now())
 
     def state(self) -> list[object]:
-        """Return variables, states of properties and due times. (`next_due` is left out: it may be too early.)"""
+        """`next_due` is left out: it may be too early."""
         state: list[object] = []
         for monitor in self.set.monitors:
             state.append((monitor.name, monitor.seen, monitor.faults, monitor.held))
@@ -150,7 +149,6 @@ class Monitored:
 
 def agree(texts: dict[str, str], known: Definitions, all_traffic: Iterable[Traffic], on_fault: str = "drop",
           switched: tuple[int, str] | None = None) -> Monitored:  # fmt: skip
-    """Fails at the first difference between batches and single messages."""
     ways = [Monitored(texts, known, together=together, on_fault=on_fault) for together in (False, True)]
     try:
         for number, traffic in enumerate(all_traffic):

@@ -1,8 +1,7 @@
 """Every action of a monitor is explained: the host, the events, the values and the line.
 
-Each row of the tables has a kind of event and its effect. The events that a record names are replayed alone, from the
-initial state; they must have the same effect. The lines for people come from the record, as `rosrv audit why`, REST and
-the console show it.
+The events that a record names are replayed alone, from the initial state; they must have the same effect. The lines
+for people come from the record, as `rosrv audit why`, REST and the console show it.
 """
 
 import struct
@@ -32,8 +31,6 @@ START = 1_900_000_000_000 * MS
 
 
 class Given(NamedTuple):
-    """A message of a topic, a request or a reply, with milliseconds since the beginning."""
-
     at: int
     where: str
     value: int
@@ -41,13 +38,10 @@ class Given(NamedTuple):
 
 
 class Row(NamedTuple):
-    """`kind` is that of the reported event."""
-
     text: str
     given: list[Given]
     kind: str
     by: str
-    """The caller id; empty of what time alone has done."""
     at: str
     because: list[tuple[str, str]]
     """The events that explain a verdict, or the verdict in whose handler it happened, and who sent each."""
@@ -115,7 +109,6 @@ def told(row: Row, given: Iterable[Given], *, together: bool, shadow: bool = Fal
 
 
 def place(text: str, piece: str) -> str:
-    """The position of a property's head if the piece is its formula."""
     before = text[: text.index(piece) + (len(piece) + 1) * piece.endswith(":")]
     return f"x.rv:{before.count(chr(10)) + 1}:{len(before) - before.rfind(chr(10))}"
 

@@ -20,8 +20,6 @@ LOOK = """look() { event drive(double y) /cmd geometry_msgs/Twist '{linear:{y:y}
 
 
 class Told:
-    """Three monitors on one topic: two that limit, and a third after them that changes nothing."""
-
     def __init__(
         self, *, together: bool, on_fault: str = "drop", texts: tuple[str, ...] = (STOP, TURN, LOOK)
     ) -> None:

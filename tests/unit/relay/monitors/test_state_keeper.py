@@ -47,7 +47,6 @@ def again(monitors: MonitorSet) -> MonitorSet:
 
 
 def unexplained(outcome: Outcome) -> Outcome:
-    """Explanations are not kept, and a throttle may repeat output."""
     outcome.verdicts = tuple(replace(verdict, why=None) for verdict in outcome.verdicts)
     outcome.log = []
     outcome.before = [unexplained(before) for before in outcome.before]
@@ -89,7 +88,6 @@ def stop(modifier: str = "", more: str = "") -> MonitorSet:
 
 
 def press(monitors: MonitorSet, keeper: StateKeeper) -> None:
-    """The engine handles the first message of a monitor, the module the second."""
     for on in (b"\x00", b"\x01"):
         monitors.judge("/stop", on, 1)
         keeper.keep("/stop")

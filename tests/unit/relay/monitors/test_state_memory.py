@@ -30,7 +30,6 @@ class Written:
 
 
 def killed_anywhere(data: bytearray, act: Callable[[Any], object]) -> list[StoredState | None]:
-    """Returns the readable state after each prefix of an action's writes."""
     torn, written = bytearray(data), Written(data)
     act(written)
     found = [read(torn)]
@@ -57,7 +56,6 @@ ACTS: dict[str, Callable[[StateMemory], object]] = {
 @pytest.mark.parametrize("act", ACTS)
 @pytest.mark.parametrize("rounds", [0, 1, 2])
 def test_a_kill_leaves_what_was_before_or_after(act: str, rounds: int) -> None:
-    """After any number of stored bytes each section has the old or the new content, and changes only once."""
     data = bytearray(SIZE)
     memory = StateMemory(written := Written(data))
     assert memory.lay_out(b"head", [(b"one", 0), (b"two", 8)])
@@ -95,7 +93,6 @@ def test_a_state_without_room_changes_nothing() -> None:
 
 @pytest.mark.parametrize("place", range(0, 200, 3))
 def test_arbitrary_bytes_are_refused(place: int) -> None:
-    """For arbitrary bytes, reading returns some bytes or raises `ValueError`."""
     data = bytearray(SIZE)
     StateMemory(data).lay_out(b"head", [(b"one", 8), (b"two", 0)])
     for value in (0, 1, 3, 0x7F, 0xFF):

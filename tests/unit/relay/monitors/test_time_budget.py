@@ -6,7 +6,6 @@ _SECOND = 10**9
 
 
 def reductions(budget: TimeBudget, seconds: float) -> list[float]:
-    """Cuts off 100 messages a second; returns the seconds at which a message had the whole budget."""
     times = [number / 100 for number in range(round(100 * seconds))]
     cut = []
     for time in times:

@@ -32,7 +32,6 @@ def receiver(limit: int = LIMIT, memory: int = 1 << 30) -> tuple[FrameReceiver, 
 
 
 def feed(one: FrameReceiver, data: bytes, cuts: list[int]) -> list[tuple[bytes, int, int]]:
-    """The last size is used repeatedly."""
     batches, position, turn = [], 0, 0
     while position < len(data):
         buffer = one.buffer()
@@ -71,7 +70,7 @@ def test_every_way_of_cutting_the_stream_gives_the_same_frames(lengths: list[int
 
 
 def test_a_torn_frame_is_never_part_of_a_batch() -> None:
-    """A batch ends with a whole frame, so a dying publisher tears no stream."""
+    """A dying publisher tears no stream."""
     one, budget = receiver()
     (batch,) = feed(one, frame(10) + frame(20) + frame(30)[:-1], [SCRATCH])
     assert batch == (frame(10) + frame(20), 2, 14)
@@ -112,7 +111,7 @@ def test_the_limit_holds_for_a_frame_after_a_large_one() -> None:
 
 
 def test_a_declared_length_costs_nothing_until_its_bytes_come() -> None:
-    """Only received bytes count, so declared lengths cannot fill the relay."""
+    """Otherwise declared lengths could fill the relay."""
     one, budget = receiver()
     feed(one, struct.pack("<I", LIMIT) + b"x" * 10, [14])
     assert budget.used == 14

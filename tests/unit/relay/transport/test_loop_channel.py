@@ -43,7 +43,6 @@ class Ends:
 
 
 def send(sock: socket.socket, count: int) -> None:
-    """As one piece, as the kernel may deliver them."""
     bodies = [msgspec.msgpack.encode(NodeWithdrawn(str(number))) for number in range(count)]
     data = b"".join(struct.pack(">I", len(body)) + body for body in bodies)
     assert sock.send(data) == len(data)

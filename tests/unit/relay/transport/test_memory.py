@@ -4,7 +4,6 @@ from appliance.relay.transport.memory import MemoryPool, RelayMemory, StallDetec
 
 
 def shares(whole: int) -> MemoryPool:
-    """All hosts are registered, and each may take all."""
     return MemoryPool("bytes", Bounds(whole, whole, 0, 0), lambda _host: QuotaClass.REGISTERED)
 
 

@@ -59,7 +59,6 @@ class Pumped:
         return self.pump.wait(longest, _ROOM, True)
 
     def left(self) -> Left | None:
-        """Returns the work of an event's step that is left to Python."""
         found = self.wait(10)
         assert found == [(self.ours.fileno(), READ)]
         return self.connection.step()

@@ -29,7 +29,6 @@ def alone(limit: FlowLimit) -> RateAllowance:
 
 
 def sent(flow: RateAllowance, *batches: tuple[float, Batch]) -> int:
-    """Each message is sent at its time."""
     passed = 0
     for now, batch in batches:
         count = flow.room(batch, batch.messages, now)
@@ -204,7 +203,6 @@ def test_a_publication_has_its_own_limit_and_a_part_of_its_topics() -> None:
 
 
 def test_the_last_message_of_a_latching_publisher_comes_later() -> None:
-    """The last message is sent when the limit allows, with its own number, unless a newer one came; its host pays."""
     memory = share()
     flow = PublicationRateLimit(memory, lambda _part, _messages, _size: None)
     flow.set(alone(FlowLimit(messages=2)), None)

@@ -1,5 +1,3 @@
-"""The frames of a connection, cut anywhere."""
-
 import asyncio
 from itertools import pairwise
 from random import Random
@@ -57,7 +55,6 @@ class Connection(asyncio.Transport):
 
 @pytest.mark.parametrize("seed", range(20))
 async def test_frames_are_the_same_wherever_the_stream_is_cut(seed: int) -> None:
-    """A frame does not wait for the rest of the next one, and frames without room are missing."""
     random = Random(seed)  # noqa: S311  not a secret
     sizes = [random.choice((0, 1, 3, 200, 5000, 65_531, 65_532, 65_533, 1 << 16, 200_000)) for _ in range(60)]
     sent = [random.randbytes(size) for size in sizes]

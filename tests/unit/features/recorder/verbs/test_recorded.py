@@ -17,7 +17,6 @@ from tests.support.transcript import Section, Transcript, sections
 pytestmark = pytest.mark.nightly
 
 BASE = 1_767_225_600
-"""2026-01-01T00:00:00Z."""
 
 
 def keep_recordings(fake: FakeAppliance, before: str, how: str = "", *, below: list[str]) -> None:

@@ -24,8 +24,6 @@ def state(role: str, epoch: int, holder: str) -> AdminAnswer[Any]:
 
 
 class Pair:
-    """The answers to `standby` come in turn, the last one again and again."""
-
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.fake = FakeAppliance()
