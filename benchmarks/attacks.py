@@ -1,12 +1,10 @@
 """The robot's delays under attack: `python -m benchmarks.attacks [--only loop,flood] [--busy 4] [--seconds 10]`.
 
-The appliance runs as users run it, on a host of a lab of network namespaces. The robot sends an unmonitored topic at
-100 Hz, and makes 20 calls a second on new connections and 20 on a kept connection. Guests, and hosts that no rule
-names, attack: one attack after the other, then in combinations. Each row shows the delays in milliseconds, lost
-messages, unanswered calls and restarted relays. The row `quiet` is measured without an attack; `--busy N` adds N
-processes that only compute.
-
-The probes run at real-time priority, so that their own scheduling adds nothing to the delays; this needs root.
+The robot sends an unmonitored topic at 100 Hz, and makes 20 calls a second on new connections and 20 on a kept
+connection. Guests, and hosts that no rule names, attack: one attack after the other, then in combinations. Each row
+has the delays in milliseconds, lost messages, unanswered calls and restarted relays; `quiet` is without an attack.
+`--busy N` adds N processes that only compute. The probes run at real-time priority, so that their own scheduling adds
+nothing; this needs root.
 """
 
 import argparse
@@ -125,8 +123,6 @@ def text(value: bytes) -> bytes:
 
 
 class _NodeApi(socketserver.StreamRequestHandler):
-    """Answers `requestTopic` with the TCPROS port, and all other calls with success."""
-
     def handle(self) -> None:
         size = 0
         while (line := self.rfile.readline()) not in (b"\r\n", b""):
@@ -163,14 +159,12 @@ class Nodes:
         assert answer[0] == 1, answer
 
     def serve(self, address: str, node: str, service: str) -> None:
-        """Requests are answered with an empty success."""
         answer = call(
             address, "registerService", node, service, f"rosrpc://{address}:{self.port}", self.uri(address)
         )
         assert answer[0] == 1, answer
 
     def peers(self, topic: str, count: int) -> list[socket.socket]:
-        """Waits until there are `count` connections of the relay."""
         with self._changed:
 
             def found() -> list[socket.socket]:
@@ -260,7 +254,6 @@ def call(address: str, method: str, *params: Any, uri: str = MASTER) -> Any:
 
 
 def subscribe(nodes: Nodes, address: str, node: str, topic: str) -> list[socket.socket]:
-    """Returns a connection for each publisher, after its header."""
     type_name, connections = TYPES[topic], []
     code, reason, publishers = call(address, "registerSubscriber", node, topic, type_name, nodes.uri(address))
     assert code == 1, reason
@@ -335,10 +328,7 @@ def probe_messages(seconds: float, robot: Host, operator: Host, answers: Connect
 
 
 def probe_calls(seconds: float, robot: Host, keep: bool, answers: Connection, begin: Event) -> None:
-    """20 calls a second, on one connection if `keep` is set, otherwise each on a new one.
-
-    Each round has the same number of calls, so that rows can be compared; it is cut off at three times its length.
-    """
+    """20 calls a second, on one connection if `keep` is set. A round is cut off at three times its length."""
     realtime()
     body = xmlrpc.client.dumps(("/looker", "/rosdistro"), "getParam").encode()
     with robot.entered():
@@ -408,7 +398,6 @@ class Pipes:
             self.sent += count
 
     def at(self, rate: float, data: bytes) -> None:
-        """This never ends."""
         for turn in itertools.count():
             if turn == 0:
                 start = time.monotonic()
@@ -652,7 +641,6 @@ class Rig:
             yield
 
     def measure(self) -> list[tuple[list[float], Counter[str]]]:
-        """Delays in seconds, and failures by kind."""
         for _, begin in self._probes:
             begin.set()
         return [ours.recv() for ours, _ in self._probes]
@@ -679,7 +667,6 @@ class Rig:
 
 
 def figures(delays: Sequence[float]) -> dict[str, float]:
-    """Median, 99th percentile and maximum in milliseconds."""
     if len(delays) < 2:
         return {"p50": float("nan"), "p99": float("nan"), "max": float("nan")}
     p99 = statistics.quantiles(delays, n=100, method="inclusive")[98]

@@ -55,7 +55,6 @@ class Running:
         self._control = next(one["pid"] for one in processes if one["role"] == "control")
 
     def cpu(self) -> float:
-        """Seconds of processor time of control."""
         fields = Path(f"/proc/{self._control}/stat").read_text().rsplit(")", 1)[1].split()
         return (int(fields[11]) + int(fields[12])) / _TICKS
 
@@ -65,7 +64,6 @@ class Running:
 
 
 def calls(port: int, seconds: float, taken: list[float]) -> None:
-    """`taken` gets the time of each call."""
     data = request("hasParam", "/bench", "/run_id", keep=True)
     with socket.create_connection(("127.0.0.1", port)) as connection:
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -86,7 +84,7 @@ def _length(answer: bytes) -> int:
 
 
 def measure(one: Running, clients: int, seconds: float) -> tuple[float, float, float, float]:
-    """Returns the median and 99th percentile, calls a second, and CPU of control per call; times in microseconds."""
+    """Return median and 99th percentile in microseconds, calls a second, and CPU of control per call."""
     taken: list[list[float]] = [[] for _ in range(clients)]
     threads = [threading.Thread(target=calls, args=(one.port, seconds, mine)) for mine in taken]
     before = one.cpu()

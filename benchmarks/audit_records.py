@@ -1,8 +1,6 @@
 """The speed of writing, proving and finding audit records: python -m benchmarks.audit_records [RECORDS]
 
-Measured: the time that `record()` costs its caller; records a second in both kinds of durability, with an idle event
-loop and beside a thread that is always busy; how long a loop is blocked; forwarding; searches over RECORDS (by default
-a million) records; verification. All files are in one directory (TMPDIR) on one disk.
+Searches are over RECORDS (by default a million) records. All files are in one directory (TMPDIR) on one disk.
 """
 
 import asyncio
@@ -67,7 +65,6 @@ def open_log(directory: Path, name: str, durability: str) -> AuditLog:
 
 
 def measure_burst(directory: Path, count: int) -> None:
-    """The cost of a record to its caller, and the writer's rate."""
     log = open_log(directory, "burst", "batched")
     records = [record(log, number) for number in range(count)]
     start = time.perf_counter()
@@ -106,7 +103,7 @@ def measure_strict(directory: Path) -> None:
 
 
 async def _paced(log: AuditLog, rate: int, seconds: float) -> tuple[float, float]:
-    """Returns the delay of the loop's other work (median, 99.9 %) in ms."""
+    """Return the delay of the loop's other work (median, 99.9 %) in ms."""
     late: list[float] = []
 
     async def other_work() -> None:
@@ -131,7 +128,6 @@ async def _paced(log: AuditLog, rate: int, seconds: float) -> tuple[float, float
 
 
 def measure_loop(directory: Path) -> None:
-    """10,000 records a second; also whether the writer keeps pace."""
     log = open_log(directory, "paced", "batched")
     median, worst = asyncio.run(_paced(log, 10_000, 5.0))
     row("10,000 records/s from an event loop: its other work waits, median", f"{median:.3f} ms")
@@ -166,7 +162,6 @@ def measure_busy(directory: Path) -> None:
 
 
 def measure_forwarding(directory: Path, count: int) -> None:
-    """Committed records are read, formatted as messages, and sent."""
     log = open_log(directory, "forward", "batched")
     for number in range(count):
         log.record(record(log, number))
@@ -189,7 +184,6 @@ def measure_forwarding(directory: Path, count: int) -> None:
 
 
 def timed(name: str, action: Callable[[], object]) -> None:
-    """Prints the best of three runs."""
     best = float("inf")
     for _ in range(3):
         start = time.perf_counter()

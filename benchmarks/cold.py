@@ -1,17 +1,13 @@
 """The cost of a message as users pay it: `python -m benchmarks.cold [--busy]` (under two minutes).
 
-On a robot most messages come alone, 20 to 1,000 times a second, and find the caches cold. The relay is that of an
-appliance started by `rosrv up`, once without a monitor and once with one (it reads two fields, writes one and steps
-one FSM). Beside it, in turns: nothing, `copying_relay.c` with epoll, and five lines of Python.
-
-Cells are medians of the rounds; in parentheses are the median, the least and the greatest ratio to the C relay of the
-same round.
+On a robot most messages come alone, 20 to 1,000 times a second, and find the caches cold. The relay is that of `rosrv
+up`, without a monitor and with one (two fields read, one written, one FSM step). Beside it, in turns: nothing,
+`copying_relay.c` with epoll, and five lines of Python. Cells are medians of the rounds; in parentheses are the
+median, the least and the greatest ratio to the C relay of the same round.
 
 *paced100*, *paced1000* (or any other number): messages a second, with real-time priority of the load if permitted.
 *window*: 64 messages on their way. `--busy` adds programs that use half of each core and walk through their memory.
-Processor time is that of the process in the middle, all threads.
-
-Needs g++, rosmaster and chrt.
+Processor time is that of the process in the middle, all threads. Needs g++, rosmaster and chrt.
 """
 
 import argparse
@@ -58,7 +54,6 @@ while True:
         at = (at + part) % len(memory)
     pause.wait(max(0, began + 0.005 - time.monotonic()))
 """
-"""Every 5 ms it walks through its memory for 2.5 ms."""
 
 
 class DeployedRelay:
@@ -81,7 +76,6 @@ class DeployedRelay:
             raise
 
     def target(self, publisher: int) -> tuple[int, str]:
-        """Returns port and topic for the subscriber."""
         self._call("unregisterSubscriber", "/load_listener", "/load", self._api.uri)
         self._call("unregisterPublisher", "/load", "/load", self._api.uri)
         self._api.publisher = publisher
@@ -132,7 +126,6 @@ def realtime() -> tuple[str, ...]:
 
 
 def cell(runs: list[Result], base: list[Result], value: Callable[[Result], float]) -> str:
-    """The median, and the median, least and greatest ratio to the base of the same round."""
     middle = statistics.median(map(value, runs))
     if not middle:
         return "-"

@@ -2,8 +2,8 @@
 
     python -m benchmarks.compose_start [RUNS]
 
-Needs root, and uses its own Docker engine, as the tests in tests/system/containers do. The first start makes the
-volume, the keys and the log; later starts find them. Times are wall clock, so run it on an otherwise idle machine.
+Needs root and an otherwise idle machine. The first start makes the volume, the keys and the log; later starts find
+them.
 """
 
 import statistics
@@ -20,7 +20,7 @@ READY = "Nodes may connect"
 
 
 def start(compose: Compose) -> tuple[float, float]:
-    """Returns the seconds until nodes may connect, and until the container counts as healthy."""
+    """Return the seconds until nodes may connect, and until the container counts as healthy."""
     moment = compose.engine.docker("info", "--format", "{{.SystemTime}}").stdout.strip()
     begun = time.perf_counter()
     compose("up", "--detach", "--no-build")

@@ -75,7 +75,6 @@ def requests(operation: str, client: int, keep: bool) -> list[bytes]:
 
 
 def furnish(port: int) -> None:
-    """As those of a small robot."""
     with xmlrpc.client.ServerProxy(f"http://127.0.0.1:{port}/") as master:
         for node in range(NODES):
             for topic in range(TOPICS):
@@ -92,7 +91,7 @@ def furnish(port: int) -> None:
 
 
 class Client:
-    """One request at a time; `delays` are seconds per call, `answer` is the last body."""
+    """`delays` are seconds per call, `answer` is the last body."""
 
     def __init__(self, port: int, wanted: list[bytes], keep: bool, host: str = "127.0.0.1") -> None:
         self.delays: list[float] = []
@@ -103,7 +102,6 @@ class Client:
         self.sock: socket.socket | None = None
 
     def send(self) -> socket.socket:
-        """Open a connection unless one is open."""
         self._began = time.perf_counter()
         if self.sock is None:
             self.sock = socket.create_connection(("127.0.0.1", self._port), source_address=(self._host, 0))
@@ -114,10 +112,7 @@ class Client:
         return self.sock
 
     def receive(self) -> bool:
-        """Returns whether the answer is complete.
-
-        Raises `ConnectionError` for a refusal.
-        """
+        """Return whether the answer is complete. Raises `ConnectionError` for a refusal."""
         assert self.sock is not None
         piece = self.sock.recv(1 << 20)
         self._buffer += piece
@@ -140,7 +135,7 @@ class Client:
 
 
 def load(port: int, operation: str, clients: int, keep: bool, seconds: float) -> tuple[float, float]:
-    """Returns calls per second and the median delay of a call in microseconds."""
+    """Return calls per second and the median delay of a call in microseconds."""
     # Each client is a separate host: a long load of one host would exceed its quota of the audit log and be delayed.
     group = [
         Client(port, requests(operation, one, keep), keep, f"127.0.0.{one + 1}") for one in range(clients)
@@ -179,7 +174,6 @@ def free_port() -> int:
 
 
 def await_port(port: int) -> None:
-    """Waits at most 30 seconds."""
     deadline = time.monotonic() + 30
     while time.monotonic() < deadline:
         with suppress(OSError), socket.create_connection(("127.0.0.1", port), timeout=1):
@@ -197,7 +191,6 @@ def processor_seconds(pids: list[int]) -> float:
 
 
 def await_rest(pids: list[int]) -> None:
-    """Waits until the processes are idle, at most 30 seconds."""
     deadline, before = time.monotonic() + 30, -1.0
     while time.monotonic() < deadline and (used := processor_seconds(pids)) != before:
         before = used
@@ -205,7 +198,6 @@ def await_rest(pids: list[int]) -> None:
 
 
 def descendants(pid: int) -> list[int]:
-    """The process itself is included."""
     found = [pid]
     for task in Path(f"/proc/{pid}/task").iterdir():
         for child in (task / "children").read_text(encoding="utf-8").split():
@@ -218,7 +210,7 @@ class Master(NamedTuple):
     pids: list[int]
 
     def under(self, operation: str, clients: int, keep: bool, seconds: float) -> tuple[float, float, float]:
-        """Returns calls per second, and median delay and processor time of a call in microseconds."""
+        """Return calls per second, and median delay and processor time of a call in microseconds."""
         before = processor_seconds(self.pids)
         began = time.perf_counter()
         rate, delay = load(self.port, operation, clients, keep, seconds)

@@ -78,14 +78,12 @@ class Node:
             self.known.add(self._wanted[place])
 
     def told(self, body: bytes) -> None:
-        """A list of publishers, or a query whether the node is alive."""
         call = parse_call(body, XmlRpcLimits())
         if call.method == "publisherUpdate" and call.params[2]:
             self.known.add(str(call.params[1]))
 
     @property
     def done(self) -> bool:
-        """All calls are answered, and a publisher of each topic is known."""
         return len(self.client.delays) >= len(self.calls) and len(self.known) == TOPICS
 
 
@@ -97,7 +95,7 @@ class Told:
         self._buffer = b""
 
     def receive(self) -> bool:
-        """Acknowledges complete calls; returns whether the connection stays open."""
+        """Acknowledge complete calls; return whether the connection stays open."""
         piece = self.sock.recv(1 << 16)
         self._buffer += piece
         head, mark, body = self._buffer.partition(b"\r\n\r\n")
@@ -110,7 +108,6 @@ class Told:
 
 
 def nodes(port: int) -> float:
-    """Until all nodes know their publishers."""
     group = [Node(port, number) for number in range(NODES)]
     poll = select.epoll()
     listening = {node.listening.fileno(): node for node in group}
@@ -163,7 +160,6 @@ def nodes(port: int) -> float:
 
 
 def timed(start: Callable[[int], float], master: Master) -> tuple[float, float]:
-    """Returns the seconds and the processor seconds."""
     before = processor_seconds(master.pids)
     return start(master.port), processor_seconds(master.pids) - before
 

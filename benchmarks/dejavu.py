@@ -42,7 +42,6 @@ def specification(name: str, events: Mapping[str, Sequence[str]], over: Sequence
 
 
 def of(events: Mapping[str, Sequence[str]], *properties: tuple[Sequence[str], str]) -> tuple[str, ...]:
-    """A property is given by parameters and formula."""
     return tuple(
         specification(f"s{number}", events, over, formula)
         for number, (over, formula) in enumerate(properties)
@@ -111,7 +110,6 @@ def messages(trace: Path) -> list[tuple[str, bytes]]:
 
 
 def failing(specifications: Sequence[str], trace: Sequence[tuple[str, bytes]]) -> tuple[list[int], float]:
-    """Returns the violated events, counted from 1, and the microseconds of an event."""
     sources = {f"{number}.rv": text for number, text in enumerate(specifications)}
     monitors = MonitorSet.of(compiled_from(sources, standard_definitions()), slices=SLICES)
     monitors.start(0)
@@ -127,7 +125,6 @@ def failing(specifications: Sequence[str], trace: Sequence[tuple[str, bytes]]) -
 
 
 def main(checkout: Path) -> int:
-    """Returns 0 if all results are equal to DejaVu's, else 1."""
     wrong = 0
     for case in CASES:
         path = checkout / TESTS / case.trace

@@ -1,13 +1,10 @@
 """A door beside rosbridge_suite and foxglove_bridge: `python -m benchmarks.doors [--rounds 3]`.
 
-A roscpp node publishes texts, and one WebSocket client on another host of a lab counts the frames that it receives. The
-ways take turns. Each is measured with 200 bytes and with 1 MB, as large as a frame of a camera: *paced* with a fixed
-rate (the delay from `publish` to the client, and the processor time for each message), and *most* (the most messages a
-second that the client received, with growing rates of the publisher). The path of a door has two processes, the relay
-and the door; their times are added. A door has a lower priority than the robot (nice 10), as on a robot.
-
-*Flooded*: a client sends messages to the door as fast as it can, while a node of the robot listens to another. The
-client has the least priority, because a flood comes from another machine.
+A roscpp node publishes texts, and one WebSocket client on another host of a lab counts the frames, of 200 bytes and
+of 1 MB. *paced* has a fixed rate (delay, and processor time for each message), *most* growing rates of the publisher.
+The times of relay and door are added. A door has a lower priority than the robot (nice 10), as on a robot. *Flooded*:
+a client of the least priority sends messages to the door as fast as it can, while a node of the robot listens to
+another.
 
 Neither peer is a Debian package. Give programs that start them, with `--rosbridge` (rosbridge_websocket.py of the
 branch ros1) and `--foxglove-bridge`; without one, its rows are left out.
@@ -75,7 +72,6 @@ class Viewer:
         self.socket.sendall(frame_of(json.dumps(message).encode()))
 
     def frames(self, head_bytes: int = _HEAD_BYTES) -> Iterator[tuple[int, bytes]]:
-        """The opcode and the first bytes of each frame."""
         data = self._data
         while True:
             length, head = (data[1] & 0x7F, 2) if len(data) >= 2 else (0, len(data) + 1)
@@ -97,7 +93,6 @@ class Viewer:
 
 
 def frame_of(data: bytes) -> bytes:
-    """The mask is zero."""
     length = bytes([0x80 | len(data)]) if len(data) < 126 else struct.pack(">BH", 0x80 | 126, len(data))
     return b"\x81" + length + b"\0\0\0\0" + data
 
@@ -149,7 +144,6 @@ class Heard(NamedTuple):
 
 
 def heard(way: Way, operator: Host, size: int, hertz: int, seconds: float) -> Heard:
-    """Counts what the client receives at this rate of the publisher."""
     talker = way.system.session.start([str(_LOAD), str(size), str(hertz)], label="talker")
     try:
         talker.wait_for(event="ready")
@@ -192,13 +186,12 @@ def processor_seconds(pid: int) -> float:
 
 
 def private_kb(pid: int) -> int:
-    """In kB; shared memory does not count."""
     text = Path(f"/proc/{pid}/smaps_rollup").read_text()
     return sum(int(one) for one in re.findall(r"Private_(?:Clean|Dirty): +(\d+)", text))
 
 
 def memory(way: Way, operator: Host) -> tuple[float, float]:
-    """Returns the server's memory in MB, and what each of some idle subscribers adds, in kB."""
+    """Return the server's memory in MB, and the part of each idle subscriber in kB."""
     pid = way.system.pids()[-1]
     first = operator.run(way.open)
     threading.Event().wait(1)
@@ -212,7 +205,6 @@ def memory(way: Way, operator: Host) -> tuple[float, float]:
 
 
 def robot_p50(way: Way, folder: Path, seconds: float) -> float:
-    """In microseconds, between two nodes of the robot."""
     talker = way.system.session.start([str(_ROBOT), "talk", "1", "200", "100"], label="robot talker")
     talker.wait_for(event="ready")
     listener = way.system.session.start([str(_ROBOT), "listen", "1", str(folder / "heard")], label="robot")
@@ -226,7 +218,7 @@ def robot_p50(way: Way, folder: Path, seconds: float) -> float:
 
 @contextmanager
 def flood(way: Way, operator: Host) -> Iterator[list[int]]:
-    """The flood has the least priority; yields the number of messages at the end."""
+    """Yield the number of messages at the end."""
     over, sent = threading.Event(), [0]
 
     def work() -> None:

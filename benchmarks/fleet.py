@@ -107,7 +107,6 @@ class _Measurement:
             self._site.kill()
 
     def _timed(self, name: str, part: Callable[[], object], searching: "_Searches") -> None:
-        """An operator searches while the part runs."""
         begun, spent, program = time.monotonic(), self._processor_seconds(), self._site.pid
         searching.take()
         part()
@@ -234,7 +233,6 @@ class _Measurement:
         raise SystemExit(f"not within {_LONGEST_SECONDS:g} s: {what}")
 
     def _processor_seconds(self) -> dict[str, float]:
-        """The time so far of each program that runs."""
         return {
             "collector": _ticks(_family(self._site.pid)),
             "PostgreSQL": _ticks(_family(self._cluster.pid)),
@@ -247,8 +245,6 @@ class _Measurement:
 
 
 class _Searches:
-    """`take` returns the times since the last call, by kind and `all`."""
-
     def __init__(self, site: FleetSite) -> None:
         self._site = site
         self._ended = threading.Event()
@@ -259,7 +255,6 @@ class _Searches:
         self._thread.start()
 
     def take(self) -> tuple[dict[str, list[float]], int]:
-        """Seconds of each search, and the number of failed ones."""
         with self._lock:
             found, self._times = self._times, defaultdict(list)
             failed, self._failed = self._failed, 0

@@ -1,8 +1,6 @@
 """Simulated appliances for `benchmarks.fleet`: the appliance's own log, signatures and both clients of the collector.
 
-Each has its own key, certificate, TLS connections, trusted metadata and files. It differs from an appliance in two
-things: its decisions are generated, and a function replaces control's gate, because compiling and the trial of a bundle
-take place on the robots. The function refuses bundles whose policy contains `BAD`.
+They differ from an appliance in two things: decisions are generated, and a function replaces control's gate.
 """
 
 import logging
@@ -28,7 +26,7 @@ from tests.support.bundle_site import GROUP, SITE
 from tests.system.fleet.fleet_site import FleetRobot, FleetSite
 
 BAD = "# refused by the gate\n"
-"""The text in a policy that makes simulated appliances refuse a bundle."""
+"""Simulated appliances refuse a bundle with this text in its policy."""
 
 _NICENESS = 10  # real robots take no processor time from the collector
 _POLL_SECONDS = 300.0
@@ -45,7 +43,6 @@ class SimulatedLoad:
 
 
 def enrol(site: FleetSite, names: Sequence[str]) -> None:
-    """The files of the appliances exist already."""
     assert site.data is not None
     robots = Robots(site.data / "robots")
     for name in names:
@@ -67,7 +64,7 @@ class SimulatedRobots:
         ]
 
     def start(self) -> None:
-        """Returns when every appliance has sealed its first records and waits."""
+        """Return when every appliance has sealed its first records and waits."""
         for process in self._processes:
             process.start()
         for _process in self._processes:
@@ -77,7 +74,7 @@ class SimulatedRobots:
         self._begin.set()
 
     def end(self) -> list[float]:
-        """Pushes what is sealed; returns the seconds from each record to its receipt."""
+        """Push what is sealed; return the seconds from each record to its receipt."""
         self._end.set()
         lags = [lag for _process in self._processes for lag in self._results.get()]
         for process in self._processes:
@@ -110,8 +107,6 @@ class SimulatedRobots:
 
 
 class _Appliance:
-    """It records and pushes in `work`, and polls for bundles in two threads."""
-
     def __init__(self, robot: FleetRobot, load: SimulatedLoad) -> None:
         self.robot = robot
         self.lags: list[float] = []

@@ -16,7 +16,6 @@ _INDEX = re.compile(r"CREATE INDEX (record_\w+) ON record .*?;", re.DOTALL)
 
 
 def fill(database: str, rows: int) -> None:
-    """The rows are of the last twenty days; prints the time and the size."""
     indexes = {
         found[1]: found[0]
         for found in _INDEX.finditer((MIGRATIONS / "0001_segments_and_records.sql").read_text())
@@ -81,7 +80,6 @@ def _row(day: str, moment: int, number: int, chance: random.Random) -> str:
 
 
 def searches() -> dict[str, Callable[[random.Random], dict[str, str]]]:
-    """The parameters of each kind of search."""
     return {
         "newest 100": lambda _chance: {},
         "denied, a day": lambda _chance: {"deny": "true", "since": "1d"},

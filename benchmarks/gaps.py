@@ -1,8 +1,7 @@
 """Seconds without messages after a relay's death and a restart: python -m benchmarks.gaps [--deaths 20] [--restarts 5]
 
-One rospy node publishes 100 messages a second to another through an appliance that `rosrv up` has started. Its relay is
-killed (SIGKILL) again and again, then the whole appliance is stopped and started. For each, the longest time between
-two messages around it counts. No node is restarted.
+One rospy node publishes 100 messages a second to another. The relay of `rosrv up` is killed (SIGKILL) again and
+again, then the whole appliance is restarted; the longest time between two messages around each counts.
 """
 
 import argparse
@@ -26,7 +25,6 @@ _SETTLED = 11.0  # seconds: a process that dies within ten seconds of its start 
 
 
 def longest_gap(listener: Process, fault: Callable[[], object]) -> float:
-    """Ends `_SETTLED` seconds after messages arrive again."""
     seen, began = len(listener.events), time.monotonic()
     fault()
     listener.wait_for(lambda event: event["ended"] > began, since=seen, event="gap", timeout=_LIMIT)

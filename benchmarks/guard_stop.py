@@ -1,8 +1,8 @@
 """Time until the guard `deadman` stops a base whose operator falls silent: python -m benchmarks.guard_stop [--busy]
 
-A rospy node commands full speed 50 times a second at an appliance that `rosrv up` has started, and falls silent. The
-time is from its last call of `publish` until the base's callback for the stop, less the guard's `silent`. With
-`--busy`, one program keeps a core busy all the time.
+A rospy node commands full speed 50 times a second, and falls silent. The time is from its last call of `publish`
+until the base's callback for the stop, less the guard's `silent`. With `--busy`, one program keeps a core busy all
+the time.
 """
 
 import argparse

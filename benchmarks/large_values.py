@@ -1,7 +1,6 @@
 """The delay that one host's large parameters cause for other hosts: `python -m benchmarks.large_values [--seconds 4]`.
 
-A robot makes one small call after the other while a guest (another address of this machine) sets large parameters,
-behind a plain `rosmaster` and behind the appliance. The table shows the delay of the robot's calls.
+A robot makes small calls while a guest sets large parameters, behind a plain `rosmaster` and behind the appliance.
 """
 
 import argparse

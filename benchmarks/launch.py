@@ -67,24 +67,17 @@ TOOLS = (("rostopic", "list"), ("rosnode", "info", "/node_0"), ("rosparam", "dum
 
 @dataclass
 class Start:
-    """Figures are in seconds."""
-
     figures: dict[str, float] = field(default_factory=dict)
 
 
 class Reports:
-    """A report says that a node is up."""
-
     def __init__(self) -> None:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.bind(("127.0.0.1", 0))
         self.port = int(self._socket.getsockname()[1])
 
     def wait(self, numbers: set[int]) -> float:
-        """Returns the time (monotonic) at which the last of these nodes is up.
-
-        Raises `TimeoutError`.
-        """
+        """Return the time (monotonic) at which the last of these nodes is up. Raises `TimeoutError`."""
         last, deadline = 0.0, time.monotonic() + LIMIT
         while numbers:
             self._socket.settimeout(max(0.001, deadline - time.monotonic()))
@@ -146,7 +139,6 @@ class _Node:
 
 
 def package(folder: Path, nodes: int, port: int, *, rospy: bool) -> Path:
-    """Returns the launch file."""
     made = folder / "launched"
     made.mkdir()
     (made / "package.xml").write_text(
@@ -233,7 +225,6 @@ def _is_first(entry: Path, folder: str) -> bool:
 
 @contextlib.contextmanager
 def plain() -> Iterator[tuple[RosSession, list[int]]]:
-    """The processes are rosmaster and rosout."""
     with (
         tempfile.TemporaryDirectory() as home,
         PlainMaster(Path(home)) as master,
@@ -244,7 +235,6 @@ def plain() -> Iterator[tuple[RosSession, list[int]]]:
 
 @contextlib.contextmanager
 def deployed() -> Iterator[tuple[RosSession, list[int]]]:
-    """The process is the supervisor."""
     options = ("--api", "off", "--listen", f"127.0.0.1:{free_port()}")
     with Appliance(options=options) as appliance, tempfile.TemporaryDirectory() as home:
         assert appliance.process is not None
@@ -253,7 +243,7 @@ def deployed() -> Iterator[tuple[RosSession, list[int]]]:
 
 
 def table_ratios(text: str, robot: str) -> dict[str, float]:
-    """Return the ratio of each row in the column of this robot, from the text of `RESULTS.md`; {} without a column."""
+    """Return the ratio of each row in the column of this robot; {} without a column."""
     tables = [part.splitlines() for part in text.split("\n\n") if f"| {robot}, load" in part]
     if not tables:
         return {}
@@ -266,7 +256,7 @@ def table_ratios(text: str, robot: str) -> dict[str, float]:
 
 
 def findings(measured: Mapping[str, Sequence[float]], table: Mapping[str, float]) -> list[str]:
-    """Return a line for each row whose ratio is outside of the table's 20 % on the same side in every round."""
+    """Return the rows whose ratio is outside of the table's 20 % on the same side in every round."""
     found = []
     for what, ratios in measured.items():
         known = table[what]

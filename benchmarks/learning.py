@@ -2,11 +2,9 @@
 
     python -m benchmarks.learning [--drives 240] [--faults 100] [--seed 1]
 
-Every drive is another mission of half a minute: speeds, turns, aims and shots are drawn, receptions are late by some
-milliseconds, GPS, battery and odometry have noise. The first half of the drives is learnt from (with a share of them
-held out, as `rosrv monitor learn` does); an alarm in the second half is a false one. Each fault is put into a drive of
-the second half, on a random topic, field and time; all kinds are equally frequent. A fault is flagged if, from its
-beginning on, there is an alarm that the same drive does not have without it.
+Every drive is another random mission of half a minute, with late receptions and noise. An alarm in the second half is
+a false one. Each fault is put into a drive of the second half, on a random topic, field and time. It is flagged if,
+from its beginning on, there is an alarm that the same drive does not have without it.
 """
 
 import argparse
@@ -44,8 +42,6 @@ Row = tuple[str, int, bytes]
 
 @dataclass(frozen=True)
 class Drive:
-    """In the form in which the learner reads a recording."""
-
     name: str
     rows: tuple[Row, ...]
 
@@ -66,7 +62,6 @@ class Drive:
 
 
 def mission(chance: random.Random) -> list[Part]:
-    """Half a minute to a minute and a half of driving, turning, aiming and shooting."""
     parts = [Part(1.0, tilt=chance.uniform(-0.4, 0.5))]
     for _ in range(chance.randint(8, 16)):
         kind = chance.choice(("ahead", "ahead", "turn", "turn", "back", "aim", "stand"))
@@ -87,7 +82,6 @@ def mission(chance: random.Random) -> list[Part]:
 
 
 def drive(number: int, seed: int) -> Drive:
-    """Received with jitter and measured with noise."""
     chance = random.Random(f"{seed} {number}")
     offset = number * 1000  # seconds: the offset differs from drive to drive
     rows: list[Row] = []
@@ -125,7 +119,6 @@ def get(fields: Any, path: str) -> Any:
 
 
 def put(fields: Any, path: str, value: Any) -> None:
-    """Paths are those of `get`."""
     path, _, element = path.partition("#")
     *above, last = path.split(".")
     for step in above:
@@ -159,8 +152,6 @@ ENUMERATIONS: Mapping[str, tuple[tuple[str, object], ...]] = {
 
 @dataclass
 class Seeding:
-    """`time` is the fault's beginning."""
-
     drive: Drive
     time: int
     chance: random.Random
@@ -173,7 +164,6 @@ class Seeding:
         return topic, found
 
     def after(self, topic: str, seconds: float = 1000.0) -> list[int]:
-        """Indexes of the topic's messages in this number of seconds from the fault's beginning."""
         return [
             place
             for place, row in enumerate(self.drive.rows)
@@ -276,10 +266,7 @@ KINDS: Mapping[str, Callable[[Seeding], list[Row]]] = {
 
 
 def seeded(kind: str, drives: Sequence[Drive], chance: random.Random) -> tuple[Drive, int, list[Row], str]:
-    """Returns a drive, its fault's time, its messages with the fault, and the fault's description.
-
-    A fault that changes nothing is replaced by another one.
-    """
+    """Return a drive, its fault's time, its messages with the fault, and the fault's description."""
     while True:
         drive_ = chance.choice(drives)
         time = drive_.began + int((drive_.ended - drive_.began) * chance.uniform(0.2, 0.6))

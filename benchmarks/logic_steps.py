@@ -85,7 +85,6 @@ def per_step(run: Run, events: Sequence[int]) -> float:
 
 
 def inline_step(compiled: CompiledProperty, events: Sequence[int]) -> float | None:
-    """Nanoseconds of code that looks up the tables inline."""
     if not isinstance(compiled, FiniteProperty):
         return None
     table, verdicts, state = compiled.automaton.table, compiled.automaton.verdicts, compiled.automaton.initial

@@ -1,11 +1,7 @@
 """The cost of monitors for one message: `python benchmarks/monitor_messages.py`.
 
-The rows are: a message on a topic without a monitor; the reference specification of the design (reads two fields,
-writes one, steps one state machine); the same with ten monitors on other topics; a growing string; a copy of the whole
-message; a vector with the last ten numbers; a message published with each message; the reference in the module, in
-batches and singly; a state machine with a timeout; a handler and a line of output with each message; a kept string;
-loading, with and without the module. Times are processor time in microseconds for each message, as the median of the
-rounds.
+The reference specification reads two fields, writes one, and steps one state machine. Times are processor time in
+microseconds for each message, as the median of the rounds.
 """
 
 import statistics

@@ -1,14 +1,14 @@
 """The cost of a monitor: `python -m benchmarks.monitors` (two or three minutes; the long run: `--all`).
 
 One publisher, one subscriber, one topic, loopback; the load is `relay_load.cpp`. In the middle, in turns: nothing;
-`copying_relay.c`; this relay without a monitor, with one on the topic (it reads two fields, writes one and steps one
-FSM at every message), with 10 and with 50 more on other topics; `topic_tools relay`; a typed rospy relay that does
-the monitor's work. Cells are medians of the rounds; ratios are to the C relay, of one round each.
+`copying_relay.c`; this relay without a monitor, with one on the topic (two fields read, one written, one FSM step),
+with 10 and with 50 more on other topics; `topic_tools relay`; a typed rospy relay that does the monitor's work. Cells
+are medians of the rounds; ratios are to the C relay, of one round each.
 
 *window*: 64 messages on their way; *flat*: as fast as it goes, with the loss; *paced*: 1,000 a second, the delay;
-*topics*: 1, 8 and more topics at 1,000 a second each, each with a monitor of its own; *memory*: that of the relay
-while a flat run of `--minutes` lasts. `--relays` leaves out the peers whose runs take longest; `--kinds` has monitors
-of one kind each instead (`KINDS`), and no peers. Needs g++, rosmaster, topic_tools and rospy.
+*topics*: 1, 8 and more topics at 1,000 a second each, each with a monitor; *memory*: that of the relay while a flat
+run of `--minutes` lasts. `--relays` leaves out the slowest peers; `--kinds` has monitors of one kind each instead
+(`KINDS`). Needs g++, rosmaster, topic_tools and rospy.
 """
 
 import argparse
@@ -68,8 +68,6 @@ Results = dict[tuple[str, int, str], list[Result]]
 
 
 class MinimalRelay:
-    """Each run has a new process."""
-
     def __init__(self, name: str, *command: str) -> None:
         """`command` is called with the publisher's port, and prints the port for the subscriber."""
         self.name = name
@@ -108,7 +106,6 @@ def specification(name: str, topic: str) -> str:
 
 
 def monitored(others: int) -> Relay:
-    """`others` monitors are on other topics."""
     name = f"+ {others} elsewhere" if others else "one monitor"
     relay = Relay(name)
     files = [("load.rv", specification("load", "/load"))]
@@ -138,7 +135,7 @@ def of_kind(name: str) -> Relay:
 def topics_at_once(number: int, seconds: float) -> tuple[float, float, float]:
     """1,000 messages of 200 bytes a second on each topic, which has a monitor.
 
-    Returns the median and the largest of the topics' p50 (microseconds), and the part of a core that the relay uses.
+    Return the median and the largest of the topics' p50 (microseconds), and the part of a core that the relay uses.
     """
     relay = Relay("topics")
     names = [f"/load{one}" for one in range(number)]
@@ -182,13 +179,11 @@ def show_topics(numbers: tuple[int, ...], rounds: int, seconds: float) -> None:
 
 
 def resident(pid: int | None) -> float:
-    """The memory is in MiB."""
     pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
 def show_memory(minutes: float) -> None:
-    """Printed twelve times while messages arrive at full speed."""
     relay = monitored(0)
     print(f"\nas fast as it goes for {minutes:g} minutes, one monitor: MiB that the relay holds", flush=True)
     try:
@@ -204,7 +199,6 @@ def show_memory(minutes: float) -> None:
 
 
 def show(results: Results, mode: str, sizes: tuple[int, ...], names: list[str]) -> None:
-    """Medians, ratios to the C relay, losses, CPU time."""
     what = {
         "window": "64 messages on their way: messages a second",
         "flat": "as fast as it goes: messages a second",

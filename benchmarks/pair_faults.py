@@ -2,16 +2,14 @@
 
     python -m benchmarks.pair_faults --faults 150 --seed 1 [--load 0] [--only TEXT] [--results FILE]
 
-The list of faults follows from the seed alone (`benchmarks.pair_fault_kinds`). With `--results`, each fault adds a line
-to the file, and a further run with the same file continues after the last one.
+The list of faults follows from the seed alone. With `--results`, a further run with the same file continues after the
+last fault.
 
 Columns: the longest time in seconds without an answer of the Master API, a message, and an answer of a service (from
 the end of the fault if no appliance could serve before); subscriptions that were not back 20 s after the fault; the
-holder of the lease before and after; how `standby status` judged the pair on either appliance near the end of the
-fault, and the seconds of the answer. An outsider, which the robot does not fence, asks both appliances all the time:
-`two` counts the changes of the answering appliance that no grant of the witness explains.
-
-A broken promise is in the last column, and the exit status is then 1.
+holder of the lease before and after; how `standby status` judged the pair near the end of the fault, and the seconds
+of the answer; `two`: the changes of the answering appliance, as an unfenced outsider sees it, that no grant of the
+witness explains. A broken promise is in the last column, and the exit status is then 1.
 """
 
 import argparse
@@ -74,8 +72,6 @@ class Noticed:
 
 
 class Statuses:
-    """A thread asks each appliance."""
-
     def __init__(self, site: StandbySite) -> None:
         self.said: dict[str, str] = {}
         self.seconds: dict[str, float] = {}
@@ -105,7 +101,6 @@ def _judgement(state: StandbyState) -> str:
 
 
 def answered_by_two(events: list[dict[str, object]], grants: int) -> int:
-    """Changes of the answering appliance that `grants` of the lease do not explain."""
     by = [event["by"] for event in events if event.get("event") == "answered"]
     changes = sum(here != there for here, there in itertools.pairwise(by))
     return max(0, changes - grants)
@@ -114,7 +109,7 @@ def answered_by_two(events: list[dict[str, object]], grants: int) -> int:
 def suffer(
     site: StandbySite, robot: StandbyRobot, probe: Process, row: Noticed, fault: Fault
 ) -> list[Process]:
-    """Returns the listeners whose subscriptions are lost."""
+    """Return the listeners whose subscriptions are lost."""
     active, passive = site.pair()
     epoch, mark = site.lease.read().epoch, probe.mark()
     with Watch(robot) as watch:
@@ -169,7 +164,6 @@ def _start_again(robot: StandbyRobot, lost: list[Process]) -> None:
 
 @contextlib.contextmanager
 def running_site() -> Iterator[tuple[StandbySite, Process]]:
-    """States are on small disks; yields the outsider's probe too."""
     with contextlib.ExitStack() as stack:
         home = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         disk = stack.enter_context(small_disk(home / "robot", "1m"))
@@ -230,14 +224,12 @@ def run(faults: Sequence[tuple[Fault, float]], *, done: int, load: int, limit: f
 
 
 def read(results: Path | None) -> list[Noticed]:
-    """The rows of earlier runs."""
     if results is None or not results.exists():
         return []
     return [Noticed(**json.loads(line)) for line in results.read_text().splitlines()]
 
 
 def keep(row: Noticed, results: Path | None) -> None:
-    """The output of all programs gets its own file."""
     line = json.dumps({name: value for name, value in asdict(row).items() if name != "story"})
     print(line, flush=True)
     if results is None:

@@ -1,11 +1,9 @@
 """Time until a stop that a monitor publishes is sent: python -m benchmarks.published_stop [--deployed] [--stops 400]
 
-A scan with a near obstacle arrives alone, some milliseconds after the one before it, and the monitor publishes a zero
-velocity. The time is from the arrival of the scan at the monitors until the relay has the zero velocity to send,
-without sockets. With `--deployed`, the time is from one rospy node's call of `publish` to another's callback, at an
-appliance that `rosrv up` has started; commands that a monitor changes take turns with the stops. The nodes have
-real-time priority if that is permitted, so that the delay is that of the appliance. With `--busy` as well, two programs
-for each core keep it busy all the time.
+The time is from the arrival of a scan with a near obstacle at the monitors until the relay has the zero velocity to
+send, without sockets. With `--deployed`, it is from one rospy node's call of `publish` to another's callback, at an
+appliance that `rosrv up` has started; changed commands take turns with the stops. The nodes have real-time priority
+if that is permitted. With `--busy` as well, two programs for each core keep it busy.
 """
 
 import argparse
@@ -37,7 +35,7 @@ NEAR = message("sensor_msgs/LaserScan", ranges=[0.1] * 40)
 
 
 def alone(stops: int) -> dict[str, list[float]]:
-    """Times are in milliseconds, and no sockets are used."""
+    """In milliseconds; no sockets are used."""
     sent: list[int] = []
     monitors = QuietMonitors(lambda _topic, _data: sent.append(time.perf_counter_ns()))
     monitors.load(STOP)
@@ -53,7 +51,6 @@ def alone(stops: int) -> dict[str, list[float]]:
 
 
 def deployed(stops: int) -> dict[str, list[float]]:
-    """In milliseconds, of changed commands and of stops."""
     monitors = {"stop": SILENT_STOP, "cap": CAP}
     with (
         Appliance(monitors=monitors, options=("--api", "127.0.0.1:0")) as appliance,
@@ -67,7 +64,6 @@ def deployed(stops: int) -> dict[str, list[float]]:
 
 @contextlib.contextmanager
 def busy_programs(number: int) -> Iterator[None]:
-    """Each always wants a core."""
     command = [sys.executable, "-c", "while True: pass"]
     programs = [subprocess.Popen(command, start_new_session=True) for _ in range(number)]
     try:

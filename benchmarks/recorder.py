@@ -1,17 +1,13 @@
 """The flight recorder beside `rosbag record` and `rosbag_snapshot`: `python -m benchmarks.recorder [--seconds 15]`.
 
-One node talks on fifty topics (20 MB/s in all) or on five (0.1 MB/s), one listens, on loopback. The systems take
-turns: a plain master; the same with `rosbag record -a`; the same with the node `snapshot` of rosbag_snapshot (not a
-Debian package: the program given by `--snapshot`, in PATH or below /opt/ros); the appliance without and with the
-recorder.
+One node talks on fifty topics (20 MB/s in all) or on five (0.1 MB/s), one listens. The systems take turns: a plain
+master; the same with `rosbag record -a`; with the node `snapshot` (not a Debian package: the program given by
+`--snapshot`, in PATH or below /opt/ros); the appliance without and with the recorder.
 
-Measured of each recording: messages, those missing between the first and the last of a topic, and the seconds from the
-end of the recorded time until the file is complete. Measured of the machine: the median delay from publisher to
-subscriber, and the processor time of the relay and the recorder, or of `rosbag record`, in percent of a core.
-
-*killed* is the appliance with the recorder, whose relay, control and recorder get SIGKILL together during the recorded
-time. There, a message is missing if the subscriber received it in the time that the recording covers, and the
-recording does not have it.
+Measured: messages, those missing between the first and the last of a topic, the seconds from the end of the recorded
+time until the file is complete, the median delay, and processor time in percent of a core. *killed*: relay, control
+and recorder get SIGKILL together. There, a message is missing if the subscriber received it in the recorded time, and
+the recording does not have it.
 """
 
 import argparse
@@ -55,7 +51,6 @@ class Bag(NamedTuple):
     messages: int
     lost: int
     closed: float
-    """Seconds from the end of the recorded time until the file is complete."""
 
 
 @dataclass
@@ -90,7 +85,6 @@ class Load:
         raise SystemExit(f"the listener ended: {self._listener.story()}")
 
     def end(self) -> float:
-        """The median delay in microseconds."""
         self._listener.interrupt()
         heard = self._listener.wait_for(event="heard")
         self._talker.stop()
@@ -110,15 +104,14 @@ class Load:
 
 @contextmanager
 def measured(pids: Mapping[str, int], seconds: float, into: dict[str, float]) -> Iterator[None]:
-    """In percent of a core over `seconds`."""
     before = {name: cpu_seconds(pid) for name, pid in pids.items()}
     yield
     into |= {name: 100 * (cpu_seconds(pid) - before[name]) / seconds for name, pid in pids.items()}
 
 
 def counted(path: Path, closed: float, heard: dict[str, set[int]] | None = None) -> Bag:
-    """Counts messages, and those missing between the first and the last of a topic; with `heard`, also each of these
-    that the bag lacks.
+    """Count messages, and those missing between the first and the last of a topic; with `heard`, also those that the
+    bag lacks.
     """
     numbers: dict[str, set[int]] = {}
     with Reader(path) as reader:
@@ -133,7 +126,6 @@ def counted(path: Path, closed: float, heard: dict[str, set[int]] | None = None)
 
 
 def snapshot_program() -> Path | None:
-    """None if rosbag_snapshot is not installed."""
     installed = Path("/").glob("opt/ros/*/lib/rosbag_snapshot/snapshot")
     found = shutil.which("snapshot")
     return next(installed, None) if found is None else Path(found)
@@ -172,10 +164,7 @@ def at_plain_master(
 def at_appliance(
     folder: Path, load: tuple[int, int, int], seconds: float, *, recorder: bool, kills: bool = False
 ) -> Result:
-    """With `kills`, the appliance's processes are killed during the load.
-
-    The recorder records the seconds before the request, and some after it.
-    """
+    """With `kills`, the appliance's processes are killed during the load."""
     configuration = folder / "appliance.yaml"
     configuration.write_text(_CONFIGURATION.format(enabled=str(recorder).lower(), seconds=seconds))
     options = ("--config", str(configuration))

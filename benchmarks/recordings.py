@@ -59,13 +59,12 @@ def make(path: Path, seed: int, seconds: int, payload: int) -> None:
 
 
 def processor_time() -> float:
-    """The seconds of all processes that have ended."""
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return used.ru_utime + used.ru_stime
 
 
 def run(folder: Path, recordings: str, workers: int) -> tuple[float, int]:
-    """Returns seconds, and the largest memory of the first process in bytes."""
+    """Return seconds, and the largest memory of the first process in bytes."""
     command = [
         sys.executable,
         "-c",

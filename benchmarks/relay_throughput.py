@@ -1,10 +1,9 @@
 """The relay beside `topic_tools relay` and nothing at all: `python -m benchmarks.relay_throughput`.
 
-One publisher, one subscriber, one topic, loopback; the load is `relay_load.cpp` (compiled on first use with g++).
-*window*: 64 messages on their way; *flat*: as fast as it goes, with the loss; *paced*: 1,000 messages a second, with
-the delay. Systems take turns; cells are medians of the rounds and ratios are to `topic_tools`, of one round each.
-*recorded* is the relay with a flight recorder's memory of 64 MiB. The relay's control is played here: it places one
-publication and grants it. Needs rosmaster and topic_tools.
+One publisher, one subscriber, one topic, loopback; the load is `relay_load.cpp`. *window*: 64 messages on their way;
+*flat*: as fast as it goes, with the loss; *paced*: 1,000 messages a second, with the delay. Systems take turns; cells
+are medians of the rounds and ratios are to `topic_tools`, of one round each. *recorded* is the relay with a flight
+recorder's memory of 64 MiB.
 """
 
 import argparse
@@ -57,7 +56,6 @@ class Result:
 
 
 def compiled() -> Path:
-    """Compiles the load generator if its source is newer."""
     source = HERE / "relay_load.cpp"
     if not PROGRAM.exists() or PROGRAM.stat().st_mtime < source.stat().st_mtime:
         PROGRAM.parent.mkdir(parents=True, exist_ok=True)
@@ -106,13 +104,11 @@ def run(
 
 
 class System(Protocol):
-    """Between the publisher and the subscriber."""
-
     name: str
     pid: int | None
 
     def target(self, publisher: int) -> tuple[int, str]:
-        """Returns port and topic for the subscriber."""
+        """Return port and topic for the subscriber."""
 
     def close(self) -> None: ...
 
@@ -149,11 +145,10 @@ class Relay:
             raise SystemExit(f"the relay does not take the specifications: {answer.findings}")
 
     def target(self, publisher: int) -> tuple[int, str]:
-        """Makes a new incarnation; returns port and topic."""
         return self.place(publisher, "/load")
 
     def place(self, publisher: int, topic: str) -> tuple[int, str]:
-        """Makes a new incarnation that publishes this topic; returns port and topic for its subscriber."""
+        """Make a new incarnation that publishes this topic; return port and topic for its subscriber."""
         key = str(len(self._publishers) + 1)
         self._publishers[key] = publisher
         with socket.create_server((LOOPBACK, 0)) as listening:
@@ -198,7 +193,6 @@ class RosRelay:
     """The node is started again for each run."""
 
     def __init__(self, name: str = "topic_tools", command: Sequence[str] = (TOPIC_TOOLS,)) -> None:
-        """`command` is called with the two topics."""
         self.name = name
         self._command = command
         port = free_port()
@@ -217,7 +211,7 @@ class RosRelay:
         self.pid: int | None = None
 
     def target(self, publisher: int) -> tuple[int, str]:
-        """Finds the port that the relay publishes on."""
+        """Find the port that the relay publishes on."""
         self.stop_relay()
         self._api.publisher = publisher
         self._runs += 1

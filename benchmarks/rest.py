@@ -56,8 +56,6 @@ def free_port() -> int:
 
 
 class Client:
-    """It has one request at a time."""
-
     def __init__(self, port: int, data: bytes) -> None:
         self.sock = socket.create_connection(("127.0.0.1", port))
         self.sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -70,7 +68,7 @@ class Client:
         self.sock.sendall(self.data)
 
     def receive(self) -> bool:
-        """Returns whether the answer is complete."""
+        """Return whether the answer is complete."""
         piece = self.sock.recv(1 << 20)
         if not piece:
             raise RuntimeError(f"the server closed the connection: {self.got[:300]!r}")
@@ -115,8 +113,6 @@ def cpu(pids: list[int]) -> float:
 
 
 class Appliance:
-    """REST is in clear text, and some nodes are registered."""
-
     def __init__(self, home: Path) -> None:
         home.chmod(0o755)
         (home / "policy.ini").write_text(POLICY)
@@ -144,7 +140,6 @@ class Appliance:
         self.pids = [int(row["pid"]) for row in rows if row["role"] in ("api", "control")]
 
     def status(self) -> dict[str, Any]:
-        """Waits until REST answers."""
         client = Client(
             self.port,
             f"GET /v1/status HTTP/1.1\r\nHost: 127.0.0.1\r\nAuthorization: Bearer {self.token}\r\n\r\n".encode(),

@@ -93,7 +93,6 @@ def _shown(tree: Any) -> str:
 
 
 def drawn(random: Random, count: int) -> Iterator[Formula]:
-    """Each logic has `count` formulas."""
     arity = ltl.UNARY | dict.fromkeys(("previously", "once"), 1)
     operators = (*ltl.TEMPORAL, "previously", "once", "since")
     for _ in range(count):

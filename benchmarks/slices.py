@@ -1,9 +1,6 @@
 """The cost of slices: `python -m benchmarks.slices`.
 
-Measured: the same property without and with a parameter, at 10,000 live slices that are visited in turn; the memory of
-100,000 slices; an event that concerns all slices, and one that gives a verdict in each; how fast new ids are accepted,
-and rejected beyond the limit; the same `fsm` with a condition, and with an action that changes variables shared by
-slices. Times are microseconds of processor time, the minimum of the rounds.
+Times are microseconds of processor time, the minimum of the rounds; 10,000 live slices are visited in turn.
 """
 
 import struct
@@ -50,14 +47,12 @@ def ids(count: int) -> list[bytes]:
 
 
 def monitors(text: str) -> MonitorSet:
-    """The monitors have been started."""
     loaded = MonitorSet.of(compiled_from({"slices.rv": text}, standard_definitions()), slices=MANY)
     loaded.start(0)
     return loaded
 
 
 def microseconds(action: Callable[[], object], times: int, rounds: int = ROUNDS) -> float:
-    """Processor time of one of `times` repetitions."""
     found = []
     for _ in range(rounds):
         started = time.process_time()
@@ -67,7 +62,6 @@ def microseconds(action: Callable[[], object], times: int, rounds: int = ROUNDS)
 
 
 def visited(text: str, messages: Sequence[bytes]) -> float:
-    """Slices get messages in turn."""
     loaded = monitors(text)
 
     def visit() -> None:

@@ -4,14 +4,11 @@
     python -m benchmarks.standby switchovers [--cuts 10] [--load 0] [--monitors FOLDER]
     python -m benchmarks.standby registrations [--rounds 40] [--load 0]
 
-`cuts`: the power of the active appliance is cut at a random time; it comes back as the standby before the next cut.
-`switchovers`: an operator orders the standby to take over. For each, the table shows the longest time without a
-message, an answer of a service, and an answer of the Master API. It includes the usual time between two of them: 20 ms
-for topics and calls. Afterwards no node has ended and no answered change is missing, or the program fails.
-
-`registrations`: one node registers and unregisters a topic behind a single appliance, and behind two. They take turns,
-so that other load affects both; ratios are of medians. `--load` starts processes that keep the machine's cores busy.
-`--monitors` loads the specifications there.
+`cuts`: the power of the active appliance is cut at a random time. `switchovers`: an operator orders the standby to
+take over. The table has the longest time without a message, an answer of a service, and an answer of the Master API,
+of which 20 ms are usual. The program fails if a node has ended or an answered change is missing. `registrations`: one
+node registers and unregisters a topic behind one appliance and behind two, in turns; ratios are of medians. `--load`
+starts processes that keep the cores busy.
 """
 
 import argparse
@@ -47,8 +44,6 @@ _SECONDS = 60.0  # until a takeover counts as failed
 
 
 class Successes:
-    """For example, messages that arrived."""
-
     def __init__(self) -> None:
         self.times = [time.monotonic()]
         self._new = threading.Condition()
@@ -115,7 +110,6 @@ class Watch:
 
 
 def _events(process: Process, event: str) -> Callable[[], None]:
-    """Waits for the next event of this name."""
     mark = [process.mark()]
 
     def once() -> None:
@@ -135,7 +129,6 @@ def _calls(robot: StandbyRobot, caller: Process) -> Callable[[], None]:
 
 @contextlib.contextmanager
 def busy(number: int) -> Iterator[None]:
-    """The processes only compute."""
     burning = [multiprocessing.Process(target=_burn, daemon=True) for _ in range(number)]
     for one in burning:
         one.start()
@@ -184,7 +177,7 @@ def print_pauses(pauses: dict[str, list[float]], title: str) -> None:
 
 
 def one_takeover(site: StandbySite, robot: StandbyRobot, *, planned: bool) -> dict[str, float]:
-    """Returns the longest pause of everything; then both appliances are in sync again."""
+    """Return the longest pause of everything; then both appliances are in sync again."""
     active, passive = site.pair()
     with Watch(robot) as watch:
         if planned:
@@ -206,7 +199,6 @@ def one_takeover(site: StandbySite, robot: StandbyRobot, *, planned: bool) -> di
 
 
 def registrations(rounds: int, load: int) -> None:
-    """Print a table of the times of registrations."""
     times: dict[str, list[float]] = {"one": [], "two": []}
     with contextlib.ExitStack() as stack:
         turns = {kind: stack.enter_context(_behind(pair=kind == "two")) for kind in times}
@@ -228,7 +220,6 @@ def registrations(rounds: int, load: int) -> None:
 
 @contextlib.contextmanager
 def _behind(*, pair: bool) -> Iterator[Callable[[], list[float]]]:
-    """Start one or two appliances; yield a function that returns the times of some registrations."""
     lab = Lab(f"rosrv-bench-{'pair' if pair else 'single'}")
     with tempfile.TemporaryDirectory() as home, lab:
         if not pair:

@@ -103,11 +103,10 @@ FAULTS: dict[str, tuple[Fault, float, float, bool]] = {
     "standby": (_blind_standby, 2, 8, False),
     "robot": (_shut, 0.5, 4, True),
 }
-"""The fault, its least and most seconds, and whether the times are counted from its end."""
 
 
 def faults(kind: str, number: int, load: int = 0, seed: int = 1) -> int:
-    """Returns the number of lost subscriptions."""
+    """Return the number of lost subscriptions."""
     make, least, most, after = FAULTS[kind]
     chance, pauses, lost = random.Random(seed), dict[str, list[float]](), 0
     with (
@@ -141,7 +140,6 @@ def faults(kind: str, number: int, load: int = 0, seed: int = 1) -> int:
 
 
 def _put_nodes_on(robot: StandbyRobot, arm: Host) -> None:
-    """Each client subscribes to each client, in both directions."""
     there = robot.ros.on(arm)
     for talker in CLIENTS:
         there.talker(talker, f"/arm_{talker}", "--rate", str(_RATE), name=f"arm_talker_{talker}")

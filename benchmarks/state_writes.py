@@ -1,12 +1,12 @@
 """Time saved by the log in front of the database: python -m benchmarks.state_writes [--rate 500] [--seconds 10]
 
-A robot's nodes register at a rate. Each registration must survive the death of control before it is answered, and is
-saved by the thread that answers all nodes. Every second another thread saves the tree of parameters. The table shows
-how long one registration blocks the answering thread, in microseconds:
+Nodes register at a rate; each registration must survive the death of control before it is answered. Every second
+another thread saves the tree of parameters. The table shows how long one registration blocks the answering thread, in
+microseconds:
 
 - `ahead`: as the program does it, a line in `state.ahead` and a statement in the queue of the writer's thread.
-- `commit`: the statement is committed to SQLite's own log (WAL, `synchronous=NORMAL`) by the answering thread. It waits
-  while the other thread writes the tree, and when it is its turn to bring SQLite's log into the database.
+- `commit`: the answering thread commits the statement to SQLite's own log (WAL, `synchronous=NORMAL`). It waits while
+  the other thread writes the tree, and when it is its turn to bring SQLite's log into the database.
 """
 
 import argparse
@@ -44,7 +44,6 @@ def main() -> None:
 
 
 def ahead(folder: Path, tree: bytes, rate: int, seconds: float) -> list[float]:
-    """The statements are kept as in the program."""
     store = StateStore(folder, failed=print)
     try:
         return _registering(
@@ -55,7 +54,6 @@ def ahead(folder: Path, tree: bytes, rate: int, seconds: float) -> list[float]:
 
 
 def commit(folder: Path, tree: bytes, rate: int, seconds: float) -> list[float]:
-    """The answering thread commits."""
     StateStore(folder, failed=print).close()
     registrations, parameters = _opened(folder), _opened(folder)
 
@@ -83,7 +81,6 @@ def _opened(folder: Path) -> sqlite3.Connection:
 def _registering(
     keep: Keep, keep_tree: Callable[[], None], tree: bytes, rate: int, seconds: float
 ) -> list[float]:
-    """The seconds of each registration."""
     over = threading.Event()
 
     def keep_trees() -> None:

@@ -1,11 +1,10 @@
 """The thesis's experiments (chapter 5, RQ2), with real nodes: `python -m benchmarks.thesis_experiments`.
 
-Two rospy nodes, ten messages a second, and how many were sent and received: behind a plain `rosmaster`, behind the
-appliance without a monitor, and with one on each topic. Experiment 1 and 2: one topic, 10 s and 10 minutes; 3: both
-nodes publish and subscribe, 10 s and 10 minutes; 4: the monitor publishes a message for each that it sees, 1 minute.
-Durations are multiplied by --scale (default 0.02, no run below 5 s: about two minutes; `--scale 1` is the thesis's
-own, about an hour). The first messages are published before the nodes have found each other, in the thesis as here;
-`lost` are those missing after the first one was received.
+Two rospy nodes, ten messages a second: behind a plain `rosmaster`, behind the appliance without a monitor, and with
+one on each topic. Experiment 1 and 2: one topic, 10 s and 10 minutes; 3: both nodes publish and subscribe, 10 s and
+10 minutes; 4: the monitor publishes a message for each that it sees, 1 minute. Durations are multiplied by --scale
+(default 0.02, no run below 5 s; `--scale 1` is the thesis's own, about an hour). `lost` are messages missing after
+the first one was received, because the first ones are published before the nodes have found each other.
 """
 
 import argparse
@@ -76,7 +75,6 @@ def appliance(enable: str, experiment: Experiment) -> Iterator[str]:
 
 
 def measure(master_uri: str, home: Path, experiment: Experiment, seconds: float) -> str:
-    """Returns the messages sent and received for each topic."""
     with RosSession(master_uri, home) as session:
         nodes = [
             session.start(

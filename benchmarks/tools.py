@@ -1,8 +1,7 @@
 """Stock tools that query everything, compared with a plain master: `python -m benchmarks.tools [--rounds 3]`.
 
 `rosbag record -a` records a robot with a hundred topics. Two times are measured: from the first topic's first message
-in the bag to the last topic's, and from the start of the tool. `rosgraph`'s library, which rqt_graph draws from,
-queries the whole graph. Both masters run at once and take turns; ratios are of medians.
+in the bag to the last topic's, and from the start of the tool. Then `rosgraph`'s library queries the whole graph.
 """
 
 import argparse
@@ -54,9 +53,7 @@ class Robot:
             node.wait_for(event="ready")
 
     def record(self, bag: Path) -> tuple[float, float, float]:
-        """Returns two times in seconds, from the first topic's first message and from the start to the last topic's
-        first message; and the number of missing topics.
-        """
+        """Return the two times in seconds, and the number of missing topics."""
         began = time.time()
         self.session.run(
             "rosbag", "record", "-a", "-O", str(bag), f"--duration={_RECORDED_SECONDS}", timeout=60
@@ -66,7 +63,6 @@ class Robot:
         return max(at) - min(at), max(at) - began, _NODES * _TOPICS - len(at)
 
     def graph(self) -> float:
-        """The time is in seconds."""
         return float(self.session.run(PYTHON, "-c", _GRAPH, timeout=90).stdout)
 
 

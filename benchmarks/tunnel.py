@@ -112,7 +112,6 @@ class Bench:
 
 
 def first_message(site: TunnelSite) -> tuple[JoinedHost, list[tuple[str, float]]]:
-    """Returns the duration of each step of joining."""
     moments = [("", time.monotonic())]
     kit = site.kit()
     moments.append(("`host add`: the kit is there", time.monotonic()))

@@ -2,9 +2,7 @@
 
     python benchmarks/wire.py
 
-RVMaster reads two documents and writes two for every call of the Master API, so a microsecond here is up to four
-microseconds per call. Each line is the best of five rounds in microseconds, because other load on the machine only adds
-time.
+Each line is the best of five rounds in microseconds. Every call of the Master API reads two documents and writes two.
 """
 
 import timeit
@@ -34,7 +32,6 @@ HEADER = {
 
 
 def measure(label: str, work: Callable[[], object], rounds: int = 5) -> None:
-    """The microseconds of one run."""
     number, _ = timeit.Timer(work).autorange()
     best = min(timeit.repeat(work, number=number, repeat=rounds)) / number
     print(f"{label:44} {best * 1e6:10.2f}")

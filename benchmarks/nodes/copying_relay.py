@@ -1,7 +1,7 @@
 """Five lines of Python between two connections, without reading the messages: `copying_relay.py PORT`.
 
-The least that a relay in Python costs: `epoll`, `recv_into`, `send`. As `copying_relay.c`, it prints its port, takes
-one subscriber, connects to the publisher at PORT, and passes on both connection headers before the messages.
+As `copying_relay.c`, it prints its port, takes one subscriber, connects to the publisher at PORT, and passes on both
+connection headers before the messages.
 """
 
 import select

@@ -1,8 +1,8 @@
 """Cut an operator's commands at full speed, with two rospy nodes (run by Debian's Python): `cut_node.py COUNT SILENT`.
 
-One node commands full speed on `/cmd_vel`, 50 times a second, and then falls silent without a closed connection, as
-behind a cut link. The other node is the base. Print `{"event": "measured", "late": [...]}`: milliseconds from the call
-of `publish` of the last command until the base's callback for the stop, less SILENT (seconds).
+One node commands full speed on `/cmd_vel`, 50 times a second, and then falls silent without a closed connection.
+Print `{"event": "measured", "late": [...]}`: milliseconds from the call of `publish` of the last command until the
+base's callback for the stop, less SILENT (seconds).
 """
 
 import json
@@ -22,7 +22,6 @@ NAMES = [word for word in sys.argv if word.startswith("__")]
 
 
 def base(arrivals):
-    """This ends with the other node."""
 
     def arrived(command):
         os.write(arrivals, ARRIVED.pack(time.monotonic(), command.linear.x))
@@ -34,7 +33,6 @@ def base(arrivals):
 
 
 def next_of(arrivals, speed):
-    """None if there is no such command."""
     while select.select([arrivals], [], [], PATIENCE)[0]:
         at, found = ARRIVED.unpack(os.read(arrivals, ARRIVED.size))
         if found == speed:
@@ -43,7 +41,7 @@ def next_of(arrivals, speed):
 
 
 def cut(publisher, arrivals, number, silent, pause):
-    """Returns the milliseconds by which the stop is late, or None without a stop."""
+    """Return the milliseconds by which the stop is late, or None without a stop."""
     command = Twist()
     command.linear.x = 1.0 + number
     for place in range(COMMANDS):

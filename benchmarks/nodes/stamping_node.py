@@ -17,7 +17,6 @@ NANOSECONDS = 1_000_000_000
 
 
 def publish(topic, size, hertz, seconds):
-    """Waits for a subscriber first."""
     publisher = rospy.Publisher(topic, String, queue_size=None)
     while not publisher.get_num_connections() and not rospy.is_shutdown():
         threading.Event().wait(0.05)
@@ -31,7 +30,6 @@ def publish(topic, size, hertz, seconds):
 
 
 def subscribe(topic):
-    """This ends with the input."""
     seen = []
     rospy.Subscriber(topic, String, lambda message: seen.append((time.monotonic_ns(), message.data[:20])))
     print(json.dumps({"event": "ready"}), flush=True)

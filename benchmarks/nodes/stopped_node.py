@@ -1,9 +1,9 @@
 """Measure how late commands and stops arrive, with two rospy nodes (run by Debian's Python): `stopped_node.py COUNT`.
 
-One node publishes in turns, each alone, a command (`/drive`), which a monitor changes, and a scan (`/scan`), for which
-a monitor publishes a stop (`/cmd_vel`). The other node receives both, because a node's messages to itself do not leave
-its process. Print `{"event": "measured", "changed": [...], "stopped": [...]}`: milliseconds from
-the call of `publish` until the subscriber's callback.
+One node publishes in turns a command (`/drive`), which a monitor changes, and a scan (`/scan`), for which a monitor
+publishes a stop (`/cmd_vel`). The other node receives both, because a node's messages to itself do not leave its
+process. Print `{"event": "measured", "changed": [...], "stopped": [...]}`: milliseconds from `publish` until the
+callback.
 """
 
 import json
@@ -25,7 +25,6 @@ NAMES = [word for word in sys.argv if word.startswith("__")]
 
 
 def receive(arrivals):
-    """This ends with the other node."""
 
     def arrived(_command):
         os.write(arrivals, ARRIVED.pack(time.monotonic()))
