@@ -1,10 +1,8 @@
 """`rosrv demo`: the appliance at work, in about a minute.
 
 A lab on this machine has four hosts: the appliance, a simulated LandShark of real ROS nodes, its operator, and an
-attacker. The operator drives and fires. The attacker tries everything that ROS 1 allows any host. For each attempt, the
-demo reads the deciding rule from the audit log. Then the operator makes mistakes that no policy can forbid, and
-monitors prevent them. Finally the operator's link is cut at full speed, and guards stop the robot. Scripts can rely on
-the exit status: 0 if the robot obeyed only its operator.
+attacker, who tries everything that ROS 1 allows any host. Scripts can rely on the exit status: 0 if the robot obeyed
+only its operator.
 """
 
 import shutil
@@ -84,7 +82,7 @@ class Show:
         self.robot: list[Actor] = []
 
     def run(self) -> bool:
-        """Run all acts; return whether every result was as expected."""
+        """Return whether every result was as expected."""
         self.introduce()
         self.open()
         operator = self.mission()
@@ -130,7 +128,6 @@ class Show:
         self.say("its own ports answer only the appliance: rosrv protect --apply")
 
     def mission(self) -> Actor:
-        """Have the operator drive, aim and fire."""
         self.headline(f"Its operator takes the controls ({OPERATOR})")
         operator = self.stage.start_operator()
         operator.expect("connected")
@@ -145,7 +142,6 @@ class Show:
         return operator
 
     def explain_grants(self) -> None:
-        """Print four decisions from the audit log that allowed the mission."""
         for caller, topic in GRANTED:
             named = ("--allow", "--caller", caller, "--topic", topic, "--limit", "1")
             record = self.stage.recorded(lambda found: next(iter(found), None), *named)
@@ -160,7 +156,7 @@ class Show:
         self.results.append(Result(attempt.name, attempt.succeeded, "granted by the policy"))
 
     def expect_denied(self, attack: Attack) -> None:
-        """Report an attack that the policy denies, with the rule from the audit log."""
+        """Report the rule from the audit log."""
         if attack.succeeded:
             self.decided("SUCCEEDED", f"{attack.name}: {attack.tried}", attack.answer)
             self.results.append(Result(f"attack: {attack.name}", good=False, remark=attack.answer))
@@ -171,15 +167,14 @@ class Show:
         self.results.append(Result(f"attack: {attack.name}", good=record is not None, remark=why))
 
     def expect_blocked(self, attack: Attack) -> None:
-        """Report an attack that bypasses the appliance; the robot's own packet filter must block it."""
+        """The attack bypasses the appliance; the robot's own packet filter must block it."""
         outcome = "SUCCEEDED" if attack.succeeded else "blocked"
         self.decided(outcome, f"{attack.name}: {attack.tried}", f"rosrv protect: {attack.answer}")
         self.results.append(Result(f"attack: {attack.name}", not attack.succeeded, attack.answer))
 
     def record_of(self, attack: Attack) -> Record | None:
-        """Return the denial of an attack: a new record of its resource, or the record whose reason the answer repeats.
-
-        The log counts a repeated denial instead of recording it again.
+        """Return the denial of an attack: a new record of its resource, or the record whose reason the answer
+        repeats.
         """
         before = self.last_sequence
 
@@ -198,7 +193,7 @@ class Show:
         return self.stage.recorded(find, "--deny", "--host", ATTACKER, "--limit", "1000")
 
     def aftermath(self, operator: Actor, before: dict[str, Any]) -> None:
-        """Check that every node is alive, the robot still drives, and only the operator fired."""
+        """Every node is alive, the robot still drives, and only the operator fired."""
         self.headline("The robot is unaffected")
         after = operator.newest("position")
         dead = [actor.name for actor in [*self.robot, operator] if not actor.running]
@@ -214,7 +209,6 @@ class Show:
         self.results += results
 
     def summary(self) -> None:
-        """Print the number of expected results, and each unexpected one."""
         bad = [result for result in self.results if not result.good]
         self.headline(
             f"{len(self.results) - len(bad)} of {len(self.results)} results as expected"
@@ -230,14 +224,13 @@ class Show:
         self.console.print(f"  {escape(text)}", highlight=False, soft_wrap=True)
 
     def decided(self, outcome: str, what: str, why: str) -> None:
-        """Print a decision: the outcome, the request and the rule."""
         colour = {"allowed": "green", "denied": "yellow", "blocked": "yellow"}.get(outcome, "bold red")
         line = f"  [{colour}]{outcome:9}[/] {escape(what)}\n            [dim]{escape(why)}[/]"
         self.console.print(line, highlight=False, soft_wrap=True)
 
 
 def rule_of(record: Record) -> str:
-    """Return the deciding rule with its position in the policy file; without a rule, the reason."""
+    """Return the rule with its position in the policy file; without a rule, the reason."""
     rule = record.get("rule")
     if not rule:
         return str(record.get("reason", ""))
@@ -245,7 +238,7 @@ def rule_of(record: Record) -> str:
 
 
 def require_everything() -> None:
-    """Raise `DemoError` if this machine lacks something that the demonstration needs."""
+    """Raises `DemoError`."""
     if not has_privileges():
         raise DemoError(
             "the demonstration creates four hosts as network namespaces, which needs root: "
@@ -264,7 +257,7 @@ def require_everything() -> None:
 
 
 def demonstrate(*, hold: bool, picture: Path | None, as_json: bool, standby: bool = False) -> int:
-    """Run the demonstration and return the exit status; draw the robot's paths into the file `picture`."""
+    """Return the exit status; draw the robot's paths into the file `picture`."""
     console, errors = Console(stderr=as_json), Console(stderr=True)
     signal.signal(signal.SIGTERM, _interrupt)
     try:
@@ -308,7 +301,7 @@ def demonstrate(*, hold: bool, picture: Path | None, as_json: bool, standby: boo
 
 
 def _show_standby(stage: StandbyStage, console: Console, hold: bool, as_json: bool) -> int:
-    """Run the demonstration of two appliances; return the exit status."""
+    """Return the exit status."""
     show = StandbyShow(stage, console)
     good = show.run()
     _print_results(show.results, as_json)

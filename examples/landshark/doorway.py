@@ -1,10 +1,6 @@
-"""Forward a loopback port of this machine to a host of a lab that has no network link to this machine.
+"""Forward a loopback port to a host of a lab that has no network link to this machine, for the demonstration's console.
 
-It leads to the demonstration's console. Bytes are copied unchanged in both directions. Clients are not authenticated,
-because the port is on loopback and the console requires a token.
-
-    with Doorway(host, ("127.0.0.1", 8443)) as door:
-        print(door.port)
+Clients are not authenticated, because the port is on loopback and the console requires a token.
 """
 
 import contextlib
@@ -21,7 +17,7 @@ _PIECE = 65536
 
 
 class Doorway:
-    """A listening port on 127.0.0.1 of this machine, as a context manager. `target` is an address on `host`."""
+    """A port on 127.0.0.1 of this machine, as a context manager. `target` is an address on `host`."""
 
     def __init__(self, host: Host, target: tuple[str, int]) -> None:
         self._host, self._target = host, target
@@ -86,7 +82,6 @@ class Doorway:
 
 
 def _pass_on(source: socket.socket, sink: socket.socket) -> None:
-    """Copy bytes until the source ends, then close the sink for writing."""
     with contextlib.suppress(OSError):
         while piece := source.recv(_PIECE):
             sink.sendall(piece)

@@ -3,9 +3,8 @@
     --bag FILE   record what the robot's nodes and its operator publish, as `rosbag record -a` would
     --svg FILE   draw the drive without monitors and the same commands with the monitors of `monitors/`
 
-The operator gives the same commands in both drives: straight at the obstacle, back, around, out of the yard, and three
-shots, one with the gun pointing at the robot itself. As in the appliance, the messages of a topic go through the
-monitors before a subscriber gets them, so the robot moves as the monitors permit. Everything is deterministic.
+As in the appliance, the messages of a topic go through the monitors before a subscriber gets them, so the robot moves
+as the monitors permit. Everything is deterministic.
 """
 
 import argparse
@@ -73,7 +72,7 @@ MISSION = (
 
 @dataclass(frozen=True)
 class Message:
-    """A published message and its fate: `result` is passed, changed or dropped."""
+    """A published message; `result` is passed, changed or dropped."""
 
     time: int
     topic: str
@@ -93,8 +92,6 @@ class Shot:
 
 @dataclass
 class Drive:
-    """The result of a drive: the robot's positions, the gun's angles, the shots, and the messages."""
-
     poses: list[physics.Pose] = field(default_factory=list)
     tilts: list[float] = field(default_factory=list)
     shots: list[Shot] = field(default_factory=list)
@@ -102,19 +99,17 @@ class Drive:
     log: list[tuple[int, str]] = field(default_factory=list)
 
     def nearest(self, obstacle: physics.Obstacle) -> float:
-        """Return the distance in metres between the robot and an obstacle; negative inside it."""
+        """In metres; negative inside the obstacle."""
         return (
             min(math.hypot(pose.x - obstacle.x, pose.y - obstacle.y) for pose in self.poses) - obstacle.radius
         )
 
     def farthest(self) -> float:
-        """Return the largest distance in metres between the robot and its origin."""
+        """The largest distance in metres between the robot and its origin."""
         return max(math.hypot(pose.x, pose.y) for pose in self.poses)
 
 
 class Simulation:
-    """The robot, its operator and, if any, the monitors between them."""
-
     def __init__(self, specifications: Sequence[Path] = ()) -> None:
         self.drive = Drive()
         self.laser_works = True
@@ -145,7 +140,7 @@ class Simulation:
         return self.drive
 
     def _send(self, topic: str, **fields: object) -> bytes | None:
-        """Publish a message; return the bytes that subscribers get, or None if the message was dropped."""
+        """Return the bytes that subscribers get, or None if the message was dropped."""
         data = self._messages.encode(
             TYPES[topic],
             header__stamp__sec=self._now // 10**9,
@@ -188,7 +183,6 @@ class Simulation:
         self.drive.tilts.append(self._turret.tilt)
 
     def _tell(self, ticks: int) -> None:
-        """Publish odometry and joints in every step, the laser at 10 Hz, the GPS at 5 Hz, and the battery at 1 Hz."""
         pose, velocity = self._pose, self._velocity
         self._send(
             "/landshark/odom",
@@ -218,7 +212,7 @@ class Simulation:
 
 
 def record(drive: Drive, path: Path) -> None:
-    """Write the published messages into a bag. Raises `FileExistsError`."""
+    """Raises `FileExistsError`."""
     if path.exists():
         raise FileExistsError(f"{path} already exists")
     store = Messages().store

@@ -6,9 +6,9 @@ with Lab("rosrv-test") as lab:
     process = robot.popen(["rosmaster", "--core"])
 ```
 
-The bridge between the hosts is in a separate namespace, so nothing appears in the machine's own namespace, and two labs
-may use the same addresses at once. Leaving the block ends every process in the lab's namespaces and deletes the
-namespaces. If the lab's process died before that, the next lab with the same prefix deletes them.
+The bridge is in a separate namespace, so nothing appears in the machine's own one, and two labs may use the same
+addresses at once. Leaving the block ends every process in the lab's namespaces. If the lab's process died before
+that, the next lab with the same prefix deletes them.
 """
 
 import contextlib
@@ -37,7 +37,7 @@ T = TypeVar("T")
 
 
 class Host:
-    """One machine of the lab: a namespace with `lo` and `eth0` up."""
+    """A namespace with `lo` and `eth0` up."""
 
     def __init__(self, name: str, namespace: Namespace, port: str, addresses: tuple[str, ...]) -> None:
         self.name = name
@@ -47,19 +47,19 @@ class Host:
 
     @property
     def address(self) -> str:
-        """Return the host's first address, without prefix length."""
+        """Without prefix length."""
         return self.interfaces[0].partition("/")[0]
 
     @property
     def address6(self) -> str:
-        """Return the host's first IPv6 address, without prefix length."""
+        """Without prefix length."""
         for text in self.interfaces:
             if ":" in text:
                 return text.partition("/")[0]
         raise NetworkError(f"the host {self.name} was given no IPv6 address")
 
     def popen(self, args: Sequence[str | os.PathLike[str]], **options: Any) -> "subprocess.Popen[Any]":
-        """Start a program on the host; it ends with the lab at the latest."""
+        """The program ends with the lab at the latest."""
         return self.namespace.popen(args, **options)
 
     def run(self, function: Callable[[], T]) -> T:
@@ -72,7 +72,7 @@ class Host:
 
 
 class Lab:
-    """Hosts on a common bridge, as a context manager. The names of the lab's namespaces begin with `prefix`."""
+    """The names of the lab's namespaces begin with `prefix`."""
 
     _numbers = itertools.count(1)
 
@@ -102,7 +102,7 @@ class Lab:
         self.close()
 
     def host(self, name: str, *addresses: str, gateway: str | None = None) -> Host:
-        """Add a host with addresses (`10.77.0.10/24`, `fd77::10/64`) and a default route by `gateway`."""
+        """Addresses are as `10.77.0.10/24`, `fd77::10/64`."""
         if name in self.hosts:
             raise ValueError(f"the lab has a host {name} already")
         if not addresses:
@@ -120,14 +120,13 @@ class Lab:
         return host
 
     def unplug(self, host: Host) -> None:
-        """Unplug the host's cable: its packets are lost from now on."""
         interfaces.set_link(self.switch, host.port, up=False)
 
     def plug(self, host: Host) -> None:
         interfaces.set_link(self.switch, host.port, up=True)
 
     def close(self) -> None:
-        """End every process in the lab and delete the lab; a second call does nothing."""
+        """A second call does nothing."""
         _clear([*(host.namespace for host in self.hosts.values()), self.switch])
         self.hosts.clear()
 

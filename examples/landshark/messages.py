@@ -14,8 +14,6 @@ DEFINITIONS = {f"{TRIGGER}.msg": (MONITORS / "msg" / f"{TRIGGER}.msg").read_text
 
 
 class Messages:
-    """Encodes and decodes messages; `store` has the types."""
-
     def __init__(self) -> None:
         self.store: Any = get_typestore(Stores.ROS1_NOETIC)
         self.store.register(
@@ -23,7 +21,6 @@ class Messages:
         )
 
     def encode(self, kind: str, **fields: object) -> bytes:
-        """Return the bytes of a message of type `package/Type`."""
         nested: dict[str, Any] = {}
         for path, value in fields.items():
             at = nested
@@ -55,6 +52,6 @@ class Messages:
 
 
 def long_name(kind: str) -> str:
-    """Return a type's name in the library's form, `package/msg/Type`."""
+    """Return `package/msg/Type`."""
     package, _, name = kind.partition("/")
     return f"{package}/msg/{name}"

@@ -1,8 +1,7 @@
 """Play the last act of `rosrv demo`: mistakes of the operator that no policy can forbid, but monitors prevent.
 
-The operator makes each mistake twice: without a monitor, and with a monitor that is enabled while the robot runs. The
-expected results depend on the simulated robot (`examples/landshark/nodes/physics.py`): it moves through obstacles, and
-continues for half a second after its last command.
+The expected results depend on the simulated robot (`examples/landshark/nodes/physics.py`): it moves through
+obstacles, and continues for half a second after its last command.
 """
 
 from collections.abc import Sequence
@@ -35,13 +34,11 @@ class Narrator(Protocol):
 
 
 class Mistakes:
-    """The operator's mistakes, one after the other."""
-
     def __init__(self, stage: Stage, narrator: Narrator) -> None:
         self._stage, self._narrator = stage, narrator
 
     def run(self) -> Ways:
-        """Make all mistakes; return the robot's paths without and with monitors."""
+        """Return the robot's paths without and with monitors."""
         self._narrator.headline(
             "The operator makes a mistake and fires while the gun points at the robot itself"
         )
@@ -89,13 +86,12 @@ class Mistakes:
         self._narrator.say(f"rosrv monitor enable {name}  ({self._stage.monitors / file})")
 
     def _fires(self, what: str, *, hit: bool) -> None:
-        """Pull the trigger; `hit` says whether a shot is expected."""
+        """Pull the trigger; `hit` is whether a shot is expected."""
         fired = self._stage.command("fire")
         shots = fired["shots"] - fired["before"]
         self._result(what, shots == (1 if hit else 0), "1 shot" if shots == 1 else f"{shots} shots")
 
     def _recorded(self, event: str, monitor: str, what: str) -> None:
-        """Find and print the audit record of a monitor's action."""
         record = self._stage.recorded(
             # the oldest record, which is not folded
             lambda found: next((one for one in reversed(found) if one["detail"]["monitor"] == monitor), None),

@@ -1,7 +1,7 @@
-"""Draw two drives from above as an SVG: the yard, the obstacle, the robot's path, and the shots with their results.
+"""Draw two drives from above as an SVG: the yard, the obstacle, the robot's path, the shots, and the gun's angle over
+time.
 
-Below them, the picture has the angle of the gun over time, with the same shots. The text has its own background, so
-that the picture can also be read on a dark page.
+The text has its own background, so that the picture can also be read on a dark page.
 """
 
 import html
@@ -32,7 +32,6 @@ text { font: 14px system-ui, 'DejaVu Sans', sans-serif; fill: #1f2937 }
 
 
 def draw(without: "Drive", guarded: "Drive") -> str:
-    """Return the picture of the same commands without and with monitors."""
     parts = [
         '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 1000 860" role="img">',
         "<title>The LandShark's drive from above, without and with monitors</title>",
@@ -57,7 +56,7 @@ def draw_ways(
     cut: list[physics.Pose] | None = None,
     stopped: list[physics.Pose] | None = None,
 ) -> str:
-    """Return the picture of two drives with only their positions, and of two drives whose link is `cut`."""
+    """Also draw two drives whose link is `cut`."""
     parts = [
         '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 1000 640" role="img">',
         "<title>The LandShark's ways from above, without and with monitors</title>",

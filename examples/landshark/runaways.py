@@ -1,7 +1,7 @@
 """Play the act of `rosrv demo` about guards: the operator's link is cut at full speed, and the base drives on.
 
-The base of this act lacks a timeout of its own, as many real drivers do. `rosrv guard` makes three guards from presets:
-`deadman` stops the base, `speed` limits it, and `fence` keeps it inside a square.
+`rosrv guard` makes three guards from presets: `deadman` stops the base, `speed` limits it, and `fence` keeps it
+inside a square.
 """
 
 import math
@@ -26,7 +26,7 @@ class Runaways:
         self._stage, self._narrator = stage, narrator
 
     def run(self) -> Ways:
-        """Play the act; return the robot's paths after a cut, without and with guards."""
+        """Return the robot's paths after a cut, without and with guards."""
         self._narrator.headline(
             "The operator's link is cut at full speed, and the base has no timeout of its own"
         )
@@ -62,7 +62,7 @@ class Runaways:
         return {"cut": without, "stopped": guarded}
 
     def _cut(self, base: Actor) -> tuple[float, list[tuple[float, float]]]:
-        """Cut the link while the robot drives; return how far it went afterwards, and its path."""
+        """Return how far the robot went afterwards, and its path."""
         base.expect("moved")
         plug = self._stage.cut_while_driving(TOP_SPEED)
         try:
@@ -77,7 +77,7 @@ class Runaways:
         return metres, [(0.0, 0.0), (begin["x"], begin["y"]), (end["x"], end["y"])]
 
     def _guard(self, preset: str, value: str, *further: str) -> None:
-        """Make a guard in shadow mode, and bring it into force."""
+        """The guard begins in shadow mode."""
         new = ("guard", "new", preset, COMMANDS, *further, "--shadow", value)
         self._stage.order(*new)
         self._stage.order("guard", "enforce", preset)

@@ -1,11 +1,6 @@
 """Run the actors of the demonstration: a simulated LandShark, its operator and an attacker, each on a host of a lab.
 
-    with Lab("rosrv-demo") as lab, Stage(lab, SHIPPED) as stage:
-        stage.start_appliance()
-        stage.start_robot()
-
-Each program is an `Actor`: a process on its host that prints one JSON object per line. The nodes know nothing of the
-appliance except ROS_MASTER_URI.
+The nodes know nothing of the appliance except ROS_MASTER_URI.
 """
 
 import contextlib
@@ -44,13 +39,11 @@ Record = dict[str, Any]
 
 
 class DemoError(RuntimeError):
-    """Report that the demonstration cannot continue; the text names what is missing, and the file to read."""
+    """The demonstration cannot continue; the text names what is missing, and the file to read."""
 
 
 @dataclass(frozen=True)
 class Attack:
-    """An attempt of the attacker, with the answer and the result."""
-
     name: str
     tried: str
     answer: str
@@ -58,7 +51,7 @@ class Attack:
 
 
 class Actor:
-    """A process on a host, with its events in order; its other output goes to a file."""
+    """A process on a host that prints one JSON object per line; its other output goes to a file."""
 
     def __init__(
         self, host: Host, name: str, command: list[str], environment: dict[str, str], log: Path
@@ -84,7 +77,7 @@ class Actor:
         return self.process.poll() is None
 
     def expect(self, event: str, seconds: float = START_SECONDS) -> Event:
-        """Return the next event with this name; skip all events before it."""
+        """Skip all events before this one."""
         deadline = time.monotonic() + seconds
         while True:
             try:
@@ -97,7 +90,7 @@ class Actor:
                 return said
 
     def newest(self, event: str, seconds: float = START_SECONDS) -> Event:
-        """Return the next event with this name that is reported after this call."""
+        """Wait for an event that is reported after this call."""
         with contextlib.suppress(queue.Empty):
             while True:
                 if self.events.get_nowait() is None:
@@ -110,7 +103,7 @@ class Actor:
             self.process.send_signal(signal.SIGTERM)
 
     def stop(self, seconds: float = 6.0) -> None:
-        """End the process: SIGTERM, then SIGKILL."""
+        """SIGTERM, then SIGKILL."""
         if self.running:
             self.interrupt()
             try:
@@ -141,10 +134,10 @@ class Actor:
 
 
 class Stage:
-    """The hosts and all their programs, as a context manager that ends them."""
+    """A context manager, which ends all programs."""
 
     def __init__(self, lab: Lab, shipped: Path, master: str = MASTER_URI) -> None:
-        """Make the hosts; `master` is the URI that the nodes get."""
+        """The nodes get the URI `master`."""
         self.master = master
         self.appliances = [APPLIANCE]
         self.shipped = shipped
@@ -164,11 +157,10 @@ class Stage:
         self.actors: list[Actor] = []
 
     def start_appliance(self) -> Event:
-        """Start `rosrv up` in its own namespace; return the ready line, once nodes may connect."""
+        """Return the ready line, once nodes may connect."""
         return self.run_appliance(self.appliance_host, "rosrv up", self.state).expect("ready")
 
     def run_appliance(self, host: Host, name: str, state: Path) -> Actor:
-        """Start `rosrv up` on a host."""
         command = [sys.executable, "-m", "appliance.cli.main", "up", "--json", "--isolation", "container"]
         command += [
             "--listen",
@@ -187,7 +179,7 @@ class Stage:
         return self._start(host, name, command)
 
     def start_robot(self) -> list[Actor]:
-        """Start the LandShark's drivers and sensors: five rospy nodes and, if it was compiled, one roscpp node."""
+        """Five rospy nodes and, if it was compiled, one roscpp node."""
         python = {
             "base": ["base.py"],
             "turret": ["turret.py"],
@@ -220,7 +212,7 @@ class Stage:
         return True
 
     def protect_robot(self) -> None:
-        """Run `rosrv protect` on the robot's machine, so that its nodes' own ports answer the appliance only."""
+        """The nodes' own ports then answer the appliance only."""
         command = [sys.executable, "-m", "appliance.cli.main", "protect", "--apply"]
         for address in self.appliances:
             command += ["--appliance", address]
@@ -235,7 +227,7 @@ class Stage:
         return self._start(self.operator_host, "ocu", [NODE_PYTHON, str(self.nodes / "ocu.py")])
 
     def command(self, what: str, *values: str) -> Event:
-        """Run one command of the operator after the control unit has ended; return the event of `command.py`."""
+        """The control unit has ended before; return the event of `command.py`."""
         program = [NODE_PYTHON, str(self.nodes / "command.py"), what, *values]
         actor = self._start(self.operator_host, "ocu command", program)
         said = actor.expect(
@@ -246,7 +238,7 @@ class Stage:
         return said
 
     def draw(self, ways: dict[str, Sequence[Sequence[float]]], picture: Path) -> None:
-        """Draw the robot's drives (metres), without and with monitors, from above as an SVG."""
+        """Ways are in metres, without and with monitors."""
         file = self.directory / "ways.json"
         file.write_text(json.dumps(ways))
         command = [sys.executable, "-m", "examples.landshark.ways", str(file), str(picture.resolve())]
@@ -262,11 +254,10 @@ class Stage:
             raise DemoError(f"the picture {picture} cannot be drawn: {done.stderr.strip()}")
 
     def console(self) -> Doorway:
-        """Forward a port of this machine to the console, which listens on loopback of the appliance's host."""
+        """The console listens on loopback of the appliance's host."""
         return Doorway(self.appliance_host, CONSOLE)
 
     def rosrv(self, *arguments: str) -> str:
-        """Run a verb of `rosrv`; return what it prints."""
         command = [sys.executable, "-m", "appliance.cli.main", *arguments]
         done = subprocess.run(command, capture_output=True, text=True, timeout=START_SECONDS, check=False)
         if done.returncode:
@@ -274,7 +265,6 @@ class Stage:
         return done.stdout
 
     def order(self, *arguments: str) -> str:
-        """Run a verb of `rosrv` on the running appliance; return what it prints."""
         return self.rosrv(*arguments, "--state", str(self.state))
 
     def start_runaway(self, heading: float) -> Actor:
@@ -286,7 +276,7 @@ class Stage:
         return self._start(self.robot_host, "landshark_base", command)
 
     def cut_while_driving(self, forward: float) -> Callable[[], None]:
-        """Have the operator drive, and cut the link at full speed; return the function that plugs it in again."""
+        """Cut the link at full speed; return the function that plugs it in again."""
         command = [NODE_PYTHON, str(self.nodes / "command.py"), "dash", str(forward)]
         actor = self._start(self.operator_host, "ocu command", command)
         actor.expect("dashing", COMMAND_SECONDS)
@@ -312,7 +302,7 @@ class Stage:
         return Attack(name, said["tried"], text, said["succeeded"])
 
     def audit(self, *flags: str) -> list[dict[str, Any]]:
-        """Return the records of `rosrv audit search` with these flags."""
+        """Take the flags of `rosrv audit search`."""
         command = [sys.executable, "-m", "appliance.cli.main", "audit", "search", *flags, "--json"]
         command += ["--state", str(self.state)]
         done = subprocess.run(command, capture_output=True, text=True, timeout=START_SECONDS, check=False)
@@ -321,10 +311,7 @@ class Stage:
         return [json.loads(line) for line in done.stdout.splitlines() if line.strip()]
 
     def recorded(self, find: Callable[[list[Record]], Record | None], *flags: str) -> Record | None:
-        """Return the record that `find` selects from an audit search; None after `RECORD_SECONDS`.
-
-        The log may write a record shortly after the answer to its call.
-        """
+        """Return None after `RECORD_SECONDS`: the log may write a record shortly after the answer to its call."""
         end = time.monotonic() + RECORD_SECONDS
         while (found := find(self.audit(*flags))) is None and time.monotonic() < end:
             pass  # a search is a process, which takes a moment

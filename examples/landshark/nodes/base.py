@@ -16,8 +16,6 @@ HERTZ = 20.0
 
 
 class Base:
-    """The moving robot."""
-
     def __init__(self, heading=None):
         self.lock = threading.Lock()
         self.runaway = heading is not None
@@ -35,7 +33,6 @@ class Base:
             self.told = rospy.Time.now()
 
     def step(self, seconds):
-        """Move for this number of seconds, and publish the robot's position."""
         now = rospy.Time.now()
         with self.lock:
             if not self.runaway and (now - self.told).to_sec() > physics.COMMAND_LIFETIME:
@@ -55,7 +52,6 @@ class Base:
 
 
 def main():
-    """Run until a signal ends the program."""
     rospy.init_node("landshark_base")
     base = Base(*map(float, rospy.myargv()[2:]))
     rate = rospy.Rate(HERTZ)

@@ -2,12 +2,11 @@
 
     command.py drive FORWARD TURN SECONDS | dash FORWARD | reach X Y | aim PAN TILT | fire
 
-Positions are in metres, speeds in metres and radians a second, angles in radians. The program waits for the driver and
-prints one JSON object. `drove` has the position at the end. `dashing` says that the robot is under way, and the program
-drives on. `reached` has the way, whether the robot arrived, its smallest distance from the obstacle's edge (negative
-inside), and its largest distance from the origin. `aimed` has the angle reached, and `fired` the number of shots so
-far. A message that is published once is latched for a while, as with `rostopic pub -1`, so that a driver or recorder
-that connects a little later also receives it.
+Positions are in metres, speeds in metres and radians a second, angles in radians. The program prints one JSON object:
+`drove` (the position at the end), `dashing` (the program drives on), `reached` (the way, whether the robot arrived,
+its smallest distance from the obstacle's edge, negative inside, and its largest from the origin), `aimed` (the
+angle), or `fired` (the shots so far). A message that is published once is latched for a while, as with `rostopic pub
+-1`.
 """
 
 import math
@@ -34,8 +33,6 @@ LATCHED = 1.5
 
 
 class Display:
-    """The newest message of a topic."""
-
     def __init__(self, topic, kind):
         self.message = None
         self.changed = threading.Condition()
@@ -47,7 +44,7 @@ class Display:
             self.changed.notify_all()
 
     def wait(self, condition, seconds=SECONDS):
-        """Wait for a message that satisfies `condition`; return whether one came."""
+        """Return whether a message satisfied `condition`."""
         with self.changed:
             return self.changed.wait_for(
                 lambda: self.message is not None and condition(self.message), seconds
@@ -55,7 +52,7 @@ class Display:
 
 
 def connected(publisher):
-    """Return the publisher once it has a subscriber; end the program if none connects."""
+    """End the program if no subscriber connects."""
     rate = rospy.Rate(HERTZ)
     for _ in range(int(SECONDS * HERTZ)):
         if publisher.get_num_connections():
@@ -65,7 +62,7 @@ def connected(publisher):
 
 
 def drive(forward, turn, seconds):
-    """Publish a velocity for this number of seconds, then wait until the robot has stopped."""
+    """Return when the robot has stopped."""
     display = Display("/landshark/odom", Odometry)
     publisher = connected(rospy.Publisher("/landshark_control/base_velocity", TwistStamped, queue_size=10))
     rate = rospy.Rate(HERTZ)
@@ -99,7 +96,7 @@ def dash(forward):
 
 
 def reach(x, y):
-    """Drive straight to a place at top speed; give up when the robot gets no nearer."""
+    """At top speed; give up when the robot gets no nearer."""
     display = Display("/landshark/odom", Odometry)
     publisher = connected(rospy.Publisher("/landshark_control/base_velocity", TwistStamped, queue_size=10))
     display.wait(lambda _odometry: True)
@@ -130,7 +127,7 @@ def reach(x, y):
 
 
 def aim(pan, tilt):
-    """Turn the gun, and wait until it points there."""
+    """Wait until the gun points there."""
     display = Display("/landshark/joint_states", JointState)
     publisher = connected(rospy.Publisher("/landshark_control/turret", JointState, queue_size=10, latch=True))
     message = JointState(name=["turret_pan", "turret_tilt"], position=[pan, tilt])
@@ -141,7 +138,6 @@ def aim(pan, tilt):
 
 
 def fire():
-    """Fire one shot and wait a second for the count that the driver reports."""
     kind = paintball_trigger()
     display = Display("/landshark/shots", UInt32)
     publisher = connected(rospy.Publisher("/landshark_control/trigger", kind, queue_size=10, latch=True))

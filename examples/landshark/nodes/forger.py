@@ -15,8 +15,6 @@ PaintballTrigger = paintball_trigger()
 
 
 class Reached(rospy.SubscribeListener):
-    """A listener that records the first driver that connects."""
-
     def __init__(self):
         self.somebody = threading.Event()
 

@@ -1,8 +1,7 @@
 """Make the LandShark's own message type from its .msg file at run time, as `catkin_make` would at build time.
 
-LANDSHARK_MESSAGES names the folder with `landshark_msgs/PaintballTrigger.msg`; the default is the folder
-`monitors/msg` of this checkout, where the appliance also finds it. The md5sum is computed from the definition, so that
-the type matches every node that was built from the same file.
+LANDSHARK_MESSAGES names the folder with `landshark_msgs/PaintballTrigger.msg`; the default is `monitors/msg` of this
+checkout.
 """
 
 import os
@@ -15,7 +14,6 @@ DEFAULT_FOLDER = Path(__file__).resolve().parents[3] / "monitors" / "msg"
 
 
 def paintball_trigger():
-    """Return the class landshark_msgs/PaintballTrigger."""
     folder = Path(os.environ.get("LANDSHARK_MESSAGES", DEFAULT_FOLDER))
     text = (folder / "landshark_msgs" / "PaintballTrigger.msg").read_text()
     divider = "=" * 80

@@ -1,7 +1,7 @@
 """Run /ocu, the operator control unit: drive out, aim, fire once, then patrol until a signal.
 
-Prints one JSON object per line: `connected`, `drove` (metres), `aimed` (radians), `fired` (shots so far), `position`.
-While it patrols, `lost` means that the robot's odometry is late, and `regained` has the seconds until it arrived again.
+Prints one JSON object per line: `connected`, `drove` (metres), `aimed` (radians), `fired` (shots so far), `position`,
+`lost` (the robot's odometry is late), and `regained` (the seconds until it arrived again).
 """
 
 import threading
@@ -21,8 +21,6 @@ PaintballTrigger = paintball_trigger()
 
 
 class Operator:
-    """The operator's displays and controls."""
-
     def __init__(self):
         self.changed = threading.Condition()
         self.seen = {}
@@ -50,17 +48,17 @@ class Operator:
             self.changed.notify_all()
 
     def wait(self, condition, seconds=30.0):
-        """Wait until the displays satisfy `condition`; return whether they did."""
+        """Return whether the displays satisfied `condition`."""
         with self.changed:
             return self.changed.wait_for(lambda: rospy.is_shutdown() or condition(self.seen), seconds)
 
     def connected(self):
-        """Return whether every control reaches a driver and every display shows something."""
+        """Every control reaches a driver and every display shows something."""
         controls = (self.velocity, self.turret, self.trigger)
         return len(self.seen) == 4 and all(control.get_num_connections() for control in controls)
 
     def drive(self, forward, turn=0.0):
-        """Send the base a velocity, which must be repeated within half a second."""
+        """The velocity must be repeated within half a second."""
         message = TwistStamped()
         message.header.stamp = rospy.Time.now()
         message.twist.linear.x, message.twist.angular.z = forward, turn
@@ -78,7 +76,6 @@ class Operator:
         self.trigger.publish(message)
 
     def watch(self):
-        """Report once that the odometry is late."""
         with self.changed:
             if not self.lost and time.monotonic() - self.odometry > LATE:
                 self.lost = True
@@ -90,7 +87,7 @@ class Operator:
 
 
 def mission(operator, rate):
-    """Drive three metres, aim and fire; report each step when the robot has done it, not when the command is sent."""
+    """Report each step when the robot has done it, not when the command is sent."""
     start = operator.x()
     while not rospy.is_shutdown() and operator.x() < start + 3:
         operator.drive(1.0)
@@ -108,7 +105,6 @@ def mission(operator, rate):
 
 
 def main():
-    """Run until a signal ends the program."""
     rospy.init_node("ocu")
     operator = Operator()
     rate = rospy.Rate(HERTZ)

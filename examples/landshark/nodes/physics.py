@@ -1,7 +1,7 @@
 """Compute how the simulated LandShark moves, and what its sensors measure, in plain functions without ROS.
 
-Lengths are metres, angles radians (counter-clockwise, 0 is east), times seconds, speeds metres or radians
-a second. The world is a flat yard around ORIGIN with one round obstacle in it.
+Lengths are metres, angles radians (counter-clockwise, 0 is east), times seconds, speeds metres or radians a second.
+The world is a flat yard around ORIGIN with one round obstacle in it.
 """
 
 import math
@@ -22,8 +22,6 @@ DRAIN_MOVING = 0.002  # additional fraction each second at one metre a second
 
 @dataclass(frozen=True)
 class Pose:
-    """The position and direction of the robot."""
-
     x: float = 0.0
     y: float = 0.0
     heading: float = 0.0
@@ -39,16 +37,12 @@ class Velocity:
 
 @dataclass(frozen=True)
 class Turret:
-    """Angles of the gun."""
-
     pan: float = 0.0
     tilt: float = 0.0
 
 
 @dataclass(frozen=True)
 class Obstacle:
-    """A round obstacle in the yard."""
-
     x: float
     y: float
     radius: float
@@ -58,14 +52,13 @@ YARD = (Obstacle(x=8.0, y=0.5, radius=1.0),)
 
 
 def limit(value: float, low: float, high: float) -> float:
-    """Return the nearest value within the limits; for not-a-number return their middle."""
+    """For not-a-number return the middle of the limits."""
     if math.isnan(value):
         return (low + high) / 2
     return min(max(value, low), high)
 
 
 def pose_of(odometry: Any) -> Pose:
-    """Return the pose in a `nav_msgs/Odometry`."""
     position, orientation = odometry.pose.pose.position, odometry.pose.pose.orientation
     return Pose(position.x, position.y, 2 * math.atan2(orientation.z, orientation.w))
 
@@ -83,7 +76,6 @@ def possible(velocity: Velocity) -> Velocity:
 
 
 def drive(pose: Pose, velocity: Velocity, seconds: float) -> Pose:
-    """Return the pose after driving for this number of seconds, along a circle or straight."""
     velocity = possible(velocity)
     turned = velocity.turn * seconds
     if abs(turned) < 1e-9:
@@ -103,7 +95,7 @@ def drive(pose: Pose, velocity: Velocity, seconds: float) -> Pose:
 
 
 def aim(turret: Turret, wanted: Turret, seconds: float) -> Turret:
-    """Return the turret after it moved toward the wanted angles for this number of seconds, within its limits."""
+    """Return the turret after it moved toward the wanted angles, within its limits."""
     reach = TURRET_SPEED * seconds
     pan, tilt = limit(wanted.pan, *PAN_LIMITS), limit(wanted.tilt, *TILT_LIMITS)
     return Turret(
@@ -113,14 +105,14 @@ def aim(turret: Turret, wanted: Turret, seconds: float) -> Turret:
 
 
 def position_on_earth(pose: Pose) -> tuple[float, float]:
-    """Return latitude and longitude in degrees."""
+    """Latitude and longitude in degrees."""
     north, east = ORIGIN
     per_degree = math.radians(1) * EARTH_RADIUS
     return north + pose.y / per_degree, east + pose.x / (per_degree * math.cos(math.radians(north)))
 
 
 def distance_along(pose: Pose, direction: float, obstacle: Obstacle) -> float:
-    """Return the distance to an obstacle in a direction from the robot; infinite if the ray misses it."""
+    """Infinite if the ray in this direction from the robot misses the obstacle."""
     ray = pose.heading + direction
     to_x, to_y = obstacle.x - pose.x, obstacle.y - pose.y
     ahead = to_x * math.cos(ray) + to_y * math.sin(ray)
@@ -137,11 +129,11 @@ def distance_along(pose: Pose, direction: float, obstacle: Obstacle) -> float:
 def scan(
     pose: Pose, directions: list[float], obstacles: tuple[Obstacle, ...] = YARD, reach: float = 30.0
 ) -> list[float]:
-    """Return the distances that a laser on the robot measures; infinite beyond its range."""
+    """Infinite beyond the laser's range."""
     nearest = (min(distance_along(pose, direction, thing) for thing in obstacles) for direction in directions)
     return [distance if distance <= reach else math.inf for distance in nearest]
 
 
 def drained(charge: float, speed: float, seconds: float) -> float:
-    """Return the charge of the battery (1 is full) after driving at this speed for this number of seconds."""
+    """Return the charge (1 is full)."""
     return max(0.0, charge - (DRAIN_IDLE + DRAIN_MOVING * abs(speed)) * seconds)

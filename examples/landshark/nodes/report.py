@@ -18,7 +18,7 @@ QUIET = ("position",)  # it comes every second
 
 
 def report(event, **fields):
-    """Print one event with one write and no lock, because a signal handler may interrupt another report."""
+    """One write and no lock, because a signal handler may interrupt another report."""
     if os.environ.get("LANDSHARK_REPORTS") != "words":
         line = json.dumps({"event": event, **fields}, default=str)
     elif event in QUIET:
@@ -31,7 +31,6 @@ def report(event, **fields):
 
 
 def in_words(attack, succeeded, tried, answer):
-    """Describe an attack, its outcome and the answer in two lines."""
     text = next((part for part in answer if isinstance(part, str)), "")
     if answer and isinstance(answer[-1], dict):
         text = f"{answer[-1]['drivers']} drivers of the robot took its messages"

@@ -1,8 +1,6 @@
 """Run one of the LandShark's sensors as a node: `sensors.py gps`, `sensors.py laser`, `sensors.py battery`.
 
-Each simulated sensor subscribes to the odometry, where a real one would measure the world, and publishes its
-measurements: /landshark_gps on /landshark/gps, /landshark_laser on /landshark/scan, /landshark_battery on
-/landshark/battery.
+Each simulated sensor subscribes to the odometry, where a real one would measure the world.
 """
 
 import math
@@ -18,8 +16,6 @@ FIELD_OF_VIEW = math.radians(120)
 
 
 class Gps:
-    """The satellite navigation: latitude and longitude."""
-
     topic, kind = "/landshark/gps", NavSatFix
 
     def measure(self, odometry):
@@ -31,8 +27,6 @@ class Gps:
 
 
 class Laser:
-    """A range finder that looks ahead."""
-
     topic, kind = "/landshark/scan", LaserScan
 
     def measure(self, odometry):
@@ -47,8 +41,6 @@ class Laser:
 
 
 class Battery:
-    """The remaining charge."""
-
     topic, kind = "/landshark/battery", BatteryState
 
     def __init__(self):
@@ -71,7 +63,6 @@ SENSORS = {"gps": (Gps, 5.0), "laser": (Laser, 10.0), "battery": (Battery, 1.0)}
 
 
 def main():
-    """Measure until a signal ends the program."""
     arguments = rospy.myargv()[1:]
     if len(arguments) != 1 or arguments[0] not in SENSORS:
         sys.exit(f"usage: sensors.py {'|'.join(SENSORS)}")

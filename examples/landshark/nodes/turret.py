@@ -22,8 +22,6 @@ SHOTS = {
 
 
 class TurretDriver:
-    """The turret and its gun."""
-
     def __init__(self):
         self.lock = threading.Lock()
         self.turret = self.wanted = physics.Turret()
@@ -35,7 +33,6 @@ class TurretDriver:
         rospy.Subscriber("/landshark_control/trigger", PaintballTrigger, self.fire)
 
     def command(self, message):
-        """Store the wanted angles of the named joints."""
         angles = dict(zip(message.name, message.position))  # noqa: B905  a shorter list leaves joints alone
         with self.lock:
             self.wanted = physics.Turret(
@@ -52,7 +49,6 @@ class TurretDriver:
             self.shots.publish(fired)
 
     def step(self, seconds):
-        """Move the joints and publish their positions."""
         with self.lock:
             self.turret = physics.aim(self.turret, self.wanted, seconds)
             turret = self.turret
@@ -64,7 +60,6 @@ class TurretDriver:
 
 
 def main():
-    """Run until a signal ends the program."""
     rospy.init_node("landshark_turret")
     driver = TurretDriver()
     rate = rospy.Rate(HERTZ)
