@@ -1,8 +1,7 @@
-"""Write the page of audit events from the registry and from the calls that record events.
+"""Print docs/reference/audit-events.md, from the registry and from the calls that record events.
 
-`python -m distribution.audit_events_page` prints docs/reference/audit-events.md. A test compares the file with the
-output. The fields of `detail`, and severities that are missing in the registry, are read from the calls that record an
-event. Events whose names are computed (the log's own records, the actions of monitors) are in `ELSEWHERE`.
+The fields of `detail`, and severities that are missing in the registry, are read from these calls. Events whose names
+are computed (the log's own records, the actions of monitors) are in `ELSEWHERE`.
 """
 
 import ast
@@ -91,7 +90,6 @@ class EventUse(NamedTuple):
 
 
 def uses() -> Iterator[EventUse]:
-    """Yield every call in the program that records an event with a literal name."""
     root = Path(appliance.__file__).parent
     for path in sorted(root.rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
@@ -115,7 +113,7 @@ def _use(node: ast.Call, place: str) -> Iterator[EventUse]:
 
 
 def _texts(node: ast.AST) -> Iterator[str]:
-    """Yield the possible texts of an expression: a literal, or both literals of a conditional expression."""
+    """Yield a literal, or both literals of a conditional expression."""
     match node:
         case ast.Constant(value=str(text)):
             yield text

@@ -1,7 +1,4 @@
-"""Write the generated part of the page about audit records.
-
-`python -m distribution.audit_record_page` prints this part. A test compares it with the page.
-"""
+"""Print the generated part of the page about audit records: `python -m distribution.audit_record_page`."""
 
 import json
 import sys
@@ -32,7 +29,6 @@ CHAIN: dict[str, Any] = {
 
 
 def markdown() -> str:
-    """Return the generated part of the page."""
     lines = ["## Fields of a record", "", "| field | meaning |", "|---|---|"]
     lines += [f"| `{name}` | {text} |" for name, (_form, text) in FIELDS.items()]
     lines += [

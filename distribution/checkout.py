@@ -11,12 +11,12 @@ ROOT = Path(__file__).parents[1]
 
 
 def time_of_commit() -> int:
-    """Return the time of the newest commit in seconds since the epoch. All files of a build get this time."""
+    """In seconds since the epoch; all files of a build get this time."""
     return int(_git("log", "-1", "--format=%ct"))
 
 
 def revision() -> str:
-    """Return the newest commit, with the suffix `-changed` if files differ from the commit."""
+    """The suffix is `-changed` if files differ from the commit."""
     changed = _git("status", "--porcelain", "--untracked-files=no")
     return _git("rev-parse", "HEAD") + ("-changed" if changed else "")
 

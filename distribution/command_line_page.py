@@ -31,7 +31,7 @@ class _Command(NamedTuple):
 
 
 def page() -> str:
-    """Return the page as Markdown: shared options first, then each command."""
+    """Shared options come first, then each command."""
     found = [*_commands("rosrv", app), *_commands("rosmop", rosmop_app)]
     uses = Counter(option for one in found for option in one.options)
     shared = sorted(option for option, number in uses.items() if number >= _SHARED_BY)

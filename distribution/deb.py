@@ -2,9 +2,8 @@
 
     python -m distribution.deb amd64 arm64
 
-The tree of the package is made under build/package/ARCH, then debhelper packs it. All its times are that of the newest
-commit, so two builds of one commit are equal, byte by byte. DEBFULLNAME and DEBEMAIL name the maintainer, as for
-Debian's own tools.
+All times are that of the newest commit, so two builds of one commit are equal, byte by byte. DEBFULLNAME and DEBEMAIL
+name the maintainer, as for Debian's own tools.
 """
 
 import os
@@ -33,7 +32,7 @@ COMPLETIONS = {
     "zsh": "usr/share/zsh/vendor-completions/_rosrv",
     "fish": "usr/share/fish/vendor_completions.d/rosrv.fish",
 }
-"""Where each shell looks for the completion of a command that a package installs."""
+"""Where each shell looks for completions of a package."""
 _NO_ADDRESS = "maintainers@localhost"
 _LAUNCHER = """\
 #!/usr/lib/rosrv/bin/python -P
@@ -49,7 +48,7 @@ main()
 
 
 def build(architecture: Architecture, *, moment: int) -> Path:
-    """Build the package of this architecture with all times at `moment` (seconds since the epoch); return its path."""
+    """All times are at `moment` (seconds since the epoch)."""
     work = ROOT / "build/package" / architecture.debian
     shutil.rmtree(work, ignore_errors=True)
     source = work / "source"
@@ -127,7 +126,7 @@ def _gather(source: Path, architecture: Architecture, work: Path, moment: int) -
 
 
 def _make_virtual(library: Path) -> None:
-    """Make a virtual environment of Debian's interpreter, any of `INTERPRETERS`."""
+    """The environment is for Debian's interpreter, any of `INTERPRETERS`."""
     (library / "bin").mkdir()
     (library / "bin/python").symlink_to("/usr/bin/python3")
     (library / "pyvenv.cfg").write_text("home = /usr/bin\ninclude-system-site-packages = false\n")
@@ -174,7 +173,7 @@ def _missing_packages(architectures: list[str]) -> list[str]:
 
 
 def main(arguments: list[str]) -> int:
-    """Build for the given architectures, print each path and size; return exit status 1 with a message on failure."""
+    """Return exit status 1 with a message on failure."""
     unknown = [name for name in arguments if name not in ARCHITECTURES]
     if unknown or not arguments:
         sys.stderr.write(f"package: give architectures of {', '.join(ARCHITECTURES)}, not {unknown}\n")

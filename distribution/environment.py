@@ -4,8 +4,8 @@
     lib/python3.12/site-packages
     common                         files for all: each `site-packages` has a `common.pth` with its path
 
-The wheels are those of requirements.lock, by hash, for the given architecture. None of their code runs here.
-python-iptables comes as source. Its one C file needs only libc, and is compiled here.
+The wheels are those of requirements.lock, by hash. None of their code runs here. python-iptables comes as source; its
+one C file needs only libc, and is compiled here.
 """
 
 import filecmp
@@ -44,7 +44,7 @@ ARCHITECTURES = {
 
 
 def make_environment(target: Path, architecture: Architecture, work: Path) -> None:
-    """Write the tree to the new folder `target`. Raises `subprocess.CalledProcessError`, `ValueError`."""
+    """The folder `target` must be new. Raises `subprocess.CalledProcessError`, `ValueError`."""
     wheels, source = _split_lock((ROOT / "requirements.lock").read_text(), work)
     trees = [target / f"lib/python{version}/site-packages" for version in INTERPRETERS]
     for version, tree in zip(INTERPRETERS, trees, strict=True):
@@ -59,7 +59,7 @@ def make_environment(target: Path, architecture: Architecture, work: Path) -> No
 
 
 def _split_lock(lock: str, work: Path) -> tuple[Path, Path]:
-    """Write two lock files to `work`: packages with wheels, and packages as source."""
+    """Packages with wheels come first, then packages as source."""
     entries = re.split(r"\n(?=\S)", lock)
     own = [entry for entry in entries if entry.startswith(f"{_SOURCE_ONLY}==")]
     if len(own) != 1:

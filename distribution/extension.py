@@ -3,10 +3,9 @@
     python distribution/extension.py               # appliance/relay/transport/pump.abi3.so, for this machine
     python distribution/extension.py --sanitized   # build/extension/sanitized/pump.abi3.so, for the fuzzers
 
-Every build uses this file: `scripts/setup`, the wheel, the Debian package and the image. It needs gcc, the headers of
-libc and Python, and the locked Cython. It does nothing if the source, the options, Cython and Python are unchanged.
-
-The module uses only the stable interface of Python 3.11, so one file serves this and all later versions of Python.
+Every build uses this file. It needs gcc, the headers of libc and Python, and the locked Cython, and does nothing if
+they and the source are unchanged. The module uses only the stable interface of Python 3.11, so it serves all later
+versions.
 """
 
 import fcntl
@@ -25,7 +24,6 @@ SOURCE = Path("appliance/relay/transport/pump.pyx")
 IN_PLACE = ROOT / SOURCE.with_suffix(".abi3.so")
 SANITIZED = "sanitized"
 OLDEST = (3, 11)
-"""The oldest Python that can load the module."""
 _MODULE = ".".join(SOURCE.with_suffix("").parts)
 _HEADERS = Path(sysconfig.get_path("include"))
 _NATIVE: str = sysconfig.get_config_var("MULTIARCH")
@@ -48,11 +46,11 @@ _CHECKED = (
 
 
 class ExtensionError(Exception):
-    """The module cannot be built: the text says why, and what to do."""
+    """The module cannot be built: the text has the reason and the remedy."""
 
 
 def build(variant: str = _NATIVE) -> Path:
-    """Build the module for an architecture (`aarch64-linux-gnu`), or `SANITIZED` for this machine; return its path.
+    """For an architecture (`aarch64-linux-gnu`), or `SANITIZED` for this machine.
 
     Raises `ExtensionError`. Safe to run twice at once.
     """
@@ -70,7 +68,7 @@ def build(variant: str = _NATIVE) -> Path:
 
 
 def install() -> bool:
-    """Build the module for this machine and put it beside its source; return whether it changed."""
+    """Put the module beside its source; return whether it changed."""
     made = build()
     if IN_PLACE.exists() and filecmp.cmp(made, IN_PLACE, shallow=False):
         return False
@@ -141,7 +139,7 @@ def _run(command: list[str]) -> None:
 
 
 def main(arguments: list[str]) -> int:
-    """Build in place, or for the fuzzers; return exit status 1 with a message on failure."""
+    """Return exit status 1 with a message on failure."""
     if arguments not in ([], [f"--{SANITIZED}"]):
         sys.stderr.write(f"extension: the only option is --{SANITIZED}, not {' '.join(arguments)}\n")
         return 2

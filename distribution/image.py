@@ -1,12 +1,10 @@
 """`make image`: dist/rosrv-image_VERSION_ARCH.tar, for `docker load` and all OCI tools.
 
     python -m distribution.image [OPTIONS OF docker build …]
-
-The engine builds the target `appliance` of the Dockerfile with the Debian packages of image-packages.lock. Then the
-result is rewritten: no time in it is later than the newest commit, so that two builds of one commit can be equal. One
-layer is added, with the list of parts (`sbom`) and the origin of the build.
-
     python -m distribution.image lock BASE [OPTIONS …]     new image-packages.lock from Debian's present packages
+
+The engine's result is rewritten: no time in it is later than the newest commit, so that two builds of one commit can
+be equal. One layer is added, with the list of parts (`sbom`) and the origin of the build.
 """
 
 import hashlib
@@ -48,7 +46,7 @@ class Blob:
 
 
 def build(options: list[str], *, moment: int) -> tuple[Path, Path]:
-    """Build the image with times up to `moment` (seconds since the epoch); return the paths of image and list.
+    """Times are up to `moment` (seconds since the epoch); return the paths of image and list.
 
     Raises `subprocess.CalledProcessError`.
     """
@@ -68,7 +66,7 @@ def build(options: list[str], *, moment: int) -> tuple[Path, Path]:
 
 
 def lock(base: str, build_options: list[str]) -> None:
-    """Write image-packages.lock: the packages of the image that are not in its base image."""
+    """List the packages of the image that are not in its base image."""
     options = ["--quiet", "--target", "appliance", str(ROOT)]
     listed = "dpkg-query --show --showformat '${Package}=${Version}\\n'"
     before, after = (
@@ -147,7 +145,7 @@ def _blob(path: Path) -> Blob:
 
 
 def _settled(config: dict[str, Any], layers: list[Blob], moment: int) -> dict[str, Any]:
-    """Return the configuration for these layers, without values that the building engine set."""
+    """Leave out values that the building engine set."""
     created = datetime.fromtimestamp(moment, UTC).isoformat().replace("+00:00", "Z")
     history = [{**step, "created": created} for step in config["history"]]
     history.append(
@@ -175,7 +173,7 @@ def _settled(config: dict[str, Any], layers: list[Blob], moment: int) -> dict[st
 
 
 def _write_oci(image: Path, config: dict[str, Any], layers: list[Blob], moment: int) -> None:
-    """Write an OCI layout as one archive, with the manifest.json for `docker load`."""
+    """Include the manifest.json for `docker load`."""
     folder = layers[0].file.parent
 
     def document(name: str, content: Any) -> Blob:
@@ -227,7 +225,7 @@ def _docker(*arguments: str) -> str:
 
 
 def attempt(options: list[str]) -> tuple[Path, ...]:
-    """Build the image and print the result. Return an empty tuple if the engine fails."""
+    """Return an empty tuple if the engine fails."""
     try:
         made = build(options, moment=time_of_commit())
     except FileNotFoundError:
@@ -242,7 +240,7 @@ def attempt(options: list[str]) -> tuple[Path, ...]:
 
 
 def main(arguments: list[str]) -> int:
-    """Build the image, or, with `lock`, write a new list of its packages. Return the exit status."""
+    """Return the exit status."""
     if arguments[:1] == ["lock"]:
         lock(arguments[1], arguments[2:])
         return 0

@@ -30,7 +30,6 @@ The pages in \\fI/usr/share/doc/rosrv\\fR.
 
 
 def write_pages(directory: Path, date: str) -> None:
-    """Write `rosrv.1` and `rosrv-VERB.1` for each visible verb."""
     directory.mkdir(parents=True, exist_ok=True)
     for words, command, context in commands(("rosrv",), app):
         text = "".join(_page(" ".join(words), command, context, date))

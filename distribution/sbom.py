@@ -1,7 +1,4 @@
-"""List the parts of the image as CycloneDX: packages of Debian, Python and the console, with their licences.
-
-The list comes from the image's files: dpkg's list, the metadata of each Python package, the console's manifest.
-"""
+"""List the parts of the image as CycloneDX: packages of Debian, Python and the console, with their licences."""
 
 import json
 import posixpath
@@ -37,12 +34,12 @@ class ImageFiles:
         self._links: dict[str, str] = {}
 
     def wants(self, name: str) -> bool:
-        """Return whether `add` needs the content of this file."""
+        """Whether `add` needs the content of this file."""
         name = name.removeprefix("./")
         return any(fnmatchcase(name, pattern) for pattern in _READ)
 
     def add(self, name: str, data: bytes, *, link: str = "") -> None:
-        """Add an entry of the next layer; `link` is the target of a symbolic link."""
+        """`link` is the target of a symbolic link."""
         name = name.removeprefix("./")
         folder, _, last = name.rpartition("/")
         if last.startswith(".wh."):
@@ -56,17 +53,17 @@ class ImageFiles:
             self._links[name] = posixpath.normpath(posixpath.join(folder, link))
 
     def copyright(self, package: str) -> str:
-        """Return the copyright file of a Debian package, or an empty string."""
+        """Return an empty string if a Debian package has no copyright file."""
         folder = f"usr/share/doc/{package}"
         return self.texts.get(f"{self._links.get(folder, folder)}/copyright", "")
 
     def matching(self, pattern: str) -> Iterator[str]:
-        """Return the texts of all files that match, in order of their names."""
+        """In order of their names."""
         return (self.texts[name] for name in sorted(self.texts) if fnmatchcase(name, pattern))
 
 
 def make_sbom(tree: ImageFiles, *, architecture: str, moment: int) -> str:
-    """Return the list as JSON, equal for equal trees. `moment` is in seconds since the epoch."""
+    """Equal trees give equal JSON. `moment` is in seconds since the epoch."""
     itself = Component(
         name="rosrv/appliance", version=__version__, type=ComponentType.CONTAINER, bom_ref="rosrv/appliance",
         licenses=_licences(["Apache-2.0"]),
@@ -92,7 +89,7 @@ def _part(
 
 
 def _licences(names: Iterable[str]) -> list[License]:
-    """Return licences for CycloneDX: one expression, or a list of single licences."""
+    """Return one expression, or a list of single licences."""
     factory = LicenseFactory()
     made = [factory.make_from_string(name) for name in sorted(set(names))]
     return made if len(made) == 1 else [factory.make_with_name(name) for name in sorted(set(names))]

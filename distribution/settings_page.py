@@ -38,7 +38,7 @@ _TYPES = {
 
 
 def page() -> str:
-    """Return the page as Markdown: the keys outside sections, then each section."""
+    """Keys outside sections come first, then each section."""
     schema = TypeAdapter(Settings).json_schema()
     sections: list[tuple[str, dict[str, Any]]] = []
     top = _rows(schema, schema["$defs"], "", sections)

@@ -20,7 +20,7 @@ BESIDE = ("compose.yaml", "compose.host.yaml", "LICENSE", "docs", "ipsec", "moni
 
 
 def pack(parts: tuple[Path, ...], *, moment: int) -> Path:
-    """Pack these files of dist/ and `BESIDE` into one archive; return its path."""
+    """Include `BESIDE`."""
     files = {part.name: part for part in parts}
     for name in BESIDE:
         found = [path for path in (ROOT / name).rglob("*") if path.is_file()] or [ROOT / name]
@@ -43,7 +43,7 @@ def pack(parts: tuple[Path, ...], *, moment: int) -> Path:
 
 
 def main(arguments: list[str]) -> int:
-    """Build the image, then the archive. Return exit status 1 if the engine fails."""
+    """Return exit status 1 if the engine fails."""
     made = image.attempt(arguments)
     if made:
         sys.stdout.write(f"{pack(made, moment=time_of_commit()).relative_to(ROOT)}\n")

@@ -15,7 +15,6 @@ class ExtensionHook(BuildHookInterface[Any]):
     """Runs `distribution/extension.py`; the wheel is for this architecture and this version of glibc or newer."""
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:  # noqa: ARG002  hatch passes both
-        """Add the module to the files of the wheel, and set its tag."""
         subprocess.run([sys.executable, str(Path(self.root, "distribution/extension.py"))], check=True)
         libc = platform.libc_ver()[1].replace(".", "_")
         build_data["artifacts"].append(f"/{_MODULE}")
