@@ -102,7 +102,6 @@ class ResumeJournal:
 
 
 def append(descriptor: int, data: bytes) -> None:
-    """One `write` may take only a part. Raises `OSError`."""
     left = memoryview(data)
     while left:
         left = left[os.write(descriptor, left) :]

@@ -24,7 +24,6 @@ class JobRunner:
     def run(
         self, jobs: Sequence[Job], done: Callable[[int], None] = lambda _number: None
     ) -> Iterator[tuple[int, Result | Failure]]:
-        """Yield results in the order in which they end. Failures are not kept."""
         waiting: list[int] = []
         for number, job in enumerate(jobs):
             known = self.journal.result(packed(job)) if self.journal is not None else None

@@ -25,7 +25,6 @@ from rosmop.certify.words import ExpressionDerivatives
 MOST_STEPS = 200_000
 """The maximum number of (pair, event) combinations for one property."""
 MOST_WORK = 400_000
-"""The maximum number of clauses, or of parts of expressions, for one formula."""
 
 S = TypeVar("S", bound=Hashable)
 Verdicts = tuple[str, ...]

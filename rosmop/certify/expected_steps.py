@@ -15,7 +15,6 @@ HAPPENED, DROPPED, CHANGED, ELSEWHERE, RESET = 1, 2, 4, 8, 16
 NEVER, BEGAN = (1 << 63) - 1, 1_000
 
 States = dict[int, Any]
-"""The state of each property by its number. A property with a clock also has the clock's start and time."""
 
 
 @dataclass(frozen=True)

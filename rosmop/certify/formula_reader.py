@@ -73,7 +73,6 @@ class WordReader:
             raise UnsupportedFormulaError(f"{self.word!r} where {word!r} is expected")
 
     def duration(self) -> int:
-        """Take a number and its unit (default: seconds); return nanoseconds."""
         number = Decimal(self.take())
         if self.word in _NANOSECONDS:
             return int(number.scaleb(_NANOSECONDS[self.take()]))
@@ -105,7 +104,6 @@ MTL = (
     {**_NOT, **{word: word for word in ("previously", "once", "historically")}},
     ({"since": "since"}, *_BOOLEAN),
 )
-"""First the unary operators, then the binary operators from tightest to loosest."""
 
 Grammar = tuple[Mapping[str, str], Sequence[Mapping[str, str]]]
 

@@ -142,7 +142,6 @@ class FutureFollower:
         self._known.update({clause: clause in good for clause in ways})
 
     def _ways(self, clause: Clause, letter: int) -> set[Way]:
-        """Return the possible remainders with their postponed untils, without redundant remainders."""
         left = [(part, self._part_after(part, letter)) for part in clause]
         self._work -= 1
         if any(state == FALSE for _, state in left):
@@ -166,7 +165,6 @@ class FutureFollower:
 
 
 def _fulfils(group: set[Clause], ways: dict[Clause, set[Way]]) -> bool:
-    """Whether a trace can stay in these clauses forever and fulfil every `until`."""
     inside = [off for clause in group for after, off in ways[clause] if after in group]
     return bool(inside) and not frozenset.intersection(*inside)
 

@@ -22,7 +22,6 @@ class PastFollower:
         )
 
     def _file(self, node: Node) -> int:
-        """Return the number of a part, which is greater than those of its operands."""
         for operand in node[1:]:
             if isinstance(operand, tuple):
                 self._file(operand)

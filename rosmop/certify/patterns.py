@@ -60,7 +60,6 @@ def _event(word: str, events: Sequence[str]) -> Node:
 
 
 def _weak(left: Node, right: Node) -> Node:
-    """Return `left W right`: the right side releases the disjunction of both sides."""
     return ("release", right, ("or", left, right))
 
 

@@ -47,7 +47,6 @@ from rosmop.form.specification_groups import groups
 from rosmop.logics.interface import ClockedProperty, ClockedRun, FiniteProperty
 
 MOST = 100_000
-"""The maximum number of steps with pairs of events for one set."""
 
 _FEW = 16  # the number of states to try if the state does not matter
 _FUEL = 100_000  # for each message
@@ -85,7 +84,6 @@ def check_steps(compiled: Compiled, module: WasmModule) -> int:
 
 
 def _cases(topic: ExpectedTopic) -> Iterator[tuple[StepCase, int | None, bool]]:
-    """Yield cases, each with the property whose states are tried (or None), and whether all of them are tried."""
     for event, function in enumerate(topic.functions):
         happens = {function: HAPPENED}
         rows = [one for one in topic.steps[event] if one.number is not None]
@@ -138,7 +136,6 @@ def _pairs(topic: ExpectedTopic) -> Iterator[tuple[StepCase, int | None, bool]]:
 
 
 def _handling(one: PropertyStep) -> tuple[int, int] | None:
-    """Return a state from which the event leads to a handler, with the number of the property, or None."""
     if one.number is None or not isinstance(one.compiled, FiniteProperty):
         return None
     handled, automaton = {each.category for each in one.handlers}, one.compiled.automaton
@@ -187,7 +184,6 @@ class _Bench:
             self._memory[at : at + 20] = struct.pack("<I", len(_FRAME)) + _FRAME
 
     def run(self, case: StepCase, number: int | None, *, everywhere: bool) -> int:
-        """Return the number of tried states. Raises `StepDiffersError`."""
         one = None if number is None else self._topic.properties[number]
         states = 1 if one is None else one.states if everywhere else min(one.states, _FEW)
         for first in range(0, states, self._most):
@@ -222,7 +218,6 @@ class _Bench:
         self._count(case, one, expected)
 
     def _waits_no_more(self, number: int, state: Any, case: StepCase) -> bool:
-        """Whether the property's deadline would have passed before the message."""
         tables = self._topic.properties[number].compiled
         if not isinstance(tables, ClockedProperty) or tables.waits[state[0]] is None:
             return False

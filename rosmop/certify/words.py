@@ -9,7 +9,6 @@ from collections.abc import Iterable
 from rosmop.certify.formula_reader import Node, UnsupportedFormulaError, WorkLimitError
 
 LONGEST = 5_000
-"""The maximum number of symbols after powers are written out."""
 
 Parts = tuple[object, ...] | frozenset[int]
 
@@ -71,7 +70,6 @@ class ExpressionDerivatives:
         return self._number("not", (inner,), matches=not self._matching[inner])
 
     def _sequence(self, first: int, rest: int) -> int:
-        """Return a sequence that nests to the right, so that its first part is not a sequence."""
         if self._none in (first, rest):
             return self._none
         if first == self._nothing:
@@ -99,7 +97,6 @@ class ExpressionDerivatives:
         return self._number(kind, frozenset(flat), matches=quantor(self._matching[part] for part in flat))
 
     def _read(self, node: Node) -> tuple[int, int]:
-        """Return the number of an expression, and its number of symbols after powers are written out."""
         kind = str(node[0])
         if kind == "event":
             return self._number("event", (node[1],), matches=False), 1

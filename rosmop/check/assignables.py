@@ -109,7 +109,6 @@ class TimePartLvalue(Lvalue):
 
 
 def path(value: Value) -> tuple[object, ...]:
-    """Return the name of the variable, then indices and fields."""
     place = value.place
     if isinstance(place, VariableLvalue):
         alias = place.variable.alias

@@ -71,7 +71,6 @@ def marked(flag: str | None, change: nodes.Expression) -> nodes.Expression:
 
 
 def mark(scope: FunctionScope, target: Value) -> str | None:
-    """Note that this place changes. Return the flag to set at the change, if any."""
     variable = root(target)
     scope.changes = True
     if variable is None:

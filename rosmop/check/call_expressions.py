@@ -234,7 +234,6 @@ def _line(scope: FunctionScope, node: tree.CallExpression) -> Value:
 
 
 def stream_of(node: tree.Expression) -> str | None:
-    """Return the level of output to `std::cout` or `std::cerr`, or None for another expression."""
     if not isinstance(node, tree.BinaryExpression):
         return None
     while isinstance(node, tree.BinaryExpression) and node.operator == "<<":

@@ -35,7 +35,6 @@ def check_convertible(value: Value, target: Type) -> None:
 
 
 def refusal(source: Type, target: Type) -> str:
-    """Return the reason why the conversion is impossible, and the text to write instead."""
     text, moment = (
         (value_types.StringType, value_types.CharactersType),
         (value_types.TimeType, value_types.DurationType),

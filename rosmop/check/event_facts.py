@@ -106,7 +106,6 @@ def _event(scope: FunctionScope, node: tree.CallExpression, function: str) -> st
 
 
 def _asked(specification: tree.Specification) -> Iterator[tuple[str, str]]:
-    """Yield the facts that must be kept, with their events. In the action of its event, a sender need not be kept."""
     own = {function.name for function in specification.functions}
     for within in tree.fields_of(specification):
         for part in within if isinstance(within, tuple) else ():

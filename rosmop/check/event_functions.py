@@ -279,7 +279,6 @@ def _assemble(
     bound: list[PatternField],
     body: tuple[list[nodes.Statement], list[nodes.Statement], list[nodes.Statement]],
 ) -> tuple[int, bool]:
-    """Return the number of statements before the action, and whether facts about the event are kept."""
     conditions, action, after = body
     read_fields(scope, bound)  # at a site without parameters, because they have no values yet
     site = scope.lines.site = scope.site(event)

@@ -250,7 +250,6 @@ def assignment(scope: FunctionScope, node: tree.Assignment) -> tuple[order.First
 
 
 def _assigned(scope: FunctionScope, target: Value, value: Value, site: int) -> nodes.Expression:
-    """As in C++, a string can be assigned a character."""
     if isinstance(target.type, value_types.StringType) and value.type == value_types.CHAR:
         return nodes.Call(value_types.STRING, "t_byte", (value.form,))
     assignments.note_copy(target, value)

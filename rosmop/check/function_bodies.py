@@ -79,7 +79,6 @@ def _known(
     kind: value_types.Type,
     value_of: Callable[[FunctionScope, tree.TypeName, tree.Declarator, value_types.Type], _T | None],
 ) -> _T | None:
-    """Return a value, or None if it is not known yet. Compiling it reports its errors."""
     try:
         return value_of(scope, declaration.type, declarator, kind)
     except SpecificationError:
@@ -138,7 +137,6 @@ def _constants(
 
 
 def _constant(scope: FunctionScope, declarator: tree.Declarator) -> Value | None:
-    """Compile a first value, which reports its errors; return it if it is constant."""
     if declarator.is_array or declarator.value is None or isinstance(declarator.value, tree.InitializerList):
         return None
     try:

@@ -124,7 +124,6 @@ def with_given(identity: bytes, topics: tuple[GivenTopic, ...]) -> bytes:
 def read_at_start(
     shared: CompilationContext, names: SpecificationNames, specification: tree.Specification
 ) -> Iterator[Diagnostic]:
-    """Report first values and `init` that read a given constant, even in called functions."""
 
     def is_given(name: str) -> bool:
         if name in names.variables:

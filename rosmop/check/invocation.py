@@ -59,7 +59,6 @@ class MemberCall:
         return Value(self.called(kind, function, *arguments), self.position)
 
     def changes(self, value: nodes.Expression) -> Value:
-        """Assign the base a new value; the call itself is void."""
         require_place(self.base, f"`{self.name}`")
         stored = store(self.scope, self.base, value)
         return Value(nodes.Discard(stored), self.position)

@@ -57,7 +57,6 @@ class MessageCursor:
         self._elements: dict[tuple[int, int], MessageCursor | Spot] = {}
 
     def start_of(self, part: int) -> Spot:
-        """Return the position of a part, after writing the statements that find the preceding parts."""
         while len(self._starts) <= part:
             index = len(self._starts) - 1
             self._starts.append(self._locator.behind(self._layout.parts[index], self._starts[index]))

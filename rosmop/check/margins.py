@@ -25,7 +25,6 @@ _TRUE, _FALSE = (nodes.Literal(value_types.BOOL, truth) for truth in (True, Fals
 def noted(
     scope: FunctionScope, node: tree.BinaryExpression, left: Value, right: Value, value: Value
 ) -> Value:
-    """Note a comparison of numbers that are not both constant."""
     compare = value.form
     if (
         not scope.notes

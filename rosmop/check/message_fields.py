@@ -49,7 +49,6 @@ def writes(scope: FunctionScope, written: list[PatternField]) -> tuple[nodes.Wri
 
 
 def _slots(scope: FunctionScope, field: PatternField) -> list[int | str]:
-    """The parts of a time keep their names (`sec`, `nsec`), other steps are indices."""
     kind: Type = value_types.RecordType(scope.message_type or "")
     path: list[int | str] = []
     for step in field.binding.path:
@@ -66,7 +65,6 @@ def _slots(scope: FunctionScope, field: PatternField) -> list[int | str]:
 
 
 def read_fields(scope: FunctionScope, bound: list[PatternField]) -> None:
-    """Write the statements that find and read the used fields, and compare fields with constants."""
     layout = scope.messages.definitions.layout(scope.message_type or "")
     walk = MessageCursor(
         FieldLocator(scope.symbols, scope.lines.found, scope.lines.site), layout, Spot(None, 0)

@@ -40,7 +40,6 @@ def kept(scope: FunctionScope, value: nodes.Expression) -> tuple[First, nodes.Ex
 
 
 def settled(scope: FunctionScope, value: Value) -> tuple[First, Value]:
-    """Fix the indices of a place. A temporary is replaced by its value."""
     place = value.place
     if place is None:
         first, read = kept(scope, value.form)

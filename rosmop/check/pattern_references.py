@@ -227,7 +227,6 @@ def _is_reference(node: tree.SyntaxNode) -> bool:
 
 
 def _mapped(node: Any, change: Any) -> Any:
-    """Replace each node by `change(node)`, children first."""
     if isinstance(node, tuple):
         return tuple(_mapped(part, change) for part in node)
     if not isinstance(node, tree.SyntaxNode):

@@ -42,7 +42,6 @@ def _reached(behind: dict[str, set[str]], name: str) -> set[str]:
 
 
 def ordered(names: Sequence[str], phases: Phases) -> list[int]:
-    """Return the order of names: each is the first of the rest that no remaining one must precede."""
     places: dict[str, list[int]] = {}
     for place, name in enumerate(names):
         places.setdefault(name, []).append(place)

@@ -160,7 +160,6 @@ class OutputStream:
         self._precision: nodes.Expression | None = None
 
     def manipulated(self, node: tree.Expression, value: Value | None) -> bool:
-        """Return whether the node is a manipulator; `value` is the argument of `setprecision`."""
         parts = node.parts if isinstance(node, tree.Name) else ()
         name = parts[-1] if parts and parts[:-1] in ((), ("std",)) else ""
         if name in ("fixed", "defaultfloat", "scientific"):

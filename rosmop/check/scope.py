@@ -60,7 +60,6 @@ class SpecificationNames:
     variables: dict[str, Variable] = field(default_factory=dict)
     functions: dict[str, HelperFunction] = field(default_factory=dict)
     parameters: dict[str, Variable] = field(default_factory=dict)
-    """The parameters of slices, which are also variables."""
     misdeclared: set[str] = field(default_factory=set)
     """Names with rejected declarations; using them is not reported again."""
     events: list[str] = field(default_factory=list)
@@ -113,10 +112,8 @@ class CompilationContext:
         self.functions: dict[str, nodes.Function] = {}
         self.specifications: list[SpecificationNames] = []
         self.types: dict[str, Type] = {}
-        """By their names in the form."""
         self.owners: dict[str, list[SpecificationNames]] = {}
         self.unsliced: set[str] = set()
-        """The variables that slices share, by their names in the form."""
         self.findings: list[Diagnostic] = []
         self.publications: list[Publication] = []
         self.calls: list[Publication] = []
@@ -290,7 +287,6 @@ class FunctionScope:
 
     @contextmanager
     def nested(self) -> Iterator[list[nodes.Statement]]:
-        """Collect the statements written in the block separately."""
         outer, self.lines.found = self.lines.found, []
         try:
             yield self.lines.found
@@ -323,7 +319,6 @@ class FunctionScope:
 
 
 def names_in(node: object) -> Iterator[str]:
-    """Yield the names in a node, without those in nested statements."""
     waiting = [node]
     while waiting:
         current = waiting.pop()

@@ -27,7 +27,6 @@ _ACTS = (nodes.Log, nodes.Throttle, nodes.Drop, nodes.StopMessage, nodes.Publish
 def declare_parameters(
     shared: CompilationContext, names: SpecificationNames, specification: tree.Specification
 ) -> None:
-    """Declare the parameters as constant variables with a value for each slice."""
     for parameter in specification.parameters:
         try:
             kind = resolve(parameter.type, shared.messages)

@@ -140,7 +140,6 @@ def _compile_all(
 
 
 def _rewritten(shared: CompilationContext, specification: tree.Specification) -> tree.Specification:
-    """A specification with an invalid reference loses all such patterns."""
     rewritten = _noted(shared, partial(with_references, specification))
     return without_references(specification) if rewritten is None else rewritten
 

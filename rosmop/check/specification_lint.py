@@ -21,7 +21,6 @@ _WITHOUT_UNIT = re.compile(
     r"\b((?:within|timeout)\s+(\d+(?:\.\d+)?))(?![\d.]|\s*[num]?s\b|\s*(?:m|h|min|us)\b)"
 )
 _BOUND_WITHOUT_UNIT = re.compile(r"[\[,]\s*((\d+(?:\.\d+)?))(?=\s*[,\]])")
-"""A bound of time of `mtl` without a unit, as in `once[0,500]`."""
 _WORD = re.compile(r"[A-Za-z_][A-Za-z_0-9]*+")
 
 
@@ -31,7 +30,6 @@ class _HasProperty(Protocol):
 
 
 def lint_size(size: int, position: Position) -> Iterator[Diagnostic]:
-    """Report variables that are not kept, or whose size in bytes is not allowed."""
     if size > MAX_BYTES:
         text = f"the variables take {size} bytes; a specification may hold {MAX_BYTES >> 20} MiB"
         yield Diagnostic(position, "error", text)
@@ -126,7 +124,6 @@ def unused_events(specification: tree.Specification, properties: Sequence[_HasPr
 
 
 def lint_statements(specification: tree.Specification) -> Iterator[Diagnostic]:
-    """Warn about valid C++ that is probably a mistake: `if (v = 0.8)`, `x == 1;`."""
     for node in tree.walk(specification):
         if (
             isinstance(

@@ -113,7 +113,6 @@ def _rounded(name: str) -> Function:
 
 
 def _absolute_of_long(call: Arguments) -> Value:
-    """Take any number."""
     for value in call.values:
         require_number(value, "`labs`")
     call.values = [Value(number(value.form, value_types.LONG), value.position) for value in call.values]
@@ -165,7 +164,6 @@ def _finite(call: Arguments) -> Value:
 
 
 def _of_library(name: str, *wanted: str) -> Function:
-    """`wanted` describes each argument, as in `_FITS`."""
 
     def function(call: Arguments) -> Value:
         call.count(len(wanted))

@@ -78,7 +78,6 @@ def _is_copy(scope: FunctionScope, declarator: tree.Declarator, kind: value_type
 def table(
     scope: FunctionScope, name: tree.TypeName, declarator: tree.Declarator, kind: value_types.Type
 ) -> bytes | None:
-    """Return the elements of a `const` array of constant numbers as in a message, or None for other variables."""
     given = declarator.value
     if not (
         name.constant and isinstance(kind, value_types.VectorType) and isinstance(given, tree.InitializerList)

@@ -74,7 +74,6 @@ def _wrong_sender(function: str, text: str) -> str:
 
 
 def _always_dropped(event: tree.EventDefinition) -> Iterator[Diagnostic]:
-    """Warn of an event that drops every message, although its action has conditions."""
     decides = any(
         isinstance(node, tree.IfStatement | tree.SwitchStatement) for node in tree.walk(event.action)
     )
@@ -105,7 +104,6 @@ def _acts(statement: tree.Statement) -> bool:
 
 
 def _lost_changes(event: tree.EventDefinition) -> Iterator[Diagnostic]:
-    """Warn of a field that is assigned just before the message is dropped or replaced."""
     fields = {parameter.name for parameter in event.parameters}
     for block in tree.walk(event.action):
         if not isinstance(block, tree.Block):
@@ -168,7 +166,6 @@ def _bounds(
 def _unordered(
     condition: tree.Expression, names: frozenset[str] | set[str]
 ) -> Iterator[tree.BinaryExpression]:
-    """Yield comparisons that NaN passes, without conditions with a negation, which finds NaN."""
     parts = [node for node in tree.walk(condition) if isinstance(node, tree.Expression)]
     if any(isinstance(node, tree.UnaryExpression) and node.operator == "!" for node in parts):
         return

@@ -21,7 +21,6 @@ messages; the number (i64) of bytes of the message that are not shown to the mod
 """
 
 MOST_KEPT = 1024
-"""The maximum bytes of a string in a variable of the module."""
 
 MOST_KEPT_ARRAY = 16 << 10
 
@@ -78,7 +77,6 @@ class Cells:
     """By the address of a variable: where its elements are stored while the number (i32) at `generation` is 0."""
     generation: int = 0
     settle: int = 0
-    """The function that copies strings and arrays to these addresses."""
 
     @property
     def kept(self) -> Sequence[int]:
@@ -127,7 +125,6 @@ class CompiledModule:
     said: int
     """Address of the lines of output, each stored by its index in `lines`."""
     senders: Mapping[str, int]
-    """By context: the address of the sender of messages (`SENDER`)."""
 
 
 @dataclass(frozen=True, eq=False)

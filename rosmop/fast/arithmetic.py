@@ -118,7 +118,6 @@ class ArithmeticCodegen(FunctionBuilder):
         return code + I32_WRAP_I64 + _narrowed(target)
 
     def _truncated(self, code: bytes, target: value_types.IntegerType) -> bytes:
-        """Truncate a double toward zero, within the limits of the type."""
         if target.bits >= 32:
             return code + _TRUNCATE[64 if target.bits == 64 else 32, target.signed]
         code += I32_TRUNC_SAT_F64_S + self._set("cut")

@@ -118,13 +118,11 @@ from rosmop.runtime.values import ValueCodec
 from rosmop.types import value_types
 
 EFFECT = 4
-"""The address where the address of the last effect is stored."""
 
 MAX_EVENTS = 63
 MAX_VERDICTS = 63
 MAX_EFFECTS = 4096
 MAX_TABLES = 8 << 20
-"""The maximum number of bytes for the tables of all properties of a set."""
 
 PAGE = 1 << 16
 
@@ -138,12 +136,9 @@ class WasmModule(CompiledModule):
     budgets: Mapping[str, int]
     strings: Mapping[bytes, int]
     references: Sequence[range]
-    """Memory for the values of references that functions return."""
     handlers: Mapping[str, Sequence[int]]
-    """Numbers of the handlers of each topic's verdicts (`TopicCode.verdicts`)."""
     functions: int
     refused: Mapping[str, NotCompiledError]
-    """The reasons for topics that are not in the module."""
     left: Mapping[str, Sequence[NotCompiledError]]
     """By function: the places at which it leaves a message to the interpreter."""
     routines: Mapping[str, int]
@@ -360,7 +355,6 @@ class TopicCodegen:
         self._clocks = {number: self._following + 3 + 3 * place for place, number in enumerate(clocked)}
         """The local variables of each property with a clock: its start, its time, and its number of steps."""
         self._telling = self._following + 3 + 3 * len(clocked)
-        """The first of the local variables of handlers."""
 
     def _reads_in_place(self, event: nodes.Event) -> bool:
         body = self._writer.functions[event.function].body
@@ -459,7 +453,6 @@ class TopicCodegen:
         return self._cells.base + 8 * number
 
     def _clock_cells(self) -> Iterator[tuple[int, int, int]]:
-        """Yield each property with a clock, the local variable of its start, and the addresses of time and steps."""
         for number, local in self._clocks.items():
             clock = self._cells.clocks[number]
             for place, at in enumerate((clock, clock + 8, self._cells.exits[number])):

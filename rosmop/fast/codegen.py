@@ -105,7 +105,6 @@ _MOVES = {
 HAPPENED, DROPPED, CHANGED, RESET, REPLACED = 1, 2, 4, 16, 32
 
 EARLY = 16
-"""The first bytes of a message, in which the fields of a header begin."""
 
 MOST_SAFE = 1024
 
@@ -147,7 +146,6 @@ class ModuleCodegen(MemoryLayout):
         self.written: list[WasmFunction] = []
         self._numbers: dict[tuple[object, ...], WasmFunction] = {}
         self.left: dict[str, list[NotCompiledError]] = {}
-        """By function: the places where it leaves the message to the interpreter."""
 
     def leave(self, function: str, error: NotCompiledError) -> None:
         self.left.setdefault(function, []).append(error)
@@ -171,7 +169,6 @@ class ModuleCodegen(MemoryLayout):
         *,
         channel: str = "",
     ) -> WasmFunction:
-        """Write a function on first use. `context` names the budget that pays for it."""
         key = (function.name, tuple(parameters), result, context, channel)
         if key not in self._numbers:
             written = _FunctionCodegen(self, function, parameters, result, context, channel=channel).written()
@@ -222,7 +219,6 @@ class _FunctionCodegen(StringCodegen):
         self._writer = writer
         self._function = function
         self._references: dict[str, int] = {}
-        """By reference parameter: the address where its value is stored before the return."""
         self._result = result
         self._is_handler = answers and function.happens is None  # type: ignore[union-attr]  # was checked
         self._types = tuple(parameters.values())
@@ -234,7 +230,6 @@ class _FunctionCodegen(StringCodegen):
         self._changes_elements = False
         self._channel = channel
         self._safe: nodes.SafeMessage | None = None
-        """The safe message that may replace the message."""
         self._bits: tuple[tuple[str, int], ...] = ()
         """The bits of the result besides `HAPPENED`: local variables, and the shift of each."""
         if answers:
@@ -379,7 +374,6 @@ class _FunctionCodegen(StringCodegen):
         return constant(I32, 1) + self._set("dropped")
 
     def _stop(self, node: nodes.StopMessage) -> bytes:
-        """Replace the message by the safe one, of the same size."""
         safe = next((one for one in node.safes if one.topic == self._channel), None)
         if safe is None:
             raise NotCompiledError("publishes safe messages")
@@ -523,7 +517,6 @@ class _FunctionCodegen(StringCodegen):
         return store(machine, self._writer.variable(node.name, node.type), value)
 
     def _named_in_place(self, node: nodes.Assign) -> bytes:
-        """Give a vector or message within the current message a name; nothing is copied."""
         source, shared = root_of(node.value), self._writer.shared
         if not source or source in shared or node.name in shared:
             raise NotCompiledError.of(node.type)
@@ -559,7 +552,6 @@ class _FunctionCodegen(StringCodegen):
         return code
 
     def _slot(self, node: nodes.Expression, name: str, at: int) -> tuple[bytes, bytes, bytes]:
-        """Return code to run first, code that stores a value in the line, and the value's cost."""
         line = self._get("line")
         if is_text(node):
             first, place, count = self._elements(node)
@@ -752,7 +744,6 @@ class _FunctionCodegen(StringCodegen):
         return code + answer + RETURN
 
     def _handed(self, name: str, node: nodes.Expression) -> bytes:
-        """Assign the result and the values of the references to numbered local variables."""
         if not isinstance(node, nodes.Invoke):
             raise NotCompiledError.of(node.type)
         code, references = self._called(node)

@@ -148,7 +148,6 @@ class MessageAccess(ArithmeticCodegen):
         return first, self._get(name) + constant(I32, 4) + I32_ADD, length
 
     def _elements(self, node: nodes.Expression) -> tuple[bytes, bytes, bytes]:
-        """Return code to run first, the address of the first element, and the number of elements (i64)."""
         if isinstance(node, nodes.Copy):
             first, place, count = self._elements(node.value)
             element, size = self._layout.element(node.type)

@@ -20,7 +20,6 @@ from rosmop.types import value_types
 HEAD = struct.Struct("<II")
 
 BYTES = BYTES_PER_INSTRUCTION // 4
-"""The number of bytes of a string that cost one instruction."""
 
 _ADDRESS = 0xFFFFFFFF
 _PIECE = 512  # the maximum number of bytes that a formatted number takes

@@ -33,7 +33,6 @@ from rosmop.form import nodes
 from rosmop.runtime.action_context import BYTES_PER_INSTRUCTION, UNMEASURED
 
 ELSEWHERE = 8
-"""The result of an event or handler that leaves its message to the interpreter."""
 
 
 class FunctionBuilder(ABC):
@@ -105,7 +104,6 @@ class FunctionBuilder(ABC):
         return self._repeated(over + less + each, body)
 
     def _repeated(self, before: bytes, body: Sequence[nodes.Statement]) -> bytes:
-        """In an endless loop, `before` may leave the outer of the two blocks."""
         self._depth += 2
         self._loops.append(self._depth)
         code = before + self._block(body)

@@ -68,13 +68,10 @@ class MemoryLayout:
         self.shared = shared
         self.budgets: dict[str, int] = {}
         self.throttles: dict[tuple[str, int], int] = {}
-        """By specification and site: the address of the time when output was last due."""
         self.senders: dict[str, int] = {}
-        """By specification: the address of the sender of messages."""
         self.constants: dict[bytes, int] = {}
         self.strings: set[bytes] = set()
         self.references: list[range] = []
-        """Addresses of memory for the values of references that functions return."""
         self.lines: list[OutputLine] = []
         self._used = FIRST
         self.said = self.take(LINES)

@@ -26,7 +26,6 @@ class SlowPath:
 
 
 def slow_paths(compiled: Compiled) -> list[SlowPath]:
-    """Leave out messages with a fault or with due output, which always go to the interpreter."""
     module = written_of(compiled)
     found: dict[SlowPath, None] = {}
     channels = dict.fromkeys(
@@ -85,7 +84,6 @@ def _of_property(code: PropertyCode) -> str:
 
 
 def _called(compiled: Compiled, function: str) -> list[str]:
-    """Return a function and those that it calls, with the skippers that they use."""
     names = [function]
     for name in names:
         body = compiled.functions[name].body if name in compiled.functions else ()

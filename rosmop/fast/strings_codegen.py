@@ -184,12 +184,10 @@ class StringCodegen(MessageAccess):
 
 
 def turns(leave: bytes, *turn: bytes) -> bytes:
-    """Write a loop that ends when `leave` is true, or when an iteration leaves its block."""
     return BLOCK + LOOP + leave + br_if(1) + b"".join(turn) + br(0) + END + END
 
 
 def mismatch() -> bytes:
-    """Return the offset of the first difference of two addresses with a length (i32)."""
     one, other, size, at = (local_get(local) for local in range(4))
 
     def compared(read: bytes, differs: bytes) -> bytes:

@@ -11,7 +11,6 @@ FUNCTION_TYPE = b"\x60"
 EXPORTED_FUNCTION = b"\x00"
 EXPORTED_MEMORY = b"\x02\x00"
 LIMITED = b"\x01"
-"""The flag of a memory with a maximum size."""
 ACTIVE = b"\x00"
 
 NOTHING = b"\x40"

@@ -322,7 +322,6 @@ def failure(error: int, trap: int) -> Exception:
 
 
 def _kinds(vector: Any) -> list[Any]:
-    """Replace kinds other than integers by None."""
     found = vector.contents
     return [_KINDS.get(load().wasm_valtype_kind(found.data[number])) for number in range(found.size)]
 

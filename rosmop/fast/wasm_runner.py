@@ -177,7 +177,6 @@ class ModuleState:
 
     @property
     def parts(self) -> list[tuple[int, int]] | None:
-        """Return address and size of each part, or None if the state is more than numbers."""
         if not self.size:
             return None if self._strings else []
         return [(self._base, self._cells.size), *((address, _CLOCK.size) for address in self._clocked)]
@@ -227,7 +226,6 @@ def packed(prepared: BatchOptions) -> bytes:
 
 
 def _entered(memory: memoryview, value: Any, buffer: int, kind: Type) -> int:
-    """Write a string or array, and return its address, with the length from bit 32 on."""
     if len(value) > most_kept(kind):
         return BEYOND << 32
     if isinstance(kind, value_types.VectorType):
@@ -238,7 +236,6 @@ def _entered(memory: memoryview, value: Any, buffer: int, kind: Type) -> int:
 
 
 def _left(memory: memoryview, word: int, before: Any, kind: Type) -> Any:
-    """Read the string or array whose address and length are in `word`, or return `before` if it is not kept."""
     at, count = word & _ADDRESS, word >> 32
     if count == BEYOND:
         return before

@@ -31,15 +31,12 @@ class EventCode:
     service_type: str | None = None
     period_ns: int | None = None
     binds: tuple[int, ...] = ()
-    """The numbers of the specification's parameters that the event binds."""
     key: str = ""
     """The function that returns the values of these parameters, for an event on messages."""
     creates: bool = False
-    """Whether a slice may begin with the event."""
     plain: bool = False
     """The event has neither an action nor a `when`, so its key alone decides."""
     acts: bool = False
-    """The action does more than change the slice's own variables."""
 
     @property
     def channel(self) -> str | None:
@@ -168,7 +165,6 @@ class SpecificationCode:
     variables: Mapping[str, str]
     uses: frozenset[str]
     comparisons: tuple[Comparison, ...] = ()
-    """Comparisons whose margins are noted."""
     slicing: Slicing | None = None
     begins: bool = False
     """Whether the specification restarts if its state is lost, instead of holding its topics."""
@@ -193,7 +189,6 @@ class Compiled:
     calls: tuple[Publication, ...] = ()
 
     def alone(self, names: Collection[str]) -> "Compiled":
-        """Return a set like `part`, which does not depend on other specifications."""
         part = self.part(names)
         functions = {name: each for name, each in self.functions.items() if Symbols.owner(name) in names}
         safes = tuple(one.safes for one in part.specifications)
@@ -212,7 +207,6 @@ class Compiled:
         )
 
     def groups(self, names: Collection[str]) -> list[set[str]]:
-        """Return the groups that share variables, directly or indirectly, with one of `names`."""
         uses = {one.name: one.uses for one in self.specifications}
         return [group for group in sharing(uses) if not group.isdisjoint(names)]
 

@@ -12,7 +12,6 @@ def sharing(uses: Mapping[str, Collection[str]]) -> list[set[str]]:
 
 
 def connected(keys: Sequence[Iterable[object]]) -> Iterable[Sequence[int]]:
-    """Return groups of indices whose items share keys."""
     owners: dict[object, int] = {}
     chief = list(range(len(keys)))
 

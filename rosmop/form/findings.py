@@ -26,7 +26,6 @@ class Position:
 
 
 def line_of(text: str, number: int) -> str:
-    """Return a line by its number (from 1), without its comment."""
     lines = text.splitlines()[number - 1 : number]
     return lines[0].partition("//")[0].strip() if lines else ""
 

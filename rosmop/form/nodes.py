@@ -707,7 +707,6 @@ def moved(root: Any, sites: Mapping[int, int]) -> Any:
 
 
 PURE = "lib"
-"""The prefix of functions without effects."""
 
 
 def acts(root: Expression) -> bool:

@@ -61,7 +61,6 @@ class Symbols:
 
 
 def showing(kind: Type) -> Callable[[Any], object]:
-    """Return a function that makes values JSON for reports of faults."""
     if isinstance(kind, value_types.StringType | value_types.CharactersType):
         return lambda value: _short(value[:200].split(b"\0")[0].decode("utf-8", "replace"))
     if isinstance(kind, value_types.TimeType | value_types.DurationType):

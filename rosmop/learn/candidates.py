@@ -63,7 +63,6 @@ class Candidate:
     events: Mapping[str, tuple[str, str]] = field(default_factory=dict)
     """For an order of topics: topic and pattern of each event."""
     alarms: int = 0
-    """The number of alarms on the held-out recordings."""
     widened: str = ""
 
     @property
@@ -85,7 +84,6 @@ class LearntFacts:
 
     types: Mapping[str, str]
     fields: Mapping[str, Mapping[str, str]]
-    """By topic: the types of the fields that are read."""
     rhythms: Mapping[str, TopicRhythm]
     contents: Mapping[str, TopicContent]
     orders: TopicOrders
@@ -118,7 +116,6 @@ class LearntFacts:
 
 
 _WHOLE_NUMBERS = (-(1 << 63), (1 << 63) - 1), (-(1 << 63), (1 << 64) - 1)
-"""The least and the greatest bound of signed and unsigned fields."""
 
 # Path, element and length of an array, and the statistics of its values
 _Place = tuple[str, int | None, int | None, Series]

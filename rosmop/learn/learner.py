@@ -53,9 +53,7 @@ class LearningResult:
     trained: tuple[LearnedSpan, ...]
     held_out: tuple[LearnedSpan, ...]
     skipped: tuple[str, ...]
-    """Topics whose type cannot be read, with the reason."""
     failed: Mapping[int, str]
-    """By number: why recordings were not, or only partly, learnt from."""
 
 
 def learn(

@@ -30,7 +30,6 @@ def rounded_down(value: float, width: float) -> str:
 
 
 def number(value: float) -> str:
-    """Write an integer as an integer."""
     text = repr(value)
     if isinstance(value, int) and value >= 1 << 63:
         return f"{text}u"  # only an unsigned type holds it

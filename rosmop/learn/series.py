@@ -49,7 +49,6 @@ class ValueSeries(msgspec.Struct):
     windows: dict[Any, int] = {}
     many: bool = False
     last: dict[Any, int] = {}
-    """The last window with each value, until the recording ends."""
 
     def add(self, value: Any, window: int) -> None:
         if self.many or self.last.get(value) == window:

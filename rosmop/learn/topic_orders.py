@@ -30,7 +30,6 @@ class TopicPair(msgspec.Struct):
     """The first message without a later message of the second topic, until the recording ends."""
     last: int | None = None
     seconds: int = 0
-    """The number of messages of the second topic since the last message of the first."""
     started: bool = False
 
     def end(self) -> None:

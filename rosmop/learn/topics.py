@@ -10,10 +10,8 @@ from rosmop.learn.field_values import Fields
 from rosmop.learn.series import HighestValues, Series, ValueSeries, merged_rows
 
 MOST_SINGLE = 6
-"""The longest array of constant length that has a series for each element."""
 
 MOST_GAPS = 5000
-"""The number of gaps from which the median of all recordings is calculated."""
 
 _IN_STEP = 60.0  # seconds from a stamp to its reception; longer times mean clocks of different robots
 
@@ -27,14 +25,12 @@ class TopicRhythm(msgspec.Struct):
     some: dict[int, list[int]] = {}
     """By the first window of each part of a recording: gaps in nanoseconds, for the median."""
     last: int | None = None
-    """The time of the last message, until the recording ends."""
 
     def begin(self, recording: int, first_window: int) -> None:
         self.recordings.add(recording)
         self.some[first_window] = []
 
     def add(self, time: int, window: int, most: int) -> None:
-        """Add a time, and its gap if there are not yet `most`."""
         self.count += 1
         if self.last is not None:
             gap = time - self.last
@@ -56,7 +52,6 @@ class TopicRhythm(msgspec.Struct):
 
     @property
     def period(self) -> float:
-        """Return the usual interval in seconds, or a nanosecond if it is unknown."""
         gaps = [gap for some in self.some.values() for gap in some]
         return max(statistics.median(gaps) if gaps else 0.0, 1.0) / 10**9
 
@@ -70,16 +65,13 @@ class TopicContent(msgspec.Struct):
 
     numbers: dict[str, Series] = {}
     elements: dict[str, list[Series]] = {}
-    """The series of arrays that always have the same, small length."""
     sets: dict[str, ValueSeries] = {}
     lengths: dict[str, ValueSeries] = {}
     moves: dict[str, dict[tuple[Any, Any], int]] = {}
-    """For fields with few values: the number of windows in which one value followed another."""
     ages: HighestValues = msgspec.field(default_factory=HighestValues)
     leads: HighestValues = msgspec.field(default_factory=HighestValues)
     counts: HighestValues = msgspec.field(default_factory=HighestValues)
     backward: bool = False
-    """Whether some message had an earlier stamp than the previous one."""
 
     def merged(self, other: "TopicContent") -> "TopicContent":
         result = TopicContent(
@@ -95,7 +87,6 @@ class TopicContent(msgspec.Struct):
         return result
 
     def limit(self) -> None:
-        """Leave out the elements of arrays with several lengths, and the moves of fields with many values."""
         for path in [path for path in self.elements if len(self.lengths[path].windows) != 1]:
             del self.elements[path]
         for path in [path for path in self.moves if self._values(path).many]:

@@ -123,7 +123,6 @@ def _coarsest_partition(automaton: Automaton) -> list[int]:
 def _smaller_halves(
     blocks: list[set[int]], cut: int, queued: set[tuple[int, int]], letters: int
 ) -> list[tuple[int, int]]:
-    """Return the splitters to process after block ``cut`` lost its members to the last block."""
     fresh = len(blocks) - 1
     small = fresh if len(blocks[fresh]) <= len(blocks[cut]) else cut
     return [(fresh if (cut, letter) in queued else small, letter) for letter in range(letters)]

@@ -74,7 +74,6 @@ class FormulaCell:
         return self.value is None and bool(self.tells or self.users)
 
     def hear(self, value: bool) -> bool | None:
-        """Take the value of an operand; return the cell's value, or None if it is still open."""
         self.touch()
         self.missing -= 1
         if self.kind == "not":
@@ -86,7 +85,6 @@ class FormulaCell:
 
 Value = bool | FormulaCell
 Journal = dict[FormulaCell, tuple[Any, ...]]
-"""The earlier content of the cells that changed since the last mark."""
 
 
 def _known(value: Value) -> bool | None:
@@ -305,7 +303,6 @@ class _OpenUntil(_Rows):
             self._look(begins, [(best[0] - self.low + 1, 0), (time, place + 1)])
 
     def _look(self, begins: list[_Mark], ends: list[_Mark]) -> None:
-        """Decide the certain rows from the latest of `begins` to the earliest of `ends`."""
         begin = bisect_left(self.pending, max(begins))
         end = max(begin, bisect_left(self.pending, min(ends)))
         self.pending[begin:end] = [entry for entry in self.pending[begin:end] if not self._decided(entry[2])]
@@ -323,7 +320,6 @@ class _OpenUntil(_Rows):
         return True
 
     def _value(self, row: _Row, goods: _Marks, bads: _Marks) -> bool:
-        """Return whether a mark of `goods` is within the bounds, and not after the first of `bads`."""
         good = _first(goods, (row.time + self.low, row.place))
         if good is None or good[0] > row.time + self.high:
             return False
@@ -493,7 +489,6 @@ class BoundedProperty(CompiledProperty):
         super().__init__(source, VERDICTS)
         self.program = program = PastProgram(formula, source.events)
         self.later: set[int] = set()
-        """The instructions whose values may become known after their event."""
         for number, instruction in enumerate(program.instructions):
             if instruction.operator in _LATER or not self.later.isdisjoint(instruction.operands):
                 self.later.add(number)
@@ -501,7 +496,6 @@ class BoundedProperty(CompiledProperty):
         at_once = sorted(asked - self.later)
         self.folded = fold(program, at_once)
         self.at_once = {number: index for index, number in enumerate(at_once)}
-        """Operands of `later` that are known at their event, with their index in `folded`."""
         self.order = {
             number: sorted(program.instructions[number].operands, key=self.later.__contains__)
             for number in self.later
@@ -512,7 +506,6 @@ class BoundedProperty(CompiledProperty):
         return BoundedRun(self, time_ns)
 
     def operators(self, run: "BoundedRun") -> dict[int, _Operator]:
-        """Return new operators for values that may be decided later, the outermost first."""
         found: dict[int, _Operator] = {}
         for number in sorted(self.later, reverse=True):
             instruction = self.program.instructions[number]
@@ -546,7 +539,6 @@ class BoundedProperty(CompiledProperty):
 
 
 _CONTAINERS = (deque, list, dict, SinceWindow)
-"""The attributes that a step changes in place."""
 
 _KINDS: dict[str, type[_Operator]] = {
     "until": _OpenUntil,
@@ -557,7 +549,6 @@ _KINDS: dict[str, type[_Operator]] = {
 
 
 _FORWARD = (_Until, _OpenUntil, _Next)
-"""The operators that keep only waiting events (`rows`)."""
 
 
 class BoundedRun:
@@ -677,7 +668,6 @@ class BoundedRun:
         return cell if cell.missing else _together(kind, cell.operands)
 
     def decide(self, cell: FormulaCell | None, value: bool) -> None:
-        """The cell is None if it is unused."""
         if cell is not None and cell.value is None:
             cell.touch()
             cell.value = value

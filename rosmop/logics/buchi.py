@@ -50,7 +50,6 @@ class Automata:
         return self._choices(FormulaTranslation(self._nodes, atoms).node(formula, True))
 
     def _choices(self, node: int) -> Sets:
-        """Return obligation sets without conjunctions and disjunctions."""
         known = self._chosen.get(node)
         if known is None:
             known = self._chosen[node] = self._find_choices(node)
@@ -179,7 +178,6 @@ class Automata:
         )
 
     def _possible(self, state: Obligations) -> int:
-        """Return a bit set of the letters that no single node excludes."""
         letters = self._nodes.everything
         for node in _members(state):
             kind, parts = self._nodes[node]

@@ -10,7 +10,6 @@ from rosmop.logics.interface import Source
 from rosmop.logics.lexer import FormulaToken, TokenReader, describe, suggestion
 
 MAX_SYMBOLS = 20_000
-"""The limit of all right sides together."""
 
 Rule = tuple[int, tuple[int, ...]]
 
@@ -214,7 +213,6 @@ def _closure(rules: list[Rule], terminals: int) -> set[int]:
 
 
 def _substantial(rules: list[Rule], terminals: int) -> set[int]:
-    """Return the nonterminals that derive more than the empty word; all rules must be productive."""
     users: dict[int, list[int]] = {}
     waiting = []
     for head, body in rules:

@@ -12,9 +12,7 @@ from rosmop.logics.interface import FiniteProperty, Source
 from rosmop.logics.lexer import TokenReader
 
 MAX_SYMBOLS = 5_000
-"""The limit after powers are expanded."""
 MAX_WORK = 8_000_000
-"""The limit of the operands of all derivatives together."""
 
 
 class TooMuchWorkError(Exception):

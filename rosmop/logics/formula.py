@@ -55,7 +55,6 @@ class Syntax:
     levels: tuple[Level, ...]
     bounded: frozenset[str] = frozenset()
     refused: Mapping[str, str] = field(default_factory=dict)
-    """Spellings of other logics, and the spelling to write instead."""
 
     def signs(self) -> list[str]:
         spellings = [*BOOLEAN_SIGNS, "[", "]", ",", *self.unary, *self.refused]
@@ -102,7 +101,6 @@ class _FormulaReader:
         return self._expression(len(self._syntax.levels) - 1, depth)
 
     def _expression(self, limit: int, depth: int) -> Formula:
-        """Read operands joined by operators that bind at least as tightly as ``limit``."""
         left = self._unary(depth)
         joined = -1
         while (strength := self._strength.get(self._tokens.token.text, limit + 1)) <= limit:
@@ -189,5 +187,4 @@ class _FormulaReader:
 
 
 def boolean_levels(temporal: Sequence[Level]) -> tuple[Level, ...]:
-    """Return the levels of boolean operators after temporal ones; implications do not chain."""
     return (*temporal, Level(AND, "flat"), Level(XOR, "flat"), Level(OR, "flat"), Level(IMPLIES, "once"))

@@ -31,7 +31,6 @@ class StateMachineText:
         return [*self.states, FAIL]
 
     def verdict(self, state: str) -> tuple[str, ...]:
-        """Return the state itself, then its aliases in source order."""
         return (state, *(alias for alias, members in self.aliases.items() if state in members))
 
     def categories(self) -> list[str]:

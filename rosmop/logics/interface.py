@@ -94,7 +94,6 @@ class CompiledProperty(ABC):
     """A compiled property; ``categories`` are the names that may have handlers."""
 
     timed = False
-    """Whether runs may have a deadline."""
 
     expiry = "deadline"
     """The name of a passed deadline in records (``timeout`` for machines)."""
@@ -202,7 +201,6 @@ class FiniteRun(UntimedRun):
 
 
 Move = tuple[int, bool]
-"""The next state, and whether the clock restarts."""
 
 
 class Wait(NamedTuple):
@@ -316,4 +314,3 @@ class Logic:
     has_states: bool = False
     """Whether coverage counts states, and formulas may write `default` for all events."""
     implicit_events: tuple[str, ...] = ()
-    """The events that a property uses although its formula does not name them."""

@@ -35,7 +35,6 @@ class FormulaToken:
 
 
 def tokenize(source: Source, signs: Sequence[str]) -> list[FormulaToken]:
-    """Return the tokens; the longest matching sign is taken, and the last token is ``end``."""
     if len(source.text) > MAX_CHARACTERS:
         raise source.error(
             0, f"a formula of more than {MAX_CHARACTERS} characters; split it into several properties"
@@ -131,7 +130,6 @@ class TokenReader:
         return self.source.error(self.token.offset, f"expected {what}, found {describe(self.token)}")
 
     def note(self, token: FormulaToken, text: str) -> None:
-        """Note an error, so that one pass finds as many as possible."""
         if len(self.findings) < 20:
             self.findings.append(self.source.finding(token.offset, text))
 

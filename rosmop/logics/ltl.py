@@ -83,7 +83,6 @@ def compile_ltl(source: Source) -> FiniteProperty:
 
 
 def _settled(for_it: Sets, against_it: Sets) -> tuple[Sets, Sets]:
-    """Return both sides; once the verdict is certain, the other side gets a common placeholder."""
     if not for_it:
         return frozenset(), _SOMETHING
     if not against_it:

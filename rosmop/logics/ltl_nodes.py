@@ -36,7 +36,6 @@ class FormulaNodes:
         return parts[0] if kind == "letters" else None
 
     def join(self, kind: str, operands: Iterable[int]) -> int:
-        """Return a flat node, in which letters are one operand."""
         mask = self.everything if kind == "and" else 0
         absorbing = 0 if kind == "and" else self.everything
         parts: set[int] = set()
@@ -109,7 +108,6 @@ class FormulaTranslation:
         return self._nodes.letters(mask if positive else everything & ~mask)
 
     def _temporal(self, operator: str, parts: list[int], positive: bool) -> int:
-        """The parts are already negated if necessary."""
         nodes = self._nodes
         if operator == "next":
             return nodes.next(parts[0])

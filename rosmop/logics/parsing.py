@@ -29,7 +29,6 @@ MAX_WIDTH = 4_000
 MAX_STEP_WORK = 300_000
 """The items that one step may complete, in a fraction of a second."""
 MAX_DEPTH = 1_000_000
-"""The deepest nesting of the trace."""
 KEPT_SHAPE_WIDTH = 8
 KEPT_SHAPE_ITEMS = 400
 KEPT_ENTRIES = 20_000
@@ -143,7 +142,6 @@ class EarleyRecogniser:
     def _complete_wide(
         self, shape: EarleyShape, conts: Conts, before: EarleySet, *, accepted: bool
     ) -> tuple[EarleyShape, Conts, bool]:
-        """Complete continuations without tables, for the large frames of ambiguous grammars."""
         items = {(item, conts[reference]) for item, reference in shape.items}
         waiting = [conts[reference] for reference in shape.done]
         completed = set(waiting)
@@ -213,7 +211,6 @@ class EarleyRecogniser:
         return known
 
     def _closure(self, shape: EarleyShape) -> tuple[dict[int, set[Entry]], dict[int, set[Entry]]]:
-        """Return, for each nonterminal and event, the items that wait for it (also predicted ones), advanced by it."""
         if shape.waiters is not None:
             return shape.waiters
         waiters: dict[int, set[Entry]] = {}
@@ -237,7 +234,6 @@ class EarleyRecogniser:
         return shape.waiters
 
     def _skip_nullable(self, item: int) -> list[int]:
-        """Return an item with the items after each next symbol that may be empty."""
         items = [item]
         while self._next[item] in self._nullable:
             item += 1
@@ -245,7 +241,6 @@ class EarleyRecogniser:
         return items
 
     def _complete(self, shape: EarleyShape, entries: set[Entry]) -> Step:
-        """Complete the items; completed continuations outside the frame are ``done``."""
         waiters, _ = self._closure(shape)
         items: set[Entry] = set()
         done: set[int] = set()
@@ -283,7 +278,6 @@ class EarleyRecogniser:
     def _join(
         self, shape: EarleyShape, conts: Conts, index: int, other: EarleyShape, others: Conts
     ) -> tuple[EarleyShape, Conts]:
-        """Return the union of two sets, without ``index`` in ``done``."""
         place = {cont: number for number, cont in enumerate(conts)}
         mapping = tuple(place.get(cont, -1) for cont in others)
         key = (shape, index, other, mapping)

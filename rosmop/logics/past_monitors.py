@@ -111,7 +111,6 @@ class PastProgram:
 
 
 _OF_ONE = {"once": "since", "historically": "since", "eventually": "until", "always": "until"}
-"""Operators that equal another one with `true` as its left operand."""
 
 
 Operation = tuple[str, int, int, int, int]
@@ -120,7 +119,6 @@ Operation = tuple[str, int, int, int, int]
 An `event` has the event's number in place of the first operand.
 """
 Residue = tuple[tuple[Operation, ...], tuple[int, ...]]
-"""The operations at an event, and the places of the requested values."""
 
 
 @dataclass(frozen=True)

@@ -62,7 +62,6 @@ def analyse(compiled: CompiledProperty, handled: Sequence[str]) -> list[Property
 
 
 def shortest_trace_to(compiled: CompiledProperty, category: str) -> tuple[str, ...] | None:
-    """Return a shortest trace to a category, or None if none is known."""
     graph = graph_of(compiled)
     return None if graph is None else _shortest_traces(graph).get(category)
 
@@ -84,7 +83,6 @@ def _shortest_traces(graph: VerdictGraph) -> dict[str, tuple[str, ...]]:
 
 
 def graph_of(compiled: CompiledProperty) -> VerdictGraph | None:
-    """Return the graph, or None if the states are not known to be finite."""
     if isinstance(compiled, FiniteProperty):
         automaton = compiled.automaton
         labels = [(event,) for event in compiled.events]

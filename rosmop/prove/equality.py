@@ -57,13 +57,10 @@ from rosmop.types.value_types import Type
 EQUAL = "equal"
 IN_PYTHON = "not compiled: Python evaluates the messages of this topic"
 PATIENCE = 30.0
-"""The default time for each event, in seconds."""
 
 _TOGETHER = 0.2
-"""The part of the time in which all conditions are asked at once."""
 
 _UNROLLED = (1, 2, 3)
-"""Iterations of each loop in which a difference is looked for."""
 
 _NOW, _REST = 16, 32  # addresses of the time and of the number of bytes that are not shown
 _HAPPENED, _DROPPED, _CHANGED, _ELSEWHERE, _REPLACED = 1, 2, 4, 8, 32
@@ -223,7 +220,6 @@ class Validation:
         return names | {self._module.budgets[context]: BUDGET_SLOT}
 
     def _spans(self, begin: StartTerms) -> Sequence[ReadableBytes]:
-        """Return the bytes of arrays of numbers: constants, and those of variables."""
         spans = [
             ReadableBytes(integer(at, 32), integer(len(raw), 64), z3.BoolVal(True))
             for raw, at in self._module.strings.items()
@@ -276,7 +272,6 @@ class Validation:
         return answer, solver.model() if answer == z3.sat else None
 
     def _beginning(self) -> tuple[StartTerms, dict[int, Term], list[Term]]:
-        """Return the initial state of every event, the same state as cells of the module, and the constraints on it."""
         now, size = z3.BitVec("now", 64), z3.BitVec("size", 32)
         known = [now >= 0, now < _LATEST, z3.ULE(size, AREA)]
         cells: dict[int, Term] = {_NOW: now, _REST: integer(0, 64)}
@@ -328,7 +323,6 @@ class Validation:
 
 
 def _holds(conditions: Sequence[Term], guess: Any) -> bool:
-    """Check a guess with the true results of costly operations."""
     values = [
         (declaration(), guess[declaration]) for declaration in guess.decls() if declaration.arity() == 0
     ]

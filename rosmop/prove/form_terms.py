@@ -79,7 +79,6 @@ _LOOPS: Mapping[type[nodes.FormNode], str] = MappingProxyType(
         nodes.Skip: "a field comes after strings or arrays in an array",
     }
 )
-"""The reasons why the number of steps depends on the message."""
 
 
 class UnknownError(Exception):

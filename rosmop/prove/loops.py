@@ -222,7 +222,6 @@ def _joined(states: Sequence[State]) -> State:
 
 
 def become(state: State, states: Sequence[State]) -> State:
-    """Make `state` the point where these states meet."""
     end = _joined(states)
     state.alive, state.slots = end.alive, end.slots or state.slots
     return state

@@ -390,7 +390,6 @@ class ModuleExecution:
         return place
 
     def _span(self, address: Any) -> ReadableBytes | None:
-        """Return the bytes from whose begin the address is calculated."""
         if not isinstance(address, z3.ExprRef):
             return None
         return next((one for one in self._spans for part in _summands(address) if part.eq(one.begin)), None)

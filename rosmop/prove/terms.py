@@ -17,7 +17,6 @@ Term = Any
 DOUBLE, SINGLE = z3.Float64(), z3.Float32()
 NEAREST = z3.RNE()
 AT = z3.BitVec("at", 32)
-"""The address of the message in the memory."""
 FRAME = z3.BitVec("position", 32)
 MEMORY = z3.Array("memory", z3.BitVecSort(32), z3.BitVecSort(8))
 """The bytes of constants and of arrays in variables, which an event does not change."""
@@ -25,7 +24,6 @@ MEMORY = z3.Array("memory", z3.BitVecSort(32), z3.BitVecSort(8))
 MISMATCH = z3.Function("mismatch", *[z3.BitVecSort(32)] * 4)
 """The place of the first difference of two strings (addresses and length), or the length; not translated."""
 SECONDS = z3.Function("seconds", z3.BitVecSort(64), DOUBLE)
-"""A time as seconds; not translated."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +54,6 @@ def integer(value: int, bits: int) -> Term:
 
 
 def floating(value: float, bits: int) -> Term:
-    """Return a constant that is exact to the last bit."""
     number = int.from_bytes(struct.pack("<d" if bits == 64 else "<f", value), "little")
     return z3.simplify(z3.fpBVToFP(integer(number, bits), DOUBLE if bits == 64 else SINGLE))
 

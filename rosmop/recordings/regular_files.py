@@ -8,7 +8,6 @@ from pathlib import Path, PosixPath
 from typing import BinaryIO
 
 LARGEST_CHUNK = 256 << 20
-"""The most bytes of one read, and of an unpacked chunk."""
 _LONGEST_LINE = 64
 _NULL = os.makedev(1, 3)  # /dev/null: an empty file
 _KINDS = {

@@ -189,7 +189,6 @@ def _outcome(  # noqa: PLR0917  a message and its facts
 
 
 def _after(started: Outcome, outcome: Outcome) -> Outcome:
-    """The output of `init` comes before the first message."""
     shift = len(started.published)
     outcome.judged = {**started.judged, **{shift + number: one for number, one in outcome.judged.items()}}
     outcome.handling = {

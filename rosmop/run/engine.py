@@ -50,7 +50,6 @@ from rosmop.runtime.wire import Buffer, WireMessage
 from roswire.definitions import Definitions
 
 GivenValues = Mapping[str, Mapping[str, bool | int | float | str]]
-"""By specification and name."""
 
 _CHANGED = "its text, or the definition of a message, has changed, and its state is lost"
 
@@ -184,15 +183,12 @@ class MonitorSet:
         self._holds = True
         self._types = types_of(compiled)
         self._beginnings: dict[str, bytes] = {}
-        """The known initial states of the monitors that guard topics, as returned by `shape`."""
         self.steps: dict[str, tuple[Step, ...]] = {}
         self._place_of = {name: place for place, name in enumerate(self.names)}
         self._places: dict[str, list[int]] = {}
-        """The places of the specifications of `steps`, in the order of all specifications."""
         self._contexts: dict[str, tuple[Context, ...]] = {}
         self._withheld: dict[str, list[tuple[MonitorInstance, Withholding]]] = {}
         self._silent: dict[str, BatchOptions] = {}
-        """The options for `judge`, by topic and source."""
         self._execution = MonitorExecution(self.interpreter, on_fault, self._guards.judging)
         self._agenda = Agenda(self._monitors, self._execution, patience, deadlines)
         self.began: tuple[str, ...] = ()
@@ -320,7 +316,6 @@ class MonitorSet:
         return topic in self._withheld
 
     def withheld_from(self, topic: str) -> tuple[str, ...]:
-        """Return the networks whose hosts get no message of a topic now."""
         return tuple(
             network
             for monitor, one in self._withheld.get(topic, ())
@@ -400,7 +395,6 @@ class MonitorSet:
         return self._contexts.get(topic, ())
 
     def lane(self, topic: str) -> FastLane | None:
-        """Return the lane of a topic, or `channel_of` a service."""
         return self._lanes.of_topic.get(topic) if topic in self.steps and not self.taps(topic) else None
 
     def lane_ready(self, lane: FastLane, time_ns: int) -> bool:
@@ -520,7 +514,6 @@ class MonitorSet:
         self._agenda.schedule()
 
     def guards(self, topic: str) -> list[str]:
-        """Return the enabled monitors that have a safe message for a topic."""
         return [monitor.name for monitor in self._monitors if monitor.enabled and topic in monitor.safes]
 
     def is_safe(self, topic: str, data: bytes) -> bool:
@@ -617,7 +610,6 @@ class MonitorSet:
         return outcome
 
     def has_departed(self, monitor: MonitorInstance) -> bool:
-        """Whether a monitor that guards topics may have left its initial state."""
         if monitor.name not in self._guards.names:
             return False
         beginning = self._beginnings.get(monitor.name)
@@ -696,7 +688,6 @@ class MonitorSet:
         return outcome
 
     def judge(self, topic: str, buffer: Buffer, time_ns: int, sender: MessageSender = NOBODY) -> Outcome:
-        """Process a message by its lane if possible, as the relay does."""
 
         def silent(lane: FastLane) -> BatchOptions:
             # Not by source: in a recording, each message has its own.

@@ -37,7 +37,6 @@ EXPLAINED = 3
 """The most explained verdicts of slices for one message, or one call with deadlines; each takes a millisecond."""
 
 SLICE_SECONDS = 50e-6
-"""The additional processor time of a message for each slice concerned."""
 
 TICK_BUDGET = 2_000
 """The instructions for each slice, if a tick concerns several."""
@@ -60,11 +59,8 @@ class MonitorExecution:
         self._bound: Bound | None = None
         self._explains = True
         self._taking_back: dict[int, Callable[[], None]] = {}
-        """The functions that undo the steps of the current message, by run or slice."""
         self._trailed: dict[MonitorInstance, int] = {}
-        """The number of trail entries that the current message made."""
         self._copies = False
-        """Whether steps in a slice may be undone."""
         self._passed: int | None = None
 
     def begin(self, monitors: Sequence[MonitorInstance], time_ns: int) -> Outcome:
@@ -246,7 +242,6 @@ class MonitorExecution:
         self._turn.log.append(LogLine("WARN", text, monitor.name))
 
     def collect(self, outcome: Outcome) -> None:
-        """Move output, publications and conditions since the last call into the outcome."""
         turn = self._turn
         outcome.log, outcome.published, outcome.looked = turn.log, turn.published, turn.looked
         outcome.sites = self._interpreter.sites
@@ -538,7 +533,6 @@ class MonitorExecution:
         *,
         in_order_told: bool = False,
     ) -> None:
-        """Run the handlers in source order, or after a deadline in the given order."""
         handlers = [(category, handler) for category, handler in running.handlers if category in categories]
         if in_order_told:
             handlers.sort(key=lambda pair: categories.index(pair[0]))

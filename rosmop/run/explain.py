@@ -30,13 +30,11 @@ from rosmop.logics.interface import (
 from rosmop.run.outcomes import NOBODY, EventOccurrence, Explanation, MessageSender
 
 TRAIL = 4096
-"""The events that are kept for all slices of a parametric specification together."""
 
 KEPT = 64
 """The least number of events that are kept without tables; the most is twice this number."""
 
 FUTURE_KEPT = 1024
-"""The events that are kept for `mtl` about the future."""
 
 ENTRY = struct.Struct("<qqI4x")
 """Time (ns) when a state was left; source of the sender; its kind (from bit 24) and the event; its number."""

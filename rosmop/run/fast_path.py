@@ -14,7 +14,6 @@ from rosmop.runtime.action_context import LogLine
 from rosmop.runtime.wire import Buffer
 
 MESSAGE_FUEL = FUEL_PER_SECOND // 100
-"""The fuel of a message; `process_one` may get a different limit."""
 
 
 class BatchResult(NamedTuple):
@@ -100,14 +99,12 @@ class FastLane(Protocol):
     """The value of `Outcome.events` for each event, if it happens alone."""
 
     monitors: tuple[str, ...]
-    """The monitor of each event."""
 
     drops: bool
 
     changes: bool
 
     verdicts: tuple[Verdict, ...]
-    """The possible verdicts, without explanation."""
 
     def writers(self, who: int) -> tuple[str, ...]:
         """Return `Outcome.changed_by` for a set of events: bit N is event N."""

@@ -266,7 +266,6 @@ class _Maker:
         return run if node.no else run_yes
 
     def _branch(self, site: int, statements: Sequence[nodes.Statement]) -> _Run:
-        """Note the condition of a branch that drops, changes or publishes a message."""
         block = self.block(statements)
         if not any(isinstance(node, nodes.Drop | nodes.StopMessage | nodes.Publish) or self._marks_field(node)
                    for node in nodes.walk(tuple(statements))):  # fmt: skip
@@ -606,7 +605,6 @@ class _Maker:
         return isinstance(value, nodes.Literal) and value.value is True
 
     def _assigned(self, node: nodes.Assign) -> _Value:
-        """Note which sites have assigned to a field, as bits in the flag of the field."""
         if not self._marks_field(node):
             return self.value(node.value)
         if self._at not in self._marks:

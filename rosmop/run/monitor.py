@@ -19,7 +19,6 @@ from rosmop.runtime.action_context import Context
 from rosmop.runtime.wire import WireMessage
 
 FAILING_AFTER = 10
-"""The number of faults from which a monitor is shown as failing."""
 
 
 class CellNames(msgspec.Struct, frozen=True, array_like=True):
@@ -52,7 +51,6 @@ class StateHolder(Protocol):
     """The bytes of `cells`; 0 if the state is not only numbers."""
 
     left: bool
-    """Whether the state has been in Python since it was last saved."""
 
     def cells(self) -> bytes | None:
         """Return the state in the module's memory: empty if it has been in Python since the last save, None to save
@@ -123,11 +121,9 @@ class Step:
     name: str
     function: Callable[[WireMessage | None], bool]
     first: bool = False
-    """Whether this is the first step of its monitor on its topic."""
     past: int = 0
     told: int | None = None
     key: Callable[[WireMessage], Any] | None = None
-    """Returns the parameters that a message binds."""
 
 
 @dataclass(eq=False, slots=True)
@@ -166,14 +162,11 @@ class MonitorInstance:
     faults: int = 0
     seen: bool = False
     home: StateHolder | None = None
-    """The holder of the state, if it may be in a module."""
     slices: Slices | None = None
     """The slices; `properties` has the runs of the slice used last."""
     slice: Slice | None = None
     group: MonitorGroup | None = None
-    """The monitors whose state changes together with its own."""
     trail: deque[Bound] = field(default_factory=partial(deque, maxlen=TRAIL))
-    """The last events of all slices of a parametric specification."""
     safes: dict[str, SafeSender] = field(default_factory=dict)
     starting: set[str] = field(default_factory=set)
     """The topics with a safe message on which no message has come since the last start."""
@@ -209,7 +202,6 @@ class MonitorInstance:
         return [sender for topic, sender in self.safes.items() if blocks or topic in self.starting]
 
     def start_anew(self) -> None:
-        """Send the safe messages until a message comes on their topics."""
         self.starting = {*self.safes}
 
     def touch(self) -> None:

@@ -26,7 +26,6 @@ SHADOW_BUDGET = 100_000
 """The instructions for one message, some tens of milliseconds, for which other messages wait."""
 
 FUEL_PER_SECOND = 1_500_000_000
-"""The instructions for which a module takes about a second."""
 
 DROPPED = -1
 """The key of the drop in `Outcome.handling`."""
@@ -41,7 +40,6 @@ class MessageSender(NamedTuple):
 
 
 Who = Callable[[int], Mapping[str, Any]]
-"""Returns data about a source (`MessageSender.source`)."""
 
 NOBODY = MessageSender()
 NO_NUMBER, SEQ = range(2)
@@ -105,7 +103,6 @@ def named(verdict: Verdict) -> str:
 
 
 def bound(verdict: Verdict) -> str:
-    """Return the text to append to the name of the property; empty without parameters."""
     if not verdict.binding:
         return ""
     return f" with {', '.join(f'{name} = {value}' for name, value in verdict.binding.items())}"
@@ -182,7 +179,6 @@ class Outcome:
 
     @property
     def conditions(self) -> dict[str, dict[str, object]]:
-        """Return the positions of conditions that were met, with the values that they compared."""
         return {
             str(site.position): {
                 each.name: showing(each.type)(value)
@@ -216,7 +212,6 @@ class Margin(NamedTuple):
 
     @property
     def threshold_at(self) -> float | None:
-        """Return the constant at which the result would have changed."""
         return None if self.threshold is None else (self.right, self.left)[self.threshold]
 
 
@@ -229,7 +224,6 @@ def of_drop(outcome: Outcome, who: Who) -> dict[str, Any]:
 
 
 def of_change(outcome: Outcome, who: Who) -> dict[str, Any]:
-    """Return the causes, with the positions of the statements."""
     return {
         "changed_by": list(outcome.changed_by),
         "at": [str(position) for position in outcome.changed_at],
@@ -238,14 +232,12 @@ def of_change(outcome: Outcome, who: Who) -> dict[str, Any]:
 
 
 def of_published(outcome: Outcome, number: int, who: Who) -> dict[str, Any]:
-    """Return the causes, with the position of the statement."""
     message = outcome.published[number]
     position = outcome.sites[message.site].position
     return {"type": message.type, "at": [str(position)], **_led(outcome, who, outcome.handling.get(number))}
 
 
 def of_fault(outcome: Outcome, fault: Fault, who: Who) -> dict[str, Any]:
-    """Return the causes, the position, and the values of variables there."""
     where = fault.position
     return {
         "file": where.file,
@@ -259,7 +251,6 @@ def of_fault(outcome: Outcome, fault: Fault, who: Who) -> dict[str, Any]:
 
 
 def of_verdict(outcome: Outcome, verdict: Verdict, who: Who) -> dict[str, Any]:
-    """Return the causes, with the position of the property."""
     return {
         "property": verdict.property,
         "logic": verdict.logic,

@@ -127,7 +127,6 @@ class Slices:
         self.refused: Mapping[str, object] | None = None
         """The binding of the last event that cannot have a slice."""
         self.why = ""
-        """The reason for the refusal."""
         self.changed: dict[Binding, Holder] | None = None
         """Bindings whose state has changed since it was last saved, with their hosts; None if it is not saved."""
         self.behind: list[Slice] = []
@@ -153,7 +152,6 @@ class Slices:
         self._whole = self._known[self._all].slices
         self._formulas = [declared.property.suppresses for declared in code.properties]
         self.suppresses = any(self._formulas)
-        """Whether some of its properties undo dropped messages."""
         self._look_at(code.properties)
         for wanted in {_domain(event) for event in code.events}:
             for domain, known in self._known.items():
@@ -184,7 +182,6 @@ class Slices:
         ]
 
     def begin(self, properties: Sequence[PropertyCode], runs: tuple[Run, ...]) -> None:
-        """Begin new slices with the present state of the specification from now on."""
         self._look_at(properties)
         zero = tuple(self._namespace[code] for _, code, _ in self._parameters)
         values = self.own()
@@ -236,7 +233,6 @@ class Slices:
         return self._whole.get(key)
 
     def quiet(self, event: int, slice_: Slice) -> Sequence[int] | None:
-        """Return the next states, or None if the event has another effect."""
         calm = self._calm[event]
         if calm is None or not slice_.kept:
             return None
@@ -453,7 +449,6 @@ class Slices:
     # State
 
     def keep(self) -> None:
-        """Track changed bindings from now on, starting with all present ones."""
         self.changed = {
             (domain, key): None if slice_ is None else slice_.holder
             for domain, known in self._known.items()
@@ -671,7 +666,6 @@ def _lost(code: PropertyCode) -> frozenset[int]:
 
 
 def _steps(compiled: CompiledProperty) -> list[list[tuple[int, Categories]]]:
-    """Return the next states and categories of each state, with those at deadlines."""
     if isinstance(compiled, FiniteProperty):
         automaton = compiled.automaton
         return [[(target, automaton.verdicts[target]) for target in row] for row in automaton.table]

@@ -65,7 +65,6 @@ def encoded(states: Sequence[MonitorSnapshot]) -> bytes:
 
 
 def refused(why: str) -> bytes:
-    """Return the bytes that replace a state that cannot be saved."""
     return msgspec.msgpack.encode(why)
 
 
@@ -76,7 +75,6 @@ GroupSnapshot = tuple[Sequence[str], bytes, bytes, bytes | None]
 def states_of(
     groups: Sequence[GroupSnapshot],
 ) -> tuple[dict[str, MonitorSnapshot], dict[str, list[SliceSnapshot]], dict[str, str]]:
-    """Return the last state of each monitor, the slices, and the reasons why other states are lost."""
     found: dict[str, MonitorSnapshot] = {}
     slices: dict[str, list[SliceSnapshot]] = {}
     lost: dict[str, str] = {}
@@ -152,7 +150,6 @@ def kept_monitor(monitor: MonitorInstance, variables: Mapping[str, Any], types: 
 
 
 def shape(monitor: MonitorInstance, variables: Mapping[str, Any]) -> bytes:
-    """Return a state without times, to compare it with the initial one."""
     monitor.move_to_python()
     runs = [
         kept(running.run)[0][:1] if isinstance(running.run, FiniteRun | ClockedRun) else kept(running.run)
@@ -231,7 +228,6 @@ def _fits(known: ValueCodec, kind: Type, value: Any) -> bool:
 
 
 def types_of(compiled: Compiled) -> dict[str, bytes]:
-    """Return a digest of the message definitions that each specification uses."""
     definitions = compiled.messages.definitions
     return {
         code.name: hashlib.sha256(

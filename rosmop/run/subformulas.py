@@ -79,7 +79,6 @@ class Meaning:
         return self._known[key]
 
     def _seen(self, at: int) -> list[int]:
-        """Return the positions before `at`, without calls that have returned."""
         seen: list[int] = []
         for place, event in enumerate(self._events[:at]):
             seen.append(place)

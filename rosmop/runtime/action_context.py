@@ -15,7 +15,6 @@ from math import inf
 from typing import Any, NamedTuple
 
 BUDGET = 1_000_000
-"""The instructions for one message."""
 
 STEP = 250
 
@@ -28,7 +27,6 @@ MAX_BYTES = 16 << 20
 UNMEASURED = 1 << 20
 
 MAX_CALLS = 100
-"""The maximum depth of recursive calls of helper functions."""
 
 BYTES_PER_INSTRUCTION = 64
 OUTPUT_COST = 100  # instructions for a line of output or a published message
@@ -118,7 +116,6 @@ class Turn:
         )
 
     def exclude(self, make: Callable[[], Any]) -> Any:
-        """Call a function without charging its time."""
         if self.clock is None:
             return make()
         began = self.clock()
@@ -163,13 +160,11 @@ class Context:
         self._pending = 0
 
     def begin(self, most: int | None = None) -> None:
-        """Start a message with the whole budget, or with at most `most` instructions."""
         whole = self.most if most is None else min(most, self.most)
         self.budget = whole if self.turn.clock is None else min(STEP, whole)
         self._left = whole - self.budget
 
     def put_off(self) -> Callable[[], None]:
-        """Return a function that restores the current budget and time."""
         budget, left, until = self.budget, self._left, self.turn.until
 
         def go_on() -> None:

@@ -5,7 +5,6 @@ import struct
 from rosmop.form.nodes import SafeMessage
 
 HEAD = 12
-"""The bytes of `seq` and `stamp` at the beginning of a header."""
 
 _STAMP = struct.Struct("<III")
 _MOST_SECONDS = (1 << 32) - 1

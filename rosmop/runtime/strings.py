@@ -97,7 +97,6 @@ def find_any(context: Context, text: bytes, wanted: bytes, start: int, site: int
 
 
 def charged(context: Context, text: bytes, site: int) -> bytes:
-    """Charge for reading or copying a string."""
     if len(text) > _LONG:
         context.spend(len(text) // BYTES_PER_INSTRUCTION, site)
     return text

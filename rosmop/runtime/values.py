@@ -151,7 +151,6 @@ class ValueCodec:
     # In a message
 
     def decoder(self, kind: Type) -> Callable[[wire.Buffer, int], tuple[Any, int]]:
-        """Return a function of a position that returns the value and its end."""
         return (
             wire.text if isinstance(kind, value_types.StringType) else self._once(ValueCodec._decoder, kind)
         )
@@ -203,7 +202,6 @@ class ValueCodec:
         return lambda buffer, start: decode(buffer, start + 4, wire.count(buffer, start, least))
 
     def encoder(self, kind: Type) -> Callable[[Any, bytearray], None]:
-        """Return a function that appends the bytes of a value."""
         return (
             wire.put_text
             if isinstance(kind, value_types.StringType)
@@ -252,7 +250,6 @@ class ValueCodec:
         return vector
 
     def _runs(self, kind: value_types.RecordType) -> Iterator[tuple[bool, list[Type]]]:
-        """Yield groups of fields: adjacent numbers, or one field of another kind."""
         for fixed, run in groupby(self.fields(kind), lambda field: struct_code(field) is not None):
             if fixed:
                 yield True, list(run)

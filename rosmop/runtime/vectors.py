@@ -21,7 +21,6 @@ def element(values: Values, index: int, site: int) -> Any:
 
 
 def put(values: Values, index: int, value: Any, site: int) -> Any:
-    """`values[index] = value`."""
     if 0 <= index < len(values):
         values[index] = value
         return value
@@ -44,7 +43,6 @@ def append_text(context: Context, values: Values, value: bytes, width: int, site
 
 
 def weighed(context: Context, values: Values, measure: Callable[[Values], int], site: int) -> Values:
-    """Charge for reading a whole vector or message of the size `measure`."""
     size = measure(values)
     if size > LARGE:
         context.spend(size // BYTES_PER_INSTRUCTION, site)
@@ -67,19 +65,16 @@ def pop(values: Values, site: int) -> None:
 
 
 def copied(context: Context, values: Values, width: int, site: int) -> Values:
-    """Copy a vector of numbers, strings or times."""
     context.allocate(len(values) * width, site)
     return values.copy()
 
 
 def copied_deep(context: Context, values: Values, width: int, copy: Callable[..., Any], site: int) -> Values:
-    """Copy a vector of vectors or messages; `copy` copies one."""
     context.allocate(len(values) * width, site)
     return [copy(context, value, site) for value in values]
 
 
 def recast(context: Context, values: Values, convert: Callable[[Values], Values], site: int) -> Values:
-    """Convert a vector of bytes to a vector of another type of bytes."""
     context.allocate(len(values), site)
     return convert(values)
 

@@ -23,7 +23,6 @@ FEW = 64  # this number of elements takes less time than one instruction
 
 
 def text(buffer: Buffer, start: int) -> tuple[bytes, int]:
-    """Return the string at `start`, and its end."""
     first = start + 4
     end = first + _LENGTH.unpack_from(buffer, start)[0]
     if end > len(buffer):
@@ -44,7 +43,6 @@ def count(buffer: Buffer, start: int, least: int) -> int:
 
 
 def numbers(buffer: Buffer, start: int, number: int, code: str, size: int) -> tuple[list[Any], int]:
-    """Return `number` values, and their end."""
     end = start + number * size
     if end > len(buffer):
         raise MalformedError(f"an array ends at byte {end} of a message of {len(buffer)}")
@@ -116,7 +114,6 @@ def put_numbers(values: list[Any], code: str, out: bytearray) -> None:
 
 
 def put_moments(values: list[int], code: str, out: bytearray) -> None:
-    """Append times (code `I`) or durations (`i`)."""
     out += struct.pack(
         f"<{2 * len(values)}{code}", *(part for v in values for part in divmod(v, 1_000_000_000))
     )
@@ -160,7 +157,6 @@ class WireMessage:
 
     @property
     def changed(self) -> bool:
-        """Whether the bytes differ from the received ones."""
         if self._replaced is not None:
             return bytes(self.buffer) != self._replaced
         if self.written is None:
@@ -218,7 +214,6 @@ class WireMessage:
         self.stopped = site
 
     def _original(self) -> bytes:
-        """Return the received bytes, if the buffer still has the same length."""
         if not self.written:
             return bytes(self.buffer)
         original = bytearray(self.buffer)

@@ -115,6 +115,5 @@ def refused(text: str) -> list[Diagnostic]:
 
 
 def refused_action(body: str, *, before: str = "") -> list[Diagnostic]:
-    """Columns count from the beginning of the action."""
     text = f"s() {{ {before}\nevent e(int x) /t std_msgs/Int32 '{{data:x}}' {{\n{body}\n}} }}"
     return refused(text)

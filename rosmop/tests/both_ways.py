@@ -48,12 +48,9 @@ class BothWays:
         self.told: list[Verdict] = []
         self.interpreted: list[Verdict] = []
         self.counts: Counter[str] = Counter()
-        """Return the number of each verdict, of both runs."""
         self.lines: list[LogLine] = []
-        """Return the output since the last check."""
         self.published: list[Published] = []
         self.counting = False
-        """Whether verdicts are only counted."""
         self._inside = False
         """Whether messages are in the module's memory; this changes with each check."""
 

@@ -68,8 +68,6 @@ def definitions() -> Definitions:
 
 @dataclass(frozen=True)
 class Traffic:
-    """Frames of `EventCode.channel`, one after another."""
-
     topic: str
     frames: bytes
     messages: int

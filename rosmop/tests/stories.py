@@ -101,7 +101,6 @@ def tell(story: Story) -> Iterator[tuple[Step, list[str]]]:
 
 
 def _without_places(lines: Sequence[str]) -> list[str]:
-    """A module does not know positions of statements."""
     return [re.sub(r" at \d\S*", "", line) for line in lines]
 
 
@@ -145,7 +144,6 @@ def _done(monitors: MonitorSet, step: Step, *, judged: bool) -> tuple[MonitorSet
 
 
 def body_of(kind: str, given: Sequence[str]) -> bytes:
-    """A single `hex=…` gives the bytes themselves."""
     pairs = [field.split("=", 1) for field in given]
     if pairs and pairs[0][0] == "hex":
         return bytes.fromhex(pairs[0][1])
@@ -191,7 +189,6 @@ def _fields(path: str, value: Any) -> Iterator[str]:
 
 
 def lines_of(outcome: Outcome, monitors: MonitorSet, kind: str = "") -> list[str]:
-    """Without a message type there is no result."""
     lines = [line for one in outcome.before for line in lines_of(one, monitors)]
     head: str = outcome.result
     if outcome.result == "changed":

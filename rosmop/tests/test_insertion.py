@@ -120,7 +120,6 @@ def drawn_ban(random: Random) -> Meaning:
 
 
 def sent(outcome: Outcome, time: int, event: str) -> Timed:
-    """In order; with what was due before the message."""
     found = [one for before in outcome.before for one in published(before)]
     found += [] if outcome.result == "dropped" else [(time, event)]
     return found + published(outcome)

@@ -102,7 +102,6 @@ def test_each_call_has_its_own_fuel() -> None:
 
 
 def test_bytes_that_are_copied_use_fuel() -> None:
-    """A single instruction cannot run for long."""
     one = made("""(func (export "fill") (memory.fill (i32.const 0) (i32.const 1) (i32.const 65536)))""")
     assert trap_of(one, "fill", fuel=60_000).reason == "out of fuel"
     one.call("fill", fuel=70_000)

@@ -30,7 +30,6 @@ def guard(*members: str, head: str = "guard()") -> str:
 
 
 def command(speed: float = 1.0, frame: str = "joy", turn: float = 0.0) -> bytes:
-    """Seq 7 and stamp 3 s."""
     return message(TWIST, header__seq=7, header__stamp__sec=3, header__frame_id=frame, twist__linear__x=speed,
                    twist__angular__z=turn)  # fmt: skip
 
@@ -39,7 +38,6 @@ SAFE_BYTES = command(0.0, "base", 0.5)
 
 
 def drive(monitors: MonitorSet, data: bytes, time: int = 5) -> bytes:
-    """Empty if the base gets nothing."""
     outcome = monitors.process("/cmd_vel", bytearray(data), time)
     return b"" if outcome.result == "dropped" else bytes(outcome.buffer)
 
@@ -213,7 +211,6 @@ def stopping(formula: str) -> str:
 
 
 def passed(monitors: MonitorSet, trace: Timed) -> list[bool]:
-    """Each other message must be the safe one."""
     found = []
     for event, time in ((event, time) for time, event in trace):
         outcome = monitors.process(f"/{event}", bytearray(message("std_msgs/Int32", data=1)), time)

@@ -94,7 +94,6 @@ Trace = Sequence[tuple[str, dict[str, object]]]
 
 
 def trace(random: Random, length: int) -> Trace:
-    """The specification decides which fields are bound."""
     few = random.randint(1, 3)
     return [
         (
@@ -300,7 +299,6 @@ def test_slices_stay_when_specifications_are_loaded_again() -> None:
 
 
 def test_nan_is_one_binding() -> None:
-    """NaN equals no value."""
     monitors = load(
         "s(double x) { event e(double x) /e std_msgs/Float64 '{data:x}' { } ere: e e @match { } @fail { } }"
     )

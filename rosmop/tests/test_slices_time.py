@@ -69,7 +69,6 @@ def entries(outcomes: Iterable[Outcome], place: int) -> list[Entry]:
 
 
 def passed(monitors: MonitorSet, end: int) -> list[Outcome]:
-    """Several calls may be needed for all deadlines."""
     found: list[Outcome] = []
     for _ in range(1000):
         found += monitors.advance(end)
@@ -154,7 +153,6 @@ def timed(random: Random) -> Made:
 
 
 def trace_of(random: Random, length: int) -> Timed:
-    """Events are often exactly at a time bound."""
     few, time, found = random.randint(1, 3), SECOND, []
     for _ in range(length):
         time += random.choice((0, 0, SECOND, SECOND, SECOND // 2, 2 * SECOND, 3 * SECOND + 1))
@@ -241,7 +239,6 @@ def test_deadlines_beyond_the_limit_wait_but_precede_messages_of_their_slice() -
 
 
 def slices_in_memory() -> int:
-    """Slices that only a deadline refers to count too."""
     gc.collect()
     return sum(isinstance(thing, Slice) for thing in gc.get_objects())
 

@@ -50,14 +50,12 @@ FORBIDDEN = {
     "or": "write `||`",
     "not": "write `!`",
 }
-"""Words of C++ outside the language, and their replacements."""
 
 RESERVED = frozenset({
     "if", "else", "while", "do", "for", "switch", "case", "default", "break", "continue", "return", "const",
     "static", "auto", "void", "bool", "char", "short", "int", "long", "float", "double", "signed",
     "unsigned", "new", "delete", "static_cast", "DROP", "PUBLISH", "__RESET", "using",
 })  # fmt: skip
-"""Words that are never names."""
 
 _FOUND = re.compile(
     r'"(?:\\.|[^"\\\n])*"|[A-Za-z_]\w*|\d[\w.]*|->|::|<<=|>>=|[-+*/%&|^<>=!]=|\+\+|--|&&|\|\||<<|>>|.',
@@ -91,7 +89,6 @@ _FORMS = tuple(
         (r"\b(?:if|while|switch|for|when)\s*\Z", "a condition is written in parentheses"),
     )
 )
-"""The text before a syntax error, and the correct form of the construct."""
 _PIECE = re.compile(
     r"""(?P<gap>\s+|//[^\n]*|/\*(?:[^*]|\*(?!/))*\*/)|"(?:\\.|[^"\\\n])*"|'\\?[^\n]'|[{}]|[^\s{}"'/]+|."""
 )
@@ -158,7 +155,6 @@ _SITUATIONS: tuple[tuple[Set[str], str, str], ...] = (
 
 
 def shown(text: str) -> str:
-    """Shorten and escape a piece of the file for a message."""
     clean = "".join(c if c.isprintable() else f"\\u{ord(c):04x}" for c in text)
     return f"`{clean if len(clean) <= 40 else clean[:37] + '…'}`"
 
@@ -189,7 +185,6 @@ def describe(text: str, offset: int, accepted: Set[str]) -> tuple[int, str]:
 
 
 def misplaced(text: str, offset: int, word: str) -> tuple[int, str]:
-    """Return the offset and the message for a word that cannot be a name."""
     if word in FORBIDDEN:
         return offset, f"`{word}` is not part of the language; {FORBIDDEN[word]}"
     opened = _open_braces(text, offset)

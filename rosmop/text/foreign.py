@@ -287,7 +287,6 @@ _WINDOW = 200
 
 
 def foreign(text: str, offset: int, depth: int) -> tuple[int, int, str] | None:
-    """Return start, end and advice, or None if the construct is unknown."""
     before = text[max(0, offset - _WINDOW) : offset]
     begin = offset - len(before) + max(before.rfind(mark) for mark in ";{}\n") + 1
     end = min(len(text), offset + _WINDOW)

@@ -11,7 +11,6 @@ _GAP = r"(?:\s|\/\/[^\n]*\n|\/\*(?:[^*]|\*(?!\/))*\*\/)"
 """White space and comments; it can match in only one way, so the lexer never backtracks."""
 
 _WORD = "(?:creation|static|unsynchronized|decentralized|perthread|suffix)"
-"""MOP's modifiers of `event`."""
 
 _AT = r"@(?=(?:bc?|c)(?!\w))(?!\w+<GAP>*\{)"
 """The `@` of an operator of `ptcaret`, which does not begin a handler."""

@@ -42,7 +42,6 @@ class RecordingsOptions:
 
     @property
     def single(self) -> Path | None:
-        """Return the recording, if it is the only one and no option concerns many."""
         many = self.sets or self.workers or self.on or self.resume or self.report
         return self.bags[0] if len(self.bags) == 1 and not many else None
 
@@ -63,7 +62,6 @@ class BatchSession:
             yield from self.runner.run(jobs, done)
 
     def in_order(self, what: str, jobs: Sequence[Job]) -> Iterator[Result | Failure]:
-        """Yield results in the order of the jobs."""
         with self._progress(what, jobs) as done:
             yield from self.runner.in_order(jobs, done)
 
@@ -78,7 +76,6 @@ class BatchSession:
             raise self.program.usage_error(failures[0].text)
 
     def failed_rows(self, failures: Iterable[tuple[int, Failure]]) -> list[dict[str, object]]:
-        """Return a row for each failure, and print its reason on standard error."""
         rows: list[dict[str, object]] = []
         for number, failure in failures:
             uri = self.recordings[number].uri

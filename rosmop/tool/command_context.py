@@ -15,7 +15,6 @@ from rosmop.recordings.regular_files import open_regular
 from rosmop.tool.terminal import printable
 
 MAX_FILE = 64 << 20
-"""The most bytes of a file that is read whole."""
 
 
 @dataclass(frozen=True)

@@ -97,4 +97,3 @@ SUMMARIES: Mapping[str, str] = {
     "learn": "Propose specifications from recordings of a robot that behaves correctly, for you to edit.",
     "coverage": "List the events, branches, handlers, states and transitions that the recordings covered or missed.",
 }
-"""The first sentence of each command's help."""

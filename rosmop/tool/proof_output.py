@@ -8,7 +8,6 @@ from rosmop.tool.terminal import say, say_json
 
 
 def say_proofs(monitors: MonitorSet, *, as_json: bool) -> int:
-    """Return the number of events whose code differs from their meaning."""
     different = 0
     for found in findings_of(monitors.compiled, time.monotonic):
         different += found.differs

@@ -34,7 +34,6 @@ class ReplayReport:
         self._closest: dict[tuple[Position, int, bool], tuple[ClosestMargin, str]] = {}
 
     def add(self, recording: str, result: Replayed | Failure) -> list[dict[str, Any]]:
-        """Print the first effects, and return the rows for programs."""
         rows = self._printed(_rows(recording, result))
         self._recordings.append(_Line.of(recording, result))
         if isinstance(result, Failure):
@@ -52,7 +51,6 @@ class ReplayReport:
         return rows
 
     def show(self, texts: Mapping[str, str]) -> list[dict[str, Any]]:
-        """Print counts and margins, and return the rows for programs."""
         closest = [row for _key, row in sorted(self._closest.items())]
         rows = self._printed(_margin_row(margin, recording) for margin, recording in closest)
         if self._as_json:

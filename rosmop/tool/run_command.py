@@ -31,7 +31,6 @@ def run(
     output: Path | None,
     as_json: bool,
 ) -> int:
-    """Report every message of a single recording, or the effects on many. Return the exit status."""
     try:
         specifications = read_for_recordings(program, files, folders)
         if options.single is not None:

@@ -18,7 +18,6 @@ from roswire.errors import DefinitionError
 from roswire.standard import standard_definitions
 
 BESIDE = "msg"
-"""The folder of definitions beside a specification."""
 _RECORDINGS = (b"#ROSBAG ", b"\x89MCAP")
 
 
@@ -106,7 +105,6 @@ def read_for_recordings(
 
 
 def definition_folders(program: CommandContext, files: Sequence[Path], folders: Sequence[Path]) -> list[Path]:
-    """Return the folders beside the files before the given ones."""
     for folder in folders:
         if not folder.is_dir():
             raise program.usage_error(f"--msg: {folder} is not a folder")
@@ -115,7 +113,6 @@ def definition_folders(program: CommandContext, files: Sequence[Path], folders: 
 
 
 def definition_texts(program: CommandContext, folder: Path) -> tuple[dict[str, str], dict[str, str]]:
-    """Return definitions by `package/File`, and their paths by this name and by type."""
     texts: dict[str, str] = {}
     places: dict[str, str] = {}
 

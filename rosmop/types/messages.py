@@ -97,7 +97,6 @@ class MessageTypes:
         return constants[constant]
 
     def _paths_to(self, name: str, field: str) -> list[str]:
-        """Return the paths of two or three steps to a field of this name."""
         level = [("", name)]
         for _ in range(3):
             found = []

@@ -161,14 +161,12 @@ def is_scalar(kind: Type) -> bool:
 
 
 def promoted(kind: Type) -> Type:
-    """Return the type to which C++ promotes an operand."""
     if isinstance(kind, BoolType) or (isinstance(kind, IntegerType) and kind.bits < 32):
         return INT
     return kind
 
 
 def common(left: Type, right: Type) -> Type:
-    """Return the type in which C++ calculates with two numbers."""
     left, right = promoted(left), promoted(right)
     if isinstance(left, FloatingType) or isinstance(right, FloatingType):
         wide = [kind.bits for kind in (left, right) if isinstance(kind, FloatingType)]

@@ -176,7 +176,6 @@ class Programs:
 
 
 def check(programs: Programs, count: int, directory: Path | None) -> BothWays:
-    """Without a directory, the program is not compiled."""
     before, statements = programs.declarations(), programs.statements(count)
     body = "\n".join(f'{one} printf("%ld\\n", look());' for one in statements)
     outcome = act(body, before=before, most=1_000_000_000)

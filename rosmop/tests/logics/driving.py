@@ -16,7 +16,6 @@ ABC = ("a", "b", "c")
 
 
 def compiled(logic: str, formula: str, events: Sequence[str] = ABC) -> CompiledProperty:
-    """The formula begins at line 7, column 11."""
     return compile_property(logic, formula, events, ORIGIN)
 
 
@@ -49,7 +48,6 @@ def traces(events: Sequence[str], longest: int) -> Iterator[tuple[str, ...]]:
 
 
 def refusal(logic: str, formula: str, events: Sequence[str] = ABC) -> list[str]:
-    """Each finding is written ``line:column: text``."""
     try:
         compile_property(logic, formula, events, ORIGIN)
     except FormulaError as error:

@@ -17,7 +17,6 @@ def drawn(random: Random) -> Automaton:
 
 
 def classes_by_refinement(automaton: Automaton) -> list[int]:
-    """By definition: split until no class splits any more."""
     known: list[object] = list(automaton.verdicts)
     while True:
         signatures = [(known[s], tuple(known[t] for t in row)) for s, row in enumerate(automaton.table)]

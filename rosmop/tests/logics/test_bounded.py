@@ -29,7 +29,6 @@ Truth = bool | None
 
 
 def least(values: list[Truth]) -> Truth:
-    """None stands for an undecided value."""
     return False if False in values else None if None in values else True
 
 

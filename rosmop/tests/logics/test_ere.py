@@ -81,7 +81,6 @@ ALPHABET = [*LETTERS.values(), REST]
 
 
 def machine(finals: set[int], moves: dict[int, dict[str, int]]) -> Fsm:
-    """State 9 is dead."""
     states = {*moves, *finals, 9}
     table = {
         state: dict.fromkeys(ALPHABET, 9)

@@ -100,7 +100,6 @@ class Meaning:
 
 
 def meanings(events: tuple[str, ...], bounds: tuple[int | None, ...]) -> list[Meaning]:
-    """Including patterns where one event has several parts."""
     scopes = [
         (None, None),
         *((e, None) for e in events),

@@ -13,7 +13,6 @@ Rule = tuple[list[str], list[str], bool, bool]
 
 
 def draw(random: Random) -> list[Rule]:
-    """The rules never lengthen the string."""
     symbols = [*ABC[: random.randint(1, 3)], *(["X"] if random.random() < 0.5 else [])]
     rules = []
     for _ in range(random.randint(1, 4)):

@@ -17,7 +17,6 @@ def make_mcap(
     compression: CompressionType = CompressionType.NONE,
     encoding: str = "ros1",
 ) -> Path:
-    """Write strings (nanoseconds, bytes) on /t."""
     with path.open("wb") as file:
         writer = Writer(file, chunk_size=chunk, compression=compression)
         writer.start(profile="ros1")

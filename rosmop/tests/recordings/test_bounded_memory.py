@@ -25,7 +25,6 @@ print(count, most)
 
 
 def memory(path: Path, count: int) -> int:
-    """The memory is in KiB."""
     command = [sys.executable, "-P", "-c", PROGRAM, str(path)]
     read, most = subprocess.run(command, check=True, capture_output=True, text=True).stdout.split()
     assert int(read) == count
