@@ -115,7 +115,6 @@ class Definitions:
         return _fingerprint(self._md5_text(service.request, ()) + self._md5_text(service.response, ()))
 
     def full_text(self, name: str) -> str:
-        """Return the text of a type with all nested types, as in connection headers."""
         self.md5sum(name)  # raises if a type is missing or contains itself
         order: dict[str, MessageDefinition] = {}
         waiting = [name]

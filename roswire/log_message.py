@@ -11,7 +11,6 @@ _LENGTH = struct.Struct("<I")
 def log_message(
     sequence: int, time_ns: int, level: int, name: str, text: str, *, file: str, function: str
 ) -> bytes:
-    """Return a serialised `Log`; `time_ns` is since the epoch, `level` a constant of the definition."""
     seconds, nanoseconds = divmod(time_ns, 1_000_000_000)
     fields = (name, text, file, function)
     return b"".join((

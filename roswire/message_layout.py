@@ -116,7 +116,6 @@ class LayoutBuilder:
             self._add_part(ArrayPart(path, type_name, count, size, layout))
 
     def add_message(self, path: str, layout: MessageLayout) -> None:
-        """`path` is a prefix of the paths of the message's items."""
         for part in layout.parts:
             if isinstance(part, FixedPart):
                 for leaf in part.leaves:

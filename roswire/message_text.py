@@ -70,7 +70,6 @@ class Field:
 
     @property
     def notation(self) -> str:
-        """Return the type as written, such as `float64[36]` or `std_msgs/Header`."""
         if not self.is_array:
             return self.type
         return f"{self.type}[{'' if self.length is None else self.length}]"

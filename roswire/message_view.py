@@ -143,7 +143,6 @@ def _more(count: int) -> str:
 
 
 def read_fields(definitions: Definitions, name: str, data: bytes) -> dict[str, Any] | None:
-    """Return the fields that can be read, or None if the type is unknown."""
     try:
         return _Reader(definitions, data).message(name)
     except _CutError as cut:

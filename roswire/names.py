@@ -83,7 +83,6 @@ def is_valid_type_name(name: str) -> bool:
 
 
 def namespace(name: str) -> str:
-    """Return the namespace of a name: `/a/` for `/a/b`, `/` for `/a`."""
     return name[: name.rstrip("/").rfind("/") + 1] or "/"
 
 

@@ -1,11 +1,8 @@
 """Check that an automaton gives, after every trace, the verdict of its formula's definition.
 
-The check follows the formula and the automaton side by side, event by event. A pair is the remaining obligation of
-the definition and the state of the automaton. There are finitely many pairs, and the check visits each with every
-event, so a result for all pairs holds after every trace.
-
-Time bounds and grammars, whose monitors are not finite automata, and properties that exceed the work limit are not
-certified.
+The check visits every reachable pair of a remaining obligation of the definition and a state of the automaton, with
+every event. There are finitely many, so a result for all pairs holds after every trace. Time bounds, grammars, and
+properties that exceed the work limit are not certified.
 """
 
 import itertools
@@ -23,7 +20,6 @@ from rosmop.certify.past_formulas import PastFollower
 from rosmop.certify.words import ExpressionDerivatives
 
 MOST_STEPS = 200_000
-"""The maximum number of (pair, event) combinations for one property."""
 MOST_WORK = 400_000
 
 S = TypeVar("S", bound=Hashable)

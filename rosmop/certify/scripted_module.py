@@ -1,9 +1,9 @@
 """Replace the functions of events and handlers in a finished module with stubs that return scripted results.
 
-The walks of topics and the data, tables included, stay byte for byte the same. The encoders and decoders in this file
-share no code with the writer of modules (`fast/wasm.py`), so an error in the writer's encoding is not repeated here.
-They share facts about the module (`WasmModule`). If the writer records a wrong address, the module traps or the
-comparison in `steps.py` fails, unless the writer uses the same wrong address everywhere.
+Everything else stays byte for byte the same. This file shares no encoder or decoder with the writer of modules
+(`fast/wasm.py`), so an error there is not repeated here, only facts about the module (`WasmModule`). If these have a
+wrong address, the module traps or the comparison in `steps.py` fails, unless the writer uses the same wrong address
+everywhere.
 """
 
 import struct

@@ -1,22 +1,18 @@
 """Run the steps of a compiled module in every state, and compare them with the certified automata.
 
-For each topic, a module exports a *walk* (`fast/batch_codegen.py`), which calls the functions of events, looks up
-states in tables, and runs handlers. The check runs the same bytes, but with stubs for events and handlers
-(`scripted_module.py`) that note their calls and return scripted results, and compares the effect with
-`expected_steps.py`:
+A *walk* of a module (`fast/batch_codegen.py`) calls the functions of events, looks up states in tables, and runs
+handlers. The check runs the same bytes, but with stubs that return scripted results (`scripted_module.py`), and
+compares the effect with `expected_steps.py`:
 
 - each event alone, in every state of every property; with a clock before, at and after its bound;
 - each handler with no result, a drop, `__RESET;`, both, and a message that is left to the engine;
 - each event that may drop, with a drop; two events on one message in every state, with a drop by the second, up to
-  `MOST` steps for the module; and several messages in one read, all with the same results;
+  `MOST` steps; and several messages in one read, all with the same results;
 - a monitor that is switched off, and a drop and a verdict that are left to the engine.
 
 Not checked: the functions themselves (see `prove`), the list of effects after a changed message, the stored
-explanations, and the translation of the module to machine code.
-
-The check takes from the code generator the addresses of states, clocks, frames and counters (`WasmModule`, `Cells`),
-from `form/specification_groups.py` the numbers of events and properties, and from `ClockedRun` the steps of clocked
-properties.
+explanations, and the translation to machine code. Addresses are taken from the code generator (`WasmModule`,
+`Cells`), and the steps of clocked properties from `ClockedRun`.
 """
 
 import struct

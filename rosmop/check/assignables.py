@@ -22,7 +22,6 @@ class Variable:
     shared: bool = False
     constant: bool = False
     known: bool | int | float | None = None
-    """The value of a `const` number that is a literal."""
     table: bytes | None = None
     """The elements of a `const` array of numbers that are known, as in a message."""
     flag: str | None = None
@@ -32,7 +31,6 @@ class Variable:
     used: bool = False
     assigned: bool = False
     sliced: bool = False
-    """Whether each slice of a parametric specification has its own value."""
 
 
 @dataclass(frozen=True)

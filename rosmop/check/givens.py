@@ -21,7 +21,6 @@ from rosmop.types.messages import shown
 from rosmop.types.resolve import resolve
 
 Topics = Mapping[str, Mapping[str, str]]
-"""By specification and by their names in its text."""
 
 
 def declare_givens(
@@ -124,7 +123,6 @@ def with_given(identity: bytes, topics: tuple[GivenTopic, ...]) -> bytes:
 def read_at_start(
     shared: CompilationContext, names: SpecificationNames, specification: tree.Specification
 ) -> Iterator[Diagnostic]:
-
     def is_given(name: str) -> bool:
         if name in names.variables:
             return name in names.givens

@@ -148,7 +148,6 @@ ELEMENTARY = frozenset({"sin", "cos", "atan2", "hypot"})
 """The functions that the interpreter has in Python, with the same bits (`runtime/elementary.py`)."""
 
 FREE = ELEMENTARY | {"turned"}
-"""The functions whose calls cost no instructions, like those of the C library."""
 
 
 @cache

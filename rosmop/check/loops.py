@@ -27,7 +27,6 @@ def charge(scope: FunctionScope, node: tree.SyntaxNode) -> None:
 
 
 def weight(node: tree.SyntaxNode) -> int:
-    """Return the charge of an iteration or call: one instruction, plus one for each statement in the body."""
     total = 1
     waiting: list[object] = tree.fields_of(node)
     while waiting:
@@ -139,7 +138,6 @@ def _by_reference(
 
 
 def write_switch(scope: FunctionScope, node: tree.SwitchStatement, write: Write) -> None:
-    """Write the index of the first case, then every block from there on until a `break`."""
     value = scope.value_of(node.value)
     kind = value_types.promoted(value.type)
     if not isinstance(kind, value_types.IntegerType):

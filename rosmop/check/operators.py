@@ -113,7 +113,6 @@ def _texts(operator: str, operands: Operands) -> Value:
 
 
 def extended(operands: Operands) -> Value:
-    """Compile `+=` on a string, which replaces the bytes of `left`."""
     return _put_together("o_extend", operands)
 
 

@@ -12,7 +12,6 @@ from rosmop.text import tree
 from rosmop.types.messages import nearest, shown
 
 Phases = frozenset[tuple[str, str]]
-"""Pairs of specifications: the first comes before the second, directly or indirectly."""
 
 
 def phases_of(orders: Sequence[tree.OrderStatement]) -> Phases:

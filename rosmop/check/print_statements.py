@@ -122,7 +122,6 @@ def _conversion(
 
 
 def _integer(letter: bytes, size: bytes | None, value: Value) -> nodes.Expression:
-    """Without a size the number has the width of the value. A floating-point value is truncated."""
     kind = value_types.promoted(value.type)
     bits = kind.bits if isinstance(kind, value_types.IntegerType) else 64
     bits = {b"hh": 8, b"h": 16, None: bits}.get(size, 64)

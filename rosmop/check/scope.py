@@ -69,7 +69,6 @@ class SpecificationNames:
     givens: dict[str, Given] = field(default_factory=dict)
     safes: dict[str, nodes.SafeMessage] = field(default_factory=dict)
     instances: dict[tuple[object, ...], HelperFunction] = field(default_factory=dict)
-    """The functions of the library that are called (`library_functions.py`), by name and types."""
     is_library: bool = False
 
     def changed_by(self, name: str) -> frozenset[str]:
@@ -218,7 +217,6 @@ class FunctionScope:
         return variable
 
     def find(self, name: str, position: Position) -> Variable | None:
-        """Note the use of the variable, which may belong to another specification."""
         variable, owner = self._known(name, position)
         if owner is not None:
             self.names.uses.add(owner)

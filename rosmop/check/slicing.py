@@ -120,7 +120,6 @@ def creates(specification: tree.Specification, event: tree.EventDefinition) -> b
 
 
 def acts(function: nodes.Function, shared: CompilationContext) -> bool:
-    """Whether the action does more than change the slice's own variables."""
     if not shared.unsliced.isdisjoint(function.shared):
         return True
     return any(

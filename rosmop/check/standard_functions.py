@@ -164,7 +164,6 @@ def _finite(call: Arguments) -> Value:
 
 
 def _of_library(name: str, *wanted: str) -> Function:
-
     def function(call: Arguments) -> Value:
         call.count(len(wanted))
         for value, kind in zip(call.values, wanted, strict=True):

@@ -24,10 +24,8 @@ from roswire import names
 from roswire.errors import DefinitionError
 
 LARGE = 4096
-"""The size in bytes from which a local variable is charged at its declaration."""
 
 MOST_TABLE = 64 << 10
-"""The maximum number of bytes of a `const` array whose elements are part of the code."""
 
 
 def write(scope: FunctionScope, node: tree.Statement) -> None:

@@ -56,7 +56,6 @@ def _unlike_a_sender(specification: tree.Specification) -> Iterator[Diagnostic]:
 
 
 def _wrong_sender(function: str, text: str) -> str:
-    """Return the reason why no sender can have this host or name, or an empty string."""
     if function == "caller" and text and not text.startswith("/"):
         return f"the name of a node begins with `/`, so this is never equal; write {shown('/' + text)}"
     if function != "host" or not text:

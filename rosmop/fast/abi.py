@@ -67,9 +67,7 @@ class Cells:
     """
     noted: Sequence[str] = ()
     exits: dict[int, int] = field(default_factory=dict)
-    """Addresses of the history of each property (`Exits`, `ClockedSteps`), by its number."""
     clocks: dict[int, int] = field(default_factory=dict)
-    """Addresses of the start and the time of a property's clock (`ClockedRun`), by its number."""
     until: int = 0
     """Address of the time (i64) when Python's next timer is due. The module reports earlier deadlines."""
     variables: dict[str, tuple[int, Type]] = field(default_factory=dict)
@@ -89,8 +87,8 @@ class TopicCode:
 
     `verdicts` has for each verdict the indices of an event, of its step of a property, and of the handler. `log` is
     the address of the log of patches. `undo` has the addresses of variables, and of their values before the current
-    message. `brief`: the code has no loops. `functions` are the numbers of the functions of events. `says`: the code
-    may print lines; those before the address stored at `SURE` are final.
+    message. `brief`: the code has no loops. `says`: the code may print lines; those before the address stored at
+    `SURE` are final.
     """
 
     name: str
@@ -104,7 +102,6 @@ class TopicCode:
     functions: Sequence[int]
     says: bool
     settle: str
-    """The export to call after a message that was left is undone, or empty."""
 
 
 @dataclass(frozen=True)
@@ -123,7 +120,6 @@ class CompiledModule:
     throttles: Mapping[tuple[str, int], int]
     lines: Sequence[OutputLine]
     said: int
-    """Address of the lines of output, each stored by its index in `lines`."""
     senders: Mapping[str, int]
 
 

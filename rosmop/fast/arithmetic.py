@@ -226,7 +226,6 @@ class ArithmeticCodegen(FunctionBuilder):
         )
 
     def _of_parts(self, seconds: bytes, nanoseconds: bytes) -> bytes:
-        """Leave the message to the interpreter if the sum may be inexact."""
         code, names = b"", [f"{part} {len(self._locals)}" for part in ("seconds", "nanoseconds")]
         for name, value, most in zip(names, (seconds, nanoseconds), (1 << 32, 1 << 61), strict=True):
             code += value + self._set(name, I64)
@@ -236,7 +235,6 @@ class ArithmeticCodegen(FunctionBuilder):
         return code + self._get(names[1], I64) + I64_ADD
 
     def _limited(self, kind: Type, code: bytes) -> bytes:
-        """Leave the message to the interpreter if the value is out of range."""
         least, most = (
             (0, times.MAX_TIME) if kind == value_types.TIME else (times.MIN_DURATION, times.MAX_DURATION)
         )
@@ -271,7 +269,6 @@ class ArithmeticCodegen(FunctionBuilder):
         return rest + whole + constant(I64, BILLION) + I64_DIV_S
 
     def _parts_of(self, kind: Type, moment: bytes) -> tuple[bytes, bytes]:
-        """Return code that splits a time, and code that packs both parts into 64 bits as in a message."""
         code = self._limited(kind, moment) + self._seconds() + self._set("whole", I64)
         low = self._get("whole", I64) + constant(I64, 0xFFFFFFFF) + I64_AND
         return code, low + self._get("rest", I64) + constant(I64, 32) + I64_SHL + I64_OR

@@ -5,14 +5,13 @@ For each topic the module exports `feed(at, end, now)` for the frames (a length 
 message) from `at` to before `end`. The result has the address of the first frame that is left (i64: the low 32 bits),
 the number of effects (the next 24 bits), and `LEFT` if that frame is for the interpreter.
 
-- A message is either processed, with all consequences, or left. `TopicCode.undo` lists the data to restore for a
-  message that is left. After a trap, that message begins at the address stored at `POSITION` (0: no message had
-  begun).
-- A message that is dropped or replaced does not change the states of properties that suppress it
-  (`nodes.Advance.suppresses`). Later events process the safe message.
-- The options at `Cells.source` are: the sender; *told*, the events (bit N for the topic's event N) whose drops are
-  left, and with `LOUD` also all changes; *enabled*, bits of the topic's specifications; *counted*, the verdicts (bit
-  N for `TopicCode.verdicts[N]`) that are only counted. A message with any other verdict is left.
+- A message is either processed, with all consequences, or left; `TopicCode.undo` lists the data to restore then.
+  After a trap, that message begins at the address stored at `POSITION` (0: no message had begun).
+- A dropped or replaced message does not change the states of properties that suppress it
+  (`nodes.Advance.suppresses`).
+- The options at `Cells.source` are: the sender; *told*, the events (by bit) whose drops are left, and with `LOUD`
+  also all changes; *enabled*, the topic's specifications; *counted*, the verdicts that are only counted. A message
+  with any other verdict is left.
 - An effect is 16 bytes: a set of events (i64) and the number (i64) of consecutive messages that they changed. For
   dropped frames it is -1 and their start and end (i32, i32).
 - If a message gives a property a deadline before the time at `Cells.until`, the loop ends after it with `SOONER`.
@@ -140,11 +139,8 @@ class WasmModule(CompiledModule):
     functions: int
     refused: Mapping[str, NotCompiledError]
     left: Mapping[str, Sequence[NotCompiledError]]
-    """By function: the places at which it leaves a message to the interpreter."""
     routines: Mapping[str, int]
-    """Numbers of functions that the proof knows only by their results."""
     names: Sequence[Sequence[str]]
-    """The names of the local variables of each function, by number: a hint for the proof."""
 
 
 def written(
@@ -236,7 +232,6 @@ def _assembled(
     constants: Mapping[bytes, int],
     memory: int,
 ) -> bytes:
-    """Functions are given by parameter types, result type and code; constants by address."""
     types = [function_type(given, result) for given, result, _ in functions]
     exported = [text(name) + EXPORTED_FUNCTION + unsigned(number) for name, number in exports.items()]
     pages = unsigned(memory // PAGE)
@@ -353,7 +348,6 @@ class TopicCodegen:
         self._sooner = self._following + 2
         clocked = sorted(properties.intersection(cells.clocks))
         self._clocks = {number: self._following + 3 + 3 * place for place, number in enumerate(clocked)}
-        """The local variables of each property with a clock: its start, its time, and its number of steps."""
         self._telling = self._following + 3 + 3 * len(clocked)
 
     def _reads_in_place(self, event: nodes.Event) -> bool:

@@ -1,14 +1,13 @@
 """Translate functions of the intermediate form (`form/nodes.py`) to WebAssembly.
 
 - The function of an event or handler takes the address of the message and its size (i32, i32), and returns flags
-  (i32): `HAPPENED`, `DROPPED`, `CHANGED` (bytes of the message), `ELSEWHERE` (the interpreter must process the
-  message), `RESET` (the handler restarts the property), `REPLACED` (by the safe message).
-- `ELSEWHERE` is returned at each fault and at each node that is not compiled (`STATEMENTS`, `EXPRESSIONS`). The
-  effects of the message are undone. Functions that events and handlers call trap instead. An event is not compiled at
+  (i32), such as `CHANGED` (bytes of the message), `RESET` (the handler restarts the property) and `REPLACED` (by the
+  safe message).
+- `ELSEWHERE` is returned at each fault and at each node that is not compiled: the interpreter must process the
+  message, whose effects are undone. Functions that events and handlers call trap instead. An event is not compiled at
   all if every message would reach such a node.
 - Before a field is written, the old bytes are appended to a log, whose end is at `UNDO`. An entry takes 16 bytes:
   address (i32), size (i32) and the old bytes (i64).
-- Charges (`nodes.Charge`, `nodes.Allocate`) are taken from the specification's budget, as in the interpreter.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -231,7 +230,6 @@ class _FunctionCodegen(StringCodegen):
         self._channel = channel
         self._safe: nodes.SafeMessage | None = None
         self._bits: tuple[tuple[str, int], ...] = ()
-        """The bits of the result besides `HAPPENED`: local variables, and the shift of each."""
         if answers:
             self._bits = (("dropped", 1), ("changed", 2), *([("reset", 4)] if self._is_handler else ()))
             if any(isinstance(node, nodes.StopMessage) for node in nodes.walk(function.body)):
@@ -607,7 +605,6 @@ class _FunctionCodegen(StringCodegen):
         return code + self._get(total, machine_type(node.type))
 
     def _nearest(self, node: nodes.Call) -> bytes:
-        """Scan between two indices, or from the first to the end and from the start to the last."""
         vector, number = node.arguments[0], len(self._locals)
         first, last, least = (f"{what} {number}" for what in ("first", "last", "least"))
         code, place, count = self._elements(vector)

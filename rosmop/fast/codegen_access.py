@@ -45,7 +45,6 @@ from rosmop.types import value_types
 from rosmop.types.value_types import Type
 
 MOST_TEXTS = 256
-"""The most strings in an array; a message with more is left to the interpreter."""
 
 _LOADS = {
     "?": i32_load8_u, "b": i32_load8_s, "B": i32_load8_u, "h": i32_load16_s, "H": i32_load16_u,
@@ -231,7 +230,6 @@ def loaded(place: bytes, offset: int, kind: Type) -> bytes:
 
 
 def root_of(node: nodes.Expression) -> str:
-    """Return the variable that `node` is, or is a part or copy of; empty if unknown."""
     while not isinstance(node, nodes.Read | nodes.Assign):
         if isinstance(node, nodes.Copy):
             node = node.value

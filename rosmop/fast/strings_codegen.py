@@ -1,12 +1,10 @@
 """Generate code for strings and arrays of numbers: constants, those of the message, and variables of the set.
 
-While a batch is processed, the string or array of a variable may be in a message, in a constant, or in the former
-memory of another variable, so assignments copy nothing. A topic that keeps an array is not compiled if it changes an
-element of one. At the end of a batch all are copied together (`settling`), to one of two buffers in turn, because
-lines of output may still read the strings of the last batch.
-
-A message that brings a value longer than `most_kept` is left to the interpreter, and the variable is marked `BEYOND`.
-Messages that read this variable are also left.
+While a batch is processed, the bytes of a variable may be in a message, in a constant, or in the former memory of
+another variable, so assignments copy nothing, and a topic that keeps an array is not compiled if it changes an
+element of one. At the end of a batch all are copied (`settling`), to one of two buffers in turn, because lines of
+output may still read the strings of the last batch. A value longer than `most_kept` is marked `BEYOND`; messages that
+bring or read it are left to the interpreter.
 """
 
 from rosmop.fast.abi import Cells, kept_size, most_kept
@@ -99,7 +97,6 @@ class StringCodegen(MessageAccess):
         return b"", constant(I32, self._layout.constant(raw)), constant(I64, len(raw) // size)
 
     def _noted(self, span: bytes, most: int | None = None) -> tuple[bytes, bytes, bytes]:
-        """Pop address and length. A length above `most` leaves the message to the interpreter."""
         place, count = (f"{what} {len(self._locals)}" for what in ("place", "count"))
         code = span + self._set(count, I64) + self._set(place)
         if most is not None:

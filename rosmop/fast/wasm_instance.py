@@ -1,14 +1,13 @@
 """Run one WebAssembly module, with bounds on its memory and its work.
 
-- Work is bounded by *fuel*: about one unit for each instruction or copied byte, the same on every machine. Exceeding
-  it, or the limit of memory, raises `WasmTrap`.
+- Work is bounded by *fuel*: about one unit for each instruction or copied byte, the same on every machine.
 - Addresses for the whole limit are reserved at the start, and the memory grows in place. So an older view stays
-  valid, only shorter. A view keeps the memory alive after the instance is closed.
+  valid, only shorter, and keeps the memory alive after the instance is closed.
 - One process translates a module into machine code (`translated`). Others run it and compile nothing.
-- The library of the package `wasmtime` is called through its C functions (0.4 µs a call, instead of 20 µs through its
-  Python code). Calls hold Python's lock, so no other thread runs in an instance. The relay cannot load wasmtime's
-  Python code: it has functions that C calls, for which libffi needs memory that is writable and executable. For the
-  same reason a module has no imports.
+- The library `wasmtime` is called through its C functions (0.4 µs a call, instead of 20 µs through its Python code).
+  Calls hold Python's lock, so no other thread runs in an instance. The relay cannot load wasmtime's Python code: it
+  has functions that C calls, for which libffi needs memory that is writable and executable. For the same reason a
+  module has no imports.
 - Traps come without signals, so a handler of SIGSEGV (`faulthandler`) does not interfere.
 """
 
@@ -26,7 +25,6 @@ from typing import Any
 PAGE = 1 << 16
 
 VERSION = "50."
-"""The version of wasmtime that has these functions and layouts."""
 
 _FUEL_AT_START = 1_000_000
 _TABLE_ELEMENTS = 10_000
@@ -39,7 +37,6 @@ _OFF = ("component_model", "custom_page_sizes", "exceptions", "function_referenc
         "relaxed_simd", "simd", "stack_switching", "tail_call", "threads", "wide_arithmetic")  # fmt: skip
 
 Call = Callable[..., int | None]
-"""A function of an instance, which uses the remaining fuel (`WasmInstance.refuel`)."""
 
 
 class WasmError(Exception):
@@ -313,7 +310,6 @@ def _addresses(store: _Store, export: _Export) -> tuple[int, int, int, object]:
 
 
 def failure(error: int, trap: int) -> Exception:
-    """Return the exception of an error or trap (0: none), and free it."""
     try:
         _check(error or None)
     except WasmError as found:

@@ -1,15 +1,11 @@
 """Run the compiled module of a set: decide when it may process a topic or a part of a service (a *lane*).
 
-Invariants:
-
 - A batch ends before the first message that the module leaves to the engine; nothing of that message has happened.
 - The earlier messages have the same effect as if `MonitorSet.process` had processed each at the time of the batch.
 - The state of specifications that share topics or variables is in one place at a time: in the module's memory from
-  the first batch on (`ModuleState.prepare`), and in Python before that and whenever Python reads it
-  (`ModuleState.leave`).
-- Frames that were received into the module's memory (`Lanes.area`) are read and changed in place. The beginning of
-  any other frame is copied to the module, and back if it was changed. Code that reads further leaves the message to
-  the engine.
+  the first batch on (`ModuleState.prepare`), in Python whenever Python reads it (`ModuleState.leave`).
+- Frames in the module's memory (`Lanes.area`) are changed in place. The beginning of any other frame is copied to the
+  module, and back if it was changed; code that reads further leaves the message to the engine.
 """
 
 import struct

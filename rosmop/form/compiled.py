@@ -32,7 +32,6 @@ class EventCode:
     period_ns: int | None = None
     binds: tuple[int, ...] = ()
     key: str = ""
-    """The function that returns the values of these parameters, for an event on messages."""
     creates: bool = False
     plain: bool = False
     """The event has neither an action nor a `when`, so its key alone decides."""
@@ -40,7 +39,6 @@ class EventCode:
 
     @property
     def channel(self) -> str | None:
-        """Return the topic, or the part of a service (see `channel_of`), or None for a timer."""
         return self.topic if self.topic is None or self.part is None else channel_of(self.topic, self.part)
 
 
@@ -167,7 +165,6 @@ class SpecificationCode:
     comparisons: tuple[Comparison, ...] = ()
     slicing: Slicing | None = None
     begins: bool = False
-    """Whether the specification restarts if its state is lost, instead of holding its topics."""
     safes: tuple[nodes.SafeMessage, ...] = ()
     givens: tuple[Given, ...] = ()
     given_topics: tuple[GivenTopic, ...] = ()

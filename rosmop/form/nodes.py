@@ -1,17 +1,14 @@
 """The form: typed expressions, statements and functions, without names to look up or types to infer.
 
-Every expression has a type (`types/value_types.py`), and its operands have the types that the operation takes;
-conversions are explicit. Values are as in C++ on a 64-bit machine: integers wrap at their width, floats have 32 or 64
-bits, strings are bytes. Times and durations are nanoseconds. Vectors and messages are references: assigning one
-shares it, so copies are also explicit (`Copy`).
+Every expression has a type (`types/value_types.py`); conversions are explicit. Values are as in C++ on a 64-bit
+machine: integers wrap at their width, floats have 32 or 64 bits, strings are bytes. Times and durations are
+nanoseconds. Vectors and messages are references, so copies are also explicit (`Copy`).
 
 Names belong to the set of specifications (`g…`) or to one call of one function. A *site* is the number of a position
-in the text, for reports of faults; -1 means the statement's own site.
-
-A message is its bytes. A `Spot` is an offset from the start, or from a position that an earlier statement named.
-Reading beyond the end is a fault, and so is exceeding the budgets of instructions and bytes, from which `Charge`,
-`Allocate` and functions with long values take. The effects of an action are a list, in order. Each back end has a
-table with a row for each kind of node: an implementation, or `Left`.
+in the text, for reports of faults; -1 means the statement's own site. A `Spot` is an offset from the start of the
+message, or from a position that an earlier statement named. Reading beyond the end is a fault, and so is exceeding
+the budgets of instructions and bytes. Each back end has a table with a row for each kind of node: an implementation,
+or `Left`.
 """
 
 from collections.abc import Iterator, Mapping
@@ -23,10 +20,8 @@ from rosmop.types import value_types
 from rosmop.types.value_types import Type
 
 CHARGED = 1024
-"""The bytes from which decoding an array or the whole message is charged."""
 
 SHORT = 64
-"""The bytes up to which comparing with a string costs no more than other instructions."""
 
 
 class FormNode(msgspec.Struct, frozen=True, tag=True, tag_field="node", array_like=True):

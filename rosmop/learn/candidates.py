@@ -61,7 +61,6 @@ class Candidate:
     then: tuple[str, ...] = ()
     formula: str = ""
     events: Mapping[str, tuple[str, str]] = field(default_factory=dict)
-    """For an order of topics: topic and pattern of each event."""
     alarms: int = 0
     widened: str = ""
 
@@ -90,11 +89,9 @@ class LearntFacts:
     seconds: float
     windows: int
     trimmed: Counter[str] = field(default_factory=Counter)
-    """By topic: the number of conditions beyond `MOST`, which `candidates` left out."""
 
     @property
     def short(self) -> Mapping[str, str]:
-        """Return a unique name for each topic, made of its last words."""
         paths = {topic: identifier(topic).replace("_", ".") for topic in self.contents}
         names = short_names(paths.values())
         return {topic: names[path] for topic, path in paths.items()}

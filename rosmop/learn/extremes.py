@@ -5,10 +5,9 @@ Gumbel's distribution, which suits exponential tails, is fitted to the largest v
 because some twenty windows are too few: if the quantity has a limit, the margin is wider than needed, which causes no
 false alarm.
 
-Windows may be of different kinds, for example if a robot often stays near and sometimes goes far. Then the upper
-quarter of windows has a longer tail: the exponential through its mean excess (Weissman 1978) is the bound if it is
-higher. An extreme that several windows reach exactly is a stop, such as a joint's limit or a clamped command, and is
-then the bound.
+If a robot often stays near and sometimes goes far, the upper quarter of windows has a longer tail: the exponential
+through its mean excess (Weissman 1978) is the bound if it is higher. An extreme that several windows reach exactly is
+a stop, such as a joint's limit, and is then the bound.
 """
 
 import math

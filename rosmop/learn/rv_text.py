@@ -17,7 +17,6 @@ WORDS = frozenset(FORBIDDEN) | RESERVED
 
 
 def rounded_up(value: float, width: float) -> str:
-    """Return a number not below the value, rounded to about a hundredth of the width."""
     if not width > 0:
         return number(value)
     quantum = Decimal(1).scaleb(math.floor(math.log10(width / 100)))
@@ -25,7 +24,6 @@ def rounded_up(value: float, width: float) -> str:
 
 
 def rounded_down(value: float, width: float) -> str:
-    """Return a number not above the value, rounded likewise."""
     return number(-float(rounded_up(-value, width)))
 
 
@@ -64,7 +62,6 @@ def identifier(text: str) -> str:
 
 
 def short_names(paths: Iterable[str]) -> dict[str, str]:
-    """Return each path's shortest unique end, as a name that is free in the language."""
     paths = list(paths)
     names: dict[str, str] = {}
     for path in paths:

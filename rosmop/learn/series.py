@@ -142,7 +142,6 @@ class Series(msgspec.Struct):
             self.infinite = True
 
     def add_array(self, low: float, high: float, nan: bool, infinite: bool, window: int) -> None:
-        """The extremes are those of the array's finite elements."""
         self.count += 1
         self.nan |= nan
         self.infinite |= infinite

@@ -27,7 +27,6 @@ class TopicPair(msgspec.Struct):
     requires: bool = True
     turns: bool = True
     first: int | None = None
-    """The first message without a later message of the second topic, until the recording ends."""
     last: int | None = None
     seconds: int = 0
     started: bool = False

@@ -23,7 +23,6 @@ class TopicRhythm(msgspec.Struct):
     recordings: set[int] = set()
     gaps: HighestValues = msgspec.field(default_factory=HighestValues)
     some: dict[int, list[int]] = {}
-    """By the first window of each part of a recording: gaps in nanoseconds, for the median."""
     last: int | None = None
 
     def begin(self, recording: int, first_window: int) -> None:

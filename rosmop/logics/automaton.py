@@ -87,7 +87,6 @@ def minimise(automaton: Automaton) -> Automaton:
 
 
 def _coarsest_partition(automaton: Automaton) -> list[int]:
-    """Return the block of equivalent states of each state (Hopcroft's algorithm)."""
     size, letters = len(automaton), len(automaton.table[0])
     sources: list[list[list[int]]] = [[[] for _ in range(size)] for _ in range(letters)]
     for state, row in enumerate(automaton.table):

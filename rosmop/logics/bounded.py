@@ -1,17 +1,14 @@
 """Monitors for mtl formulas about a bounded future (`past_monitors.py` implements the part about the past).
 
-The value of the formula at an event is reported once it is certain: after an event, or when a bound passes.
-
-Theory of operation. A `PastProgram` lists the distinct subformulas; those that only look back are computed at their
-event (`FoldedProgram`). Each other subformula has a *cell*: its value at one event while the value is open. A decided
-cell notifies its *users*. Cells exist only where needed: for `fire => eventually[0,1s] safe`, only the waiting `fire`
-events are kept.
+Subformulas that only look back are computed at their event (`FoldedProgram`). Each other one has a *cell*: its value
+at one event while the value is open. A decided cell notifies its *users*. Cells exist only where needed: for `fire =>
+eventually[0,1s] safe`, only the waiting `fire` events are kept.
 
 - `until` over operands known at once decides the oldest waiting event first, so the cost of a step does not depend on
   their number.
-- `until` and `since` over open operands keep *rows*, one for each relevant event. A result is certain if it is the same
-  whether all open operands fail or all hold, because both operators are monotonic. When an operand is decided, `until`
-  visits only the rows that it may decide; `since` visits all rows.
+- `until` and `since` over open operands keep *rows*, one for each relevant event. A result is certain if it is the
+  same whether all open operands fail or all hold, because both operators are monotonic. When an operand is decided,
+  `until` visits only the rows that it may decide; `since` visits all rows.
 
 To undo a step, `BoundedRun.mark` copies the operators' rows, and `FormulaCell.touch` copies each cell before its
 first change. Rows do not change after their step.
@@ -92,7 +89,6 @@ def _known(value: Value) -> bool | None:
 
 
 def _use(value: Value, user: "FormulaCell | _Operator") -> bool:
-    """Return whether the value is open; if so, `user` is notified once it is known."""
     if isinstance(value, FormulaCell) and value.value is None:
         value.touch()
         value.users.append(user)
@@ -686,7 +682,6 @@ class BoundedRun:
         return _CATEGORIES[False in told, True in told]
 
     def about(self, category: str) -> int:
-        """Return the number, from 1, of the event that the last verdict is about."""
         return self._about[category == VERDICTS[True]]
 
     def _pass_on(self, cell: FormulaCell) -> None:
@@ -715,4 +710,3 @@ _CATEGORIES: dict[tuple[bool, bool], Categories] = {
 }
 
 PARTS: Mapping[str, type] = {"cell": FormulaCell, "row": _Row, "window": SinceWindow}
-"""The classes in the state of these runs, by their names in `state_of_runs.py`."""

@@ -20,13 +20,11 @@ from rosmop.logics.ltl_nodes import FormulaNodes, FormulaTranslation
 Obligations = int
 
 Sets = frozenset[Obligations]
-"""A union of obligation sets: the possible states of a nondeterministic automaton."""
 
 _Node = TypeVar("_Node", bound=Hashable)
 
 MAX_OBLIGATION_SETS = 20_000
 MAX_WORK = 1_500_000
-"""The limit of all obligation sets together, with dropped ones."""
 
 
 class TooLargeError(Exception):
@@ -128,7 +126,6 @@ class Automata:
         return found
 
     def live(self, states: Sets) -> Sets:
-        """Return the states that accept some word, without sets that include another one."""
         fresh = [state for state in states if state not in self._live]
         if fresh:
             self._decide_live(fresh)
@@ -207,7 +204,6 @@ def _members(bits: int) -> list[int]:
 def strong_components(
     nodes: Iterable[_Node], successors: Callable[[_Node], Iterable[_Node]]
 ) -> list[list[_Node]]:
-    """Return the components, each after those that it leads to (Tarjan)."""
     index: dict[_Node, int] = {}
     low: dict[_Node, int] = {}
     open_nodes: dict[_Node, None] = {}

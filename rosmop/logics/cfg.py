@@ -73,7 +73,6 @@ def compile_cfg(source: Source) -> CompiledProperty:
 
 
 def _table(recogniser: EarleyRecogniser, events: int) -> Automaton | None:
-    """Return the recogniser as an automaton if it reaches few frames, which are compared by content."""
     frames: dict[object, EarleySet] = {}
 
     def held(frame: EarleySet) -> object:

@@ -43,7 +43,6 @@ def diagram_of(compiled: CompiledProperty) -> Diagram | None:
 
 
 def to_dot(compiled: CompiledProperty) -> str | None:
-    """Return a ``digraph``, or None if the monitor is not finite."""
     diagram = diagram_of(compiled)
     if diagram is None:
         return None

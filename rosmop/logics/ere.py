@@ -163,7 +163,6 @@ def _match_automaton(source: Source, reader: "_ExpressionReader") -> Automaton:
 
 
 def with_fail(automaton: Automaton) -> Automaton:
-    """Add ``fail`` to the state of a minimal automaton from which nothing can match, if there is one."""
     verdicts = tuple(
         ("fail",) if not verdict and all(target == state for target in row) else verdict
         for state, (row, verdict) in enumerate(zip(automaton.table, automaton.verdicts, strict=True))

@@ -150,7 +150,6 @@ def _read_alias(reader: TokenReader, machine: StateMachineText, used: list[Formu
 
 
 def _more_members(reader: TokenReader) -> bool:
-    """Whether the list goes on; commas are optional, as in MOP; the next alias or a misplaced state ends it."""
     return reader.token.kind == "name" and reader.token.text != "alias" and reader.ahead(1).kind != "["
 
 

@@ -96,18 +96,14 @@ class CompiledProperty(ABC):
     timed = False
 
     expiry = "deadline"
-    """The name of a passed deadline in records (``timeout`` for machines)."""
 
     made_of: tuple[Any, ...]
-    """The arguments from which another process makes the same property."""
 
     @property
     def suppresses(self) -> bool:
-        """Whether a dropped message does not count, so its steps are undone."""
         return self.source.suppresses
 
     remedy: str | None = None
-    """The function that publishes the due message at a deadline (`enforced by`)."""
 
     def __new__(cls, *made_of: Any) -> Self:
         made = super().__new__(cls)
@@ -306,11 +302,9 @@ class Logic:
 
     compile: Compiler
     properties: tuple[type[CompiledProperty], ...] = (FiniteProperty,)
-    """The classes of properties; the arguments of their constructors can be serialised."""
     suppresses: bool = False
     """Whether a dropped message does not count. Other logics count each event whose action passes the message."""
     failure: str | None = None
     """The category of failure: `check` warns about a property that always fails at the first event."""
     has_states: bool = False
-    """Whether coverage counts states, and formulas may write `default` for all events."""
     implicit_events: tuple[str, ...] = ()

@@ -66,7 +66,6 @@ def tokenize(source: Source, signs: Sequence[str]) -> list[FormulaToken]:
 
 
 def _sign_pattern(sign: str) -> str:
-    """A sign that ends with a letter (``~o``) must end where the word ends."""
     return re.escape(sign) + (r"(?![A-Za-z_0-9])" if sign[-1].isalnum() else "")
 
 

@@ -1,21 +1,20 @@
-"""Recognise any context-free grammar.
+"""Recognise any context-free grammar: Earley's algorithm with the nullable symbols of Aycock and Horspool.
 
-Theory of operation. This is Earley's algorithm with the nullable symbols of Aycock and Horspool. Instead of the
-position where it began, an item holds a *continuation*: the items that wait there for its left side to be completed.
-So positions are not stored, and an item without a waiting continuation is freed.
+Instead of the position where it began, an item holds a *continuation*: the items that wait there for its left side to
+be completed. So positions are not stored, and an item without a waiting continuation is freed.
 
 - A *frame* is an Earley set: an ``EarleyShape`` (items whose continuations are numbered) and the continuations
   themselves.
-- A continuation is a frame and a symbol: the items of that frame's closure that wait for the symbol. None is the
-  continuation of the whole trace: its completion means that the trace is in the language.
+- A continuation is a frame and a symbol: the items of that frame's closure that wait for the symbol. None is that of
+  the whole trace: its completion means that the trace is in the language.
 - If completing a symbol in a frame only completes one of the frame's own continuations, that continuation is used
   instead (Leo, 1991). So right recursion needs neither memory nor time, and LR grammars need constant time per event
   on average.
-- Every step that depends on shapes alone is computed once and stored in tables, where a deterministic grammar soon
-  finds every step. Large shapes, which only ambiguous grammars have, are not stored.
+- Every step that depends on shapes alone is computed once and stored in tables, except for large shapes, which only
+  ambiguous grammars have.
 
-Invariants: the continuations of a frame belong to less deep frames, so completing goes from deep to less deep and
-ends. A frame is viable if it has an item, because every symbol can be completed (``grammar.prepare``).
+Invariants: the continuations of a frame belong to less deep frames, so completing ends. A frame is viable if it has
+an item, because every symbol can be completed (``grammar.prepare``).
 """
 
 from collections.abc import Sequence
@@ -27,7 +26,6 @@ from rosmop.logics.interface import RunFaultError
 MAX_WIDTH = 4_000
 """The most continuations of a frame; only ambiguous grammars come close to it."""
 MAX_STEP_WORK = 300_000
-"""The items that one step may complete, in a fraction of a second."""
 MAX_DEPTH = 1_000_000
 KEPT_SHAPE_WIDTH = 8
 KEPT_SHAPE_ITEMS = 400
@@ -297,7 +295,6 @@ class EarleyRecogniser:
 
 
 def _deepest(done: tuple[int, ...], conts: Conts) -> int:
-    """Return the deepest continuation, whose completion completes only less deep ones."""
     deepest, depth = done[0], -2
     if len(done) > 1:
         for index in done:

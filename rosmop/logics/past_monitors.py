@@ -1,13 +1,9 @@
 """Monitors for formulas about the past: ptltl, and the past part of mtl (`bounded.py` has the future part).
 
-Theory of operation. A formula becomes a *program*: its distinct subformulas, each after its operands. The only
-temporal operators are ``previously`` and ``since`` (``once b`` is ``true since b``). A step computes all subformulas
-from the event and from the values that the last step kept (Havelund and Rosu, 2002): the operand of ``previously``,
-the value of ``since`` itself, or with bounds its `SinceWindow`.
-
-Each event determines which atoms hold. Therefore the program is folded in advance, for each event, into the
-operations that remain, as data (`FoldedProgram`). Without time bounds the values are bits and the program is a finite
-automaton, which is built if it is small enough.
+A formula becomes a *program*: its distinct subformulas, each after its operands, with ``previously`` and ``since`` as
+the only temporal operators. A step computes all from the event and from the values that the last step kept (Havelund
+and Rosu, 2002). The program is folded in advance, for each event, into the operations that remain, as data
+(`FoldedProgram`). Without time bounds it is a finite automaton, which is built if it is small enough.
 """
 
 import copy
@@ -258,7 +254,6 @@ class _Fold:
 
 
 def compile_past(source: Source, formula: Formula) -> CompiledProperty:
-    """Return a table if the automaton is finite and small, otherwise the folded program."""
     program = PastProgram(formula, source.events)
     folded = fold(program, [program.result])
     bounds = [found for found in folded.bounds if found is not None]

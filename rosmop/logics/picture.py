@@ -34,7 +34,6 @@ def dot_of(properties: Sequence[CompiledProperty]) -> str | None:
 
 
 def svg_of(properties: Sequence[CompiledProperty]) -> str | None:
-    """Draw one below the other; return None if no property has an automaton."""
     parts: list[str] = []
     top, right = 0, 0
     for compiled in properties:

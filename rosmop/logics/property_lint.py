@@ -16,7 +16,6 @@ from rosmop.logics.pattern import TimedPattern
 from rosmop.logics.tfsm import TimedStateMachine
 
 TIME = "<time>"
-"""In traces, a deadline or a time bound that passes."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +97,6 @@ def graph_of(compiled: CompiledProperty) -> VerdictGraph | None:
 
 
 def _past_graph(compiled: ClockedPastProperty) -> VerdictGraph:
-    """Return a graph with each state twice: before and after the time bound has passed."""
     size = len(compiled.moves)
     late = [
         [
@@ -119,7 +117,6 @@ def _past_graph(compiled: ClockedPastProperty) -> VerdictGraph:
 
 
 def _machine_graph(compiled: TimedStateMachine) -> VerdictGraph:
-    """Return a graph with each state except the start twice: entered by an event, and by a timeout."""
     base = compiled.automaton
     size = len(base)
     silent = compiled.silence_ns is not None

@@ -113,7 +113,6 @@ class Reader:
         return tuple(TYPES[self.byte()] for _ in range(self.unsigned()))
 
     def block(self) -> tuple[tuple[WasmInstruction, ...], int]:
-        """Read up to `else` or `end`, and return which of the two came."""
         found: list[WasmInstruction] = []
         while True:
             code = self.byte()

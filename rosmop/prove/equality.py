@@ -147,7 +147,6 @@ class Validation:
             return ProofFinding(topic, event, str(error))
 
     def _compared(self, name: str, number: int, topic: str) -> str:
-        """A difference for any number of iterations must also be one after few iterations."""
         begun = self._clock()
         try:
             return self._answer(name, number, topic, begun)

@@ -571,7 +571,6 @@ class FormTerms:
         return wrapped(value if width(target) == value.size() else z3.Extract(31, 0, value), target)
 
     def _truncated(self, value: Term, target: value_types.IntegerType) -> Term:
-        """Truncate a number toward zero; types narrower than 32 bits are first limited as `int`."""
         whole = target if target.bits >= 32 else value_types.INT
         bits = whole.bits
         least, most = floating(whole.least, 64), floating(whole.most, 64)
@@ -676,7 +675,6 @@ class FormTerms:
         return same if node.operator == "==" else opposite(same)
 
     def _same_texts(self, node: nodes.CompareTexts, state: State) -> Term:
-        """Compare two strings whose bytes are not known; `MISMATCH` is their length if they are equal."""
         one, other = self._value(node.left, state), self._value(node.right, state)
         if not isinstance(one, TextTerm) or not isinstance(other, TextTerm):
             raise UnknownError("a comparison of strings")

@@ -1,17 +1,17 @@
 """Loops of the form and of the module, as one induction over their iterations.
 
-Both sides run through their loops in the same order, so the loops are paired by number. A loop is *cut* at its head.
-Each slot that an iteration changes gets a new constant there, on the module's side that of the form's variable with
-the same name. Then one iteration, and the statements after the loop, are translated once, for the state at the head
-of the last iteration. `loop_conditions` yields the conditions that must not hold; together they are the induction:
+Both sides run through their loops in the same order, so the loops are paired by number. A loop is *cut* at its head:
+each slot that an iteration changes gets a new constant there, on the module's side that of the form's variable with
+the same name. Then one iteration, and the statements after the loop, are translated once. `loop_conditions` yields
+the conditions that must not hold; together they are the induction:
 
 - both sides reach the loop, or neither does, and paired slots are equal then;
 - if one side begins another iteration, so does the other one, and paired slots are equal again;
 - each iteration takes something from the budget, so the loop of the form ends.
 
-Names of variables are only a guess of equal slots: a wrong pair leaves a condition that may hold, and a slot without
-a pair has any value. So a proof is for each number of iterations, but the answer to a condition may be a state that
-does not occur. `equality.py` then searches for a difference in `unrolled` loops.
+Names are only a guess of equal slots: a wrong pair leaves a condition that may hold, and a slot without a pair has
+any value. So a proof is for each number of iterations, but the answer to a condition may be a state that does not
+occur; `equality.py` then searches for a difference in `unrolled` loops.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -181,7 +181,6 @@ def is_budget(value: Term) -> Term:
 
 
 def _pairs(one: Cut, other: Cut) -> Iterator[tuple[tuple[Any, Any, Any], tuple[Any, Any, Any]]]:
-    """Two slots are a pair if they have the same constant."""
     known = {value.get_id(): key for key, value in one.head.items() if value is not MIXED}
     for key, value in other.head.items():
         match = None if value is MIXED else known.get(value.get_id())
@@ -198,7 +197,6 @@ def _differ(one: Any, other: Any) -> Term:
 
 
 def constant_for(key: Any, value: Any) -> Any:
-    """Return a new constant of the value's sort. Nothing is known of a string or an address that changes."""
     if not isinstance(value, z3.ExprRef):
         return MIXED
     return z3.FreshConst(value.sort(), f"{key} at the head")

@@ -19,7 +19,6 @@ NEAREST = z3.RNE()
 AT = z3.BitVec("at", 32)
 FRAME = z3.BitVec("position", 32)
 MEMORY = z3.Array("memory", z3.BitVecSort(32), z3.BitVecSort(8))
-"""The bytes of constants and of arrays in variables, which an event does not change."""
 
 MISMATCH = z3.Function("mismatch", *[z3.BitVecSort(32)] * 4)
 """The place of the first difference of two strings (addresses and length), or the length; not translated."""

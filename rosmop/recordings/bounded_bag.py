@@ -1,14 +1,12 @@
 """Read a ROS 1 bag in time linear in its size, even if the bag is malicious, and in memory independent of its length.
 
-`rosbags` trusts the headers of a bag, and keeps the index of all messages. This reader keeps the index of one chunk,
-or of chunks whose times overlap (as the flight recorder writes them), and adds limits:
+`rosbags` trusts the headers of a bag, and keeps the index of all messages. This reader keeps the index of chunks
+whose times overlap (as the flight recorder writes them), and adds limits:
 
 1. It reads at most `LARGEST_CHUNK` bytes at once, and unpacks a chunk to at most that size.
-2. It unpacks and reads at most `PER_BYTE` bytes for each byte of the bag, plus one chunk. Without this limit, index
-   entries could name one message many times, or unpack many chunks in turn.
+2. It unpacks and reads at most `PER_BYTE` bytes for each byte of the bag, plus one chunk. Otherwise, index entries
+   could name one message many times, or unpack many chunks in turn.
 3. The index has at most as many entries as fit in the bag, so chunks cannot share an index.
-
-Unpacked chunks are kept until their last message, up to `LARGEST_CHUNK` bytes.
 """
 
 import bz2

@@ -213,7 +213,6 @@ def _refusal(monitors: MonitorSet, connection: Connection) -> str | None:
 
 
 def refusals(monitors: MonitorSet, reader: Reader, topics: Sequence[str] = ("*",)) -> list[str]:
-    """Return the reasons why messages on topics that match a pattern are dropped."""
     found = [
         _refusal(monitors, connection) for connection in reader.connections if fits(connection.topic, topics)
     ]

@@ -1,12 +1,9 @@
 """The running monitors: `MonitorSet` decides what happens to each message. It does no I/O and reads no clock.
 
-- The caller gives the time, in nanoseconds, with every message. Ticks and deadlines that are due (`timers.py`) happen
-  before the message (`before` of the outcome). While no message comes, the caller calls `advance` at `next_due`.
-- A lane of the fast path (`fast_path.py`) processes many messages at once with the same results, as long as none has
-  to be recorded or explained.
-- Specifications in shadow mode are in separate sets (`shadows`), each with those that share variables, so that they
-  do not affect other specifications. After a message is passed on, the caller gives its copies to them
-  (`ShadowCopy.give`).
+The caller gives the time, in nanoseconds, with every message; due ticks and deadlines (`timers.py`) happen before it.
+While no message comes, the caller calls `advance` at `next_due`. A lane of the fast path (`fast_path.py`) has the
+same results. Specifications in shadow mode are in separate sets (`shadows`), so that they do not affect others; after
+a message is passed on, the caller gives its copies to them (`ShadowCopy.give`).
 """
 
 import sys
@@ -114,7 +111,6 @@ class KeptGroup:
         return b"" if self._group.home is None else self._group.home.cells()
 
     def base(self) -> bytes:
-        """Return the state, or the reason why it is too large to be saved."""
         group = self._group
         try:
             data = encoded([
@@ -131,7 +127,6 @@ class KeptGroup:
         return [data for parts in self._slices for data in parts.all()]
 
     def changed_parts(self) -> dict[int, bytes]:
-        """Return the parts that have changed since the last call, by number."""
         return {
             place * BUCKETS + number: data
             for place, parts in enumerate(self._slices)
@@ -688,7 +683,6 @@ class MonitorSet:
         return outcome
 
     def judge(self, topic: str, buffer: Buffer, time_ns: int, sender: MessageSender = NOBODY) -> Outcome:
-
         def silent(lane: FastLane) -> BatchOptions:
             # Not by source: in a recording, each message has its own.
             if topic not in self._silent:

@@ -1,13 +1,9 @@
 """Processes one message, tick or deadline: events, properties, handlers, faults. No I/O, no clock.
 
-The events of a message happen specification by specification, in source order. After the action of an event, unless
-it dropped the message, every property steps, and the handlers of the new categories run. A drop, or a fault unless
-`on_fault="pass"`, stops the processing of the message.
-
 For formulas (`CompiledProperty.suppresses`) a dropped message does not count: in all specifications they undo their
 steps, so their trace is the one that subscribers saw. Variables, output and other properties keep the effects.
-`STOP;`, and a fault of a monitor with a safe message on the topic, replace the message by the safe one: formulas undo
-their steps, and the events behind this one process the safe message.
+`STOP;`, and a fault of a monitor with a safe message on the topic, replace the message: formulas undo their steps,
+and the events behind this one process the safe message.
 """
 
 import struct
@@ -39,7 +35,6 @@ EXPLAINED = 3
 SLICE_SECONDS = 50e-6
 
 TICK_BUDGET = 2_000
-"""The instructions for each slice, if a tick concerns several."""
 
 
 class MonitorExecution:

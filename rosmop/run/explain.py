@@ -2,13 +2,12 @@
 verdict.
 
 1. With tables, `Exits` stores for each state the event that left it last. From the initial state these events lead to
-   the present state: the trace without its loops, however long it is, and without events before `__RESET;`.
-2. For other properties, `Steps` (with a clock `ClockedSteps`) keeps the last events and the run before them. If the
-   events give the verdict to a new run, they explain it alone; otherwise only with that run (`Explanation.since`). A
-   run about the future cannot be copied, but knows at which event the decided formula was evaluated. The events from
-   there on suffice, unless the formula also looks back; then there is no explanation.
-3. For a parametric specification, the last `TRAIL` events are kept with their bindings, and must explain a slice's
-   verdict alone.
+   the present state: the trace without its loops, however long it is.
+2. For other properties, `Steps` keeps the last events and the run before them. If the events give the verdict to a
+   new run, they explain it alone; otherwise only with that run (`Explanation.since`). A run about the future cannot
+   be copied, but knows at which event the decided formula was evaluated. The events from there on suffice, unless the
+   formula also looks back; then there is no explanation.
+3. For a parametric specification, the last `TRAIL` events must explain a slice's verdict alone.
 """
 
 import copy
@@ -32,7 +31,6 @@ from rosmop.run.outcomes import NOBODY, EventOccurrence, Explanation, MessageSen
 TRAIL = 4096
 
 KEPT = 64
-"""The least number of events that are kept without tables; the most is twice this number."""
 
 FUTURE_KEPT = 1024
 
@@ -155,7 +153,6 @@ class Exits:
 def _shortest(
     automaton: Automaton, way: Sequence[EventOccurrence], category: str
 ) -> Sequence[EventOccurrence]:
-    """Return a shortest path to the category, with the latest events if there are several."""
     best: dict[int, tuple[int, ...]] = {automaton.initial: ()}
     fewest: tuple[int, ...] = ()
     mine: tuple[int, ...] = ()
@@ -368,7 +365,6 @@ class _Trial:
         return told
 
     def fewest(self, events: list[EventOccurrence]) -> tuple[tuple[EventOccurrence, ...], bool]:
-        """Return as few events as suffice, and whether each of them is needed."""
         last = events[-1:] if self._ended is None else []
         some = self._fewer(events[: len(events) - len(last)], last)
         if last and some and self._left > 0 and self.gives(some):

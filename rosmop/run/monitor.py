@@ -48,7 +48,6 @@ class StateHolder(Protocol):
     def is_true(self, name: str) -> bool: ...
 
     size: int
-    """The bytes of `cells`; 0 if the state is not only numbers."""
 
     left: bool
 
@@ -95,7 +94,6 @@ class RunningProperty:
         self.history.begin(time_ns)
 
     def mark(self) -> Callable[[], None]:
-        """Return a function that undoes everything since this call, except the passing of time."""
         run = cast("FormulaRun", self.run)
         before, history = run.mark(), self.history.mark()
 

@@ -18,7 +18,6 @@ from rosmop.runtime.action_context import Published as Published  # noqa: PLC041
 from rosmop.runtime.wire import Buffer
 
 _EACH_END = 5
-"""The number of first events, and of last events, that are listed; the others are only counted."""
 
 Result = Literal["passed", "changed", "dropped"]
 
@@ -43,7 +42,6 @@ Who = Callable[[int], Mapping[str, Any]]
 
 NOBODY = MessageSender()
 NO_NUMBER, SEQ = range(2)
-"""Kinds of sequence numbers: none, and `seq` of the header."""
 
 
 class EventOccurrence(NamedTuple):
@@ -160,7 +158,6 @@ class Outcome:
         self.time = time
 
     def restore(self, buffer: memoryview) -> None:
-        """Restore the received bytes, unless the buffer is read-only."""
         if not buffer.readonly:
             for start, old in reversed(self.overwritten):
                 buffer[start : start + len(old)] = old
@@ -272,7 +269,6 @@ def _led(outcome: Outcome, who: Who, handled: Verdict | None = None) -> dict[str
 
 
 def why_of(verdict: Verdict, who: Who) -> dict[str, Any]:
-    """Return the explanation as data; empty if it was not requested or is unknown."""
     why = verdict.why
     if why is None:
         return {}
@@ -302,7 +298,6 @@ def _event(verdict: Verdict, happened: EventOccurrence, who: Who) -> dict[str, A
 
 
 def decided_by(source: Source, why: Explanation) -> list[str]:
-    """Return the subformulas that decide the formula at the last event; empty if earlier events matter."""
     if why.since is not None:
         return []
     return deciding(source, [event.event for event in why.events], [event.time for event in why.events])

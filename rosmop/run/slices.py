@@ -1,20 +1,18 @@
 """The slices of a running parametric specification (Chen and Roşu, "Parametric trace slicing and monitoring", 2012).
 
 A *binding* gives a value to some or all of the parameters. The *slice* of a binding has the events whose bindings are
-part of it, from the first `creation event` on (without such events: from the first event on). Each slice whose events
-bind all parameters is monitored like a separate specification.
+part of it, from the first `creation event` on. Each slice whose events bind all parameters is monitored like a
+separate specification.
 
-1. An event concerns every known binding that agrees with its own, joined with it (`targets`). A new slice starts with
-   the state of the largest known binding within its own, which is unique, because the union of two known bindings
-   that agree is also known. Slices that lack a parameter (`seeds`) only provide such start states, without output.
-2. The engine (`execution.py`) loads each slice in turn into the monitor (`select`), steps the monitor, and stores the
-   state again (`settle`). If an event only changes the states of automata, `step` and `quiet` do so directly.
-3. Each slice has its own clocks. A slice has one valid entry in the heap of deadlines (`Slice.due`), whose time may
-   be too early, but never too late.
-4. A slice ends when no event and no deadline leads to a handler any more, and its actions only change its own
+1. An event concerns every known binding that agrees with its own, joined with it. A new slice starts with the state
+   of the largest known binding within its own, which is unique, because the union of two known bindings that agree is
+   also known. Slices that lack a parameter (`seeds`) only provide such start states, without output.
+2. Each slice has its own clocks, and one valid entry in the heap of deadlines (`Slice.due`), whose time may be too
+   early, but never too late.
+3. A slice ends when no event and no deadline leads to a handler any more, and its actions only change its own
    variables. Its binding is remembered, so that it does not start again. A slice in its initial state is forgotten at
    once if any relevant event would create it again.
-5. No host (*holder*) has more slices than are left for all other hosts (`slice_quota.py`), and none causes the
+4. No host (*holder*) has more slices than are left for all other hosts (`slice_quota.py`), and none causes the
    removal of another host's slice or ended binding. At its limit, the host's oldest slice is forgotten if the
    specification only observes. If it acts on messages or publishes, the new binding is `refused`, so that no host can
    get rid of an obligation.
@@ -112,7 +110,6 @@ class Slices:
         limit: int,
         holder_of: HolderOf,
     ) -> None:
-        """`holder_of(source)` is charged for slices that messages of this source make."""
         assert code.slicing is not None  # noqa: S101  the caller checks this
         properties = [declared.property for declared in code.properties]
         self._all = (1 << len(code.slicing.parameters)) - 1
@@ -125,12 +122,9 @@ class Slices:
         if any(_domain(event) != self._all for event in code.events):
             self.limit = min(self.limit, TOGETHER_LIMIT)
         self.refused: Mapping[str, object] | None = None
-        """The binding of the last event that cannot have a slice."""
         self.why = ""
         self.changed: dict[Binding, Holder] | None = None
-        """Bindings whose state has changed since it was last saved, with their hosts; None if it is not saved."""
         self.behind: list[Slice] = []
-        """Slices of the last event whose earlier deadlines are not processed yet."""
         self._code = code
         self._holder_of = holder_of
         self._namespace = namespace
@@ -163,7 +157,6 @@ class Slices:
         return self.quota.total
 
     def _look_at(self, properties: Sequence[PropertyCode]) -> None:
-        """Compute in which states a slice is over, counts as absent, or consists only of its state."""
         self._properties, events = properties, self._code.events
         finite = [declared for declared in properties if isinstance(declared.property, FiniteProperty)]
         every = len(finite) == len(properties)
@@ -307,7 +300,6 @@ class Slices:
         return [slice_ for slice_ in found if slice_ is not None]
 
     def _derived(self, domain: int, key: Key, most: int) -> Slice | None:
-        """Copy the state of the largest known binding within `key`; None if that slice has ended."""
         values = dict(zip(_members(domain), key[1:], strict=True))
         parent: Slice | None = self._first
         for other in sorted(self._known, key=int.bit_count, reverse=True):
@@ -419,7 +411,6 @@ class Slices:
         return self._deadlines[0][2]
 
     def _await(self, slice_: Slice) -> None:
-        """Add an entry to the heap, unless there is an earlier one."""
         deadline = slice_.deadline
         if deadline is None or (slice_.due is not None and slice_.due <= deadline):
             return

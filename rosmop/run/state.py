@@ -25,7 +25,6 @@ from rosmop.types import value_types
 from rosmop.types.value_types import Type
 
 MOST_BYTES = 64 << 10
-"""The limit for a group without slices, which is written with each batch that changes it."""
 
 _CLOCK = struct.Struct("<qq")
 

@@ -1,10 +1,8 @@
 """Bound a specification's actions, and collect their output: log lines, published messages, faults.
 
-Invariants:
-
-1. Between two calls of `begin` a specification spends at most its budget of instructions. Loops, calls, copies of
-   long values, and reads of many elements are charged before they run. If processor time is bounded (`Turn.limit`),
-   the clock is read every `STEP` instructions, and every `PART` elements of a loop or copy.
+1. Between two calls of `begin` a specification spends at most its budget of instructions. Loops, calls, long copies
+   and reads of many elements are charged before they run. If processor time is bounded (`Turn.limit`), the clock is
+   read every `STEP` instructions, and every `PART` elements.
 2. The values of a specification never exceed `MAX_BYTES` plus `UNMEASURED` bytes. Code that makes long values calls
    `allocate`; after `UNMEASURED` bytes the live values are measured.
 """
@@ -100,7 +98,6 @@ class Turn:
             self.until = self.clock() + self.seconds * self.part
 
     def late(self, more: float = 0.0) -> bool:
-        """Whether the time is over, or will be after `more` seconds."""
         return self.clock is not None and self.clock() + more > self.until
 
     def check(self) -> None:
@@ -147,7 +144,6 @@ class Context:
         measures: Mapping[str, Measure],
         live: Callable[[], Sequence[Mapping[str, object]]],
     ) -> None:
-        """`live` returns the values of all variables, and `measures` has a function for each name."""
         self.monitor = monitor
         self.turn = turn
         self.most = BUDGET
@@ -178,7 +174,6 @@ class Context:
             self._go_on(site, "; is there an endless loop?")
 
     def walk(self, elements: int) -> None:
-        """Charge for reading array elements one by one to reach a later field."""
         self.budget -= elements
         if self.budget < 0:
             self._go_on(-1, ": too many elements precede a field")
@@ -196,7 +191,6 @@ class Context:
         self.budget += given
 
     def allocate(self, size: int, site: int, replaced: int = 0) -> None:
-        """Charge for `size` new bytes that replace `replaced` bytes of a variable."""
         if size > MAX_BYTES:
             raise FaultError(site, f"{_TOO_LARGE}: a value of {size} bytes")
         self.spend(size // BYTES_PER_INSTRUCTION, site)
@@ -209,7 +203,6 @@ class Context:
         self.turn.log.append(line_of(level, text, self.monitor))
 
     def throttle(self, period: float, site: int) -> bool:
-        """Whether output is due: the last one was at least `period` seconds ago."""
         now = self.turn.now
         last = self.throttled.get(site)
         if last is not None and last <= now < last + period * 1e9:

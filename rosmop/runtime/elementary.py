@@ -75,7 +75,6 @@ def atan2(y: float, x: float) -> float:
 
 
 def _arctangent(x: float) -> float:
-    """Return the arctangent of `x` from 0 to 2**60: `atan(v)` for a smaller `v`, and the rest in two parts."""
     high, low, v = 0.0, 0.0, x
     if x >= 39 / 16:
         high, low, v = 1.57079632679489655800, 6.12323399573676603587e-17, -1.0 / x

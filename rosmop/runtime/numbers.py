@@ -221,7 +221,6 @@ MATH: dict[str, tuple[int, Callable[..., float]]] = {
     "erf": (1, math.erf),
     "erfc": (1, math.erfc),
 }
-"""Functions of `<math.h>` on doubles, with their number of arguments."""
 
 
 def _of_floats(name: str, count: int) -> Callable[..., float]:

@@ -11,7 +11,6 @@ _MOST_SECONDS = (1 << 32) - 1
 
 
 def is_safe(safe: SafeMessage, buffer: bytes | bytearray | memoryview) -> bool:
-    """Whether a message is the safe one, apart from `seq` and `stamp` of its header."""
     first = HEAD if safe.stamped else 0
     return len(buffer) == len(safe.data) and buffer[first:] == safe.data[first:]
 

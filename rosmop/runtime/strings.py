@@ -168,7 +168,6 @@ def extended(context: Context, buffer: bytes, text: bytes, site: int) -> bytes:
 
 
 def terminated(context: Context, buffer: bytes, site: int) -> bytes:
-    """Return the string in a `char` buffer, up to the first zero."""
     return _cut(charged(context, buffer, site))
 
 

@@ -37,7 +37,6 @@ def scaled(value: int, factor: float, site: int) -> int:
 
 
 def with_part(value: int, part: bytes, new: int, site: int) -> int:
-    """Return a time or duration after `value.sec = new` or `value.nsec = new`."""
     seconds, rest = divmod(value, BILLION)
     result = new * BILLION + rest if part == b"sec" else seconds * BILLION + new
     return result if -MAX_TIME <= result <= MAX_TIME else time(result, site)

@@ -66,7 +66,6 @@ class ValueCodec:
     # Sizes
 
     def width(self, kind: Type) -> int:
-        """Return the size in C++, without the contents of strings and vectors."""
         if isinstance(kind, value_types.IntegerType | value_types.FloatingType):
             return kind.bits // 8
         if isinstance(kind, value_types.RecordType):
@@ -129,7 +128,6 @@ class ValueCodec:
         return lambda: zero
 
     def copier(self, kind: Type) -> Callable[[Context, Any, int], Any]:
-        """Return a function of context, value and site that charges for and returns a deep copy."""
         return self._once(ValueCodec._copier, kind)
 
     def _copier(self, kind: Type) -> Callable[[Context, Any, int], Any]:
@@ -268,7 +266,6 @@ def zero_of(kind: Type) -> bool | float | bytes | None:
 
 
 def unpacker(codes: Sequence[str]) -> Callable[[wire.Buffer, int], tuple[Sequence[Any], int]]:
-    """Return a function that decodes the codes, two of which are nanoseconds."""
     plain = struct.Struct("<" + "".join(codes))
     unpack, size = plain.unpack_from, plain.size
     if all(len(code) == 1 for code in codes):
@@ -284,7 +281,6 @@ def unpacker(codes: Sequence[str]) -> Callable[[wire.Buffer, int], tuple[Sequenc
 
 
 def packer(codes: Sequence[str]) -> Callable[[Sequence[Any]], bytes]:
-    """Return a function that encodes the codes, two of which are nanoseconds."""
     pack = struct.Struct("<" + "".join(codes)).pack
     if all(len(code) == 1 for code in codes):
         return lambda values: pack(*values)

@@ -134,7 +134,6 @@ def filled_with(  # noqa: PLR0917  the arguments are C++'s
     measure: Callable[[Any], int],
     site: int,
 ) -> Values:
-    """`std::vector<T>(count, value)`; `measure` returns the size of a value."""
     context.allocate(count * max(measure(value), 1), site)
     context.spend(count // 4, site)
     return _made(context, count, lambda: copy(value))

@@ -16,7 +16,6 @@ Buffer = bytes | bytearray | memoryview
 
 _LENGTH = struct.Struct("<I")
 MAX_EMPTY = 1_000_000
-"""The most elements of an array whose elements have no bytes."""
 
 _MAX_DECODED = 1_000_000  # the maximum number of elements that are decoded one by one
 FEW = 64  # this number of elements takes less time than one instruction
@@ -35,7 +34,6 @@ def text_end(buffer: Buffer, start: int) -> int:
 
 
 def count(buffer: Buffer, start: int, least: int) -> int:
-    """Return the number of elements of the array at `start`, each with at least `least` bytes."""
     number: int = _LENGTH.unpack_from(buffer, start)[0]
     if number * least > len(buffer) - start - 4 or (not least and number > MAX_EMPTY):
         raise MalformedError(f"an array of {number} elements in a message of {len(buffer)} bytes")

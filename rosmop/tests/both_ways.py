@@ -60,7 +60,6 @@ class BothWays:
         return found
 
     def check(self, bodies: list[bytes], topic: str = "/plain", time: int = 1) -> list[bytes]:
-        """Returns the messages that pass; fails if a batch makes a difference."""
         expected = []
         began, self.counts = len(self.interpreted), Counter()
         lines: list[LogLine] = []

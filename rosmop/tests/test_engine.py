@@ -99,8 +99,6 @@ def test_the_events_of_a_change_are_those_found_by_comparing_all_bytes() -> None
 def _compared(
     name: str, function: Callable[[WireMessage | None], bool], found: list[str]
 ) -> Callable[[WireMessage | None], bool]:
-    """Add the name to `found` if the event has changed any byte."""
-
     def compared(seen: WireMessage | None) -> bool:
         assert seen is not None
         before = bytes(seen.buffer)

@@ -50,7 +50,6 @@ def test_random_specifications_and_messages(seed: int, wild: list[bytes]) -> Non
 
 
 def test_the_random_messages_reach_every_outcome() -> None:
-    """All outcomes occur, so that the comparison above is meaningful."""
     came: Counter[str] = Counter()
     for seed in range(24):
         try:

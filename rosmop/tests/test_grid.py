@@ -30,7 +30,6 @@ def test_each_back_end_has_a_row_for_each_kind_of_node(row: str) -> None:
 
 
 def test_each_kind_of_node_is_in_the_grid() -> None:
-    """A new node class must be an expression, a statement, or one of their known parts."""
     parts = {
         "Spot",
         "Skipper",

@@ -69,7 +69,6 @@ class Naive:
         self.out: Timed = []
 
     def judge(self, time: int, event: str, first: int = 0) -> None:
-        """Give a message to the phases from `first` on: the first that forbids it suppresses it."""
         inserted = []
         passes = True
         for place in range(first, len(self.phases)):

@@ -60,14 +60,12 @@ def test_other_bytes_are_not_opcodes(source: str) -> None:
 
 
 def named(name: str) -> str:
-    """Return the name of an instruction as in the WebAssembly specification, or the given name if it has no family."""
     family, _, rest = name.lower().partition("_")
     return f"{family}.{rest}" if rest and family in FAMILIES else name.lower()
 
 
 @pytest.mark.parametrize("name", [name for name in vars(wasm) if "." in named(name) or name in OTHERS])
 def test_instructions_have_their_names(name: str) -> None:
-    """The decoder of the proofs, which has its own table, reads every instruction back."""
     instruction = getattr(wasm, name)
     code = instruction if isinstance(instruction, bytes) else instruction(300)
     reader = decoding.Reader(code)

@@ -72,7 +72,6 @@ def test_an_invalid_state_of_a_property_is_refused(name: str, data: object) -> N
 
 
 def test_a_deep_stack_is_too_large_to_keep() -> None:
-    """The data written with each message is limited."""
     formula = compiled(FORMULAS["cfg"]).compiled.specifications[0].properties[0].property
     run = formula.start(0)
     for _ in range(2 * MOST_PARTS):

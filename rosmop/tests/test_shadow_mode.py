@@ -38,8 +38,6 @@ def number(data: int) -> bytes:
 
 
 class Both:
-    """Three sets: with one specification enabled, with it in shadow mode, and without it."""
-
     def __init__(self, texts: dict[str, str], shadowed: str, on_fault: OnFault = "drop") -> None:
         self.shadowed, self.on_fault = shadowed, on_fault
         place = next(at for at, text in enumerate(texts.values()) if text.startswith(shadowed))

@@ -120,7 +120,6 @@ def told(outcome: Outcome) -> Told:
 
 
 def naive(one: Made, trace: Trace) -> list[Told]:
-    """Return the effects by definition: each binding's part of the trace is given to the plain specification."""
     expected: list[Told] = [[] for _ in trace]
     values = [dict.fromkeys(values[name] for _, values in trace) for name in one.parameters]
     for choice in itertools.product(*values):

@@ -55,7 +55,6 @@ def running(text: str, start: int, deadlines: int = sys.maxsize) -> MonitorSet:
 
 Timed = Sequence[tuple[int, str, dict[str, object]]]
 Entry = tuple[int, int, tuple[tuple[str, str], ...]]
-"""The time, the place of the message (-1: a deadline), and what it brought about."""
 
 
 def entries(outcomes: Iterable[Outcome], place: int) -> list[Entry]:
@@ -124,7 +123,6 @@ def agree(one: Made, trace: Timed, deadlines: int = sys.maxsize) -> None:
 
 
 def joined(found: Iterable[Entry]) -> list[Entry]:
-    """Return the reports with one message's effects in several slices joined; deadlines stay separate by slice."""
     whole: dict[int, Entry] = {}
     rest: list[Entry] = []
     for time, place, said in found:

@@ -99,7 +99,6 @@ def test_an_interlock_neither_sticks_nor_forgets(handler: str) -> None:
 
 @pytest.mark.parametrize("formula", FORMULAS)
 def test_all_short_traces(formula: str) -> None:
-    """A message passes if it does not violate the formula after the messages that passed."""
     logic, _, text = formula.partition(": ")
     property_ = compiled(logic, text)
     for length in (3, 5):

@@ -137,7 +137,6 @@ def gives(
     target: EventOccurrence,
     category: str,
 ) -> bool:
-    """Whether events give a category, as a reader would try: with the last event, or at the target's deadline."""
     run = made.start(0) if before is None else copy.copy(before)
     told: tuple[str, ...] = ()
     for one in explanation:

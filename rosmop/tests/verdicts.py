@@ -56,7 +56,6 @@ def _untimed(
     events: Sequence[str] = ABC,
     longest: tuple[int, int] = (4, 12),
 ) -> Drawn:
-    """All traces up to one length, random ones up to another; `meant` are the verdicts after each event."""
     monitor = compiled(logic, text, events)
     return Drawn(
         text,

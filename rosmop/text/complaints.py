@@ -160,7 +160,6 @@ def shown(text: str) -> str:
 
 
 def describe(text: str, offset: int, accepted: Set[str]) -> tuple[int, str]:
-    """Return the offset and the message where only tokens of `accepted` may follow."""
     if offset >= len(text):
         return _at_end(text, accepted)
     if text.startswith("/*", offset):

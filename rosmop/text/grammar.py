@@ -13,10 +13,8 @@ _GAP = r"(?:\s|\/\/[^\n]*\n|\/\*(?:[^*]|\*(?!\/))*\*\/)"
 _WORD = "(?:creation|static|unsynchronized|decentralized|perthread|suffix)"
 
 _AT = r"@(?=(?:bc?|c)(?!\w))(?!\w+<GAP>*\{)"
-"""The `@` of an operator of `ptcaret`, which does not begin a handler."""
 
 _CONDITION = r"\{[^{}@]*@[A-Za-z_]\w*\.[^{}]*\}"
-"""A condition of a pattern that refers to an earlier message, such as `{x < @A.x}`."""
 
 _GRAMMAR = r"""
 file: (specification | using | order | ";")*
@@ -241,7 +239,6 @@ PREAMBLE.10: /#(\\\r?\n|[^\n])*/
 """
 
 _NEXT = rf"(?<!\w)(?:(?i:{'|'.join(LOGICS)}|dl)\s*:(?!:)|(?:{_WORD}\s+)*event\s+[A-Za-z_]\w*\s*\()"
-"""The end of a formula without handlers: another property, or an event."""
 
 GRAMMAR = (
     _GRAMMAR.replace("<CONDITION>", _CONDITION)

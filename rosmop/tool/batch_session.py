@@ -112,7 +112,6 @@ class BatchSession:
 
 @contextmanager
 def batch_session(program: CommandContext, options: RecordingsOptions) -> Iterator[BatchSession]:
-    """Exit with status 2 if there are no recordings, or an option is wrong."""
     if not options.bags and not options.sets:
         raise program.usage_error("give recordings: --bag FILE, or --bags with a folder, a pattern or s3://…")
     if options.report is not None and not os.access(options.report.parent, os.W_OK):

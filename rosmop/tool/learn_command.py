@@ -162,7 +162,6 @@ def _write(program: CommandContext, out: Path, learnt: LearningResult, recorded:
 
 
 def _needed(learnt: LearningResult, recorded: Definitions) -> list[str]:
-    """Return the types of the specifications, and of their fields, that `check` would not know."""
     own = standard_definitions()
     waiting = [learnt.types[topic] for candidate in learnt.candidates for topic in candidate.topics]
     found: set[str] = set()

@@ -22,7 +22,6 @@ def say_finding(finding: Diagnostic, *, as_json: bool) -> None:
 def record(
     outcome: Outcome, index: int | None = None, topic: str | None = None, publisher: str = ""
 ) -> dict[str, object]:
-    """Return an outcome as data; without a topic, it is a tick or deadline."""
     head: dict[str, object] = {"timer": outcome.timer}
     if topic is not None:
         head = {"publisher": publisher, "topic": topic} if publisher else {"index": index, "topic": topic}
@@ -69,7 +68,6 @@ def _fault(fault: Fault) -> dict[str, object]:
 def lines(
     outcome: Outcome, index: int | None = None, topic: str | None = None, publisher: str = ""
 ) -> Iterator[str]:
-    """Yield no lines for a message without an outcome to report."""
     seconds = f"{outcome.time / BILLION:.3f}"
     number = f"published by {publisher}:" if publisher else f"#{index}"
     head = f"{seconds} {outcome.timer}" if topic is None else f"{seconds} {number} {topic}"

@@ -14,7 +14,6 @@ from rosmop.tool.tables import add_row, say_table, table_of
 from rosmop.tool.terminal import counted, say, say_json
 
 MOST_IN_ROWS = 10_000
-"""The most rows for each recording, monitor, topic and kind. The counts are of all effects."""
 _MOST_RECORDINGS = 100  # lines of the table of recordings
 _WOULD = {"drop": "would drop it", "change": "would change it"}
 _HEADS = ("would drop", "would change", "verdicts", "warnings", "faults")

@@ -119,7 +119,6 @@ def field_type(field: Field) -> Type:
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-    """Return text to append to an error. At most `_COMPARED` names are compared."""
     known = list(islice(known, _COMPARED))  # a file can have thousands of names and thousands of mistakes
     near = difflib.get_close_matches(name[:100], known, 1, 0.65)
     if near:

@@ -12,7 +12,6 @@ from roswire.errors import RosError
 from roswire.tcpros import Body
 
 BUFFER_BYTES = 1 << 19
-"""Half the number of received bytes at which a connection stops reading."""
 
 
 class NodeCallError(RosError):
@@ -60,7 +59,6 @@ class ListeningServer(Protocol):
 
     @property
     def port(self) -> int: ...
-
     def close(self) -> None: ...
 
 
@@ -129,7 +127,6 @@ class OwnedTasks:
             task.add_done_callback(self._tasks.discard)
 
     async def close(self) -> None:
-        """Cancel the tasks, and return when all have ended."""
         tasks = [task for task in self._tasks if task is not asyncio.current_task()]
         for task in tasks:
             task.cancel()

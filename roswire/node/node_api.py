@@ -30,7 +30,6 @@ class NodeTables(Protocol):
 
     @property
     def tcpros(self) -> tuple[str, int]: ...
-
     def follow(self, subscriber: NodeSubscription, uris: Sequence[Value]) -> None: ...
 
 

@@ -94,7 +94,6 @@ class RosNode:
         return self._network.source, self._servers[1].port
 
     async def close(self) -> None:
-        """Unregister everything, as far as the master answers soon, and end."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(_CLOSE_SECONDS):
                 await self._unregister_all()
@@ -160,13 +159,11 @@ class RosNode:
             return subscriber
 
     def repeat(self, topic: str, received: Received) -> None:
-        """Give `received` the last message of each latched publisher."""
         self.subscribers[topic].repeat(received)
         if topic in self.publishers:
             self.publishers[topic].repeat(received)
 
     def follow(self, subscriber: NodeSubscription, uris: Sequence[Value]) -> None:
-        """Connect to the publishers of a topic; the node's own messages take no connection."""
         subscriber.update([uri for uri in uris if isinstance(uri, str) and uri != self._uri])
 
     async def unsubscribe(self, topic: str) -> None:

@@ -146,7 +146,6 @@ class TcprosReceiver(asyncio.BufferedProtocol):
             self._pause()
 
     def _begin_large(self, size: int, begin: int, end: int) -> int:
-        """Return the position behind the bytes that are used."""
         if self._memory.refusal(size):
             self._skipped()
             self._missing = size

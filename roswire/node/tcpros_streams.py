@@ -47,7 +47,6 @@ class MessageType:
 
 
 ANY_TYPE = MessageType(ANY, ANY, "")
-"""The type of a subscriber that accepts every type."""
 
 
 async def read_frame(reader: asyncio.StreamReader, limit: int) -> bytes:

@@ -216,7 +216,6 @@ def printed(body: str, before: str, directory: Path, *options: str) -> list[str]
 def test_the_language_agrees_with_a_compiler(
     seed: int, make: tuple[Callable[[Random], str], str], tmp_path: Path
 ) -> None:
-    """The interpreter computes all of them, the module the numbers."""
     write, before = make
     body = write(Random(seed))  # noqa: S311  draws examples, not keys
     expected = [line.replace("-nan", "nan") for line in printed(body, before, tmp_path)]

@@ -27,7 +27,6 @@ def told(compiled: CompiledProperty, trace: Iterable[str]) -> list[tuple[str, ..
 def play(
     run: Run, events: Sequence[str], trace: Iterable[tuple[int, str]], end: int = 0
 ) -> list[tuple[int, tuple[str, ...]]]:
-    """Times and categories, with all deadlines up to and including ``end``."""
     record = []
     for time, event in trace:
         record += _expired(run, time)

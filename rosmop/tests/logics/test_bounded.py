@@ -41,7 +41,6 @@ def negated(value: Truth) -> Truth:
 
 
 def worth(tree: Tree, trace: Timed, i: int, passed: int) -> Truth:  # noqa: PLR0911, PLR0912  # one per operator
-    """At event ``i`` of ``trace``, if no event follows until ``passed``."""
     operator, *rest = tree
     low, high = 0, OVER
     if operator in (*PAST, *FUTURE):
@@ -95,7 +94,6 @@ def worth(tree: Tree, trace: Timed, i: int, passed: int) -> Truth:  # noqa: PLR0
 
 
 def expected(tree: Tree, trace: Timed, end: int) -> list[tuple[int, str]]:
-    """By the definition: each verdict is due when it first becomes certain."""
     record: list[tuple[int, str]] = []
     known: set[int] = set()
 

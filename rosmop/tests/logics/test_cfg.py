@@ -33,7 +33,6 @@ def show(rules: Rules, random: Random) -> str:
 
 
 def derives(rules: Rules, start: str, word: tuple[str, ...]) -> bool:
-    """By the least table of spans closed under the rules."""
     size = len(word)
     spans: dict[str, set[tuple[int, int]]] = {head: set() for head in rules}
     for event in (*ABC, *word):

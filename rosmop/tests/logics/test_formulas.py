@@ -68,7 +68,6 @@ def shown(time: int) -> str:
 
 
 def facts_of(case: Case) -> tuple[str, ...]:
-    """Return what is known of a formula: `category by trace` where a table asks for it, else all facts."""
     logic, _, formula = case.source.partition(": ")
     monitor = compiled(logic, formula)
     asked = [line.partition(" by ")[0] for line in case.expected if " by " in line]

@@ -36,7 +36,6 @@ def lassos(events: tuple[str, ...], stem: int, loop: int) -> list[Lasso]:
 
 
 def holds(tree: Tree, lasso: Lasso) -> list[bool]:  # noqa: PLR0911  # one per kind of operator
-    """By the definition of each operator; fixed points are iterated."""
     word, back = lasso
     size = len(word)
     after = [*range(1, size), back]
@@ -95,7 +94,6 @@ def looking_back(operator: str, values: list[list[bool]]) -> list[bool]:
 
 
 def by_enumeration(tree: Tree, words: list[Lasso], longest: int) -> dict[tuple[str, ...], tuple[str, ...]]:
-    """The verdict that all enumerated continuations of a prefix have in common."""
     verdicts: dict[tuple[str, ...], set[bool]] = {}
     for lasso in words:
         truth = holds(tree, lasso)[0]

@@ -51,7 +51,6 @@ class Meaning:
             yield opened, tuple(inside), False
 
     def unmet(self, trace: Timed, now: int) -> tuple[bool, frozenset[tuple[int, int]]]:
-        """The duties are a scope and a position in it."""
         results = [self._in_scope(*scope, now) for scope in self.scopes(trace)]
         due = {(number, place) for number, (_, places) in enumerate(results) for place in places}
         return any(violated for violated, _ in results), frozenset(due)
@@ -133,7 +132,6 @@ def told_by(meaning: Meaning, trace: Timed, end: int) -> list[tuple[int, tuple[s
 
 
 def _deadline(meaning: Meaning, seen: Timed, instant: int) -> tuple[str, ...]:
-    """The verdict is certain only because no further event happens at this time."""
     if meaning.unmet(seen, instant + 1)[0]:
         return ("violation",)
     windows = [opened + (meaning.within or 0) for opened, _, closed in meaning.scopes(seen) if not closed]

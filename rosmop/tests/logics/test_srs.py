@@ -25,7 +25,6 @@ def draw(random: Random) -> list[Rule]:
 
 
 def show(rules: list[Rule]) -> str:
-    """One of the rules writes X, which the test searches for."""
     text = "a a a a a a a a a a a a a -> X . "
     for left, right, begins, ends in rules:
         written = f"#{right[1]}" if right[:1] == ["#"] else " ".join(right) or "#epsilon"

@@ -8,7 +8,6 @@ PROPERTIES = {
     "pattern": 240, "ptcaret": 400, "srs": 600,
 }  # fmt: skip
 SHORT = {"fsm": 120, "ere": 120, "cfg": 39, "ltl": 39, "pattern": 5}
-"""The number of short traces of each property; 20 of the others."""
 
 
 @pytest.mark.parametrize("logic", PROPERTIES)

@@ -154,7 +154,6 @@ def faulty(text: str, every: int = 1) -> Iterator[tuple[str, str]]:
 def faulty_event(
     code: Compiled, event: str, every: int, *, patience: float = 100
 ) -> Iterator[tuple[str, str]]:
-    """Yield the kind of each fault in the function of the event, also in those that it calls, and the answer."""
     [group] = groups(code.specifications)
     module = written(code.functions, [group.component], ValueCodec(code.messages))
     validation = Validation(
@@ -181,7 +180,6 @@ def faulty_event(
 
 
 def _called(codes: Sequence[Code], number: int) -> list[int]:
-    """Return the function with all functions that it calls, each once."""
     found = [number]
     for one in found:
         found += {called for called in _calls(codes[one].body) if called not in found}

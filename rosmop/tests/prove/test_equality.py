@@ -53,7 +53,6 @@ def test_no_shipped_specification_is_left_out() -> None:
 
 
 def row_of(preset: str, found: Mapping[str, str]) -> str:
-    """Return the row of a preset in the table of docs/dev/assurance.md."""
     proved = [f"`{name}`" for name, answer in found.items() if answer == EQUAL]
     others: dict[str, list[str]] = {}
     for one, answer in found.items():

@@ -33,7 +33,6 @@ def required(requirements: Iterable[str]) -> set[str]:
 
 @pytest.fixture(scope="module")
 def environment(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The environment has only the wheel and the dependencies that it loads."""
     folder = tmp_path_factory.mktemp("installed")
     built = run(sys.executable, "-P", "-m", "hatchling", "build", "--target", "wheel", "--directory", folder)
     assert built.returncode == 0, built.stderr
@@ -58,7 +57,6 @@ def environment(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_wheel_is_complete(environment: Path) -> None:
-    """It has the wire format, but no tests, appliance or WebAssembly compiler."""
     packages = next(environment.glob("lib/python*/site-packages"))
     ours = {path.relative_to(FOLDER) for path in FOLDER.rglob("*.py") if "tests" not in path.parts}
     assert {path.relative_to(packages / "rosmop") for path in (packages / "rosmop").rglob("*.py")} == ours
