@@ -126,7 +126,6 @@ def test_a_change_that_cannot_be_stored_has_no_effect(small: SmallDisk) -> None:
 
 
 def test_a_revocation_is_effective_even_if_it_cannot_be_stored(small: SmallDisk) -> None:
-    """The answer warns of a restart, and the revocation is stored once there is space."""
     small.fill()
     answer = small.ask(admin.TokenRevoke("guest"))
     assert answer.error is not None

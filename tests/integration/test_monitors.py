@@ -37,7 +37,6 @@ def common_appliance() -> Iterator[Appliance]:
 
 @pytest.fixture
 def appliance(common_appliance: Appliance) -> Iterator[Appliance]:
-    """Only `words`, in its initial state, and only this test's log."""
     common_appliance.ignore_earlier_records()
     yield common_appliance
     common_appliance.rosrv("monitor", "remove", "words", check=False)

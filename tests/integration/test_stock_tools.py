@@ -71,7 +71,6 @@ def test_rostopic_hz(ros: RosSession) -> None:
 
 
 def _window(event: Event) -> int:
-    """The number of messages of the average that `rostopic hz` prints; 0 for other lines."""
     _, found, count = event.get("text", "").rpartition("window: ")
     return int(count) if found else 0
 

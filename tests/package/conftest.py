@@ -40,7 +40,6 @@ def package() -> Path:
 
 
 def elsewhere(folder: Path) -> Path:
-    """Another user has the checkout like this, readable for its owner only."""
     git = ["git", "-c", f"safe.directory={ROOT}", "-c", f"safe.directory={ROOT}/.git"]
     subprocess.run(
         [*git, "clone", "--quiet", "--no-hardlinks", str(ROOT), str(folder)], umask=0o077, check=True

@@ -57,7 +57,6 @@ class AutojumpLoop(asyncio.BaseEventLoop):
         return []
 
     def _process_events(self, _events: list[Never]) -> None: ...
-
     def _write_to_self(self) -> None: ...
 
     def _waiting(self) -> str:

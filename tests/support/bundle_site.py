@@ -42,8 +42,6 @@ class SupportsClose(Protocol):
 
 
 class BundleSite:
-    """The repository has one group; `selection` is selected in it."""
-
     def __init__(self, folder: Path, now: Callable[[], datetime.datetime] | None = None) -> None:
         self.folder = folder
         self.authority = FleetAuthority(folder / "certificates")

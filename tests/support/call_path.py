@@ -55,7 +55,6 @@ class Profiler:
             self.entered[name] = None
 
     def take(self) -> list[str]:
-        """Forget them, and return those of the project; without a folder, they are in `appliance`."""
         entered, self.entered = self.entered, {}
         paths = (name.removeprefix(f"{ROOT}/") for name in entered)
         return [
@@ -64,7 +63,6 @@ class Profiler:
 
 
 async def _run_always(what: str, work: Callable[[], Awaitable[object]]) -> None:
-    """Mark the work that goes on without calls; tasks and callbacks inherit the mark."""
     _GOES_ON.set(True)
     await run_always(what, work)
 
@@ -118,8 +116,6 @@ class Control:
 
 
 class Caller(xmlrpc.client.Transport):
-    """Also the API of the node: it counts the updates of publishers."""
-
     def __init__(self, name: str) -> None:
         super().__init__()
         self.name = name

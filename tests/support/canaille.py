@@ -24,8 +24,6 @@ _UV = Path(sys.executable).with_name("uv")
 
 
 class Canaille:
-    """`groups` are the groups of each person, whose password is the name twice."""
-
     def __init__(self, host: Host, folder: Path, certificates: Certificates, redirect_uri: str) -> None:
         self._host, self._folder, self._certificates = host, folder, certificates
         self._program = folder / "environment" / "bin" / "canaille"

@@ -84,8 +84,6 @@ _OF_GRAPH = {"registered", "unregistered", "revoked", "replaced", "takeover", "n
 
 
 class Records:
-    """Keeps (event, resource), the denied decisions, and the requests that were not understood."""
-
     def __init__(self, note: Callable[[Seen], None] = lambda _seen: None) -> None:
         self._note = note
         self.events: list[tuple[str, str | None]] = []
@@ -181,8 +179,6 @@ class NoSpecifications:
 
 
 class HiddenMaster:
-    """Keeps its registrations with their URIs, its parameters, and every call it received."""
-
     def __init__(self, note: Callable[[Seen], None]) -> None:
         self._note = note
         self.calls: list[tuple[Value, ...]] = []
@@ -353,7 +349,6 @@ class ControlParts:
     """`reload(text)` puts another policy in force, `settle()` waits for its consequences."""
 
     def __init__(self, *, silent: float = 0.0) -> None:
-        """After `silent` seconds without an answer a node is lost."""
         self._not_ours = asyncio.all_tasks()  # the test's own
         self.current = compile_policy(OPEN, file="policy")
         self.seen: list[Seen] = []
@@ -512,7 +507,6 @@ class ControlParts:
         await self.settle()
 
     async def settle(self) -> None:
-        """Check the nodes on the watchlist, and wait until all started work is done."""
         self.sinks.flush()
         self.liveness.look_at_watched()
         while others := asyncio.all_tasks() - self._not_ours:

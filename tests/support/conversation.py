@@ -141,7 +141,6 @@ class Conversation:
             self._name_nodes()
 
     def _answered(self, method: str, answer: Any, *, raw: bool = False) -> list[str]:
-        """A call that is only carried out has no lines."""
         if isinstance(answer, dict):
             return [f"fault: {answer['faultString']}"]
         if raw and not (answer and isinstance(answer[0], int)):
@@ -275,7 +274,6 @@ class Conversation:
     # --- as text ---
 
     def _stated(self, message: messages.Message) -> str:
-        """Return an empty text for the port of a node, which goes before its first topic."""
         for word, kind in messages.FACTS.items():
             if isinstance(message, (kind.stated, kind.withdrawn)):
                 key, *rest = (getattr(message, name) for name in kind.fields)

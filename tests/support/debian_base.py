@@ -122,7 +122,6 @@ def apt_settings(dump: str, proxies: Mapping[str, str]) -> str:
 
 
 def pip_settings(listed: str) -> str:
-    """Leave out folders of this machine, which the tree does not have."""
     kept = {"cert": f"/{_CERTIFICATES}"}
     for name, _, value in (line.partition("=") for line in listed.splitlines()):
         key = name.rpartition(".")[2]

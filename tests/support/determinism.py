@@ -54,7 +54,6 @@ class Watch:
 
     @contextmanager
     def watching(self) -> Iterator[list[str]]:
-        """Yield the list of what was attempted, which is complete at the end."""
         found: list[str] = []
         outer = self._found, self._watched
         self._found, self._watched = found, True

@@ -232,7 +232,6 @@ class Compose:
         return self.engine.docker("exec", self.container(service), *command, check=check, timeout=timeout)
 
     def wait_healthy(self, service: str = "appliance", timeout: float = HEALTHY_SECONDS) -> None:
-        """Wait until the health check has passed since the last start."""
         container = self.container(service)
         since = self.engine.inspect(container)["State"]["StartedAt"]
         command = [

@@ -39,7 +39,6 @@ class Inline(ByHand):
         super().hurry()
 
     def hurry(self) -> None:
-        """Call the turns that are due, and the next one when it is: a log that failed answers only then."""
         super().hurry()
         if self.due is not None and self.due < math.inf:
             with contextlib.suppress(RuntimeError):  # no loop runs

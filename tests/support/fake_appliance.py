@@ -1,7 +1,8 @@
 """Fake an appliance that gives a test's answers over its admin socket and over REST, and keeps the requests.
 
-fake.answer("status", version="1.0")        # fields that are not given are empty, zero or None fake.reject("monitor
-enable", "unknown", "no monitor is named x") fake.problem(403, "refused", "for admins")  # every answer of REST
+fake.answer("status", version="1.0")        # fields that are not given are empty, zero or None
+fake.reject("monitor enable", "unknown", "no monitor is named x")
+fake.problem(403, "refused", "for admins")  # every answer of REST
 """
 
 import contextlib

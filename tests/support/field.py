@@ -65,7 +65,6 @@ class Field:
     # --- actions of the rogue ---
 
     def rogue(self, method: str, *parameters: Any, uri: str | None = None) -> Any:
-        """A fault or an HTTP error is raised as an exception."""
         return self.call(self.attacker, method, *parameters, uri=uri)
 
     def call(self, host: Host, method: str, *parameters: Any, uri: str | None = None) -> Any:
@@ -82,7 +81,6 @@ class Field:
         return answer
 
     def raw(self, data: bytes, host: Host | None = None, port: int = 11311) -> bytes:
-        """Read until the appliance closes, or until an answer is complete and nothing follows."""
         with self.connect(host, port) as sock:
             sock.sendall(data)
             received = b""
@@ -103,7 +101,6 @@ class Field:
         return self.trail.wait_for(lambda event: reason in (event.get("reason") or ""), **fields)
 
     def unharmed(self, messages: int = 3) -> None:
-        """Every message arrives once, in order, and from the talker."""
         now = self.listener.mark()
         self.listener.wait_for_count(messages, since=now, event="received")
         heard = [

@@ -45,7 +45,6 @@ def syn_sources(wire: socket.socket) -> list[str]:
 
 
 def flood_command(source: str, target: str, port: int, *, per_second: int, seconds: float) -> list[str]:
-    """The program sends SYNs evenly from one address, each from another ephemeral port, and prints their number."""
     return [
         sys.executable,
         "-m",

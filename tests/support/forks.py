@@ -56,7 +56,6 @@ class Fork(subprocess.Popen[Any]):
         start_new_session: bool = True,
         **standard: Any,
     ) -> None:
-        """Take `standard`: `stdin`, `stdout` and `stderr`, each PIPE or an open file."""
         assert start_new_session
         self.args, self.returncode = arguments, None
         self.stdin = self.stdout = self.stderr = None

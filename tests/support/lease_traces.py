@@ -62,7 +62,6 @@ class TraceBounds:
 
 
 def lease_accepts(folder: Path, events: Sequence[str], names: tuple[str, str] = ("a", "b")) -> bool:
-    """Raises `ValueError` for a line that is not an event."""
     fields = [_fields(line, names) for line in events]
     numbers = [one["number"] for one in fields if "number" in one]
     if len(numbers) != len(set(numbers)):

@@ -77,9 +77,6 @@ def machine_disk(kernel: Kernel) -> Path:
 
 
 def clean_disk(kernel: Kernel, packages: tuple[str, ...], *, name: str = "clean") -> Path:
-    """A Debian without the project: these packages, systemd, and the agent. For each `name` only the newest image is
-    kept.
-    """
     return _disk(name, kernel, (*packages, *_MACHINES_OWN), environment=False)
 
 

@@ -10,8 +10,6 @@ _ROOM = 1 << 16  # bytes after which a reader pauses its peer, twice
 
 
 class MemoryNetwork:
-    """The servers by address and port; `connections` counts those that were made to each."""
-
     def __init__(self) -> None:
         self.servers: dict[tuple[str, int], Serve] = {}
         self.connections: list[tuple[str, tuple[str, int]]] = []  # source, target
@@ -41,7 +39,6 @@ class MemoryNetwork:
         return near.reader, near
 
     def feed(self, source: str, address: tuple[str, int], receiver: asyncio.BufferedProtocol) -> None:
-        """Give what the server sends to `receiver`, as an event loop does."""
         reader, writer = self.connect(source, address)
         task = asyncio.ensure_future(_Transport(reader, writer).feed(receiver))
         self._tasks.add(task)

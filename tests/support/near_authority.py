@@ -23,7 +23,6 @@ class NearAuthority(Authority):
     async def issue(
         self, request: bytes, name: str, days: float, *, proof: bytes = b"", former: bytes = b""
     ) -> CertificateMade:
-        """The refusal is as it comes over the link; `meanwhile` runs before."""
         self.meanwhile()
         await asyncio.sleep(0)
         try:

@@ -162,7 +162,6 @@ def without_gap(numbers: Sequence[int]) -> bool:
 
 @functools.cache
 def roscpp_program(name: str) -> Path:
-    """Compile the node on first use and after changes of its source."""
     source, header = HERE / "roscpp_nodes" / f"{name}.cpp", HERE / "roscpp_nodes" / "report.hpp"
     target = BUILD / name
     BUILD.mkdir(parents=True, exist_ok=True)

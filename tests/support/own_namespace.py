@@ -13,7 +13,6 @@ _TURN = Path(tempfile.gettempdir()) / "rosrv-test-netns.lock"
 
 @contextlib.contextmanager
 def own_namespace() -> Iterator[None]:
-    """Wait until no other test runs an appliance with isolation netns, the default of `rosrv up`."""
     with _TURN.open("w") as turn:
         fcntl.flock(turn, fcntl.LOCK_EX)
         yield
@@ -21,7 +20,6 @@ def own_namespace() -> Iterator[None]:
 
 @contextlib.contextmanager
 def own_loopback() -> Iterator[None]:
-    """The processes of the block have a network that is only a loopback. Needs root."""
     namespace = Namespace(f"rosrv-test-loopback.{os.getpid()}").create()
     with namespace.entered():
         interfaces.set_link(Namespace.own(), "lo", up=True)

@@ -35,7 +35,6 @@ def mirror(
     note: Callable[[str, Value], None] = lambda _key, _value: None,
     **more: Any,
 ) -> ParameterMirror:
-    """One host may have all of the tree (`whole`), or the limits in `bounds`."""
     pool = Pool("bytes of parameters", bounds or Bounds(whole, whole, 0, 0), quota_class)
     owners = owners or Owners()
     charges = ParameterCharges(pool, owners, list(owners.kept.items()))

@@ -22,7 +22,6 @@ LIMIT = 30.0 * float(os.environ.get("TESTS_PATIENCE", "1"))
 class Host(Protocol):
     @property
     def address(self) -> str: ...
-
     def popen(self, args: Sequence[str | os.PathLike[str]], **options: Any) -> "subprocess.Popen[Any]": ...
 
 
@@ -92,7 +91,6 @@ class Process:
         since: int = 0,
         **fields: Any,
     ) -> Event:
-
         def accepts(event: Event) -> bool:
             given = all(event.get(key) == value for key, value in fields.items())
             return given and (wanted is None or wanted(event))
@@ -112,8 +110,6 @@ class Process:
                 self._changed.wait(left)
 
     def wait_for_text(self, text: str, *, timeout: float = LIMIT, since: int = 0) -> str:
-        """Return the first line, plain or of a log, that contains `text`."""
-
         def said(event: Event) -> str:
             return str(event.get("text", event.get("event", "")))
 
@@ -127,7 +123,6 @@ class Process:
     def wait_for_count(
         self, count: int, *, timeout: float = LIMIT, since: int = 0, **fields: Any
     ) -> list[Event]:
-        """Each may take `timeout` seconds; `since` is an index of events."""
         found: list[Event] = []
         position = since
         deadline = time.monotonic() + timeout
@@ -149,7 +144,6 @@ class Process:
                 self._changed.wait(left)
 
     def mark(self) -> int:
-        """Pass the result as `since` to see only later events."""
         with self._changed:
             return len(self.events)
 

@@ -210,7 +210,6 @@ class PumpFuzzer:
         topic.keeps_large = self._random.random() < 0.5
 
     def _move(self) -> None:
-        """The new area is memory of the module, or other memory, some of it unfit."""
         area: Any = memoryview(bytearray(self._random.choice((2 * _SMALL, 1 << 16, 512 << 10))))
         unfit = (
             bytearray(2 * _SMALL - 1),
@@ -412,7 +411,6 @@ class PumpFuzzer:
 
 
 def fuzz(seed: int, size: int) -> str:
-    """Until `size` bytes are sent and all `OUTCOMES` are seen, at most for ten times `size` bytes."""
     appliance.relay.transport.__path__.insert(0, str(build(SANITIZED).parent))
     pump = importlib.import_module("appliance.relay.transport.pump")
     assert SANITIZED in str(pump.__file__), pump.__file__

@@ -71,8 +71,6 @@ _ANSWERS: dict[type, Any] = {
 
 
 class Carried:
-    """Answers every request instead of control's parts; an order ends with `error` if it is set."""
-
     def __init__(self) -> None:
         self.answers = dict(_ANSWERS)
         self.orders: list[tuple[AdminRequest[Any], str | None]] = []
@@ -118,8 +116,6 @@ class Trail:
 
 
 class RestWorld:
-    """The audit trail is empty; `asked` sends a request. The api reads the log in `state`."""
-
     def __init__(self, state: Path = _STATE) -> None:
         with using(VirtualClock(wall=_NOW)):
             self._runner = asyncio.Runner(loop_factory=InlineLoop)
@@ -194,7 +190,6 @@ class RestWorld:
     def bypassing(
         self, request: AdminRequest[Any], role: str, asked: ClientRequest | None = None
     ) -> dict[str, Any]:
-        """As a compromised api would; return the only record of the order."""
         self.trail.records.clear()
         self.carried.orders.clear()
 

@@ -13,8 +13,6 @@ PORT = 11311
 
 
 class PlainMaster:
-    """`rosmaster --core` and `rosout` on a host: on the usual port in a lab, on a free one otherwise."""
-
     def __init__(self, home: Path, host: Host | None = None) -> None:
         self.host: Host = host or ThisMachine()
         self.home = home
@@ -76,7 +74,6 @@ def await_node(uri: str, host: Host, name: str) -> None:
 
 
 def _await(attempt: Callable[[], object], complaint: str, process: Process | None) -> None:
-    """A foreign program sends no event when it is ready."""
     deadline = time.monotonic() + LIMIT
     pause = threading.Event()
     while True:

@@ -33,8 +33,6 @@ _PATIENT_LOOKS = 20  # some seconds
 
 
 class ScriptHost:
-    """`address` is the address for ROS nodes on the host (set once it has joined)."""
-
     def __init__(self, host: Host, directory: Path, root: Path | None = None) -> None:
         self.outer = host
         self.directory = directory
@@ -68,7 +66,6 @@ class ScriptHost:
         return found
 
     def _left(self) -> bool:
-        """Whether the ports are free for the next host; a remaining process is terminated."""
         programs = self._programs()
         self._looks += 1
         if self._looks == _PATIENT_LOOKS:

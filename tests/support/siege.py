@@ -101,7 +101,6 @@ class Crowd:
             self.held += [sock for sock in coming if sock not in waiting]
 
     def subscribe(self, address: str, caller_id: str, publisher: str, topic: str) -> int:
-        """Return the relay's port, for which a permission now exists."""
         face = self.call(address, "lookupNode", caller_id, publisher)
         assert face[0] == 1, face
         port = int(face[2].rstrip("/").rpartition(":")[2])
@@ -197,7 +196,6 @@ class Siege:
         assert self.call("deleteParam", "/starter", "/robot")[0] == 1
 
     def works(self, *, slowest: float, messages: int = 25) -> None:
-        """No message is lost, all calls are answered in time, and a node can start."""
         heard = len(self.listener.seen(event="received"))
         took = self.calls()
         assert took < allowed(slowest), f"the robot's call took {took:.2f} s"
@@ -225,7 +223,6 @@ class Siege:
         self.appliance.rosrv("policy", "reload")
 
     def throughout(self, attack: Callable[[], None], *, slowest: float) -> None:
-        """The robot works during this attack and afterwards, including a reload."""
         attack()
         self.works(slowest=slowest)
         self.reload()

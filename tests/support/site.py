@@ -79,7 +79,6 @@ class Site:
         }
 
     def reset(self) -> None:
-        """Remove the dead nodes and the parameters of a test; fail if anything else is not as it was."""
         now = self.state()
         if now["parameters"] != self._first["parameters"]:
             self._call("setParam", "/", self._first["parameters"])
@@ -118,8 +117,6 @@ class Site:
 
 
 class Masters:
-    """Each master starts when a test first needs it, and again after a test that broke it."""
-
     def __init__(self, new_home: Callable[[str], Path]) -> None:
         self._new_home = new_home
         self._running: dict[tuple[Mode, Place], tuple[Site, contextlib.ExitStack]] = {}

@@ -29,7 +29,6 @@ def stated(
     restarted: bool = False,
     **more: Any,
 ) -> SpecificationsStated:
-    """Only monitors in `enabled` run. Invalid files give an empty statement."""
     if not files:
         return SpecificationsStated(revision, b"", {}, restarted, **more)
     known = _standard().extended(Definitions.from_files(definitions))

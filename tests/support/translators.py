@@ -216,7 +216,6 @@ def load(machine: Namespace, form: str, rules: str) -> None:
 
 
 def guest_behind(machine: Namespace, guest: Namespace, translator: Translator) -> Host:
-    """The guest's end is on a bridge; then the program's rules are loaded."""
     interfaces.create_bridge(machine, translator.interface)
     interfaces.add_address(machine, translator.interface, f"{translator.network}.1/24")
     interfaces.add_address(machine, translator.interface, "fd88::1/64")
@@ -230,7 +229,6 @@ def guest_behind(machine: Namespace, guest: Namespace, translator: Translator) -
 
 
 def plugged(machine: Namespace, guest: Namespace, bridge: str, network: str) -> Host:
-    """The guest has .2 of `network`; the bridge, on the machine, has .1."""
     interfaces.create_veth(guest, "eth0", machine, "vguest")
     interfaces.attach(machine, "vguest", bridge)
     interfaces.set_link(guest, "lo", up=True)

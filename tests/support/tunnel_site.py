@@ -68,7 +68,6 @@ class TunnelSite:
     def joined(
         self, kit: Path, host: Host | None = None, *, log: str = "", settings: str = ""
     ) -> Iterator[JoinedHost]:
-        """The tunnel is up on both sides in the block, and down on both afterwards."""
         mark = self.mark
         joined = self.join(kit, host, log=log)
         conf = joined.folder / "swanctl" / "swanctl.conf"
@@ -115,7 +114,6 @@ class TunnelSite:
         return self.trail.wait_for(since=since, timeout=timeout, **fields)
 
     def refused(self, since: int, host: str | None = None) -> Event:
-
         def is_it(event: Event) -> bool:
             folded = event.get("event") == "denials folded" and event["detail"]["of"] == "tunnel refused"
             return (folded or event.get("event") == "tunnel refused") and host in (None, event.get("host"))
@@ -157,7 +155,6 @@ class TunnelSite:
 
 
 def left_behind(host: Host) -> dict[str, str]:
-
     def told(*command: str) -> str:
         process = host.popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
         return str(process.communicate(timeout=LIMIT)[0]).strip()

@@ -9,7 +9,6 @@ import pytest
 
 
 def make_unreadable(folder: Path, patch: pytest.MonkeyPatch) -> None:
-
     def refusing(listed: Any) -> Any:
         def list_folder(path: Any = ".") -> Any:
             listed_folder = Path(f"/proc/self/fd/{path}").readlink() if isinstance(path, int) else path

@@ -38,8 +38,6 @@ class VirtualClock:
 
 
 class ShiftedClock:
-    """The present clocks, with a system time that is ahead by some seconds, or behind."""
-
     def __init__(self, ahead: float) -> None:
         present = clock.source()
         self.now_ns, self.since_boot_ns = present.now_ns, present.since_boot_ns

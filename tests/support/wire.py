@@ -134,7 +134,6 @@ def hardware_address(host: Host) -> bytes:
 
 
 def send_frames(host: Host, frames: list[bytes]) -> None:
-    """Uses the host's own Ethernet address, whatever the IP source is."""
     own = hardware_address(host)
     with host.entered(), socket.socket(socket.AF_PACKET, socket.SOCK_RAW) as raw:
         raw.bind((INTERFACE, 0))
@@ -163,7 +162,6 @@ def _checksum(header: bytes) -> bytes:
 
 
 def connect(host: Host, source: str, target: str, port: int = 11311) -> str:
-
     def work() -> str:
         with socket.socket() as client:
             client.settimeout(4)

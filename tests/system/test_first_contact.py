@@ -95,7 +95,6 @@ def checkout(request: pytest.FixtureRequest) -> Iterator[Checkout]:
 
 
 def clone(place: Path, way: Way) -> None:
-    """Files are written as their owner would, under the umask of the way."""
     listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, check=True).stdout
     files = subprocess.run(
         ["tar", "--null", "--files-from=-", "--create", "--mode=u+w,go+rX"],

@@ -162,7 +162,6 @@ REFUSED: dict[str, dict[str, Any]] = {
     "make_own_ticket": {}, "plan_guard": {}, "approve": {"number": 48213}, "approval_refuse": {"number": 48213},
     "end_sessions": {"name": "alice"}, "sign_out": {"session": "0" * 12},
 }  # fmt: skip
-"""Operations on things that do not exist, which return the promised problem."""
 
 ELSEWHERE = {"begin_sign_on", "complete_sign_on", "new_guard", "set_guard", "check_driver", "add_door"}
 """Operations that need a provider, a guard's topics or a door: the tests of these features call them."""
@@ -215,7 +214,6 @@ class Client:
         )
 
     def ask(self, *call: Any) -> Any:
-        """Return status, type of the parsed answer, parsed answer, raw JSON."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         with contextlib.suppress(BrokenPipeError):
@@ -322,5 +320,4 @@ def body_of(operation: dict[str, Any], changes: dict[str, Any]) -> tuple[str, di
 
 
 def kind_of(content: dict[str, Any]) -> str:
-    """Empty where a body or an answer has no type."""
     return str(content["schema"].get("$ref", "")).rpartition("/")[2]

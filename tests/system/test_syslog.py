@@ -91,7 +91,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 
 def configure(folder: Path, tls: Certificates, to: str, backend: str = "auto") -> Path:
-    """The log is sealed every second; the key is the forwarder's."""
     mine = folder / "forwarder.key"
     shutil.copy(tls.key, mine)
     os.chown(mine, *FORWARDER)

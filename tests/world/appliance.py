@@ -45,8 +45,6 @@ class Connection(NamedTuple):
 
 
 class Relay:
-    """One life of the relay: the product's grant table, the ports of nodes, and the connections."""
-
     def __init__(self, world: "World", process: Process, link: LinkEnd) -> None:
         self.process = process
         self.table = GrantTable()
@@ -192,7 +190,6 @@ class Appliance:
         return self.supervisor.alive and self.watch.active
 
     def crash(self) -> None:
-        """The disk keeps what was written. The machine starts again after some time."""
         lease = [self.lease] if self.lease is not None else []
         for process in (self.control, self.relay.process, self.rosmaster.process, self.supervisor, *lease):
             if process is not None:

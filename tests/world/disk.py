@@ -67,8 +67,6 @@ class WorldDatabase(Database):
 
 
 def files() -> tuple[Any, Any]:
-    """The open files of these `os` and `sqlite3` end with their process."""
-
     def opened(*given: Any, **named: Any) -> int:
         descriptor = os.open(*given, **named)
         process = owners[descriptor] = present_process()

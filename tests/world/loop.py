@@ -157,7 +157,6 @@ class WorldLoop(asyncio.BaseEventLoop):
         file.readable = lambda: None
 
     def discard(self) -> None:
-        """The ends of its tasks have no effect any more."""
         for task in [*self.tasks]:
             task._log_destroy_pending = False  # type: ignore[attr-defined]  # they were killed
             with contextlib.suppress(BaseException):
@@ -169,7 +168,6 @@ class WorldLoop(asyncio.BaseEventLoop):
         return _process.get().machine
 
     def _write_to_self(self) -> None: ...
-
     def _process_events(self, event_list: Any) -> None: ...
 
     def _run_once(self) -> None:

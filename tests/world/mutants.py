@@ -46,7 +46,6 @@ _attach, _state_fact = RelayControl.attach, vars(RelayControl)["_state_fact"]
 
 
 def _without_grants(self: RelayControl, index: int, channel: Any) -> None:
-    """Attach a new relay, and state no grants to it."""
     vars(self.grants)["of"] = lambda _key: ()
     try:
         _attach(self, index, channel)
@@ -55,8 +54,6 @@ def _without_grants(self: RelayControl, index: int, channel: Any) -> None:
 
 
 def _not_stated(kind: type[Any], *, withdrawn: bool = False) -> Callable[..., None]:
-    """Leave out the facts of a kind, or their withdrawals."""
-
     def state(self: RelayControl, post: Any, node: Incarnation, fact: Any, wanted: Any) -> None:
         if not (isinstance(fact, kind) and (wanted is None) is withdrawn):
             _state_fact(self, post, node, fact, wanted)

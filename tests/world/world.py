@@ -71,8 +71,6 @@ class Policy:
 
 @dataclass
 class Setting:
-    """Overlapping calls that set a parameter: how many are under way, their values, whether one was answered."""
-
     under_way: int = 0
     values: set[int | None] = field(default_factory=set)
     known: bool = False
@@ -97,8 +95,6 @@ _ORDER_SECONDS = (0.0, 0.001, 0.01)
 
 
 class World:
-    """`pauses` are the seconds between two events, `settles` those after the last."""
-
     pauses: tuple[float, ...] = (0.0, 0.001, 0.05, 0.5, 3.0, 30.0)
     settles = 150.0
 
@@ -258,7 +254,6 @@ class World:
 
     @contextlib.contextmanager
     def reading(self, key: str) -> Iterator[set[int | None]]:
-        """Yield the values that a read may get: all that the parameter may have had since it began."""
         read = Read(key, set(self.parameters[key]))
         self._reads.append(read)
         try:
@@ -273,7 +268,6 @@ class World:
             self.fail(f"{connection} carries messages, which no policy allows")
 
     def check(self) -> None:
-        """The relay has only what a policy allows that may be in force."""
         relay = self.appliance.relay
         if not relay.process.alive:
             return
@@ -284,7 +278,6 @@ class World:
                 self.fail(f"the relay has {grant}, which no policy allows")
 
     def interrupted(self, connection: Connection) -> None:
-        """A restart of control ends no connection that all policies allow which may be in force."""
         parts = self.appliance.parts
         publisher = parts and parts.core.registry.by_key(connection.key)
         if not publisher or publisher.life is not Life.LIVE or connection.kind != "topic":
@@ -324,7 +317,6 @@ class World:
     # --- operators ---
 
     async def order(self, request: admin.AdminRequest[Any]) -> Any:
-        """None if control ended before, or could not carry out the order."""
         given = getattr(self.appliance.admin, "administration", None)
         if given is None:
             return None
@@ -471,7 +463,6 @@ class World:
         self.appliance.restart_rosmaster()
 
     def rosmaster_breaks_off(self) -> None:
-        """Calls fail now and then, before or after their effect."""
         self.say("calls to rosmaster break off")
         self.network.flaky = ("127.0.0.1", ROSMASTER_PORT)
 
@@ -490,7 +481,6 @@ class World:
         self.appliance.kill_control()
 
     def crashes(self) -> None:
-        """All processes end at once, as when a container is killed."""
         self.say("the appliance crashes")
         if self.unread is not None:  # a start reads the file
             self.possible = self.possible | {self.unread}

@@ -28,7 +28,6 @@ def appliance() -> Iterator[Appliance]:
 
 @pytest.fixture
 def rest(appliance: Appliance) -> Iterator[Rest]:
-    """After each attack the same process still serves, and its memory has grown little."""
     rest = appliance.rest()
     pid = api_of(rest)
     before = resident(pid)
@@ -52,7 +51,6 @@ def resident(pid: int) -> int:
 
 
 def statuses(rest: Rest, data: bytes, idle: float = 2) -> list[int]:
-    """The connection ends, or stays silent for `idle` seconds after the first bytes."""
     assert rest.url.hostname is not None
     got = bytearray()
     with socket.create_connection((rest.url.hostname, rest.url.port), LIMIT) as sock:

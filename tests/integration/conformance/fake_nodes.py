@@ -72,7 +72,6 @@ class FakeNodes:
             return [one.params[1:] for one in self._calls if (one.node, one.method) == (node, method)]
 
     def wait_until(self, wanted: Callable[[], bool], *, timeout: float = LIMIT) -> bool:
-        """`wanted()` is tested after each call; return False after `timeout` seconds without a call."""
         with self._changed:
             while not wanted():
                 before = self._told

@@ -105,7 +105,6 @@ def _later(name: str, number: int, event: dict[str, Any]) -> bool:
 
 
 def _ask_until_answered(asker: Process) -> None:
-    """The call in progress may fail, the next ones must not."""
     deadline = time.monotonic() + LIMIT
     while True:
         mark = asker.mark()

@@ -25,7 +25,6 @@ _CONVERSATIONS = conversations_of(_TEXT.read_text(encoding="utf-8")).conversatio
 
 @pytest.fixture(scope="module")
 def pair(masters: Masters, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, str]]:
-    """One node is registered at a plain master, the other at the appliance."""
     with (
         masters.lend("plain", "loopback") as plain,
         masters.lend("appliance", "loopback") as appliance,
@@ -72,7 +71,6 @@ def test_answers_are_those_of_rospy(pair: tuple[str, str], title: str) -> None:
 
 @pytest.mark.parametrize("method", ["getPid", "getBusInfo", "getBusStats"])
 def test_connection_information(pair: tuple[str, str], method: str) -> None:
-    """The value changes at any time, so only its form is compared."""
     answers = asked(pair, (method, TESTER))
     assert answers.plain[:2] == answers.appliance[:2]
     assert len(answers.plain) == len(answers.appliance) == 3

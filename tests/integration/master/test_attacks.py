@@ -170,7 +170,6 @@ STRING = {"type": "std_msgs/String", "md5sum": "992ce8a1687cec8c8bd883ec73ca41d1
 
 
 def test_granted_topic_arrives(field: Field) -> None:
-    """The denials in the tests below have the intended reason."""
     answer = knock(field, relay_port(field), header(callerid="/taker", topic="/shared/talk", **STRING))
     assert b"callerid=/shared_voice" in answer
 

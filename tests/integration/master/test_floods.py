@@ -72,13 +72,11 @@ def bystander(field: Field, calls: int = 30) -> float:
 
 
 def settled(field: Field, role: str, most: int) -> None:
-    """Requests in progress at the flood's end are still carried out."""
     eventually(lambda: field.memory(role) < most, f"{role} keeps less than {most >> 20} MiB")
 
 
 @pytest.fixture
 def calm(field: Field) -> Iterator[Field]:
-    """The memory of control and relay does not grow, and nodes can still register."""
     before = {role: field.memory(role) for role in ("control", "relay")}
     pids = {role: field.appliance.pids(role) for role in ("control", "relay", "rosmaster")}
     yield field

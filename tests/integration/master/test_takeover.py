@@ -33,13 +33,11 @@ class Pair:
     topic: str
 
     def talker(self, host: Host) -> Process:
-        """`ready` is set when the constructor returns, whatever the master answered."""
         return self.ros.on(host).talker("rospy", self.topic, "--text", host.name, name=self.voice[1:])
 
 
 @pytest.fixture
 def pair(masters: Masters, tmp_path: Path) -> Iterator[Pair]:
-    """The machines, the voice and the topic belong to this test alone."""
     number = next(_NUMBERS)
     voice, topic = f"/voice{number}", f"/chatter{number}"
     with masters.lend("appliance", "lab") as site:

@@ -106,7 +106,6 @@ def test_a_latched_stop_stays(stopped: Appliance, common_robot: Host, tmp_path: 
 def test_a_changed_stop_holds_until_it_is_resumed(
     stopped: Appliance, common_robot: Host, tmp_path: Path
 ) -> None:
-    """A load that would lose a latched stop blocks all messages, and names the command that resumes them."""
     with RosSession(stopped.master_uri, tmp_path, common_robot) as ros:
         listener = ros.listener("roscpp", "/chatter")
         ros.talker("roscpp", "/chatter")

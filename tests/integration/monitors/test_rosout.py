@@ -19,7 +19,6 @@ gate() {
 
 @pytest.fixture
 def appliance() -> Iterator[Appliance]:
-    """It has two relays, and puts the output of the monitor `gate` on /rosout."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     settings, monitors = "monitors_on_rosout: true\n", {"gate": SPECIFICATION}
     with Appliance(settings=settings, monitors=monitors, options=("--api", "off"), relays=2) as appliance:

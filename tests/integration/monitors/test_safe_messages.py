@@ -61,7 +61,6 @@ def held(appliance: Appliance) -> list[str]:
 
 
 def only_stops(base: Process, since: int) -> None:
-    """Wait for twenty safe messages; fail if another message passes in the meantime."""
     base.wait_for_count(20, event="received", data="stop", since=since, timeout=90)
     assert [one["data"] for one in base.seen(event="received")[-20:]] == ["stop"] * 20
 
@@ -103,7 +102,6 @@ def test_the_base_gets_stops_and_nothing_else(
 def test_a_restart_sends_stops_until_a_command_comes(
     guarded: Appliance, common_robot: Host, tmp_path: Path, death: str
 ) -> None:
-    """The publisher has gone, so only the monitor can stop the base."""
     with RosSession(guarded.master_uri, tmp_path, common_robot) as ros:
         base = ros.listener("roscpp", "/chatter")
         talker = ros.talker("roscpp", "/chatter")

@@ -14,7 +14,6 @@ COMPILED: Final = {
     "httptools",
     "_sqlite3",
 }
-"""Their compiled part shows in the memory of the process."""
 
 MAY_HAVE: Final = {
     "supervisor": {"pydantic_core", "yaml", "_sqlite3"},

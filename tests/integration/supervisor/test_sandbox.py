@@ -68,7 +68,6 @@ PROGRAMS = {"rosmaster", "rosout", "charon"}
 
 @pytest.fixture(scope="module")
 def place() -> Iterator["Place"]:
-    """A state directory, two listening ports, and a file that every user may read and write."""
     need_root()
     needs(landlock.version() >= landlock.SIGNALS, "a kernel with Landlock 6")
     # pytest's folder is closed to the users of the processes

@@ -86,7 +86,6 @@ def test_the_weights_of_processes(appliance: Appliance) -> None:
 
 
 def test_a_relay_has_short_turns(appliance: Appliance) -> None:
-    """A message finds it running soon; Linux 6.12 and newer obey."""
     slices = {}
     for role in ("relay", "control"):
         attributes = (ctypes.c_uint32 * 12)()

@@ -56,7 +56,6 @@ def serve(orders):
 
 
 def become(order, descriptors, report):
-    """Take the state of a new Python process at its first instruction."""
     *standard, namespace = descriptors
     elsewhere = os.fstat(namespace).st_ino != Path("/proc/self/ns/net").stat().st_ino
     if elsewhere and ctypes.CDLL(None, use_errno=True).setns(namespace, CLONE_NEWNET):

@@ -49,7 +49,6 @@ def test_records_come_while_it_is_followed(
     expect(page.get_by_text("No record matches")).to_be_visible()
 
     def made_before(route: Route) -> None:
-        """A stream has begun once there are records that were not in the list."""
         refuse("/other")
         refuse("/live_1")
         route.continue_()

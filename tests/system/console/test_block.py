@@ -16,7 +16,6 @@ def test_a_denied_host_can_be_blocked_from_its_record(
     attempt: Callable[..., Any],
     token: Callable[..., str],
 ) -> None:
-    """The dialog has the host's address, an hour, and what would end; a refusal of the appliance is shown in it."""
     assert attempt("registerPublisher", "/wheel", "/free", "std_msgs/String", "http://127.0.0.1:1/")[0] == 1
     attempt("registerPublisher", "/wheel", "/guarded", "std_msgs/String", "http://127.0.0.1:1/")
     [record, *_] = appliance.recorded("--deny", caller_id="/wheel", resource="/guarded")

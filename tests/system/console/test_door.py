@@ -24,7 +24,6 @@ def test_a_wrong_token_stays_outside_and_a_right_one_shows_its_role(
 
 
 def test_the_token_is_forgotten(browser: Browser, appliance: Appliance) -> None:
-    """It is lost on reload, unless it is kept for the tab; after signing out neither is stored."""
     with Reader(browser, str(appliance.ready["api"])) as reader:
         page = reader.page
         for keep in (False, True):

@@ -142,7 +142,6 @@ def test_names_lose_their_first_namespaces_first(opened: Callable[..., Reader]) 
 
 
 def test_a_thousand_topics(opened: Callable[..., Reader], attempt: Callable[..., Any], node_api: str) -> None:
-    """They are drawn as some dozens of groups, one of which is opened; the page answers all the while."""
     for number in range(TOPICS):
         node = f"/fleet/robot_{number % NODES:03}"
         topic = f"/fleet/robot_{number % NODES:03}/sensor_{number // NODES}"

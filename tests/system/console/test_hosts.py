@@ -41,7 +41,6 @@ def inside(appliance: Appliance, playwright: Playwright, chromium: str, tmp_path
 
 
 def test_a_host_is_enrolled_and_revoked(appliance: Appliance, inside: Browser) -> None:
-    """A token is shown once, with the script that uses it."""
     with Reader(inside, "https://127.0.0.1:8443", str(appliance.ready["token"])) as reader:
         page = reader.go("hosts")
         expect(page.get_by_text("No host is enrolled")).to_be_visible()

@@ -257,7 +257,6 @@ def test_a_policy_that_ends_connections_rolls_back_unless_confirmed(
 
 
 def page_with_an_outdated_draft(appliance: Appliance, reader: Reader) -> Page:
-    """The page's draft is `# mine`; another engineer has loaded `# theirs`."""
     page = reader.go("policy")
     rest = appliance.rest()
     text = rest.get("/v1/policy").json["text"]

@@ -128,7 +128,6 @@ def test_numbers_agree(opened: Callable[..., Reader], appliance: Appliance) -> N
 def test_a_refusal_runs_behind_no_box(
     appliance: Appliance, robot: Robot, opened: Callable[..., Reader]
 ) -> None:
-    """Otherwise the line would seem to be that of the boxes."""
     policy = appliance.policy_file.read_text()
     appliance.reload(policy.replace("[Publishers]\n", "[Publishers]\n/arm/command = 127.0.0.11\n"))
     for node in ("/operator/bridge", "/camera/bridge"):

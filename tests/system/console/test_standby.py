@@ -55,7 +55,6 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StandbySite]:
 
 @pytest.fixture(scope="module")
 def tokens(site: StandbySite) -> dict[str, str]:
-    """They are made on the active appliance, and known to the api of the standby."""
     made = {}
     for role in ("viewer", "operator", "admin"):
         done = site.appliances["a"].rosrv(
@@ -164,7 +163,6 @@ def test_a_standby_that_could_not_start_is_shown_on_both(pair: PairConsoles) -> 
 
 
 def _listener() -> socket.socket | None:
-    """None while the check of the takeover listens there, for a moment."""
     try:
         return socket.create_server(("0.0.0.0", 11311))
     except OSError as error:
@@ -207,7 +205,6 @@ def test_a_switchover_leads_to_the_other_console_and_back(pair: PairConsoles) ->
 
 
 def _switch_over(page: Page, name: str) -> None:
-    """Order again if the standby did not store the last changes in time."""
     button = panel(page).get_by_role("button", name="Switch over…")
     expect(button).not_to_have_attribute("aria-disabled", "true", timeout=2 * LIMIT)
     button.click()

@@ -28,7 +28,6 @@ HELPERS = {"tini", "python", "sh", "cat", "nft"}
 
 @pytest.fixture(scope="module")
 def attacks(demo: Compose) -> dict[str, dict[str, Any]]:
-    """All are made, and the operator has driven, aimed and fired."""
     demo.wait_for_log("ocu", '"fired"', timeout=120)
     demo.wait_for_log("visitor", LAST_ATTACK, timeout=180)
     lines = demo("logs", "--no-color", "visitor").stdout.splitlines()

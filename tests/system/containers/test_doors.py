@@ -35,7 +35,6 @@ with connect("ws://appliance:9092", open_timeout=20) as client:
 
 
 def with_doors(policy: str) -> str:
-    """Return the policy of compose.yaml with the rights of the doors: they see the battery's charge."""
     given = {
         "[Nodes]\n": "viewers = door:alice door:agent-1 door:agent-2\n\n[Nodes]\n/door_* = viewers\n",
         f"{BATTERY}    = vehicle ocu tablet": f"{BATTERY} = vehicle ocu tablet viewers",

@@ -27,7 +27,6 @@ MOST_MEGABYTES = (
 
 
 def members(site: Site, image: str) -> Iterator[tuple[str, tarfile.TarInfo, bytes]]:
-    """Deleted files are included; the bytes are the first megabyte."""
     saved = site.engine.directory / "image.tar"
     site.engine.docker("save", "--output", str(saved), image, timeout=300)
     try:

@@ -43,7 +43,6 @@ def test_a_stop_is_clean_and_quick(alone: Compose) -> None:
 
 
 def log_of_a_stop(alone: Compose) -> str:
-    """Starts the appliance unless it runs; the log begins at that start."""
     alone("start")
     alone.wait_healthy()
     container = alone.container("appliance")

@@ -40,7 +40,6 @@ def make_robot(site: FleetSite) -> Iterator[Callable[..., FleetRobot]]:
 
 @pytest.fixture(scope="module")
 def shared(cluster: PostgresCluster, tmp_path_factory: pytest.TempPathFactory) -> Iterator[FleetSite]:
-    """A hundred decisions of one robot, for tests that only read."""
     database = cluster.create(f"test_{secrets.token_hex(6)}")
     with running(FleetSite(tmp_path_factory.mktemp("shared") / "site", database)) as found:
         robot = FleetRobot(found, "arm1")

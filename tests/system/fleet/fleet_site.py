@@ -113,7 +113,6 @@ class FleetSite:
         return httpx.Client(base_url=f"https://127.0.0.1:{self.port}", verify=context, timeout=60)
 
     def answer(self, path: str, **parameters: Any) -> dict[str, Any]:
-        """Raises `NoAnswerError` if the collector asks to come back later."""
         found = self.get(path, **parameters)
         if found.status_code in (429, 503):
             raise NoAnswerError(found.text)
@@ -153,8 +152,6 @@ class FleetSite:
 
 
 class FleetRobot:
-    """It has a real audit log with a signer's key, a certificate, and the appliance's pusher."""
-
     def __init__(
         self, site: FleetSite, name: str, *, enrolled: bool = True, every: int = 10, group: str = ""
     ) -> None:

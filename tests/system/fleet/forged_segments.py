@@ -45,7 +45,6 @@ def _line(columns: StoredColumns, before: bytes, digest: bytes, end: SignedCheck
 def forged(
     robot: FleetRobot, records: int, *, log: str = "", number: int = 1, **fields: Any
 ) -> tuple[SegmentSummary, bytes]:
-    """`fields` are those of the records. A number above 1 claims to begin after records that retention removed."""
     log = log or secrets.token_hex(16)
     start = 0 if number == 1 else number
     placed = _chain(log, start, records, tuple(sorted(fields.items())))

@@ -31,7 +31,6 @@ def segment(robot: FleetRobot, number: int) -> tuple[SegmentSummary, bytes]:
 def put(
     site: FleetSite, certificates: Certificates, summary: SegmentSummary, body: bytes, **headers: str
 ) -> httpx.Response:
-    """Waits while the robot must pause because others were refused."""
     end = summary.header.end
     path = f"/v1/logs/{end.log}/segments/{end.number}/{summary.name}"
 

@@ -18,7 +18,6 @@ MakeRobot = Callable[..., FleetRobot]
 
 @pytest.fixture
 def narrow(database: str, tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[FleetSite]:
-    """It permits few connections, each for a time (seconds) without a request."""
     limits = {"robot_connections": 3, "address_connections": 6, "header_seconds": request.param}
     with running(FleetSite(tmp_path / "site", database, limits)) as found:
         yield found

@@ -128,7 +128,6 @@ class RolloutSite:
             assert answer.status_code == 200, answer.text
 
     def report(self, **changes: Any) -> None:
-        """The last robot was never seen and does not report."""
         report: dict[str, Any] = dict.fromkeys(("in_force", "trying", "refused", "reason", "trouble"), "")
         report |= {"site": "site-a", "group": "arms", "changed": False, "denials": 0, "failing": 0} | changes
         for robot in self.robots[:-1]:

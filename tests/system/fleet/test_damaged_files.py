@@ -57,7 +57,6 @@ def test_the_file_of_a_robot_at_the_start(site: FleetSite, make_robot: MakeRobot
     ids=["empty", "no gzip", "cut", "no UTF-8"],
 )
 def test_the_newest_segment(content: bytes, site: FleetSite, make_robot: MakeRobot) -> None:
-    """Its robot sends it again when it connects, and continues."""
     robot = make_robot("arm1")
     robot.record(20)
     robot.push()
@@ -72,7 +71,6 @@ def test_the_newest_segment(content: bytes, site: FleetSite, make_robot: MakeRob
 
 
 def test_a_segment_before_others(site: FleetSite, make_robot: MakeRobot) -> None:
-    """The robot continues; a repair by hand is noticed, and no gap stays."""
     robot = make_robot("arm1")
     robot.record(20)
     pusher = robot.pusher()
@@ -107,7 +105,6 @@ def test_the_note_of_the_newest_segment(site: FleetSite, make_robot: MakeRobot) 
 
 
 def test_the_tokens(site: FleetSite, make_robot: MakeRobot) -> None:
-    """Operators get an error that names no content; robots push."""
     assert site.data is not None
     file = site.data / "tokens.json"
     whole = file.read_bytes()

@@ -246,7 +246,6 @@ def test_a_bundle_of_a_rewritten_log_is_refused(
 
 
 def test_sizes_have_limits(site: FleetSite, make_robot: MakeRobot, tmp_path: Path) -> None:
-    """One limit is for a bundle, the other for all bundles of a robot."""
     operator, robot = Operator(site, tmp_path / "operator"), make_robot("arm1")
     first, second = (incident(robot, tmp_path / f"{number}.zip") for number in (1, 2))
     robot_bytes = first.stat().st_size + second.stat().st_size - 1

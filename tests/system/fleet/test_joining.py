@@ -140,7 +140,6 @@ def test_an_expired_invitation_is_refused(inviting: FleetSite, make_robot: MakeR
 
 
 def test_one_of_two_wins(inviting: FleetSite, make_robot: MakeRobot, tmp_path: Path) -> None:
-    """Twenty requests with one token arrive at the same time."""
     robot = make_robot("arm1", enrolled=False)
     file = invite(inviting, "arm1", tmp_path / "arm1.json")
     requests = [request_of(robot, file) for _ in range(20)]
@@ -267,14 +266,12 @@ def test_a_malformed_request_is_refused(body: bytes, inviting: FleetSite) -> Non
 
 
 def test_guessing_has_to_wait(inviting: FleetSite, make_robot: MakeRobot, tmp_path: Path) -> None:
-    """An address that sent thirty wrong tokens within a minute gets 429."""
     request = request_of(make_robot("arm1", enrolled=False), invite(inviting, "arm1", tmp_path / "arm1.json"))
     wrong = [request | {"token": f"rosrv-join_{number:043d}"} for number in range(31)]
     assert [post(inviting, one).status_code for one in wrong] == [*[403] * 30, 429]
 
 
 def test_a_second_join_renews(inviting: FleetSite, make_robot: MakeRobot, tmp_path: Path) -> None:
-    """A robot with another log key cannot take its name."""
     robot, other = make_robot("arm1", enrolled=False), make_robot("other", enrolled=False)
     join(robot, invite(inviting, "arm1", tmp_path / "first.json"))
     earlier = (state_of(robot) / "joined" / "robot.pem").read_text()

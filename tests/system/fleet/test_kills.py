@@ -23,13 +23,11 @@ _ROUNDS = 6
 
 @pytest.fixture
 def own_cluster() -> Iterator[PostgresCluster]:
-    """Return a PostgreSQL that this test may kill; it survives a kill with all it committed."""
     with postgres() as cluster:
         yield cluster
 
 
 def _work(robot: FleetRobot, ended: threading.Event) -> int:
-    """Record and push until the end, then push the rest; return the last sequence that has a receipt."""
     pusher = robot.pusher()
     pusher.jitter = lambda: -0.4  # pauses of a tenth: the test kills often
     while not ended.is_set():

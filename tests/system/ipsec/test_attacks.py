@@ -233,7 +233,6 @@ def test_the_name_must_match_the_certificate(
 
 
 def test_a_trusted_address_without_a_tunnel_is_denied(site: TunnelSite, kit: Path) -> None:
-    """Under its own address by the policy, under its virtual one by the firewall."""
     with site.joined(kit) as joined:
         virtual = joined.address
     interfaces.add_address(site.ocu.namespace, INTERFACE, f"{virtual}/32")

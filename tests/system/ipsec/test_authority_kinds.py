@@ -7,7 +7,6 @@ from tests.support.tunnels import need_strongswan
 
 
 def test_an_encrypted_ed25519_authority(tmp_path: Path) -> None:
-    """Its certificates open tunnels, and revocation works; with a wrong passphrase the appliance reports it."""
     need_root()
     need_strongswan()
     passphrase = tmp_path / "passphrase"

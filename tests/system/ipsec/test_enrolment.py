@@ -164,7 +164,6 @@ def again(site: TunnelSite, laptop: ScriptHost, script: Path) -> None:
 
 
 def renew(site: TunnelSite, laptop: ScriptHost) -> None:
-    """Renewal has no effect early; with --now there is a new key and certificate, and the old one is revoked."""
     assert "nothing to do" in laptop.run("/etc/rosrv/renew.sh").stdout
     key = laptop.run("cat", "/etc/swanctl/private/rosrv.key").stdout
     before = row(site, "laptop")["serial"]
@@ -343,7 +342,6 @@ def endless(laptop: ScriptHost, commands: str) -> Iterator[None]:
 
 
 def test_revocation_while_rekeying(site: TunnelSite, laptop: ScriptHost, tmp_path: Path) -> None:
-    """It is out within a second of its revocation, and stays out."""
     script = tmp_path / "join.sh"
     joined = laptop.run("sh", str(script), awaited(site, "other", script))
     laptop.address = re.findall(r"ROS_IP=(\S+)", joined.stdout)[0]

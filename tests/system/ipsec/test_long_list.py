@@ -17,7 +17,6 @@ _FIRST = 1 << 70  # as long as the authority's serial numbers
 
 
 def test_tunnels_work_with_thousands_of_revoked_certificates(tmp_path: Path) -> None:
-    """The latest certificate of a host with 2,000 revoked ones opens the tunnel, the last does not."""
     need_root()
     need_strongswan()
     with Lab("rosrv-list") as lab, TunnelSite(lab, tmp_path) as site:

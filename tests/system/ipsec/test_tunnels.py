@@ -203,7 +203,6 @@ def revoke_while_it_talks(site: TunnelSite, joined: JoinedHost) -> None:
 
 
 def _seconds(record: Event) -> float:
-    """The time within its day; a test over midnight is a second off, which no assertion notices."""
     hours, minutes, seconds = str(record["time"]).split("T")[1].rstrip("Z").split(":")
     return int(hours) * 3600 + int(minutes) * 60 + float(seconds)
 

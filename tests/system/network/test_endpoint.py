@@ -11,7 +11,6 @@ LO = ("lo",)
 
 
 def test_the_default_route_decides_between_addresses(lab: Lab) -> None:
-    """Its source address is used; IPv6 only without an IPv4 route."""
     both = lab.host("both", "10.78.0.2/24", "fd78::2/64", gateway="10.78.0.1").namespace
     interfaces.add_address(both, INTERFACE, "10.79.0.2/24")
     assert outward_address(both, without=LO) == PublicAddress("10.78.0.2", ROUTE)

@@ -69,7 +69,6 @@ def connect(host: Host, uid: int, *targets: tuple[str, int]) -> list[str]:
 
 @contextlib.contextmanager
 def listening(host: Host, address: str = "::", port: int = 0) -> Iterator[int]:
-    """Listens on all addresses of both families by default; yields the port."""
     with host.entered():
         family = socket.AF_INET6 if ":" in address else socket.AF_INET
         server = socket.create_server(
@@ -272,7 +271,6 @@ def test_hosts_without_a_bucket_have_one_common_limit(
 
 
 def flood(host: Host, address: str, servers: tuple[socket.socket, ...], rounds: int) -> int:
-    """Return how many succeeded at the first attempt; a second takes 1 s."""
     with contextlib.ExitStack() as stack, host.entered():
         for server in servers * rounds:
             target = (address, server.getsockname()[1])

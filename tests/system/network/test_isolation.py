@@ -264,7 +264,6 @@ def test_the_subnet_conflicts_with_no_route(bare: Host, tmp_path: Path) -> None:
 
 
 def test_a_foreign_namespace_or_interface_is_not_taken(bare: Host, tmp_path: Path) -> None:
-    """Without a record it is not touched, and the error says how to remove it."""
     wanted = settings(tmp_path)
     foreign = Namespace(wanted.name).create()
     try:

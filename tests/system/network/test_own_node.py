@@ -67,7 +67,6 @@ def connect(host: Host, uid: int, *targets: tuple[str, int]) -> list[str]:
 
 @contextlib.contextmanager
 def rosout(host: Host, port: int) -> Iterator[int]:
-    """Runs under rosout's user; yields the port of its API."""
     process = host.popen(
         [sys.executable, "-I", "-S", "-c", SERVE, str(port)],
         user=ROSOUT, group=ROSOUT, extra_groups=[], cwd="/",

@@ -29,7 +29,6 @@ def gateway(lab: Lab) -> Host:
 
 
 def protect(host: Host, *arguments: str, status: int = 0, **environment: str) -> str:
-    """Return the error output if the command is to fail."""
     process = host.popen(
         [sys.executable, "-c", COMMAND, *arguments],
         stdout=subprocess.PIPE,

@@ -24,7 +24,6 @@ DOCKER = TRANSLATORS[0]
 
 @pytest.fixture
 def lab() -> Iterator[Lab]:
-    """The appliance runs on the machine; the guest is behind it."""
     need_root()
     for program, package in (("nft", "nftables"), ("iptables-legacy", "iptables")):
         need_program(program, package)

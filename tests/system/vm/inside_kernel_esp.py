@@ -68,7 +68,6 @@ def test_a_node_publishes_through_the_kernel(site: TunnelSite, joined: JoinedHos
 
 
 def test_a_forged_address_gets_nowhere(site: TunnelSite, joined: JoinedHost) -> None:
-    """For a host with a tunnel, for one without, and for an unassigned address; packets in the tunnel are answered."""
     interfaces.add_route(site.attacker.namespace, f"{OWN}/32", MIDDLE)
     for forged in (joined.address, "10.113.11.77"):
         interfaces.add_address(site.attacker.namespace, INTERFACE, f"{forged}/32")

@@ -21,7 +21,6 @@ def test_an_order_of_a_disconnected_client_does_not_take_effect() -> None:
 
 
 def test_only_orders_are_withdrawn() -> None:
-    """Starts, signals, rollbacks, and tasks that an order left behind have no client."""
     take_effect()
 
     async def order() -> asyncio.Task[None]:

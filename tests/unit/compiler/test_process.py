@@ -211,7 +211,6 @@ async def test_a_compiler_without_its_link_ends(used: float) -> None:
 
 
 def _until_used(pid: int, seconds: float) -> None:
-
     def used() -> float:
         fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
         return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")

@@ -38,7 +38,6 @@ def table(monkeypatch: pytest.MonkeyPatch) -> ClientConnections:
 
 
 def _opened(table: ClientConnections, address: str, number: int = 1) -> list[_Socket]:
-    """Opened slowly enough for the share of the address; only the accepted ones are returned."""
     accepted = []
     for _ in range(number):
         let_time_pass(10.0)

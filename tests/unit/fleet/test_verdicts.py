@@ -148,7 +148,6 @@ def edited(line: bytes, **fields: object) -> bytes:
 
 
 def checkpoints(change: Callable[[dict[str, Any]], dict[str, Any]]) -> Callable[[Lines, Lines], Lines]:
-
     def changed(value: Any, number: int) -> Any:
         if isinstance(value, dict):
             inner = {name: changed(one, number) for name, one in value.items()}

@@ -217,7 +217,6 @@ class World:
         return fields
 
     def gets(self, peer: Peer, data: bytes) -> None:
-
         def whole() -> bool:
             peer.read()
             return len(peer.data) >= len(data)

@@ -281,7 +281,6 @@ async def test_pieces_that_arrive_while_a_host_waits_for_its_turn_are_read_in_or
 
 
 async def test_a_request_that_has_begun_keeps_its_connection_for_a_while() -> None:
-
     async def handler(request: HttpRequest) -> bytes:
         return request.body
 

@@ -27,7 +27,6 @@ pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
     "beginning", [b"", b"POST /", b"POST / HTTP/1.1\r\nHost: m\r\nX: "], ids=["silent", "line", "head"]
 )
 async def test_slowloris(beginning: bytes) -> None:
-
     async def drip(client: Client) -> None:
         with contextlib.suppress(ConnectionError):
             while beginning:

@@ -173,7 +173,6 @@ class Taking:
         return set()
 
     def withdraw(self, moves: Sequence[Move]) -> None: ...
-
     def place(self, moves: Sequence[Move]) -> None: ...
 
 

@@ -103,7 +103,6 @@ async def test_a_first_token_that_cannot_be_saved_ends_the_start(tmp_path: Path)
 async def test_a_machine_without_processes_causes_no_tight_loop(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-
     def none_left(*_arguments: object) -> ProcessHandle:
         raise OSError(errno.EAGAIN, "no process can be made")
 

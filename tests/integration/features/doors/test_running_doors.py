@@ -129,7 +129,6 @@ def test_an_agent_hears_publishes_and_calls_within_its_rights(
 def test_large_messages_for_clients_that_read_nothing_take_bounded_memory(
     appliance: Appliance, common_robot: Host, tmp_path: Path
 ) -> None:
-    """Each client reads nothing of a message of 30 MB; together, the messages have 600 MB."""
     program = tmp_path / "large.py"
     program.write_text(LARGE)
     with RosSession(appliance.master_uri, tmp_path, common_robot) as ros, ExitStack() as stack:

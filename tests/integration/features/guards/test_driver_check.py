@@ -40,7 +40,6 @@ def guards(appliance: Appliance) -> list[str]:
 
 
 def outcome_in_log(appliance: Appliance, outcome: str) -> dict[str, Any]:
-
     def found() -> list[dict[str, Any]]:
         details = [one["detail"] for one in appliance.audit("--event", "driver checked")]
         return [one for one in details if one["outcome"] == outcome]
@@ -106,7 +105,6 @@ def test_commands_pass_and_guards_act_after_a_death_during_the_measurement(
 
 
 def test_a_killed_command_withholds_nothing_later(guarded: Appliance, ros: RosSession) -> None:
-    """It is killed while it waits for a drive; a person drives afterwards."""
     base = ros.node("rospy", "driven_base", "0")
     idle = ros.node("rospy", "driver", name="idle")
     base.wait_for(event="moves")

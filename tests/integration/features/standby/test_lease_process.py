@@ -88,7 +88,6 @@ class Site:
         self.control.send(lease_link.ControlPresent())
 
     def serve(self, times: int = 1) -> None:
-        """Answer requests as the witness: this number, and those that wait by then."""
         with contextlib.suppress(TimeoutError):
             while times > 0 or select.select([self.witness], [], [], 0)[0]:
                 times -= 1

@@ -25,8 +25,6 @@ BEGAN = 1_767_225_600 * SECOND  # 2026-01-01T00:00:00Z
 
 
 class World:
-    """The time for both appliances, in nanoseconds since the epoch."""
-
     def __init__(self) -> None:
         self.now = BEGAN
 
@@ -35,8 +33,6 @@ class World:
 
 
 class Member:
-    """Its clock is `ahead` seconds. Call `open` in an event loop."""
-
     def __init__(self, state: Path, name: str, other: str, world: World, *, ahead: float = 0) -> None:
         self.state, self.name, self.other = state, name, other
         self.key = Ed25519PrivateKey.generate()
@@ -87,7 +83,6 @@ class Member:
 
     @asynccontextmanager
     async def active(self, epoch: int, *, sealed: bool = True) -> AsyncIterator[None]:
-        """Wait until the takeover is `sealed`, and stay active for the block."""
         with self.timed():
             await self.recorder.took_over(epoch)
         following = asyncio.create_task(self.recorder.follow())

@@ -111,8 +111,6 @@ class ActiveSide:
 
 
 class StandbySide:
-    """It connects again and again; `ends` has the reasons why links ended."""
-
     def __init__(
         self, path: Path, context: ssl.SSLContext, port: Callable[[], int], *, largest: int = 1 << 30
     ) -> None:
@@ -138,8 +136,6 @@ class StandbySide:
 
 
 class CuttingProxy:
-    """Closes a connection after a random number of bytes, often in a frame."""
-
     def __init__(self, port: Callable[[], int], chosen: random.Random) -> None:
         self.cutting = True
         self.cuts = 0

@@ -40,7 +40,6 @@ class Registrar:
         self.parameters: dict[str, int] = {}
         self.topics: set[str] = set()
         self.longest = 0.0
-        """The longest time of a call, in seconds, since the last report."""
         self._proxy = xmlrpc.client.ServerProxy(master, Transport())
 
     def call(self, method: str, *arguments: Any) -> Any:

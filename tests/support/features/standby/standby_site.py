@@ -129,7 +129,6 @@ class StandbySite:
         self.start_witness()
 
     def start(self, name: str) -> Process:
-        """Return when the appliance could take over or is active."""
         one = self.appliances[name]
         one.process = Process(one.host, self._up(one), env=dict(os.environ), label=f"rosrv up {name}")
         one.process.wait_for(lambda event: event.get("event") in {"standby", "ready"}, timeout=2 * LIMIT)

@@ -158,7 +158,6 @@ class Site:
         return self.sockets.enter_context(host.run(lambda: socket.create_server((host.address, port))))
 
     def refused(self, host: Host, address: str, port: int) -> bool:
-        """While the rules change, an attempt may get no answer."""
         begun = time.monotonic()
         try:
             self.connect(host, address, port, LIMIT / 3).close()

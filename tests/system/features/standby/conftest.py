@@ -16,7 +16,6 @@ RULE = "seen() { event said() /map std_msgs/String '{}' { } }\n"
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StandbySite]:
-    """Both are in sync; a policy, a specification and a token came from an operator."""
     need_root()
     need_program("nft", "nftables")
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")

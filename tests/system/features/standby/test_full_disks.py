@@ -15,7 +15,6 @@ from tests.support.waiting import eventually
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StandbySite]:
-    """The states of `a` and of the witness are on small disks."""
     need_root()
     need_program("nft", "nftables")
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")

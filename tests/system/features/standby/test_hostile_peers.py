@@ -125,7 +125,6 @@ def standby_replaced(site: StandbySite, folder: Path) -> Iterator[Liar]:
 
 
 def test_a_standby_that_lies(site: StandbySite, robot: StandbyRobot, tmp_path: Path) -> None:
-    """No false report makes it count as in sync, and none ends or slows the active appliance."""
     active, _ = site.pair()
     with standby_replaced(site, tmp_path) as liar:
         for false in (
@@ -200,7 +199,6 @@ def connects(address: str) -> bool:
 
 
 def record(site: StandbySite, number: int) -> list[bytes]:
-
     def listen() -> list[bytes]:
         found: list[bytes] = []
         with socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(3)) as sock:

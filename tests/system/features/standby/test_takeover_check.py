@@ -45,7 +45,6 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StandbySite]:
 
 
 def until_obstacle(site: StandbySite, words: str, *names: str) -> None:
-
     def reported(name: str) -> bool:
         done = site.appliances[name].rosrv("standby", "status", "--json", check=False)
         state = row_of(done)
@@ -89,8 +88,6 @@ def test_other_site_keys(site: StandbySite) -> None:
 
 
 def until_obstacle_without_active(site: StandbySite) -> None:
-    """Wait until the standby has seen the lease expire for several seconds."""
-
     def waits() -> bool:
         state = site.appliances["b"].ask(standby_requests.StandbyWanted())
         return state.role == "standby" and (state.other.trouble_seconds or 0) > 5 and bool(state.obstacle)

@@ -32,7 +32,6 @@ def kinds(result: Verification) -> set[FindingKind]:
 
 
 def forge(path: Path, proof: dict[str, object] | None = None) -> RemovedRange:
-    """Removes as many records as possible, with age as the recorded reason."""
     writer = ChainWriter(path, 0)
     gone = writer.removable(1 << 30, signed=True)
     assert gone is not None

@@ -164,7 +164,6 @@ async def test_a_lease_of_a_service_is_for_any_arguments_until_its_time(site: Si
 
 
 async def leased_call(site: Site) -> int:
-    """A lease on a service cannot become an approval of one call with any arguments."""
     number = number_in(await site.call(b"1"))
     await site.orders.approve(ApproveCall(number, 10.0), "ann")
     return number

@@ -57,7 +57,6 @@ def test_an_interrupted_restore_does_not_start(tmp_path: Path, monkeypatch: pyte
 
 
 def test_a_restored_state_starts(tmp_path: Path) -> None:
-    """This holds also in a container where root cannot read the parts."""
     state = tmp_path / "state"
     restore(archive(tmp_path / "backup"), state)
     assert stat.S_IMODE((state / "lock").stat().st_mode) == 0o600

@@ -32,7 +32,6 @@ __all__ = ["MakeLog", "Notary", "key", "make_log", "notary", "path"]  # fixtures
 
 _SECONDS = 0.4
 Client = Callable[[str], str]
-"""Makes one step with the URL of a collector, and returns the reported trouble."""
 
 
 def drips_the_handshake(visitor: Visitor) -> None:

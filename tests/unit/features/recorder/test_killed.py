@@ -27,7 +27,6 @@ _KILLED = 9
 
 
 def _life(scene: Scene) -> None:
-
     def order() -> Trigger:
         return Trigger(scene.clock.now + SECOND, "order", "r", "eve")
 

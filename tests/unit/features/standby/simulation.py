@@ -145,17 +145,12 @@ class Host:
         self.history.at(due, lambda: self._wake(life, timer))
 
     def started(self) -> None: ...
-
     def crashed(self) -> None: ...
-
     def tick(self) -> None: ...
-
     def received(self, sender: str, message: Any) -> None: ...
 
 
 class SimulatedAppliance(Host):
-    """The product's lease and datagrams, with an abstract replicated log on its disk."""
-
     def __init__(self, history: "History", name: str) -> None:
         super().__init__(history, name)
         self.other = "b" if name == "a" else "a"
@@ -260,8 +255,6 @@ class SimulatedAppliance(Host):
 
 
 class SimulatedRobot(Host):
-    """The product's witness, a disk, and `nft` as the kernel would act on its rules."""
-
     def __init__(self, history: "History") -> None:
         super().__init__(history, "witness")
         self.disk = witness.LeaseRecord(1, "", NAMES, "")

@@ -143,7 +143,6 @@ def test_a_standby_that_was_never_active_has_no_log(pair: Pair, tmp_path: Path) 
 
 
 def test_the_tail_is_counted(pair: Pair) -> None:
-    """Later checkpoints seal the records after the named one, until the next takeover."""
     second, third = verified(pair.a, pair.b).takeovers[1:3]
     ((next_takeover,),) = read(pair.a, "SELECT max(sequence) FROM record WHERE event = 'took over'")
     assert second.tail == next_takeover - 1 - second.through >= 5
@@ -443,7 +442,6 @@ def test_an_older_copy(pair: Pair, tmp_path: Path) -> None:
 
 
 def overlapping(folder: Path, both: float, *, lasting: float = 60, clock_set: str = "") -> Pair:
-
     async def story(a: Member, b: Member, world: World) -> None:
         async with a.active(1):
             await a.decide(5, 5)
@@ -498,7 +496,6 @@ def test_a_clock_that_was_set_proves_no_overlap(tmp_path: Path, who: str) -> Non
     ],
 )
 def test_decisions_after_a_hand_over(tmp_path: Path, seconds: float, event: str, findings: list[Any]) -> None:
-
     async def story(a: Member, b: Member, _world: World) -> None:
         async with a.active(1):
             await a.decide(2, 2)
