@@ -22,7 +22,6 @@ NAMES = [word for word in sys.argv if word.startswith("__")]
 
 
 def base(arrivals):
-
     def arrived(command):
         os.write(arrivals, ARRIVED.pack(time.monotonic(), command.linear.x))
 

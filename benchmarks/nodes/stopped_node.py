@@ -25,7 +25,6 @@ NAMES = [word for word in sys.argv if word.startswith("__")]
 
 
 def receive(arrivals):
-
     def arrived(_command):
         os.write(arrivals, ARRIVED.pack(time.monotonic()))
 
