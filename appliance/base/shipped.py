@@ -6,8 +6,9 @@ from pathlib import Path
 from appliance.base import clock
 
 _CHECKOUT = Path(__file__).resolve().parents[2]
-# In a checkout: its top folder. Otherwise: where the wheel and the Debian package install the files.
-IS_CHECKOUT = (_CHECKOUT / "pyproject.toml").exists()
+# In a checkout: its top folder, of which a process may see a part only (`private_view.py`). Otherwise: where the wheel
+# and the Debian package install the files.
+IS_CHECKOUT = (_CHECKOUT / "monitors" / "guards").is_dir()
 SHIPPED = _CHECKOUT if IS_CHECKOUT else Path(sys.prefix) / "share" / "rosrv"
 DPKG = Path("/var/lib/dpkg")
 _DAY = 86_400.0

@@ -24,7 +24,7 @@ from appliance.supervisor.privileges import libc_call
 from appliance.supervisor.sandbox.system_calls import system_call
 from appliance.supervisor.users import Account
 
-_PACKAGES = ("appliance", "roswire", "rosmop")
+_PARTS = ("appliance", "roswire", "rosmop", "monitors")
 _ENTER, _READ = stat.S_IXOTH, stat.S_IROTH
 _CLONE_NEWNS, _CLONE_NEWUSER = 0x00020000, 0x10000000
 _MS_RDONLY, _MS_NOSUID, _MS_NODEV, _MS_NOEXEC, _MS_REMOUNT, _MS_REC, _MS_SLAVE = (
@@ -58,7 +58,7 @@ class PrivateView:
 
 def program_folders() -> tuple[Path, ...]:
     top, environment = Path(appliance.__file__).resolve().parent.parent, Path(sys.prefix).resolve()
-    packages = () if top.is_relative_to(environment) else tuple(top / name for name in _PACKAGES)
+    packages = () if top.is_relative_to(environment) else tuple(top / name for name in _PARTS)
     return (environment, *packages)
 
 
@@ -127,7 +127,7 @@ def _closed_above(path: Path) -> Path | None:
 
 def _is_open(folder: Path) -> bool:
     """Check every file: a pull may have another umask."""
-    if folder.name not in _PACKAGES:
+    if folder.name not in _PARTS:
         return _permits(folder, _ENTER | _READ)
     return all(
         _permits(Path(place), _ENTER | _READ) and all(_permits(Path(place, name), _READ) for name in files)
