@@ -66,6 +66,7 @@ STAGES = (
         "machine",
         (
             "tests/system/vm",
+            "tests/system/console/test_sign_on.py",
             "tests/system/test_examples.py",
             "tests/system/test_generated_client.py",
             "tests/system/test_recordings_cluster.py",
