@@ -41,7 +41,7 @@ class AdminServer:
         try:
             while line := await reader.readline():
                 with awaited(lambda: _given_up(writer)):
-                    answer = await self._answer(line)
+                    answer = await self.answer(line)
                 writer.write(admin.encode(answer) + b"\n")
                 await writer.drain()
         except (ValueError, ConnectionError) as error:
@@ -51,14 +51,20 @@ class AdminServer:
             with contextlib.suppress(ConnectionError):
                 await writer.wait_closed()
 
-    async def _answer(self, line: bytes) -> admin.AdminAnswer[Any]:
+    async def answer(self, line: bytes) -> admin.AdminAnswer[Any]:
         try:
             request = self._decoder.decode(line)
         except ValueError as error:
             return admin.AdminAnswer(
                 False, error=f"not a request of this version: {error}", trouble="request"
             )
-        return await self._administration.carry_out(request, who=_OPERATOR)
+        try:
+            return await self._administration.carry_out(request, who=_OPERATOR)
+        except Exception as error:  # noqa: BLE001  a defect ends one order, not the connection of its operator
+            verb = admin.verb_of(request)
+            _log.critical("an order ended by a defect", order=verb, exc_info=error)
+            text = f"{verb}: a defect in rosrv, please report it with the appliance's log: {error!r}"
+            return admin.AdminAnswer(False, error=text, trouble="failed")
 
 
 def _given_up(writer: asyncio.StreamWriter) -> bool:

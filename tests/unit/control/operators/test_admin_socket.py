@@ -3,7 +3,7 @@ import contextlib
 import socket
 from collections.abc import AsyncIterator
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
@@ -124,3 +124,14 @@ def _then(method: Any, after: Any) -> Any:
         return result
 
     return both
+
+
+async def test_an_order_that_ends_by_a_defect_is_answered() -> None:
+    class Broken:
+        async def carry_out(self, _request: object, *, who: str) -> AdminAnswer[Any]:
+            raise FileNotFoundError(f"no presets for {who}")
+
+    answer = await AdminServer(cast(Any, Broken())).answer(encode(PolicyConfirm()))
+    assert (answer.ok, answer.trouble) == (False, "failed")
+    assert "a defect in rosrv, please report it" in str(answer.error)
+    assert "no presets for operator" in str(answer.error)
