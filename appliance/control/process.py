@@ -123,10 +123,7 @@ class _Control:
         await listener_limits.open(listen(sockets[RVMASTER].dup(), calls))
         await listener_limits.open(listen(sockets[OWN].dup(), own, guarded=False))
         # Do not keep connections alive: at each call, the ROS master queries the kernel about every open connection.
-        inside = listen(
-            sockets[INNER].dup(), inner.handle, guarded=False, at_once=inner.acknowledge, keep=False
-        )
-        await listener_limits.open(inside)
+        await listener_limits.open(listen(sockets[INNER].dup(), inner.handle, guarded=False, keep=False))
         if base.lifeline.announced:
             operators.tokens.first_token_shown()
         if _ADMIN in sockets:

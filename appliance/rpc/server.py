@@ -4,7 +4,8 @@
    reading pauses.
 2. A request from a host that no policy rule names is refused before its body is complete. Only the beginning of the
    body is read, for the audit record of the refusal.
-3. A request no longer waits for its turn once its connection has ended.
+3. A request no longer waits for its turn once its connection has ended. One that is answered without waiting does not
+   count its last bytes.
 4. A peer that exceeds a limit gets a fault that names the limit. At most a few connections wait for such a fault.
 """
 
@@ -68,15 +69,8 @@ class HttpRequest(NamedTuple):
 
 Handler = Callable[[HttpRequest], Awaitable[bytes]]
 
-AtOnce = Callable[[HttpRequest], bytes | None]
-"""A function that answers a request without waiting; None leaves it to the handler."""
-
 Refusal = Callable[[bytes], bytes]
 """A function that answers a refused request, from the beginning of its body."""
-
-
-def not_at_once(_request: HttpRequest) -> bytes | None:
-    return None
 
 
 class NoAnswerError(Exception):
@@ -94,7 +88,6 @@ class HttpServer:
     sock: socket.socket
     handler: Handler
     _: KW_ONLY
-    at_once: AtOnce = not_at_once
     limits: HttpLimits
     connection_table: ConnectionTable[Address]
     turns: Turns[Address]
@@ -185,12 +178,13 @@ class _Connection(Front, asyncio.BufferedProtocol):
         self._counted = False
         self._too_many = ""  # the reason if the connection is refused
         self._unparsed = b""  # input that waits for the host's turn
-        self._busy: HostTask[None] | None = None  # serves a request that could not be answered at once
+        self._busy: HostTask[None] | None = None  # serves a request that waits
         self._waiting = False  # whether the request waits for a slot
         self._has_slot = False
         self._pending: deque[tuple[HttpRequest, bool]] = deque()
         self._body = bytearray()
         self._held = 0  # bytes of the body that are counted
+        self._serving = 0  # counted bytes of the request being served
         self._unsent = 0  # counted bytes of an answer that the peer has not read
         self._refusal: Refusal | None = None
         self._patience: asyncio.TimerHandle | None = None  # ends the wait of a refusal for the body
@@ -329,29 +323,30 @@ class _Connection(Front, asyncio.BufferedProtocol):
             return
         keep = self.server.keep and self.parser.should_keep_alive()
         request = HttpRequest(self.peer, self._url.decode("latin-1"), bytes(self._body), clock.now_ns())
-        if self.is_quiet and not self._pending and self._answered_at_once(request, keep=keep):
-            if self._held:
-                self._release(self._held)
-            self._body, self._held = bytearray(), 0
-            return
-        size = len(self._body) - self._held + _REQUEST_BYTES + len(self._url)
-        too_much = self.connection_table.hold(self.peer.host, size)
-        if too_much:
-            self.reject(b"503 Service Unavailable", f"sent a request while {too_much}")
+        served = self.is_quiet and not self._pending
+        if not served and not self._holds(_held_by(request) - self._held, "sent a request"):
             return
         super().on_message_complete()
-        self._body, self._held = bytearray(), 0
+        held, self._body, self._held = self._held, bytearray(), 0
+        if served:
+            self._begin(request, keep, held)
+            return
         self._pending.append((request, keep))
         if self.is_quiet:
             self._serve_next()
         else:
             self.transport.pause_reading()
 
+    def _holds(self, size: int, what: str) -> bool:
+        """Count bytes. If there are too many, refuse the request and return False."""
+        too_much = self.connection_table.hold(self.peer.host, size)
+        if too_much:
+            self.reject(b"503 Service Unavailable", f"{what} while {too_much}")
+        return not too_much
+
     def _body_is_held(self) -> bool:
         unheld = len(self._body) - self._held
-        too_much = self.connection_table.hold(self.peer.host, unheld) if unheld else ""
-        if too_much:
-            self.reject(b"503 Service Unavailable", f"sent a body while {too_much}")
+        if unheld and not self._holds(unheld, "sent a body"):
             return False
         self._held += unheld
         return True
@@ -391,23 +386,30 @@ class _Connection(Front, asyncio.BufferedProtocol):
         elif not (closing or self._unparsed):
             self.transport.resume_reading()
 
-    def _answered_at_once(self, request: HttpRequest, *, keep: bool) -> bool:
-        answer = self.server.at_once(request)
-        if answer is None:
-            return False
-        super().on_message_complete()
-        self._sent(b"200 OK", answer, keep=keep)
-        return True
-
     def _serve_next(self) -> None:
-        if not (self._pending and self.is_quiet):
-            return
-        request, keep = self._pending.popleft()
+        if self._pending and self.is_quiet:
+            request, keep = self._pending.popleft()
+            self._begin(request, keep, _held_by(request))
+
+    def _begin(self, request: HttpRequest, keep: bool, held: int) -> None:
+        """Serve a request, of which `held` bytes are counted; the others count once it waits.
+
+        A request that waits for a slot while there are too many bytes is refused.
+        """
         self.deadline = float("inf")  # the handler has limits of its own
+        self._serving = held
         serving = HostTask(self.server.time, self.peer.host, self._serve(request, keep))
-        if not serving.done():
-            self._busy = serving
-            self.connection_table.file(self, Stage.SERVED if self._has_slot else Stage.UNFINISHED)
+        if serving.done():
+            return
+        self._busy = serving
+        more = _held_by(request) - held
+        if self._has_slot:
+            self.connection_table.held.charge(self.peer.host, more)
+        elif not self._holds(more, "sent a request"):
+            serving.cancel()
+            return
+        self._serving += more
+        self.connection_table.file(self, Stage.SERVED if self._has_slot else Stage.UNFINISHED)
 
     async def _serve(self, request: HttpRequest, keep: bool) -> None:
         try:
@@ -417,7 +419,8 @@ class _Connection(Front, asyncio.BufferedProtocol):
             return
         finally:
             self._busy = None
-            self._release(_held_by(request))
+            self._release(self._serving)
+            self._serving = 0
         if self.closing:
             self.connection_table.file(self, Stage.UNFINISHED)
         else:
@@ -463,7 +466,8 @@ class _Connection(Front, asyncio.BufferedProtocol):
         self._unsent = unsent
 
     def _release(self, size: int) -> None:
-        self.connection_table.release(self.peer.host, size)
+        if size:
+            self.connection_table.release(self.peer.host, size)
 
     def _write(self, status: bytes, body: bytes, *, keep: bool, unread: bool = False) -> None:
         """Write an answer; without `keep`, close the connection.

@@ -23,7 +23,7 @@ from appliance.rpc.connection_table import ConnectionTable, Patience
 from appliance.rpc.fair_queue import Turns
 from appliance.rpc.front import HttpLimits
 from appliance.rpc.processor_time import ProcessorTime
-from appliance.rpc.server import AtOnce, Handler, HttpRequest, HttpServer, Peer, listen, not_at_once
+from appliance.rpc.server import Handler, HttpRequest, HttpServer, Peer, listen
 from roswire.xmlrpc import FaultReceived, parse_response
 
 LIMITS = HttpLimits()
@@ -100,7 +100,6 @@ class Server:
         self, handler: Handler | None, limits: HttpLimits, refusal: bytes | None, shares: "Shares"
     ) -> None:
         self.requests: list[HttpRequest] = []
-        self.at_once: AtOnce = not_at_once
         self.troubles: list[str] = []
         table = (
             partial(ConnectionTable[Address], patience=shares.patience)
@@ -123,7 +122,6 @@ class Server:
         self.http = HttpServer(
             self.socket,
             self._handle,
-            at_once=lambda request: self.at_once(request),  # noqa: PLW0108 - the one of that moment
             limits=limits,
             connection_table=self.connection_table,
             turns=self.turns,

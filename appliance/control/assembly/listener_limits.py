@@ -25,7 +25,7 @@ from appliance.rpc.connection_table import ConnectionTable
 from appliance.rpc.fair_queue import Turns
 from appliance.rpc.front import HttpLimits
 from appliance.rpc.processor_time import ProcessorTime
-from appliance.rpc.server import AtOnce, Handler, HttpServer, Peer, Refusal, not_at_once
+from appliance.rpc.server import Handler, HttpServer, Peer, Refusal
 from appliance.telemetry.audit_trail import AuditTrail
 from roswire.xmlrpc import XmlRpcLimits, build_fault
 
@@ -75,14 +75,12 @@ class ListenerLimits:
         handler: Handler,
         *,
         guarded: bool = True,
-        at_once: AtOnce = not_at_once,
         keep: bool = True,
     ) -> HttpServer:
         """`guarded` is false for a listener that only the appliance's own processes can reach."""
         return HttpServer(
             sock,
             handler,
-            at_once=at_once,
             limits=self.http,
             connection_table=self.connection_table if guarded else self.own_connection_table,
             turns=self.turns if guarded else self._own_turns,

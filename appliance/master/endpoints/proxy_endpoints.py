@@ -70,9 +70,6 @@ class MasterSideApi:
         self._registry = registry
 
     async def handle(self, request: HttpRequest) -> bytes:
-        return self.acknowledge(request)
-
-    def acknowledge(self, request: HttpRequest) -> bytes:
         if request.path != PUBLISHER_PATH and self._registry.by_key(request.path.strip("/")) is None:
             return build_fault(1, "this address serves no calls")
         return build_response([1, "", 0])

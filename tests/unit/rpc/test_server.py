@@ -50,43 +50,67 @@ async def test_pipelined_requests(server: Server, client: Client) -> None:
 
 
 @pytest.mark.parametrize("together", [False, True], ids=["one by one", "in one piece"])
-async def test_requests_that_are_answered_at_once(together: bool) -> None:
-    async def slowly(request: HttpRequest) -> bytes:
-        await asyncio.sleep(0)
-        return b"known" if b"known" in request.body else request.body
+async def test_requests_that_wait_and_others_are_answered_in_order(together: bool) -> None:
+    async def sometimes_slow(request: HttpRequest) -> bytes:
+        if request.body.startswith(b"slow"):
+            await asyncio.sleep(0)
+        return request.body
 
-    async with serving(slowly) as server:
-        server.at_once = lambda request: b"known" if b"known" in request.body else None
+    async with serving(sometimes_slow) as server:
         client = await server.connect()
-        bodies = [b"known", b"new", b"known 2" + b"x" * 100_000, b"new 2", b"known 3", *[b"known"] * 300]
+        bodies = [b"one", b"slow", b"two" + b"x" * 100_000, b"slow 2", b"three", *[b"four"] * 300]
         if together:
             await client.send(b"".join(post(body) for body in bodies))
         for body in bodies:
             if not together:
                 await client.send(post(body))
-            status, _headers, answer = await client.response()
-            assert (status, answer) == (200, b"known" if b"known" in body else body)
-        assert [request.body for request in server.requests] == [b"new", b"new 2"] or together
+            assert (await client.response())[::2] == (200, body)
+        assert server.connection_table.held.total == 0
 
 
-async def test_an_answer_at_once_needs_no_slot() -> None:
-    go = asyncio.Event()
+async def test_the_bytes_of_a_request_count_while_it_waits() -> None:
+    go, held = asyncio.Event(), list[int]()
 
     async def slow(request: HttpRequest) -> bytes:
-        await go.wait()
+        held.append(server.connection_table.held.total)
+        if request.body != b"quick":
+            await go.wait()
         return request.body
 
-    async with serving(slow, shares=Shares(requests=Bounds(1, 1, 1, 0))) as server:
-        server.at_once = lambda request: b"at once" if request.body == b"known" else None
-        first, second, third = [await server.connect() for _ in range(3)]
-        await first.send(post(b"one"))
-        await until(lambda: bool(server.requests))
-        await second.send(post(b"two"))
-        await until(lambda: bool(server.turns.waiting))
-        await third.send(post(b"known"))
-        assert (await third.response())[2] == b"at once"
+    few = Shares(requests=Bounds(1, 1, 1, 0), held=Bounds(13_000, 13_000, 0, 0))
+    async with serving(slow, shares=few) as server:
+        quick, served, first, second, third = [await server.connect() for _ in range(5)]
+        await quick.send(post(b"quick"))
+        assert (await quick.response())[2] == b"quick"
+        assert held == [0]  # a request that waits for nothing does not count
+        await served.send(post(b"served"))
+        await until(lambda: server.connection_table.held.total > 4096)
+        await first.send(post(b"first"))
+        await until(lambda: server.connection_table.held.total > 2 * 4096)
+        await second.send(post(b"second"))
+        await until(lambda: server.connection_table.held.total > 3 * 4096)
+        await third.send(post(b"third"))
+        status, _headers, _body = await third.response()
+        assert status == 503
+        assert "sent a request while" in await server.trouble()
         go.set()
-        assert [(await one.response())[2] for one in (first, second)] == [b"one", b"two"]
+        assert [(await one.response())[2] for one in (served, first, second)] == [
+            b"served", b"first", b"second",
+        ]  # fmt: skip
+        assert server.connection_table.held.total == 0
+        assert [request.body for request in server.requests] == [b"quick", b"served", b"first", b"second"]
+
+
+async def test_a_request_with_a_slot_is_served_while_there_are_too_many_bytes() -> None:
+    async def slow(request: HttpRequest) -> bytes:
+        await asyncio.sleep(0)
+        return b"%d" % server.connection_table.held.total
+
+    async with serving(slow, shares=Shares(held=Bounds(1000, 1000, 0, 0))) as server:
+        client = await server.connect()
+        await client.send(post(b"x"))
+        assert int((await client.response())[2]) > 4096
+        assert server.connection_table.held.total == 0
 
 
 async def test_requests_of_a_host_that_used_much_wait_for_another_hosts() -> None:
@@ -111,10 +135,8 @@ async def test_requests_of_a_host_that_used_much_wait_for_another_hosts() -> Non
         assert len(order) == 21
 
 
-@pytest.mark.parametrize("at_once", [False, True])
-async def test_a_server_that_keeps_no_connection(at_once: bool, server: Server) -> None:
+async def test_a_server_that_keeps_no_connection(server: Server) -> None:
     server.http.keep = False
-    server.at_once = lambda _request: b"known" if at_once else None
     client = await server.connect()
     await client.send(post(b"x") * 2)
     status, headers, _body = await client.response()
