@@ -136,7 +136,6 @@ METHOD = CallParameter("method_name", _text)
 def canonicalise(
     parameters: Sequence[CallParameter[Any]], caller_id: str, values: Sequence[Value]
 ) -> tuple[object, ...]:
-    check_arity(parameters, values)
     canonical = []
     for parameter, value in zip(parameters, values, strict=True):
         try:
@@ -262,6 +261,7 @@ class RosCall(Generic[S]):
 
     def attempt(self, caller: Caller, params: Sequence[Value]) -> "Attempt":
         if self.identity is Identity.NOBODY:
+            check_arity(self.method.parameters, params)
             return Attempt(caller, self, canonicalise(self.method.parameters, "", params))
         if not params:
             raise ProtocolError("missing required caller_id parameter")
@@ -280,24 +280,22 @@ class RosCall(Generic[S]):
 
 @dataclass(frozen=True, slots=True)
 class Attempt:
-    """A valid call, with canonical arguments in the order of the row. `resource` may be empty."""
+    """A valid call, with canonical arguments in the order of its row. `api` is the URI of the caller."""
 
     caller: Caller
     call: RosCall[Any]
     arguments: tuple[object, ...]
     resource: str = field(init=False)
+    api: ApiUri | None = field(init=False)
     request: Request = field(init=False)
 
     def __post_init__(self) -> None:
         caller, call = self.caller, self.call
         resource = "" if call.resource is None else str(self.arguments[call.resource])
+        object.__setattr__(self, "api", None if call.api is None else self.arguments[call.api])
         request = request_of(call.policy_name, caller.peer.host, caller.caller_id, resource)
         object.__setattr__(self, "resource", resource)
         object.__setattr__(self, "request", request)
-
-    @property
-    def api(self) -> ApiUri | None:
-        return None if self.call.api is None else cast(ApiUri, self.arguments[self.call.api])
 
     @property
     def value(self) -> Value:

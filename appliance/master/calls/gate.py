@@ -126,8 +126,9 @@ class CallGate:
 
     def _too_many_names(self, host: Address) -> Decision | None:
         """Hosts that the policy names as a network count as one."""
-        left = max(0, self._limits.registrations_in_all - self._registry.registrations)
-        if self._registry.registrations < _TIMES_THE_REST * left:
+        registrations = self._registry.registrations
+        left = max(0, self._limits.registrations_in_all - registrations)
+        if registrations < _TIMES_THE_REST * left:
             return None  # no host can have too many
         policy = self._policy()
         named = policy.named_as(host)

@@ -171,6 +171,8 @@ class Registry:
 
     def take_changes(self) -> list[Change]:
         """Return what has changed since the last call: first the nodes, then the rest in order."""
+        if not self._changed:
+            return []
         changed, self._changed = self._changed, {}
         nodes = [change for change in changed if isinstance(change, Incarnation)]
         return [*nodes, *(change for change in changed if not isinstance(change, Incarnation))]

@@ -56,13 +56,15 @@ class Arrivals:
             self.registry.reached_at(incarnation, self.addresses.address_for(caller.peer))
             return incarnation
         incarnation = self._make(caller, api)
+        incarnation.calls += 1
         try:
-            with EvictionGuard(incarnation):
-                await self.faces.open(incarnation)  # first, so that the end of the node closes its ports
-                await self._check_place(caller, incarnation)
+            await self.faces.open(incarnation)  # first, so that the end of the node closes its ports
+            await self._check_place(caller, incarnation)
         except (NoPortError, NodeElsewhereError):
             self.graph.forgotten(incarnation)
             raise
+        finally:
+            incarnation.calls -= 1
         return incarnation
 
     async def _check_place(self, caller: Caller, incarnation: Incarnation) -> None:
@@ -107,22 +109,3 @@ class Arrivals:
                 if evicted is None:
                     raise
                 self.graph.forgotten(evicted)
-
-
-class EvictionGuard:
-    """A registering call, whose incarnation is not evicted inside the `with` block.
-
-    Otherwise, two nodes that arrive at the same time could evict each other forever.
-    """
-
-    __slots__ = ("_incarnation",)
-
-    def __init__(self, incarnation: Incarnation) -> None:
-        self._incarnation = incarnation
-
-    def __enter__(self) -> Incarnation:
-        self._incarnation.calls += 1
-        return self._incarnation
-
-    def __exit__(self, *_error: object) -> None:
-        self._incarnation.calls -= 1
