@@ -19,6 +19,8 @@ from appliance.base import clock
 from appliance.quotas.pool import Bounds, Holder, Pool, Queue, QuotaClass
 from appliance.quotas.table import RVMASTER_ARRIVALS, RVMASTER_BYTES, RVMASTER_CONNECTIONS, RVMASTER_FAREWELLS
 
+_MOST_MOVED = 64  # the most idle connections that one search moves
+
 
 class Stage(StrEnum):
     """The stage of a connection."""
@@ -33,9 +35,10 @@ class Stage(StrEnum):
 
 
 class TrackedConnection(Protocol):
-    """A connection in the table; `deadline` is in monotonic seconds."""
+    """A connection in the table; `deadline` and the time of the last progress are in monotonic seconds."""
 
     deadline: float
+    progress: float
 
     @property
     def holding(self) -> int:
@@ -120,10 +123,12 @@ class ConnectionTable(Generic[Holder]):
             pool.give_back(host)
 
     def file(self, connection: TrackedConnection, stage: Stage) -> None:
+        before = self._stages.get(connection)
+        if before is stage is Stage.IDLE:  # `_longest` finds out that it was used
+            return
         host, pool = self._of.get(connection, (None, self.farewells))
         if host is None or pool is not self.connected:
             return
-        before = self._stages.get(connection)
         if before is not None:
             self._queues[before].remove(connection)
         self._stages[connection] = stage
@@ -159,10 +164,21 @@ class ConnectionTable(Generic[Holder]):
             if quota_class > mine:
                 return None
             for stage, queue in self._queues.items():
-                found = queue.longest(quota_class)
+                found = self._longest(stage, queue, quota_class)
                 patience = self._patience(quota_class, stage, quota_class is mine)
                 if found is not None and self._clock() - found[2] >= patience:
                     return found[0]
+        return None
+
+    def _longest(
+        self, stage: Stage, queue: Queue[Holder, TrackedConnection], quota_class: QuotaClass
+    ) -> tuple[TrackedConnection, Holder, float] | None:
+        """Return the longest waiting connection, and move idle ones that were used since to their place."""
+        for _ in range(_MOST_MOVED):
+            found = queue.longest(quota_class)
+            if found is None or stage is not Stage.IDLE or found[0].progress <= found[2]:
+                return found
+            queue.put(found[0], found[1], found[0].progress)
         return None
 
     def _to_free_bytes(self, host: Holder) -> TrackedConnection | None:

@@ -47,6 +47,8 @@ class Front(asyncio.BaseProtocol, ABC):
 
     transport: asyncio.Transport
     most_waiting: int
+    fields: frozenset[bytes] = frozenset()
+    """The lower-case names of header fields that are given to `on_field`."""
 
     def __init__(
         self, limits: HttpLimits, connection_table: ConnectionTable[Any], sock: socket.socket | None = None
@@ -65,7 +67,8 @@ class Front(asyncio.BaseProtocol, ABC):
         self.allow(limits.head_seconds)
 
     def allow(self, seconds: float) -> None:
-        self.deadline = clock.now() + seconds
+        self.progress = clock.now()
+        self.deadline = self.progress + seconds
 
     @abstractmethod
     def reject(self, status: bytes, what: str) -> None:
@@ -139,6 +142,12 @@ class Front(asyncio.BaseProtocol, ABC):
         self._head_bytes += len(name) + len(value) + _FIELD_FRAMING
         if self._head_bytes > self.limits.head_bytes and not self.closing:
             self._reject_head()
+        lowered = name.lower()
+        if lowered in self.fields and not self.closing:
+            self.on_field(lowered, value)
+
+    def on_field(self, name: bytes, value: bytes) -> None:
+        """Take a header field of `fields`."""
 
     def on_headers_complete(self) -> None:
         self.head_done = True

@@ -114,17 +114,13 @@ class ProcessorTime:
     def running(self) -> bool:
         return self._since is not None
 
-    @property
-    def _turn_has_time(self) -> bool:
-        running = 0.0 if self._since is None else self._clock() - self._since
-        return self._spent + running < TURN_SECONDS
-
     def run(self, host: Address, work: Work) -> bool:
         """Run work of a host now, or queue it for the host's turn and return False.
 
         Exceptions of the work are reported to the event loop.
         """
-        if not self._classes.queues and self._turn_has_time:
+        running = 0.0 if self._since is None else self._clock() - self._since
+        if not self._classes.queues and self._spent + running < TURN_SECONDS:
             self._do(host, work)
             return True
         self._queue(host, work)

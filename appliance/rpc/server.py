@@ -40,7 +40,6 @@ _MOST_PIPELINED = 512
 _REQUEST_BYTES = 4096
 _OPENING_SECONDS = 50e-6  # the processor time to open and close a transport
 _READ_AT_ONCE = 8192  # the bytes that are read and parsed in one piece
-_LENGTHS = frozenset(map(len, (b"content-length", b"content-encoding", b"expect")))
 _BEGINNING = 4096  # the bytes of a refused body that are read for its audit record
 _BEGINNING_SECONDS = 1.0  # the longest wait for these bytes
 
@@ -170,6 +169,7 @@ class HttpServer:
 
 class _Connection(Front, asyncio.BufferedProtocol):
     most_waiting = _MOST_PIPELINED
+    fields = frozenset({b"content-length", b"content-encoding", b"expect"})
 
     def __init__(self, server: HttpServer, sock: socket.socket, host: Address) -> None:
         super().__init__(server.limits, server.connection_table, sock)
@@ -269,21 +269,17 @@ class _Connection(Front, asyncio.BufferedProtocol):
         self._url += url
         super().on_url(url)
 
-    def on_header(self, name: bytes, value: bytes) -> None:
-        super().on_header(name, value)
-        if self.closing or len(name) not in _LENGTHS:
-            return
-        lowered = name.lower()
-        if lowered == b"content-length" and value.isdigit() and int(value) > self.limits.body_bytes:
+    def on_field(self, name: bytes, value: bytes) -> None:
+        if name == b"content-length" and value.isdigit() and int(value) > self.limits.body_bytes:
             self.reject(
                 b"413 Content Too Large",
                 f"announced a body of {int(value)} bytes; the limit is {self.limits.body_bytes}",
             )
-        elif lowered == b"content-encoding" and value.lower() != b"identity":
+        elif name == b"content-encoding" and value.lower() != b"identity":
             encoding = value[:20].decode("latin-1")
             what = f"sent a body encoded as {encoding!a}; send it as it is, without Content-Encoding"
             self.reject(b"415 Unsupported Media Type", what)
-        elif lowered == b"expect" and value.lower() == b"100-continue":
+        elif name == b"expect" and value.lower() == b"100-continue":
             self._expects = True
 
     def on_headers_complete(self) -> None:

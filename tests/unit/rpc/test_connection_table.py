@@ -33,6 +33,7 @@ class Guest:
     connection_table: ConnectionTable[Address]
     host: Address
     deadline: float = 0.0
+    progress: float = 0.0
     holding: int = 0
     cut: bool = False
 
@@ -193,6 +194,22 @@ def test_no_order_of_events_loses_count(steps: list[tuple[int, Stage | None, Quo
             here.append(connection)
         here = [one for one in here if not one.cut]
         assert connection_table.connected.total == len(here) == len(connection_table.connections) <= 6
+
+
+def test_an_idle_connection_that_was_used_waits_from_then_on() -> None:
+    quota_classes = QuotaClasses(dict.fromkeys((ROBOT, OTHER, guest(1)), QuotaClass.REGISTERED))
+    connection_table = books(quota_classes, Bounds(3, 3, 0, 0))
+    used, unused, last = (come(connection_table, host) for host in (ROBOT, OTHER, ROBOT))
+    assert used and unused and last
+    quota_classes.now = used.progress = 5.0
+    connection_table.file(used, Stage.IDLE)
+    assert come(connection_table, guest(1))
+    assert (used.cut, unused.cut, last.cut) == (False, True, False)
+    assert come(connection_table, guest(1))
+    assert (used.cut, last.cut) == (False, True)
+    quota_classes.now = 6.0
+    assert come(connection_table, guest(1))
+    assert used.cut
 
 
 def test_served_connections_of_unknown_hosts_may_make_room() -> None:

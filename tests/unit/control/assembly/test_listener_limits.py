@@ -111,7 +111,7 @@ def test_registered_hosts_of_a_wildcard_leave_the_robot_its_slots(tmp_path: Path
 
 
 class Opened:
-    deadline = 0.0
+    deadline = progress = 0.0
     holding = 0
     cut = False
 
