@@ -35,14 +35,26 @@ class ClientMemory:
         self.closed = False
         self._door = door
         self._shared = 0  # of the bytes that it holds, those of the shared half
+        self._leaving = 0
 
     def add(self, size: int) -> None:
         if self.closed:
             return
         self.held += size
-        shared = max(0, self.held - self._door.least)
-        self._door.shared += shared - self._shared
-        self._shared = shared
+        if self.held > self._door.least or self._shared:
+            shared = max(0, self.held - self._door.least)
+            self._door.shared += shared - self._shared
+            self._shared = shared
+
+    def send(self, size: int) -> None:
+        """Hold these bytes, which are charged, until `sent`."""
+        self._leaving += size
+
+    def sent(self) -> None:
+        """Give the bytes back that were sent."""
+        if self._leaving:
+            self.add(-self._leaving)
+            self._leaving = 0
 
     def refusal(self, size: int) -> str:
         held = self.held + size
@@ -55,6 +67,17 @@ class ClientMemory:
         if shared > max(left, 0):
             return f"the client would hold {held} bytes of its door and leave {max(left, 0)} for all others"
         return ""
+
+    def try_take(self, size: int) -> bool:
+        """Charge `size` bytes if this client may hold them; return whether it may."""
+        held = self.held + size
+        if held <= self._door.least and not self._shared and not self.closed:
+            self.held = held
+            return True
+        if self.refusal(size):
+            return False
+        self.add(size)
+        return True
 
     def take(self, size: int, trouble: str = "") -> None:
         if reason := self.refusal(size):

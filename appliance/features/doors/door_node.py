@@ -17,7 +17,7 @@ from msgspec import Raw
 from appliance.base import clock
 from appliance.features.doors.door_memory import ClientMemory
 from appliance.features.doors.door_parameters import TOO_MANY_CALLS, DoorParameters, ParameterClient
-from appliance.features.doors.known_types import DoorMessage, Encodings, KnownTypes
+from appliance.features.doors.known_types import DoorMessage, KnownTypes, SharedFrames
 from appliance.features.doors.message_writer import MessageWriter, Now
 from appliance.features.doors.requests import (
     AdvertiseTopic,
@@ -63,13 +63,13 @@ BuiltIn = Callable[[CallOfService], "Awaitable[Raw] | None"]
 
 
 class _Subscriber(Protocol):
-    def heard(self, message: DoorMessage) -> None: ...
+    def heard(self, message: DoorMessage, now: float) -> None: ...
 
     def failed(self, request: DoorRequest, reason: str) -> None: ...
 
 
 class _Learner:
-    def heard(self, message: DoorMessage) -> None: ...
+    def heard(self, message: DoorMessage, now: float) -> None: ...
 
     def failed(self, request: DoorRequest, reason: str) -> None: ...
 
@@ -137,7 +137,7 @@ class DoorNode:
         self._heard: dict[str, dict[_Subscriber, SubscribeTopic]] = {}
         self._offers: dict[str, _Offer] = {}
         self._parameters = DoorParameters(node, calls)
-        self._encodings = Encodings()
+        self._frames = SharedFrames()
         self._locks: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()
         self._tasks = OwnedTasks()
 
@@ -299,13 +299,14 @@ class DoorNode:
         receivers: Iterable[_Subscriber] | None = None,
     ) -> None:
         clients, kind = self._heard.get(topic, {}), header.get("type", ANY)
-        encodings = self._encodings if receivers is None and len(clients) > 1 else None
-        message = DoorMessage(topic, body, header, clock.wall_ns(), self._types.learn, encodings)
+        shared = self._frames if receivers is None and len(clients) > 1 else None
+        message = DoorMessage(topic, body, header, clock.wall_ns(), self._types.learn, shared)
+        now = asyncio.get_running_loop().time()
         wrong = []
         for client in clients if receivers is None else receivers:
             request = clients.get(client)
             if request is not None and request.type in (None, kind):
-                client.heard(message)
+                client.heard(message, now)
             elif request is not None:
                 wrong.append((client, request))
         for client, request in wrong:

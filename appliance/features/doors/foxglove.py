@@ -12,6 +12,7 @@ from typing import Any
 import msgspec
 from msgspec import UNSET, Raw
 
+from appliance.features.doors.client_frames import ClientFrame, binary_frame, frame_size, text_frame
 from appliance.features.doors.foxglove_frames import (
     FOXGLOVE_OPERATION,
     FoxgloveAdvertise,
@@ -30,16 +31,15 @@ from appliance.features.doors.foxglove_frames import (
     service_fields,
 )
 from appliance.features.doors.known_types import DoorMessage
+from appliance.features.doors.png_frames import DoorFrame
 from appliance.features.doors.requests import (
     AdvertiseTopic,
     CallOfService,
     DoorRequest,
-    Pieces,
     PublishMessage,
     ReadParameters,
     SubscribeParameter,
     SubscribeTopic,
-    TextFrame,
     UnadvertiseTopic,
     UnsubscribeParameter,
     UnsubscribeTopic,
@@ -125,7 +125,7 @@ class Foxglove:
         )
 
     def _tell(self, op: str, **fields: Any) -> None:
-        self.queue.reply(TextFrame(msgspec.json.encode({"op": op} | fields)))
+        self.queue.reply(text_frame(msgspec.json.encode({"op": op} | fields)))
 
     # --- frames of the client ---
 
@@ -285,7 +285,7 @@ class Foxglove:
 
     def _fetch_asset(self, operation: FoxgloveFetchAsset) -> list[DoorRequest]:
         reason = b"this door has no assets"
-        self.queue.reply(_ASSET_RESPONSE.pack(4, operation.requestId, 1, len(reason)) + reason)
+        self.queue.reply(binary_frame(_ASSET_RESPONSE.pack(4, operation.requestId, 1, len(reason)), reason))
         return []
 
     # --- answers and refusals ---
@@ -315,7 +315,7 @@ class Foxglove:
         if number in self._calls:
             service, call = self._calls.pop(number)
             head = _SERVICE_CALL.pack(3, service, call, len(_ENCODINGS[0])) + _ENCODINGS[0].encode("ascii")
-            self.queue.reply(head + bytes(values))
+            self.queue.reply(binary_frame(head, bytes(values)))
 
     def parameters(self, values: Mapping[str, Any], reply_to: str | None) -> None:
         rows = [{"name": name, "value": value} for name, value in values.items()]
@@ -323,8 +323,8 @@ class Foxglove:
 
     def parameter_changed(self, subscribed: str, name: str, value: Value, now: float) -> None:
         row = {"name": name} if value == {} else {"name": name, "value": value}
-        frame = TextFrame(msgspec.json.encode({"op": "parameterValues", "parameters": [row]}))
-        self.queue.put(subscribed, frame, len(frame), now)
+        frame = text_frame(msgspec.json.encode({"op": "parameterValues", "parameters": [row]}))
+        self.queue.put(subscribed, frame, frame_size(frame), now)
 
     def ask(self, service: str, _values: Raw) -> str:
         raise _FoxgloveError(f"the client does not offer {service}")
@@ -394,17 +394,23 @@ class Foxglove:
         for number in self._by_topic.get(message.topic, ()):
             self.queue.put(number, message, len(message.body), now)
 
-    def next_frame(self, now: float) -> bytes | Pieces | None:
+    def next_frame(self, now: float) -> DoorFrame | None:
         taken = self.queue.take(now)
         if taken is None or taken[0] is None:
             return None if taken is None else taken[1]
         number, message = taken
-        if isinstance(message, TextFrame):  # of a parameter
-            return message
-        return _MESSAGE_DATA.pack(1, number, message.received), message.body
+        if isinstance(number, int):
+            frame: DoorFrame = message.frame(number, _message_frame)
+            return frame
+        changed: ClientFrame = message  # of a parameter
+        return changed
 
     def next_time(self) -> float | None:
         return self.queue.next_time()
+
+
+def _message_frame(message: DoorMessage, number: int) -> ClientFrame:
+    return binary_frame(_MESSAGE_DATA.pack(1, number, message.received), message.body)
 
 
 def _values(encoding: str, data: bytes) -> Raw | bytes:

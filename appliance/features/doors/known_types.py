@@ -5,19 +5,19 @@ the operator gave the file of a service.
 """
 
 from collections import OrderedDict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from typing import TypeVar
 
-from msgspec import Raw
-
+from appliance.features.doors.client_frames import frame_size
+from appliance.features.doors.png_frames import DoorFrame, PngFrame
 from appliance.features.doors.values import MessageCodec, ValueLimits
 from roswire.definitions import Definitions
 from roswire.errors import DefinitionError
 from roswire.tcpros import Body
 
-E = TypeVar("E", Raw, bytes)
-_ENCODING_OVERHEAD = 500  # bytes that a kept encoding takes besides its own and those of its message
+Form = TypeVar("Form", bound=Hashable)
+_FRAME_OVERHEAD = 500  # bytes that a shared frame takes besides its own and those of its message
 
 _MOST_CHARACTERS = 500_000
 """The size of all kept definitions together. A codec takes up to 140 bytes for each character of its definition."""
@@ -27,8 +27,8 @@ _MOST_CHARACTERS = 500_000
 class DoorMessage:
     """A message that came on a topic, with its publisher's header.
 
-    `received` is nanoseconds since the epoch. Encoding raises `MessageValueError`, or `DefinitionError` if the
-    definition cannot be used.
+    `received` is the system time in nanoseconds. If several clients get the message, they share its frames in `shared`.
+    Encoding raises `MessageValueError`, or `DefinitionError` if the definition cannot be used.
     """
 
     topic: str
@@ -36,44 +36,45 @@ class DoorMessage:
     header: Mapping[str, str]
     received: int
     codec_of: Callable[[Mapping[str, str]], MessageCodec] = field(repr=False)
-    encodings: "Encodings | None" = field(default=None, repr=False)
+    shared: "SharedFrames | None" = field(default=None, repr=False)
 
     @property
-    def json(self) -> Raw:
-        return self._encoded(MessageCodec.json)
+    def codec(self) -> MessageCodec:
+        return self.codec_of(self.header)
 
-    @property
-    def cbor(self) -> bytes:
-        return self._encoded(MessageCodec.cbor)
-
-    def _encoded(self, encode: Callable[[MessageCodec, Body], E]) -> E:
-        if self.encodings is None:
-            return encode(self.codec_of(self.header), self.body)
-        return self.encodings.of(self, encode)
+    def frame(self, form: Form, make: Callable[["DoorMessage", Form], DoorFrame]) -> DoorFrame:
+        """Return the frame that `make` makes in this form, which clients with the same form share."""
+        return make(self, form) if self.shared is None else self.shared.frame(self, form, make)
 
 
-class Encodings:
-    """The last encodings: at most `most` bytes with their messages."""
+class SharedFrames:
+    """The frames that were made last, for the other clients of a door: at most `most` bytes with their messages."""
 
     def __init__(self, most: int = 16 << 20) -> None:
         self.bytes = 0
         self._most = most
-        self._kept: OrderedDict[tuple[DoorMessage, Any], Any] = OrderedDict()  # oldest first
+        self._kept: OrderedDict[tuple[DoorMessage, Hashable], DoorFrame] = OrderedDict()  # oldest first
 
-    def of(self, message: DoorMessage, encode: Callable[[MessageCodec, Body], E]) -> E:
-        known: E | None = self._kept.get((message, encode))
+    def frame(
+        self, message: DoorMessage, form: Form, make: Callable[[DoorMessage, Form], DoorFrame]
+    ) -> DoorFrame:
+        known = self._kept.get((message, form))
         if known is not None:
             return known
-        made = self._kept[message, encode] = encode(message.codec_of(message.header), message.body)
+        made = make(message, form)
+        if isinstance(made, tuple) and made[1] is message.body:  # its head is made faster than it is found
+            return made
+        self._kept[message, form] = made
         self.bytes += _kept_bytes(message, made)
         while self.bytes > self._most:
-            (oldest, _), encoding = self._kept.popitem(last=False)
-            self.bytes -= _kept_bytes(oldest, encoding)
+            (oldest, _), frame = self._kept.popitem(last=False)
+            self.bytes -= _kept_bytes(oldest, frame)
         return made
 
 
-def _kept_bytes(message: DoorMessage, encoding: Raw | bytes) -> int:
-    return len(message.body) + memoryview(encoding).nbytes + _ENCODING_OVERHEAD
+def _kept_bytes(message: DoorMessage, frame: DoorFrame) -> int:
+    size = frame.size if isinstance(frame, PngFrame) else frame_size(frame)
+    return len(message.body) + size + _FRAME_OVERHEAD
 
 
 class KnownTypes:

@@ -8,8 +8,6 @@ from typing import TypeAlias
 
 import msgspec
 
-from roswire.tcpros import Body
-
 ClientId: TypeAlias = str | int | float | None
 """The id of a client's operation, or None."""
 
@@ -151,13 +149,3 @@ DoorRequest: TypeAlias = (
     | SubscribeParameter
     | UnsubscribeParameter
 )
-
-
-class TextFrame(bytes):
-    """A text message to a client, in UTF-8."""
-
-    __slots__ = ()
-
-
-Pieces: TypeAlias = tuple[bytes, Body]
-"""The head and the body of a binary WebSocket message: a body is large, and not copied."""

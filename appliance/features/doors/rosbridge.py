@@ -14,8 +14,10 @@ from typing import Any
 
 from msgspec import Raw
 
+from appliance.features.doors.client_frames import frame_size
 from appliance.features.doors.fragments import FragmentStore
 from appliance.features.doors.known_types import DoorMessage
+from appliance.features.doors.png_frames import DoorFrame, PngFrame
 from appliance.features.doors.requests import (
     AdvertiseTopic,
     AnswerCall,
@@ -23,7 +25,6 @@ from appliance.features.doors.requests import (
     ClientId,
     DoorRequest,
     OfferService,
-    Pieces,
     PublishMessage,
     SubscribeTopic,
     UnadvertiseTopic,
@@ -54,7 +55,7 @@ from appliance.features.doors.rosbridge_frames import (
 )
 from appliance.features.doors.surroundings import DoorSurroundings
 from appliance.features.doors.viewer_queue import ViewerQueue
-from roswire.errors import LimitExceededError, PeerError, quoted
+from roswire.errors import PeerError, quoted
 from roswire.names import resolve
 from roswire.xmlrpc import Value
 
@@ -348,17 +349,19 @@ class Rosbridge:
         for spelling in self._spellings.get(message.topic, ()):
             self.queue.put(spelling, message, len(message.body), now)
 
-    def next_frame(self, now: float) -> bytes | Pieces | None:
+    def next_frame(self, now: float) -> DoorFrame | None:
         taken = self.queue.take(now)
         if taken is None or taken[0] is None:
             return None if taken is None else taken[1]
         spelling, message = taken
         try:
             compression = self._subscriptions[spelling].compression
-            frame = publish_frame(spelling, message, compression)
+            frame: DoorFrame = message.frame((spelling, compression), publish_frame)
             # A raw message had room while it waited; what is made of one can be many times as large.
-            if compression != "cbor-raw" and (reason := self.queue.memory.refusal(_size(frame))):
-                raise LimitExceededError(reason)
+            if compression != "cbor-raw":
+                more = max(_size(frame) - len(message.body), 0)
+                self.queue.memory.take(more)
+                self.queue.memory.send(more)
             return frame
         except PeerError as error:  # there is no room, or the message does not fit its definition
             return json_frame({"op": "status", "level": "error", "msg": f"{spelling}: {error}"})
@@ -367,8 +370,8 @@ class Rosbridge:
         return self.queue.next_time()
 
 
-def _size(frame: bytes | Pieces) -> int:
-    return len(frame) if isinstance(frame, bytes) else sum(map(len, frame))
+def _size(frame: DoorFrame) -> int:
+    return frame.size if isinstance(frame, PngFrame) else frame_size(frame)
 
 
 def _one_type(topic: str, use: str, known: str | None, given: str | None) -> str | None:

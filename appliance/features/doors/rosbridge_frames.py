@@ -1,17 +1,17 @@
 """The frames of the rosbridge protocol, version 2: the operations of clients as structs, and frames to clients."""
 
-import base64
-import math
 import struct
-import zlib
+from functools import lru_cache
 from typing import Annotated, Any, Literal
 
 import msgspec
 from msgspec import Meta, Raw, Struct
 
 from appliance.features.doors.cbor_frames import json_of_cbor
+from appliance.features.doors.client_frames import ClientFrame, binary_frame, text_frame
 from appliance.features.doors.known_types import DoorMessage
-from appliance.features.doors.requests import ClientId, Pieces, TextFrame
+from appliance.features.doors.png_frames import DoorFrame, PngFrame
+from appliance.features.doors.requests import ClientId
 from appliance.features.doors.values import cbor
 from roswire.errors import PeerError, quoted
 
@@ -149,53 +149,31 @@ class Envelope(Struct):
     receiver: Any = None
 
 
-def publish_frame(topic: str, message: DoorMessage, compression: Compression) -> TextFrame | Pieces:
+def publish_frame(message: DoorMessage, form: tuple[str, Compression]) -> DoorFrame:
+    """Return a message for clients that spell its topic and compress it in this form; raises `MessageValueError`."""
+    topic, compression = form
     if compression == "cbor-raw":
-        return _raw_head(topic, message), message.body
+        secs, nsecs = divmod(message.received, 1_000_000_000)
+        head = _RAW.pack(_RAW_SECS, secs, _RAW_NSECS, nsecs, _RAW_BYTES, len(message.body))
+        return binary_frame(_publish_head(topic) + head, message.body)
     if compression == "cbor":
-        return _publish_head(topic) + b"\x63msg", message.cbor
-    text = msgspec.json.encode({"op": "publish", "topic": topic, "msg": message.json})
-    if compression == "png":
-        return json_frame({"op": "png", "data": base64.b64encode(as_png(text)).decode("ascii")})
-    return TextFrame(text)
+        return binary_frame(_publish_head(topic) + b"\x63msg", message.codec.cbor(message.body))
+    text = msgspec.json.encode({"op": "publish", "topic": topic, "msg": message.codec.json(message.body)})
+    return PngFrame(text) if compression == "png" else text_frame(text)
 
 
+_RAW_SECS, _RAW_NSECS, _RAW_BYTES = b"\x63msg\xa3\x64secs\x1a", b"\x65nsecs\x1a", b"\x65bytes\x5a"
+_RAW = struct.Struct(f">{len(_RAW_SECS)}sI{len(_RAW_NSECS)}sI{len(_RAW_BYTES)}sI")
+"""The CBOR of a raw message without its bytes, which follow: a map of three fields."""
+
+
+@lru_cache(maxsize=256)
 def _publish_head(topic: str) -> bytes:
     return b"\xa3\x62op\x67publish\x65topic" + cbor(topic)
 
 
-def _raw_head(topic: str, message: DoorMessage) -> bytes:
-    secs, nsecs = divmod(message.received, 1_000_000_000)
-    return b"".join(
-        (
-            _publish_head(topic),
-            b"\x63msg\xa3\x64secs\x1a",
-            secs.to_bytes(4, "big"),
-            b"\x65nsecs\x1a",
-            nsecs.to_bytes(4, "big"),
-            b"\x65bytes\x5a",
-            len(message.body).to_bytes(4, "big"),
-        )
-    )
-
-
-def json_frame(fields: dict[str, Any], reply_to: ClientId = None) -> TextFrame:
-    return TextFrame(msgspec.json.encode(fields if reply_to is None else fields | {"id": reply_to}))
-
-
-def as_png(data: bytes) -> bytes:
-    """Return an image whose pixels (8-bit RGB) are these bytes, filled up with line feeds."""
-    width = max(math.isqrt(len(data) // 3), 1)
-    height = -(-len(data) // (3 * width))
-    row = 3 * width
-    padded = data.ljust(row * height, b"\n")
-    rows = b"".join(b"\0" + padded[start : start + row] for start in range(0, len(padded), row))
-    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
-    parts = (b"IHDR", header), (b"IDAT", zlib.compress(rows, 1)), (b"IEND", b"")
-    return b"\x89PNG\r\n\x1a\n" + b"".join(
-        struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
-        for kind, body in parts
-    )
+def json_frame(fields: dict[str, Any], reply_to: ClientId = None) -> ClientFrame:
+    return text_frame(msgspec.json.encode(fields if reply_to is None else fields | {"id": reply_to}))
 
 
 def type_name(text: str) -> str:

@@ -12,7 +12,7 @@
 
 import asyncio
 import contextlib
-import struct
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from http import HTTPStatus
@@ -28,17 +28,17 @@ from websockets.protocol import State
 from websockets.server import ServerProtocol
 from websockets.typing import Subprotocol
 
+from appliance.features.doors.client_frames import ClientFrame, content, frame_size, is_text
 from appliance.features.doors.door_memory import ClientMemory, DoorMemory
 from appliance.features.doors.door_node import DoorNode
 from appliance.features.doors.known_types import DoorMessage
 from appliance.features.doors.lookout import Lookout
 from appliance.features.doors.origins import rejection
+from appliance.features.doors.png_frames import DoorFrame, PngFrame
 from appliance.features.doors.requests import (
     AdvertiseTopic,
     DoorRequest,
-    Pieces,
     PublishMessage,
-    TextFrame,
     UnadvertiseTopic,
 )
 from appliance.features.doors.surroundings import DoorSurroundings
@@ -99,7 +99,7 @@ class ClientProtocol(Protocol):
 
     def message(self, message: DoorMessage, now: float) -> None: ...
 
-    def next_frame(self, now: float) -> bytes | Pieces | None:
+    def next_frame(self, now: float) -> DoorFrame | None:
         """Return the next frame to send now, or None."""
 
     def next_time(self) -> float | None:
@@ -142,8 +142,9 @@ class DoorSession:
         self._frame = bytearray()  # the fragments that have come; empty ones take nothing
         self._is_text = False
         self._pieces: list[Body] = []  # of frames for the client
-        self._in_flight = 0  # their bytes, also while the connection holds them
         self._wake = asyncio.Event()
+        self._alarm: asyncio.Handle | None = None  # sets `_wake` for a ping or a frame
+        self._alarm_time = -math.inf
         self._over = asyncio.Event()
         self._socket = ServerProtocol(
             extensions=[
@@ -339,62 +340,77 @@ class DoorSession:
     async def _send(self) -> None:
         loop, options = asyncio.get_running_loop(), self._options
         last_ping = loop.time()
-        while self._socket.state is State.OPEN:
-            if self._take_frames(loop.time()):
+        try:
+            while self._socket.state is State.OPEN:
+                self._wake.clear()
+                now = loop.time()
+                taken = await self._take_frames(now)
+                next_ping = last_ping + (options.will_ping_seconds if self._wills else options.ping_seconds)
+                if now >= next_ping:
+                    last_ping = now
+                    self._socket.send_ping(b"")
                 await self._flush()
-                continue
-            next_ping = last_ping + (options.will_ping_seconds if self._wills else options.ping_seconds)
-            if loop.time() >= next_ping:
-                last_ping = loop.time()
-                self._socket.send_ping(b"")
-            await self._flush()
-            due = self._protocol.next_time()
-            with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout_at(next_ping if due is None else min(due, next_ping)):
+                self.memory.sent()
+                if taken < _BATCH_BYTES:  # otherwise, more may wait
+                    due = self._protocol.next_time()
+                    self._wake_at(next_ping if due is None else min(due, next_ping))
                     await self._wake.wait()
-            self._wake.clear()
+        finally:
+            if self._alarm is not None:
+                self._alarm.cancel()
         await asyncio.sleep(_CLOSING_SECONDS)  # for the client's answer to the closing frame
 
-    def _take_frames(self, now: float) -> int:
-        """Return the number of bytes.
+    def _wake_at(self, when: float) -> None:
+        if self._alarm_time != when:
+            if self._alarm is not None:
+                self._alarm.cancel()
+            self._alarm_time = when
+            self._alarm = asyncio.get_running_loop().call_at(when, self._ring)
 
-        Without deflate, the session writes the heads itself, and the bodies are not copied. `_flush` sends them
-        before anything else can be added, so nothing follows a closing frame.
+    def _ring(self) -> None:
+        self._alarm, self._alarm_time = None, -math.inf
+        self._wake.set()
+
+    async def _take_frames(self, now: float) -> int:
+        """Pass frames that may be sent now to the WebSocket; return their number of bytes, about
+        `_BATCH_BYTES`.
+
+        Without deflate, frames are sent as they are, and large bodies are not copied. `_flush` sends them before
+        anything else can be added, so nothing follows a closing frame.
         """
-        size = 0
-        while size < _BATCH_BYTES and (frame := self._protocol.next_frame(now)) is not None:
-            opcode = Opcode.TEXT if isinstance(frame, TextFrame) else Opcode.BINARY
-            pieces = (frame,) if isinstance(frame, bytes) else frame
-            length = sum(map(len, pieces))
-            self.memory.add(length)
-            self._in_flight += length
-            if self._socket.extensions:
-                send = self._socket.send_text if opcode is Opcode.TEXT else self._socket.send_binary
-                send(b"".join(pieces))
-            else:
-                head, *bodies = pieces
-                self._pieces += (
-                    (frame_head(opcode, length) + head, *bodies)
-                    if bodies
-                    else (frame_head(opcode, length), head)
-                )
-            size += length
+        size, next_frame, deflates = 0, self._protocol.next_frame, bool(self._socket.extensions)
+        while size < _BATCH_BYTES and (made := next_frame(now)) is not None:
+            frame = await self._made(made) if isinstance(made, PngFrame) else made
+            if self._socket.state is not State.OPEN:  # it was closed in the meantime
+                break
+            size += frame_size(frame)
             self.sent += 1
+            if deflates:
+                send = self._socket.send_text if is_text(frame) else self._socket.send_binary
+                send(content(frame))
+            elif isinstance(frame, bytes):
+                self._pieces.append(frame)
+            else:
+                self._pieces += frame
         return size
+
+    async def _made(self, png: PngFrame) -> ClientFrame:
+        while png.frame is None:
+            png.step()
+            await asyncio.sleep(0)
+        return png.frame
 
     async def _flush(self) -> None:
         self._pings = 0
-        pieces = self._pieces + self._socket.data_to_send()
-        self._pieces = []
-        if sum(map(len, pieces)) <= 2 * _BATCH_BYTES:
-            pieces = [b"".join(pieces)]
-        for data in pieces:
+        pieces, self._pieces = self._pieces + self._socket.data_to_send(), []
+        if not pieces:
+            return
+        size = sum(map(len, pieces))
+        self.sent_bytes += size
+        for data in pieces if size > 2 * _BATCH_BYTES else (b"".join(pieces),):
             if data:
-                self.sent_bytes += len(data)
                 self._writer.write(data)
         await self._writer.drain()
-        self.memory.add(-self._in_flight)
-        self._in_flight = 0
 
     def disconnect(self, reason: str) -> None:
         self._disconnect(CloseCode.POLICY_VIOLATION, reason)
@@ -409,8 +425,8 @@ class DoorSession:
 
     # --- the door's side: a `DoorClient` ---
 
-    def heard(self, message: DoorMessage) -> None:
-        self._protocol.message(message, asyncio.get_running_loop().time())
+    def heard(self, message: DoorMessage, now: float) -> None:
+        self._protocol.message(message, now)
         self._wake.set()
 
     def answered(self, call: int, values: Raw | bytes) -> None:
@@ -445,16 +461,6 @@ class DoorSession:
         except ViewerStalledError as error:
             self._disconnect(CloseCode.POLICY_VIOLATION, str(error))
         self._wake.set()
-
-
-def frame_head(opcode: Opcode, length: int) -> bytes:
-    """Return the head of a final, unmasked frame (RFC 6455, section 5.2)."""
-    first = 0x80 | opcode
-    if length < 126:
-        return struct.pack(">BB", first, length)
-    if length < 1 << 16:
-        return struct.pack(">BBH", first, 126, length)
-    return struct.pack(">BBQ", first, 127, length)
 
 
 def _reason(socket: ServerProtocol) -> str:

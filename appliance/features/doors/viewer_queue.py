@@ -1,9 +1,12 @@
 """Queue the frames that wait for one client: replies in order, and the newest messages of each topic.
 
-1. Beyond `message_bytes`, the topic with the most bytes loses its oldest message.
-2. A client that requests more than `reply_bytes` of replies without reading gets `ViewerStalledError`.
-3. All frames are charged to the client's memory. Without room, its oldest messages are dropped, or the new one if
-   that is not enough, and a reply ends the connection.
+A client that reads slowly loses the oldest messages of its topics, never a reply. Invariants:
+
+1. At most `message_bytes` of messages wait. If more come, the topic with the most bytes loses its oldest message.
+2. At most `reply_bytes` of replies wait. A client that requests more without reading gets `ViewerStalledError`.
+3. All frames that wait, or that are taken and not sent, are charged to the client's part of the memory of its door.
+   Without room, the client's oldest messages are dropped, or the new one if that is not enough, and a reply ends the
+   connection.
 4. Topics take turns, so that a large topic delays a small one by one message.
 """
 
@@ -12,6 +15,7 @@ from collections.abc import Hashable
 from dataclasses import dataclass, field
 from typing import Any, Generic, TypeVar
 
+from appliance.features.doors.client_frames import ClientFrame, frame_size
 from appliance.features.doors.door_memory import ClientMemory, DoorMemory
 
 _BURST = 1000
@@ -53,16 +57,17 @@ class ViewerQueue(Generic[Key]):
         self.memory = memory or DoorMemory().client()
         self._most_message_bytes = message_bytes
         self._most_reply_bytes = reply_bytes
-        self._replies: deque[bytes] = deque()
+        self._replies: deque[ClientFrame] = deque()
         self._reply_bytes = 0
         self._message_bytes = 0
         self._topics: dict[Key, _Waiting] = {}
-        self._turns: OrderedDict[Key, None] = OrderedDict()  # the topics with messages, the next one first
+        self._turns: OrderedDict[Key, _Waiting] = OrderedDict()  # topics with messages, the next one first
 
-    def reply(self, frame: bytes) -> None:
+    def reply(self, frame: ClientFrame) -> None:
+        """Add a reply. Raises `ViewerStalledError`."""
         if self.memory.closed:
             return
-        size = len(frame)
+        size = frame_size(frame)
         if reason := self.memory.refusal(size + _OVERHEAD):
             raise ViewerStalledError(reason)
         self.memory.add(size + _OVERHEAD)
@@ -103,39 +108,41 @@ class ViewerQueue(Generic[Key]):
             if now < topic.next_time:
                 return
             topic.next_time = now + topic.interval
-        while self.memory.refusal(size + _OVERHEAD):
+        while not self.memory.try_take(size + _OVERHEAD):
             if self.memory.refusal(size + _OVERHEAD - self._message_bytes):
                 self.dropped += 1
                 return
             self._drop_from_largest()
-        self.memory.add(size + _OVERHEAD)
+        if not topic.items:
+            self._turns[key] = topic
         topic.items.append((item, size))
-        self._turns.setdefault(key)
         topic.bytes += size
         self._message_bytes += size
-        self._trim(topic)
+        if len(topic.items) > topic.depth or topic.bytes > topic.most_bytes:
+            self._trim(topic)
         while self._message_bytes > self._most_message_bytes:
-            key = max(self._turns, key=lambda one: self._topics[one].bytes)
-            largest = self._topics[key]
+            largest = max(self._turns.values(), key=lambda one: one.bytes)
             if len(largest.items) == 1 and largest is topic:
                 break  # the newest message of the topic stays, whatever its size
             self._drop_from_largest()
 
-    def take(self, now: float) -> "tuple[None, bytes] | tuple[Key, Any] | None":
-        """Replies have the key None."""
+    def take(self, now: float) -> "tuple[None, ClientFrame] | tuple[Key, Any] | None":
+        """Return the next reply (with the key None) or message; None if nothing may be sent now.
+
+        It stays charged until `memory.sent()`.
+        """
         if self._replies:
             frame = self._replies.popleft()
-            size = len(frame)
+            size = frame_size(frame)
             self._reply_bytes -= size
-            self.memory.add(-size - _OVERHEAD)
+            self.memory.send(size + _OVERHEAD)
             return None, frame
-        for key in self._turns:
-            topic = self._topics[key]
+        for key, topic in self._turns.items():
             if not topic.queued or topic.next_time <= now:
                 item, size = topic.items.popleft()
                 topic.bytes -= size
                 self._message_bytes -= size
-                self.memory.add(-size - _OVERHEAD)
+                self.memory.send(size + _OVERHEAD)
                 if topic.queued:
                     topic.next_time = now + topic.interval
                 if topic.items:
@@ -148,17 +155,18 @@ class ViewerQueue(Generic[Key]):
     def next_time(self) -> float | None:
         if self._replies:
             return 0.0
-        waiting = [self._topics[key] for key in self._turns]
-        return min((topic.next_time if topic.queued else 0.0 for topic in waiting), default=None)
+        if not self._turns:
+            return None
+        return min(topic.next_time if topic.queued else 0.0 for topic in self._turns.values())
 
     def _trim(self, topic: _Waiting) -> None:
         while len(topic.items) > topic.depth or (topic.bytes > topic.most_bytes and len(topic.items) > 1):
             self._drop(topic)
 
     def _drop_from_largest(self) -> None:
-        key = max(self._turns, key=lambda one: self._topics[one].bytes)
-        self._drop(self._topics[key])
-        if not self._topics[key].items:
+        key, topic = max(self._turns.items(), key=lambda one: one[1].bytes)
+        self._drop(topic)
+        if not topic.items:
             del self._turns[key]
 
     def _drop(self, topic: _Waiting) -> None:

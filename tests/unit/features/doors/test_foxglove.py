@@ -5,13 +5,14 @@ from typing import Any
 
 import pytest
 
+from appliance.features.doors.client_frames import content, is_text
 from appliance.features.doors.foxglove import SUBPROTOCOLS, Foxglove, FoxgloveLimits
+from appliance.features.doors.png_frames import PngFrame
 from appliance.features.doors.quotas import DOOR_BYTES
 from appliance.features.doors.requests import (
     DoorRequest,
     PublishMessage,
     SubscribeTopic,
-    TextFrame,
     UnsubscribeTopic,
 )
 from appliance.features.doors.surroundings import DoorSurroundings, SeenTopic, VisibleGraph
@@ -313,8 +314,8 @@ def received(foxglove: Foxglove, frame: str | bytes) -> list[DoorRequest]:
 
 def text_frame(foxglove: Foxglove) -> str | None:
     frame = foxglove.next_frame(0.0)
-    assert frame is None or isinstance(frame, TextFrame)
-    return None if frame is None else frame.decode()
+    assert frame is None or (not isinstance(frame, PngFrame) and is_text(frame))
+    return None if frame is None else content(frame).decode()
 
 
 def viewer(**limits: int) -> tuple[Foxglove, ViewerQueue[int | str]]:
@@ -375,7 +376,8 @@ def test_a_call_of_an_unknown_service_fails_in_words(service: int) -> None:
 def test_an_asset_is_an_error_at_once() -> None:
     foxglove, _queue = viewer()
     received(foxglove, '{"op":"fetchAsset","uri":"package://x/y.stl","requestId":5}')
-    assert foxglove.next_frame(0.0) == struct.pack("<BIBI", 4, 5, 1, 23) + b"this door has no assets"
+    frame = foxglove.next_frame(0.0)
+    assert frame == b"\x82\x21" + struct.pack("<BIBI", 4, 5, 1, 23) + b"this door has no assets"
 
 
 def test_a_subscription_ends_with_its_channel() -> None:

@@ -3,7 +3,9 @@ from collections.abc import Mapping
 
 import pytest
 
-from appliance.features.doors.known_types import DoorMessage, Encodings, KnownTypes
+from appliance.features.doors.known_types import DoorMessage, KnownTypes, SharedFrames
+from appliance.features.doors.png_frames import DoorFrame
+from appliance.features.doors.rosbridge_frames import Compression, publish_frame
 from appliance.features.doors.values import MessageCodec, ValueLimits
 from roswire.definitions import Definitions
 from roswire.errors import DefinitionError
@@ -87,15 +89,21 @@ def test_a_message_is_encoded_once_for_all_clients_within_bounds(types: KnownTyp
         return types.learn(fields)
 
     def message(size: int) -> DoorMessage:
-        return DoorMessage("/x", struct.pack("<I", size) + bytes(size), given, 0, learn, encodings)
+        return DoorMessage("/x", struct.pack("<I", size) + bytes(size), given, 0, learn, shared)
 
-    encodings = Encodings(most=100_000)
+    def frame(message: DoorMessage, topic: str, compression: Compression) -> DoorFrame:
+        return message.frame((topic, compression), publish_frame)
+
+    shared = SharedFrames(most=150_000)
     first = message(10_000)
-    assert bytes(first.json) == bytes(first.json)
-    assert len(learned) == 1
-    assert first.cbor == first.cbor
-    assert len(learned) == 2
+    for compression in ("none", "cbor", "png"):
+        assert frame(first, "/x", compression) is frame(first, "/x", compression)
+    assert len(learned) == 3
+    assert frame(first, "x", "none") is not frame(first, "/x", "none")
+    assert frame(first, "x", "none") is frame(first, "x", "none") and len(learned) == 4
+    raw = message(50_000)
+    assert frame(raw, "/x", "cbor-raw") is not frame(raw, "/x", "cbor-raw")  # it has the bytes of the message
     for size in (10_000, 10_000, 10_000, 50_000, 90_000):
-        assert message(size).json
-        assert encodings.bytes <= 100_000
-    assert first.json and len(learned) == 8  # it is no longer kept
+        assert frame(message(size), "/x", "none")
+        assert shared.bytes <= 150_000
+    assert frame(first, "/x", "none") and len(learned) == 10  # it is no longer kept

@@ -8,8 +8,10 @@ from typing import Any
 import cbor2
 import pytest
 
+from appliance.features.doors.client_frames import content, is_text
 from appliance.features.doors.door_memory import DoorMemory
 from appliance.features.doors.known_types import DoorMessage
+from appliance.features.doors.png_frames import PngFrame
 from appliance.features.doors.requests import (
     AdvertiseTopic,
     AnswerCall,
@@ -18,7 +20,6 @@ from appliance.features.doors.requests import (
     OfferService,
     PublishMessage,
     SubscribeTopic,
-    TextFrame,
     UnadvertiseTopic,
     UnsubscribeTopic,
     WithdrawService,
@@ -54,8 +55,10 @@ class Client:
     def gets(self) -> list[Any]:
         frames = []
         while (frame := self.rosbridge.next_frame(self.now)) is not None:
-            data = b"".join(frame) if isinstance(frame, tuple) else frame
-            frames.append(json.loads(data) if isinstance(data, TextFrame) else cbor2.loads(data))
+            while isinstance(frame, PngFrame):
+                frame.step()
+                frame = frame.frame or frame
+            frames.append(json.loads(content(frame)) if is_text(frame) else cbor2.loads(content(frame)))
         return frames
 
     def hears(self, text: str, topic: str = "/chatter") -> None:
@@ -177,12 +180,12 @@ def test_png_holds_the_frame_in_its_pixels(client: Client, length: int) -> None:
     client.hears("x" * length)
     (frame,) = client.gets()
     png = base64.b64decode(frame["data"])
-    chunks, position = {}, 8
+    chunks, position = dict[bytes, bytes](), 8
     while position < len(png):
         size, kind = struct.unpack_from(">I4s", png, position)
         body = png[position + 8 : position + 8 + size]
         assert struct.unpack_from(">I", png, position + 8 + size) == (zlib.crc32(kind + body),)
-        chunks[kind] = body
+        chunks[kind] = chunks.get(kind, b"") + body
         position += 12 + size
     width, height, *form = struct.unpack(">IIBBBBB", chunks[b"IHDR"])
     assert form == [8, 2, 0, 0, 0] and [*chunks][-1] == b"IEND"

@@ -1,0 +1,66 @@
+"""Texts as PNG images, for rosbridge's compression `png`.
+
+The compression of a large text takes long, so it is divided into steps, between which a door serves its other clients.
+"""
+
+import base64
+import math
+import struct
+import zlib
+from collections.abc import Iterator
+from typing import TypeAlias
+
+from appliance.features.doors.client_frames import ClientFrame, text_frame
+
+_STEP_BYTES = 3 << 14  # of the text, or of the image: about a millisecond
+
+
+class PngFrame:
+    """The frame of an image; `frame` is None until it is made. `size` is the memory that it takes at most."""
+
+    def __init__(self, text: bytes) -> None:
+        self.size = 2 * len(text)
+        self.frame: ClientFrame | None = None
+        self._steps = self._make(text)
+
+    def step(self) -> None:
+        """Do a part of the work; clients that share the frame also share its steps."""
+        next(self._steps, None)
+
+    def _make(self, text: bytes) -> Iterator[None]:
+        image, encoded = bytearray(), bytearray(b'{"op":"png","data":"')
+        parts = _image(text)
+        del text  # each part of the memory ends with its use
+        for part in parts:
+            image += part
+            yield
+        del parts
+        for start in range(0, len(image), _STEP_BYTES):
+            encoded += base64.b64encode(image[start : start + _STEP_BYTES])
+            yield
+        encoded += b'"}'
+        self.frame = text_frame(encoded)
+
+
+DoorFrame: TypeAlias = ClientFrame | PngFrame
+
+
+def _image(data: bytes) -> Iterator[bytes]:
+    """Yield the parts of an image whose pixels (8-bit RGB) are these bytes, filled up with line feeds."""
+    width = max(math.isqrt(len(data) // 3), 1)
+    height = -(-len(data) // (3 * width))
+    row = 3 * width
+    step = row * max(_STEP_BYTES // row, 1)
+    yield b"\x89PNG\r\n\x1a\n" + _chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0))
+    compression = zlib.compressobj(1)
+    for begin in range(0, row * height, step):
+        end = min(begin + step, row * height)
+        part = data[begin:end].ljust(end - begin, b"\n")
+        rows = b"".join(b"\0" + part[start : start + row] for start in range(0, len(part), row))
+        compressed = compression.compress(rows)
+        yield _chunk(b"IDAT", compressed) if compressed else b""
+    yield _chunk(b"IDAT", compression.flush()) + _chunk(b"IEND", b"")
+
+
+def _chunk(kind: bytes, body: bytes) -> bytes:
+    return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
