@@ -18,6 +18,7 @@ from appliance.base import clock
 from appliance.features.doors.door_memory import ClientMemory
 from appliance.features.doors.door_parameters import TOO_MANY_CALLS, DoorParameters, ParameterClient
 from appliance.features.doors.known_types import DoorMessage, KnownTypes, SharedFrames
+from appliance.features.doors.lingering import Lingering
 from appliance.features.doors.message_writer import MessageWriter, Now
 from appliance.features.doors.requests import (
     AdvertiseTopic,
@@ -140,8 +141,16 @@ class DoorNode:
         self._frames = SharedFrames()
         self._locks: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()
         self._tasks = OwnedTasks()
+        self._published = Lingering(
+            _LINGER_SECONDS, lambda topic: self._tasks.start(self._end_publication(topic))
+        )
+        self._subscribed = Lingering(
+            _LINGER_SECONDS, lambda topic: self._tasks.start(self._end_subscription(topic))
+        )
 
     async def close(self) -> None:
+        self._published.close()
+        self._subscribed.close()
         await self._tasks.close()
         await self._parameters.close()
         await self.node.close()
@@ -205,6 +214,7 @@ class DoorNode:
                     replay=_REPLAY_SECONDS,
                 )
                 known = self._publications[request.topic] = _Publication(publication, codec, clock.now())
+                self._published.left(request.topic)  # until the client is added
             elif request.type not in (None, known.publication.type.name):
                 raise ProtocolError(
                     f"{request.topic} is advertised as {known.publication.type.name}, not {request.type}"
@@ -213,6 +223,7 @@ class DoorNode:
                 _written(known.codec.writer, request.will, client.memory)  # raises if it does not fit
                 known.wills[client] = request.will
             known.clients.add(client)
+            self._published.used(request.topic)
 
     async def _type_of(self, topic: str) -> str:
         try:
@@ -229,14 +240,13 @@ class DoorNode:
 
     def _unadvertise(self, topic: str, client: DoorClient) -> None:
         known = self._publications.get(topic)
-        if known is not None:
-            known.clients.discard(client)
+        if known is not None and client in known.clients:
+            known.clients.remove(client)
             known.wills.pop(client, None)
             if not known.clients:
-                self._tasks.start(self._end_publication(topic))
+                self._published.left(topic)
 
     async def _end_publication(self, topic: str) -> None:
-        await asyncio.sleep(_LINGER_SECONDS)
         async with self._lock(f"publisher {topic}"):
             known = self._publications.get(topic)
             if known is not None and not known.clients:
@@ -277,6 +287,7 @@ class DoorNode:
         async with self._lock(f"subscriber {topic}"):
             if topic in self._heard:
                 self._heard[topic][client] = request
+                self._subscribed.used(topic)
                 self.node.repeat(topic, lambda body, header: self._hear(topic, body, header, [client]))
                 return
             self._check_room(self._heard)
@@ -315,13 +326,10 @@ class DoorNode:
 
     def _unsubscribe(self, topic: str, client: _Subscriber) -> None:
         clients = self._heard.get(topic)
-        if clients is not None:
-            clients.pop(client, None)
-            if not clients:
-                self._tasks.start(self._end_subscription(topic))
+        if clients is not None and clients.pop(client, None) is not None and not clients:
+            self._subscribed.left(topic)
 
     async def _end_subscription(self, topic: str) -> None:
-        await asyncio.sleep(_LINGER_SECONDS)
         async with self._lock(f"subscriber {topic}"):
             if topic in self._heard and not self._heard[topic]:
                 del self._heard[topic]

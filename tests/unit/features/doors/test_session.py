@@ -466,6 +466,36 @@ async def test_an_agent_that_connects_for_each_call_registers_once() -> None:
         assert world.master.publishers["/cmd"] == [] and world.master.subscribers["/state"] == []
 
 
+async def test_a_topic_ends_ten_seconds_after_its_last_client_however_often_clients_leave() -> None:
+    async with door_world() as world:
+        tasks = len(asyncio.all_tasks())
+        for _ in range(4):
+            client = await world.client()
+            for number in range(20):
+                client.send({"op": "advertise", "topic": f"/cmd{number}", "type": "std_msgs/String"})
+                client.send({"op": "subscribe", "topic": f"/state{number}"})
+            await asyncio.sleep(4)
+            client.writer.close()
+            await asyncio.sleep(2)
+            assert len(asyncio.all_tasks()) < tasks + 10
+        await asyncio.sleep(7)
+        assert world.master.publishers["/cmd0"] and world.master.subscribers["/state0"]
+        await asyncio.sleep(2)
+        for number in range(20):
+            assert world.master.publishers[f"/cmd{number}"] == []
+            assert world.master.subscribers[f"/state{number}"] == []
+
+
+async def test_a_topic_whose_advertisement_is_refused_ends_too() -> None:
+    async with door_world() as world:
+        client = await world.client()
+        client.send({"op": "advertise", "topic": "/cmd", "type": "std_msgs/String", "will": {"datum": 1}})
+        assert "unknown field" in (await client.next())["msg"]
+        assert world.master.publishers["/cmd"]
+        await asyncio.sleep(15)
+        assert world.master.publishers["/cmd"] == []
+
+
 async def test_a_viewer_that_stops_reading_delays_no_other_and_takes_bounded_memory() -> None:
     async with door_world() as world:
         robot = await world.robot("10.0.0.3", "/robot")

@@ -1,0 +1,43 @@
+"""Topics that no client uses any longer: each ends some seconds later, unless a client comes back."""
+
+import asyncio
+from collections.abc import Callable
+
+
+class Lingering:
+    """The topics of a door that will end, with one timer: `end(topic)` is called `seconds` after `left(topic)`."""
+
+    def __init__(self, seconds: float, end: Callable[[str], object]) -> None:
+        self._seconds = seconds
+        self._end = end
+        self._ends: dict[str, float] = {}  # the first to end first
+        self._timer: asyncio.TimerHandle | None = None
+
+    def left(self, topic: str) -> None:
+        self.used(topic)
+        self._ends[topic] = asyncio.get_running_loop().time() + self._seconds
+        if self._timer is None:
+            self._start()
+
+    def used(self, topic: str) -> None:
+        self._ends.pop(topic, None)
+
+    def close(self) -> None:
+        self._ends.clear()
+        if self._timer is not None:
+            self._timer.cancel()
+
+    def _start(self) -> None:
+        first = next(iter(self._ends.values()))
+        self._timer = asyncio.get_running_loop().call_at(first, self._ring)
+
+    def _ring(self) -> None:
+        self._timer = None
+        now = asyncio.get_running_loop().time()
+        while self._ends:
+            topic, when = next(iter(self._ends.items()))
+            if when > now:
+                self._start()
+                return
+            del self._ends[topic]
+            self._end(topic)
