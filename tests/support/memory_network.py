@@ -119,6 +119,10 @@ class _Transport(asyncio.Transport):
 class _Reader(asyncio.StreamReader):
     _buffer: bytearray
 
+    @property
+    def unread(self) -> int:
+        return len(self._buffer)
+
     def discard(self) -> bool:
         unread = bool(self._buffer)
         self._buffer.clear()
@@ -156,6 +160,14 @@ class MemoryWriter:
             for end in (self, self.peer):
                 if not end.reader.at_eof():
                     end.reader.feed_eof()
+
+    @property
+    def unsent(self) -> int:
+        return 0 if self.peer.has_room.is_set() else self.peer.reader.unread
+
+    def abort(self) -> None:
+        self.peer.reader.discard()
+        self.close()
 
     def pause_reading(self) -> None:
         self.has_room.clear()

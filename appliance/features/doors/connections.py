@@ -6,11 +6,26 @@ An agent that makes a connection for each call is normal; a client that connects
 import asyncio
 import socket
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from http import HTTPStatus
+from typing import Protocol
 
-from roswire.node.network import BUFFER_BYTES, ByteWriter, OwnedTasks, Serve
+from roswire.node.network import BUFFER_BYTES, ByteWriter, OwnedTasks
+
+
+class ClientWriter(ByteWriter, Protocol):
+    """The writer of a client's connection."""
+
+    @property
+    def unsent(self) -> int:
+        """The bytes that wait in this process until the client takes more."""
+
+    def abort(self) -> None:
+        """Close the connection, and drop the unsent bytes."""
+
+
+ServeClient = Callable[[asyncio.StreamReader, ClientWriter], Awaitable[None]]
 
 _REFUSAL_SECONDS = 5.0
 _MOST_REFUSALS = 64  # at the same time; further connections end without words
@@ -35,21 +50,23 @@ class DoorConnections:
         self._recent: deque[float] = deque()
         self._tasks = OwnedTasks()
 
-    def adopt(self, descriptor: int, serve: Serve, refused: Callable[[str], None]) -> None:
+    def adopt(self, descriptor: int, serve: ServeClient, refused: Callable[[str], None]) -> None:
         self._tasks.start(self._adopt(socket.socket(fileno=descriptor), serve, refused))
 
-    async def _adopt(self, connection: socket.socket, serve: Serve, refused: Callable[[str], None]) -> None:
+    async def _adopt(
+        self, connection: socket.socket, serve: ServeClient, refused: Callable[[str], None]
+    ) -> None:
         connection.setblocking(False)
         local = connection.family == socket.AF_UNIX
         opening = asyncio.open_unix_connection if local else asyncio.open_connection
         reader, writer = await opening(sock=connection, limit=BUFFER_BYTES)
-        await self.serve(serve, reader, writer, refused=refused)
+        await self.serve(serve, reader, _StreamWriter(writer), refused=refused)
 
     async def serve(
         self,
-        serve: Serve,
+        serve: ServeClient,
         reader: asyncio.StreamReader,
-        writer: ByteWriter,
+        writer: ClientWriter,
         *,
         refused: Callable[[str], None],
     ) -> None:
@@ -95,6 +112,19 @@ class DoorConnections:
 
     async def close(self) -> None:
         await self._tasks.close()
+
+
+class _StreamWriter:
+    def __init__(self, writer: asyncio.StreamWriter) -> None:
+        self._transport = writer.transport
+        self.write, self.drain, self.close = writer.write, writer.drain, writer.close
+
+    @property
+    def unsent(self) -> int:
+        return self._transport.get_write_buffer_size()
+
+    def abort(self) -> None:
+        self._transport.abort()
 
 
 def _refusal(reason: str) -> bytes:

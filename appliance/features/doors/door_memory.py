@@ -5,7 +5,8 @@ Large messages from other nodes have a memory of their own until they are whole,
 from the others.
 
 1. Each client may hold `least` bytes, whatever the others hold: half of the whole, divided by the most clients.
-2. Beyond `least`, a client gets no more of the other half than it leaves for all others.
+2. Beyond `least`, clients share the other half. A client gets no more of it than it leaves for all others, and is
+   disconnected if it does not read the frames that take it (`session.py`).
 """
 
 from collections.abc import Iterator
@@ -55,6 +56,11 @@ class ClientMemory:
         if self._leaving:
             self.add(-self._leaving)
             self._leaving = 0
+
+    @property
+    def shares(self) -> bool:
+        """Whether this client holds memory of the shared half."""
+        return self._shared > 0
 
     def refusal(self, size: int) -> str:
         held = self.held + size

@@ -20,7 +20,7 @@ from appliance.channel.channel import Channel
 from appliance.channel.child_process import Child
 from appliance.features.doors import door_link
 from appliance.features.doors.client_counts import SAMPLE_SECONDS, CountedClient, shown
-from appliance.features.doors.connections import ConnectionLimits, DoorConnections
+from appliance.features.doors.connections import ClientWriter, ConnectionLimits, DoorConnections
 from appliance.features.doors.door_link import node_name
 from appliance.features.doors.door_memory import ClientMemory, DoorMemory
 from appliance.features.doors.door_node import DoorNode, present_time
@@ -36,7 +36,7 @@ from appliance.features.doors.viewer_queue import ViewerQueue
 from roswire.definitions import Definitions
 from roswire.errors import DefinitionError
 from roswire.node import NodeLimits, RosNode
-from roswire.node.network import ByteWriter, OwnedTasks
+from roswire.node.network import OwnedTasks
 from roswire.standard import standard_definitions
 
 _MOST_TOPICS = 500
@@ -253,7 +253,9 @@ class _Process:
         serve, refused = partial(self._serve, peer, ticket), partial(self._ended, peer, ticket)
         door.connections.adopt(connection.detach(), serve, refused)
 
-    async def _serve(self, peer: str, ticket: str, reader: asyncio.StreamReader, writer: ByteWriter) -> None:
+    async def _serve(
+        self, peer: str, ticket: str, reader: asyncio.StreamReader, writer: ClientWriter
+    ) -> None:
         door, given = self._door, self._given
         if door is None or given is None or (ticket and ticket not in self._tickets):
             writer.close()

@@ -6,8 +6,10 @@
 3. Frames are sent only as fast as the client reads. In the meantime, its queue keeps the newest messages of each
    topic, and its requests are carried out: a stop does not wait for pictures.
 4. A client that sends nothing, and does not answer pings, is disconnected: within seconds if it has a will.
-5. Once the session disconnects a client, it carries out no further request, and ends even if the client does not
-   read.
+5. Once the session disconnects a client, it carries out no further request, and ends even if the client does not read.
+   Frames that the client does not take then are dropped.
+6. A client that holds memory which all clients share (`door_memory.py`) must take frames: `_LEAST_TAKEN` bytes in
+   `_TAKING_SECONDS`. Otherwise it is disconnected, because large messages of others may find no room.
 """
 
 import asyncio
@@ -29,7 +31,8 @@ from websockets.server import ServerProtocol
 from websockets.typing import Subprotocol
 
 from appliance.features.doors.client_frames import ClientFrame, content, frame_size, is_text
-from appliance.features.doors.door_memory import ClientMemory, DoorMemory
+from appliance.features.doors.connections import ClientWriter
+from appliance.features.doors.door_memory import ClientMemory
 from appliance.features.doors.door_node import DoorNode
 from appliance.features.doors.known_types import DoorMessage
 from appliance.features.doors.lookout import Lookout
@@ -44,7 +47,6 @@ from appliance.features.doors.requests import (
 from appliance.features.doors.surroundings import DoorSurroundings
 from appliance.features.doors.viewer_queue import ViewerStalledError
 from roswire.errors import LimitExceededError, ProtocolError, RosError
-from roswire.node.network import ByteWriter
 from roswire.tcpros import Body
 from roswire.xmlrpc import Value
 
@@ -53,7 +55,11 @@ _READ_DEFLATED_BYTES = 1 << 12  # the frames that are read at once take up to 10
 _BATCH_BYTES = 1 << 15
 _COPIES = 2  # of a frame while it is carried out: itself, and its operation
 _TURN = 64  # frames after which frames for clients are sent, although more have come
+_TAKING_SECONDS = 5.0
+_LEAST_TAKEN = 1 << 19
 _CLOSING_SECONDS = 2.0
+_LAST_SECONDS = 1.0  # in which the client may take the last frames
+_LAST_TURN_SECONDS = 0.05
 _WATCH_SECONDS = 2.0  # between two looks at the surroundings
 _MOST_PINGS = 100  # of the client that wait for their answers
 _WINDOW_BITS = 12  # with this and the level, a connection takes about 40 KB for compression
@@ -116,14 +122,14 @@ class DoorSession:
     def __init__(
         self,
         reader: asyncio.StreamReader,
-        writer: ByteWriter,
+        writer: ClientWriter,
         *,
         door: DoorNode,
         lookout: Lookout,
         protocols: Protocols,
         subprotocols: Sequence[str],
         options: SessionOptions,
-        memory: ClientMemory | None = None,
+        memory: ClientMemory,
     ) -> None:
         self.end = ""
         self.received = self.sent = 0  # frames
@@ -137,7 +143,7 @@ class DoorSession:
         self._protocol: ClientProtocol
         self._wills: set[str] = set()  # the topics on which the client has a will
         self._pings = 0
-        self.memory = memory or DoorMemory().client()
+        self.memory = memory  # also that of the protocol's queue
         self._unfinished = 0  # bytes of a frame that has not come whole, as charged to the memory
         self._frame = bytearray()  # the fragments that have come; empty ones take nothing
         self._is_text = False
@@ -174,7 +180,7 @@ class DoorSession:
         except OSError as error:
             self.end = self.end or f"the connection broke: {error}"
         finally:
-            self._writer.close()
+            await self._end_connection()
             await self._door.forget(self)
             self.memory.close()
 
@@ -213,12 +219,20 @@ class DoorSession:
             for task in tasks:
                 task.cancel()
             ends = await asyncio.gather(*tasks, return_exceptions=True)
-            with contextlib.suppress(OSError, TimeoutError):
-                async with asyncio.timeout(1):
-                    await self._flush()
         for end in ends:
             if isinstance(end, Exception):
                 raise end
+
+    async def _end_connection(self) -> None:
+        with contextlib.suppress(OSError):
+            async with asyncio.timeout(_LAST_SECONDS):
+                await self._flush()
+                while self._writer.unsent:
+                    await asyncio.sleep(_LAST_TURN_SECONDS)
+        if self._writer.unsent:
+            self._writer.abort()
+        else:
+            self._writer.close()
 
     async def _watch(self) -> None:
         while True:
@@ -401,16 +415,39 @@ class DoorSession:
         return png.frame
 
     async def _flush(self) -> None:
+        if not self._write():
+            return
+        if self._writer.unsent <= 2 * _BATCH_BYTES:
+            await self._writer.drain()
+        else:
+            await self._wait_for_room()
+
+    def _write(self) -> int:
+        """Give frames to the connection, which alone keeps them; return their number of bytes."""
         self._pings = 0
         pieces, self._pieces = self._pieces + self._socket.data_to_send(), []
-        if not pieces:
-            return
         size = sum(map(len, pieces))
         self.sent_bytes += size
         for data in pieces if size > 2 * _BATCH_BYTES else (b"".join(pieces),):
             if data:
                 self._writer.write(data)
-        await self._writer.drain()
+        return size
+
+    async def _wait_for_room(self) -> None:
+        while True:
+            before = self._writer.unsent
+            try:
+                async with asyncio.timeout(_TAKING_SECONDS) as limit:
+                    await self._writer.drain()
+                    return
+            except TimeoutError:
+                if not limit.expired():  # it is an error of the connection
+                    raise
+            taken = before - self._writer.unsent
+            if self.memory.shares and taken < _LEAST_TAKEN:
+                self.disconnect(
+                    f"the client took {taken} bytes in {_TAKING_SECONDS:g} s, and holds memory that others need"
+                )
 
     def disconnect(self, reason: str) -> None:
         self._disconnect(CloseCode.POLICY_VIOLATION, reason)

@@ -9,10 +9,11 @@ import socket
 import sys
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from functools import partial
 from pathlib import Path
 
-from appliance.features.doors.connections import ConnectionLimits, DoorConnections
-from appliance.features.doors.door_memory import DoorMemory
+from appliance.features.doors.connections import ClientWriter, ConnectionLimits, DoorConnections, ServeClient
+from appliance.features.doors.door_memory import ClientMemory, DoorMemory
 from appliance.features.doors.door_node import DoorNode, present_time
 from appliance.features.doors.foxglove import SUBPROTOCOLS, Foxglove, FoxgloveLimits
 from appliance.features.doors.known_types import KnownTypes
@@ -24,16 +25,15 @@ from appliance.features.doors.values import ValueLimits
 from appliance.features.doors.viewer_queue import ViewerQueue
 from roswire.definitions import Definitions
 from roswire.node import NodeLimits, RosNode, SourceNetwork
-from roswire.node.network import ByteWriter, Serve
 from roswire.standard import standard_definitions
 
 NAME = "/door"
 
 
-def protocol_of(subprotocol: str | None) -> ClientProtocol:
+def protocol_of(memory: ClientMemory, subprotocol: str | None) -> ClientProtocol:
     if subprotocol is None:
-        return Rosbridge(NAME, RosbridgeLimits(), ViewerQueue())
-    return Foxglove(NAME, FoxgloveLimits(), ViewerQueue())
+        return Rosbridge(NAME, RosbridgeLimits(), ViewerQueue(memory=memory))
+    return Foxglove(NAME, FoxgloveLimits(), ViewerQueue(memory=memory))
 
 
 @asynccontextmanager
@@ -50,15 +50,17 @@ async def real_door(
     door = DoorNode(node, types, Rosapi(sight, types).answer, most_topics=2000, calls=DoorMemory().client())
     lookout = Lookout(sight, types, door.learn)
 
-    async def serve(reader: asyncio.StreamReader, writer: ByteWriter) -> None:
+    async def serve(reader: asyncio.StreamReader, writer: ClientWriter) -> None:
+        memory = DoorMemory().client()
         await DoorSession(
             reader,
             writer,
             door=door,
             lookout=lookout,
-            protocols=protocol_of,
+            protocols=partial(protocol_of, memory),
             subprotocols=SUBPROTOCOLS,
             options=SessionOptions(),
+            memory=memory,
         ).run()
 
     connections = DoorConnections(ConnectionLimits())
@@ -73,7 +75,7 @@ async def real_door(
             await door.close()
 
 
-async def _accept(listener: socket.socket, connections: DoorConnections, serve: Serve) -> None:
+async def _accept(listener: socket.socket, connections: DoorConnections, serve: ServeClient) -> None:
     while True:
         connection, _address = await asyncio.get_running_loop().sock_accept(listener)
         with connection:

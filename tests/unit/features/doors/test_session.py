@@ -547,6 +547,31 @@ async def test_an_image_of_a_large_text_delays_no_other_client(monkeypatch: pyte
         assert 60 < len(arrived) < 90  # both clients share the steps
 
 
+async def test_a_client_that_does_not_read_gives_shared_memory_back_within_seconds() -> None:
+    """A client that reads slowly, or that holds no memory of the others, stays."""
+    async with door_world() as world:
+        publication = await talks(await world.robot("10.0.0.3", "/robot"), "/image")
+        clients = [await world.client() for _number in range(4)]
+        stuck, slow, small, reading = clients
+        for client in clients:
+            client.send({"op": "subscribe", "topic": "/image", "compression": "cbor-raw"})
+        await asyncio.sleep(1)
+        for client in clients[:3]:
+            client.stop_reading()
+        for memory in (world.memories[2], world.memories[3]):  # as for a larger message
+            memory.add(DOOR_BYTES.bounds.host // 2)
+        publication.publish(string("x" * 3_000_000))
+        await asyncio.sleep(1)
+        assert DOOR_BYTES.bounds.host // 2 < world.memory.shared
+        for _second in range(12):
+            await slow.reader.readexactly(200_000)
+            await asyncio.sleep(1)
+        assert "the client took 0 bytes in 5 s" in world.sessions[0].end
+        assert world.memories[2].held == 0 and stuck.writer.peer.closed
+        assert [session.end for session in world.sessions[1:]] == ["", "", ""]
+        assert (await reading.next())["op"] == "publish" and small.is_open
+
+
 async def test_a_message_is_charged_until_the_client_has_room_for_it() -> None:
     async with door_world() as world:
         publication = await talks(await world.robot("10.0.0.3", "/robot"), "/image")
