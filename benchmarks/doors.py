@@ -1,10 +1,15 @@
 """A door beside rosbridge_suite and foxglove_bridge: `python -m benchmarks.doors [--rounds 3]`.
 
-A roscpp node publishes texts, and one WebSocket client on another host of a lab counts the frames, of 200 bytes and
-of 1 MB. *paced* has a fixed rate (delay, and processor time for each message), *most* growing rates of the publisher.
-The times of relay and door are added. A door has a lower priority than the robot (nice 10), as on a robot. *Flooded*:
-a client of the least priority sends messages to the door as fast as it can, while a node of the robot listens to
-another.
+A roscpp node publishes texts, and WebSocket clients on another host of a lab count the frames that they receive. The
+ways take turns. Each is measured with 200 bytes and with 1 MB, as large as a frame of a camera: *paced* with one client
+and a fixed rate (the delay from `publish` to the client, and the processor time for each message), and *most*, with one
+client and with several of the same topic, as a door has dashboards: the most frames a second that all received, with
+growing rates of the publisher. *Most* also shows the processor time of each process, so a publisher or a client that is
+the limit is seen: all of them share the cores. The path of a door has two processes, the relay and the door. A door has
+a lower priority than the robot (nice 10), as on a robot; `--same-priority` gives both 0.
+
+*Flooded*: a client sends messages to the door as fast as it can, while a node of the robot listens to another. The
+client has the least priority, because a flood comes from another machine.
 
 Neither peer is a Debian package. Give programs that start them, with `--rosbridge` (rosbridge_websocket.py of the
 branch ros1) and `--foxglove-bridge`; without one, its rows are left out.
@@ -14,6 +19,7 @@ import argparse
 import json
 import os
 import re
+import selectors
 import signal
 import socket
 import statistics
@@ -39,8 +45,9 @@ from tests.support.waiting import eventually
 
 _BENCHMARKS = ROOT / "build" / "benchmarks"
 _LOAD, _ROBOT = _BENCHMARKS / "door_load", _BENCHMARKS / "recorder_load"
-_SIZES = {200: (100, (8_000, 32_000)), 1_000_000: (20, (100, 400))}
+_SIZES = {200: (100, (8_000, 32_000, 64_000)), 1_000_000: (20, (100, 400, 1_600))}
 """The size of a message: the rate of *paced*, and the rates of *most*."""
+_RECEIVED_BYTES = 1 << 18
 _STAMP = re.compile(rb"t=([0-9a-f]{16})")
 _HEAD_BYTES = 400
 _WARM_SECONDS = 1.0
@@ -85,11 +92,38 @@ class Viewer:
             del data[: head + length]
             yield opcode, found
 
+    def rest(self) -> bytes:
+        """The bytes that have come, and that `frames` did not take."""
+        return bytes(self._data)
+
     def _receive(self) -> None:
         data = self.socket.recv(1 << 20)
         if not data:
             raise SystemExit("the server ended the connection")
         self._data += data
+
+
+class FrameCounter:
+    """Counts the frames in what a connection receives, at a fraction of the server's work for them."""
+
+    def __init__(self) -> None:
+        self.frames = 0
+        self._skip = 0  # bytes of a frame that has begun
+        self._rest = b""  # the begin of a head
+
+    def add(self, data: bytes) -> None:
+        data = self._rest + data
+        position, end = self._skip, len(data)
+        while position + 2 <= end:
+            length, head = data[position + 1], 2
+            if length >= 126:
+                head = 4 if length == 126 else 10
+                length = int.from_bytes(data[position + 2 : position + head], "big")
+            if position + head > end:
+                break
+            position += head + length
+            self.frames += 1
+        self._skip, self._rest = max(position - end, 0), data[position:]
 
 
 def frame_of(data: bytes) -> bytes:
@@ -141,6 +175,60 @@ class Heard(NamedTuple):
     p50_us: float
     p99_us: float
     cpu_us: float
+
+
+class Carried(NamedTuple):
+    """The frames a second of all clients, and the processor time of each process for one of them, in microseconds."""
+
+    rate: float
+    publisher_us: float
+    relay_us: float
+    server_us: float
+    clients_us: float
+
+
+def carried(way: Way, operator: Host, size: int, hertz: int, *, clients: int, seconds: float) -> Carried:
+    """Counts what clients of one topic receive at this rate of the publisher."""
+    talker = way.system.session.start([str(_LOAD), str(size), str(hertz)], label="talker")
+    try:
+        talker.wait_for(event="ready")
+        return operator.run(lambda: _count_all(way, talker.popen.pid, clients, seconds))
+    finally:
+        talker.stop()
+
+
+def _count_all(way: Way, publisher: int, clients: int, seconds: float) -> Carried:
+    *relay, server = way.system.pids()
+
+    def spent() -> tuple[float, float, float, float]:
+        times = [processor_seconds(pid) for pid in (publisher, server)]
+        return times[0], sum(map(processor_seconds, relay)), times[1], time.thread_time()
+
+    viewers = [way.open() for _ in range(clients)]
+    counters = [FrameCounter() for _ in viewers]
+    with selectors.DefaultSelector() as selector:
+        for viewer, counter in zip(viewers, counters, strict=True):
+            counter.add(viewer.rest())
+            selector.register(viewer.socket, selectors.EVENT_READ, counter)
+
+        def receive(seconds: float) -> float:
+            begins = time.monotonic()
+            while (now := time.monotonic()) < begins + seconds:
+                for key, _events in selector.select(0.1):
+                    data = key.fileobj.recv(_RECEIVED_BYTES)  # type: ignore[union-attr]  # a socket
+                    if not data:
+                        raise SystemExit(f"{way.name} ended the connection")
+                    key.data.add(data)
+            return now - begins
+
+        receive(_WARM_SECONDS)
+        before, frames = spent(), sum(counter.frames for counter in counters)
+        took = receive(seconds)
+        after, frames = spent(), sum(counter.frames for counter in counters) - frames
+    for viewer in viewers:
+        viewer.close()
+    each = ((end - begin) / max(frames, 1) * 1e6 for begin, end in zip(before, after, strict=True))
+    return Carried(frames / took, *each)
 
 
 def heard(way: Way, operator: Host, size: int, hertz: int, seconds: float) -> Heard:
@@ -271,6 +359,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--seconds", type=float, default=2.0)
+    parser.add_argument("--clients", type=int, nargs="+", default=[1, 8])
+    parser.add_argument("--sizes", type=int, nargs="+", choices=[*_SIZES], default=[*_SIZES])
+    parser.add_argument("--same-priority", action="store_true", help="the door and its peers have the same")
+    parser.add_argument("--only-most", action="store_true", help="leave out delays, memory and the flood")
     parser.add_argument("--rosbridge", metavar="PROGRAM")
     parser.add_argument("--foxglove-bridge", metavar="PROGRAM")
     given = parser.parse_args()
@@ -299,32 +391,58 @@ def main() -> None:
         for system in {id(way.system): way.system for way in ways}.values():
             stack.enter_context(system.session)
             stack.callback(system.stop)
-        for size in _SIZES:
-            show_speed(ways, operator, size, given.rounds, given.seconds)
-        show_memory(ways, operator)
-        show_flood(ways[2], operator, home, given.rounds, given.seconds)
+        if given.same_priority:
+            for way in ways:
+                for pid in way.system.pids():
+                    os.setpriority(os.PRIO_PROCESS, pid, os.getpriority(os.PRIO_PROCESS, 0))
+        for size in given.sizes:
+            if not given.only_most:
+                show_delays(ways, operator, size, given.rounds, given.seconds)
+            for clients in given.clients:
+                show_most(ways, operator, size, clients=clients, rounds=given.rounds, seconds=given.seconds)
+        if not given.only_most:
+            show_memory(ways, operator)
+            show_flood(ways[2], operator, home, given.rounds, given.seconds)
     Console().print(f"load average of the machine: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
 
 
-def show_speed(ways: Sequence[Way], operator: Host, size: int, rounds: int, seconds: float) -> None:
-    hertz, rates = _SIZES[size]
+def show_delays(ways: Sequence[Way], operator: Host, size: int, rounds: int, seconds: float) -> None:
+    hertz, _rates = _SIZES[size]
     paced: dict[str, list[Heard]] = {way.name: [] for way in ways}
-    most: dict[str, list[Heard]] = {way.name: [] for way in ways}
     for _ in range(rounds):
         for way in ways:
             paced[way.name].append(heard(way, operator, size, hertz, seconds))
-            most[way.name].append(max(heard(way, operator, size, rate, seconds) for rate in rates))
-    table = Table(
-        "", "p50 µs", "p99 µs", "cpu µs", "most a second", "cpu µs", title=f"{size:,} bytes, {hertz} Hz"
-    )
-    for way in ways:
+    table = Table("", "p50 µs", "p99 µs", "cpu µs", title=f"{size:,} bytes, {hertz} Hz")
+    for name, found in paced.items():
         figures = [
-            statistics.median(getattr(one, field) for one in found[way.name])
-            for found, fields in ((paced, ("p50_us", "p99_us", "cpu_us")), (most, ("rate", "cpu_us")))
-            for field in fields
+            statistics.median(getattr(one, field) for one in found)
+            for field in ("p50_us", "p99_us", "cpu_us")
         ]
-        table.add_row(way.name, *(f"{figure:,.0f}" for figure in figures))
+        table.add_row(name, *(f"{figure:,.0f}" for figure in figures))
     Console().print(table)
+
+
+def show_most(
+    ways: Sequence[Way], operator: Host, size: int, *, clients: int, rounds: int, seconds: float
+) -> None:
+    _hertz, rates = _SIZES[size]
+    most: dict[str, list[Carried]] = {way.name: [] for way in ways}
+    for _ in range(rounds):
+        for way in ways:
+            most[way.name].append(
+                max(carried(way, operator, size, rate, clients=clients, seconds=seconds) for rate in rates)
+            )
+    fields = [field.removesuffix("_us") for field in Carried._fields[1:]]
+    table = Table(
+        "",
+        "frames a second",
+        *(f"{field} µs" for field in fields),
+        title=f"{size:,} bytes, {clients} clients: processor time of each process for a frame to a client",
+    )
+    for name, found in most.items():
+        rate, *each = (statistics.median(figures) for figures in zip(*found, strict=True))
+        table.add_row(name, f"{rate:,.0f}", *(f"{figure:,.1f}" for figure in each))
+    Console(width=140).print(table)
 
 
 def show_memory(ways: Sequence[Way], operator: Host) -> None:
