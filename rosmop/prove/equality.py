@@ -203,10 +203,7 @@ class Validation:
             return answer
         for what, condition in meant.unknown.items():
             question = [*known, opposite(left), opposite(meant.left), opposite(going_on), condition]
-            if all(
-                self._asked(one, begun)[0] != z3.unsat
-                for one in (Abstraction(floats=True).of(question), question)
-            ):
+            if self._decided(question, begun)[0] != z3.unsat:
                 return f"uses {what}"
         return EQUAL
 
@@ -238,24 +235,28 @@ class Validation:
         possible = {
             text: simple for text, one in wrong.items() if not z3.is_false(simple := z3.simplify(one))
         }
-        coarse, fine = Abstraction(floats=True), Abstraction()
         every = [*known, either(*possible.values())]
-        if self._asked(coarse.of(every), begun, part=_TOGETHER)[0] == z3.unsat:
+        if self._asked(Abstraction(floats=True).of(every), begun, part=_TOGETHER)[0] == z3.unsat:
             return None
         undecided = False
         for text, condition in possible.items():
-            question = [*known, condition]
-            if self._asked(coarse.of(question), begun)[0] == z3.unsat:
-                continue
-            answer, guess = self._asked(fine.of(question), begun)
-            if answer != z3.unsat:
-                if guess is not None and _holds(question, guess):
-                    raise found(f"{text}, for {_example(guess)}")
-                answer, model = self._asked(question, begun)
-                if model is not None:
-                    raise found(f"{text}, for {_example(model)}")
-                undecided = undecided or answer != z3.unsat
+            answer, model = self._decided([*known, condition], begun)
+            if model is not None:
+                raise found(f"{text}, for {_example(model)}")
+            undecided = undecided or answer != z3.unsat
         return "not decided in time" if undecided else None
+
+    def _decided(self, question: Sequence[Term], begun: float) -> tuple[Any, Any]:
+        """Return whether the conditions are satisfiable, and a model; formulas without costly operations are tried
+        first.
+        """
+        for abstraction in (Abstraction(floats=True), Abstraction()):
+            answer, guess = self._asked(abstraction.of(question), begun)
+            if answer == z3.unsat:
+                return answer, None
+        if guess is not None and _holds(question, guess):
+            return answer, guess
+        return self._asked(question, begun)
 
     def _asked(self, conditions: Sequence[Term], begun: float, *, part: float = 1) -> tuple[Any, Any]:
         """Return whether the conditions are satisfiable, and a model, within this part of the time that is left since
