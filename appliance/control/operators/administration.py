@@ -3,8 +3,6 @@
 from collections.abc import Awaitable, Callable, Iterable
 from typing import Any
 
-import structlog
-
 from appliance.base.withdrawal import WithdrawnError, require_awaited
 from appliance.channel import admin
 from appliance.channel.admin import A
@@ -29,8 +27,6 @@ from appliance.specifications.specification_manager import (
     UnknownMonitorError,
 )
 from appliance.store.writer_thread import StoreError
-
-_log = structlog.get_logger()
 
 # The first matching exception class is used.
 _TROUBLES: dict[type[Exception], admin.Trouble] = {
@@ -101,11 +97,6 @@ class Administration:
             return admin.AdminAnswer(False, error=str(error), trouble="conflict", tag=error.tag)
         except tuple(_TROUBLES) as error:
             return admin.AdminAnswer(False, error=str(error), trouble=_trouble(error))
-        except Exception as error:  # noqa: BLE001  a defect ends one order, not the connection of its operator
-            verb = admin.verb_of(request)
-            _log.critical("an order ended by a defect", order=verb, exc_info=error)
-            text = f"a defect in rosrv, please report it with the appliance's log: {type(error).__name__}: {error}"
-            return admin.AdminAnswer(False, error=f"{verb}: {text}", trouble="failed")
 
     def _in_force(self, error: PolicyRefusedError | SpecificationsRefusedError) -> str:
         if isinstance(error, PolicyRefusedError):

@@ -94,6 +94,9 @@ def test_a_person_sees_and_drives_the_robot_through_their_own_door(
         assert console.axe() == []
         drive(page, base)
         own.get_by_label("Commands").fill("/other")
+        expect(own).to_contain_text(
+            "rosrv guard new deadman /other"
+        )  # the pad is off until it knows the topic
         own.get_by_role("application").press("ArrowUp")
         expect(own.get_by_role("alert")).to_contain_text(re.compile(r"\[Publishers\].*policy\.ini:8"))
         [client] = appliance.row("door", "list")["clients"]
