@@ -89,7 +89,7 @@ class NextDue(Protocol):
     """Returns the time of the next tick or deadline (ns), or None."""
 
     def __call__(self, *, anew: bool) -> int | None:
-        """`anew`: do not use the last result, because there may be an earlier deadline."""
+        """With `anew`, compute the time again, because a deadline may have become earlier."""
 
 
 class FastLane(Protocol):
@@ -140,8 +140,8 @@ class FastLane(Protocol):
         prepared: BatchOptions,
         answer: int | Exception | None = None,
     ) -> BatchResult | None:
-        """Process messages up to the first one that needs the engine; return None if all were processed and stay in
-        their buffer.
+        """Process messages until one needs the engine. Return None if the lane processed all of them, and all of them
+        stay in their buffer.
 
         `answer` is the module's answer, or the exception, if it was already called for these messages (`native`).
         Call this only while the lane is `ready` and nothing in the set is due. `view` has whole frames and is

@@ -1,9 +1,9 @@
 """The interpreter defines the meaning of the intermediate form (`form/nodes.py`); every faster implementation is
 compared with it.
 
-Each expression becomes a Python function of the variables of a call, each statement one that returns how it ends its
-block (None: the block goes on). Strings are bytes, vectors and messages are lists, times and durations are integers.
-This is one file because it is the definition. Invariants:
+Each expression becomes a Python function of a call's variables. Each statement becomes a function that returns how the
+block ends, or None if the block goes on. Strings are bytes, vectors and messages are lists, times and durations are
+integers. This is one file because it is the definition. Invariants:
 
 1. A name is a variable of the monitor set (`g…`) or of one call. Only variables of the set, and the values they refer
    to, outlive a call. In a call, `m` is the message, `b` its original bytes, `p` the start of a skipped element, and

@@ -68,7 +68,7 @@ class Agenda:
         self.due = min(times, default=None)
 
     def when_due(self, *, anew: bool) -> int | None:
-        """`anew`: do not use the last result, because lanes may have moved deadlines."""
+        """With `anew`, compute the time again, because lanes may have moved deadlines."""
         if anew:
             self.schedule()
         return self.due

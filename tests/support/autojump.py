@@ -1,7 +1,7 @@
 """An event loop with virtual time, so that a test waits for nothing and runs the same way each time.
 
-When nothing is ready, the clock jumps to the next timer; if there is none, `DeadlockError` names the tasks. Functions
-of `to_thread` run in the loop, in the order of the calls. Sockets, signals, programs and calls of other threads raise
+When nothing is ready, the clock jumps to the next timer. Without a timer, `DeadlockError` names the waiting tasks. A
+function passed to `to_thread` runs in the loop. Sockets, signals, programs and calls from other threads raise
 `RealLoopError`.
 """
 

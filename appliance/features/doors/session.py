@@ -386,8 +386,7 @@ class DoorSession:
         self._wake.set()
 
     async def _take_frames(self, now: float) -> int:
-        """Pass frames that may be sent now to the WebSocket; return their number of bytes, about
-        `_BATCH_BYTES`.
+        """Take about `_BATCH_BYTES` of the frames that may be sent now; return their number of bytes.
 
         Without deflate, frames are sent as they are, and large bodies are not copied. `_flush` sends them before
         anything else can be added, so nothing follows a closing frame.

@@ -1,7 +1,7 @@
 """A base on /cmd_vel with odometry on /odom: driven_base.py TIMEOUT.
 
-It obeys a command for TIMEOUT seconds (0: until the next one). Events: `moves` and `stands` with a changed speed, and
-`silent` if no command came for 0.3 s.
+It obeys a command for TIMEOUT seconds, or until the next command if TIMEOUT is 0. It prints the events `moves` and
+`stands` when its speed changes, and `silent` when no command has come for 0.3 s.
 """
 
 import sys

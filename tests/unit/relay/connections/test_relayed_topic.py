@@ -326,7 +326,7 @@ def test_a_guards_stop_follows_the_motions_before_it_on_their_connection(latchin
 
 
 def test_a_command_of_a_monitor_is_not_repeated_as_a_stop() -> None:
-    """The next stop is sent again, also for those who connect later."""
+    """The next stop is sent again, and subscribers that connect later also get it."""
     story = monitored()
     base = story.join()
     story.topic.supersede(b"stop")
