@@ -8,9 +8,8 @@ from typing import Any, Final
 
 import pytest
 
-from appliance.features.guards.presets import FOLDER
 from appliance.supervisor.errors import StartError
-from appliance.supervisor.sandbox.private_view import PrivateView, program_folders, require_view, view_of
+from appliance.supervisor.sandbox.private_view import PrivateView, require_view, view_of
 from tests.support.requirements import need_root
 
 USER: Final = 61099
@@ -78,10 +77,6 @@ def seen(home: Path, view: PrivateView | None) -> dict[str, Any]:
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     found: dict[str, Any] = json.loads(done.stdout)
     return found
-
-
-def test_a_view_has_what_the_processes_read_of_a_checkout() -> None:
-    assert any(FOLDER.is_relative_to(part) for part in program_folders())
 
 
 @pytest.mark.nightly

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from appliance.features.guards.presets import (
+    FOLDER,
     PRESETS,
     Guard,
     GuardError,
@@ -13,6 +14,7 @@ from appliance.features.guards.presets import (
     text_of,
     with_values,
 )
+from appliance.supervisor.sandbox.private_view import program_folders
 from rosmop.check.sources import compiled_from
 from rosmop.fast.build import fast_path_of
 from rosmop.form.compiled import Compiled
@@ -128,3 +130,7 @@ def test_the_page_names_an_existing_test_for_each_fault() -> None:
         for name in re.findall(r"^(?:async )?def (test_\w+)", file.read_text(encoding="utf-8"), re.MULTILINE)
     }
     assert names - there == {""} and last.count("") == 1
+
+
+def test_processes_see_the_presets_of_a_checkout_in_a_closed_home() -> None:
+    assert any(FOLDER.is_relative_to(part) for part in program_folders())
