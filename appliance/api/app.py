@@ -3,7 +3,7 @@
 import asyncio
 import pkgutil
 
-from fastapi import Depends, FastAPI, Request
+from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.routing import iter_route_contexts
 from starlette.exceptions import HTTPException
@@ -24,10 +24,9 @@ from appliance.api.routes import (
 )
 from appliance.api.routes.contract import contract_of
 from appliance.api.routes.contract_page import PATH, page_of
-from appliance.base.validation_messages import meant, refusal
+from appliance.base.validation_messages import refusal
 from appliance.features.table import FEATURES
 
-_MOST_SHOWN = 5
 _DESCRIPTION = """\
 The appliance's own interface for scripts and other programs. Every call but the health probes needs a bearer token
 (`rosrv token add`). Errors are problem details (RFC 9457). A change needs `If-Match` with the ETag of what it changes.
@@ -43,7 +42,6 @@ def build_app(services: Services) -> FastAPI:
         docs_url=None,
         redoc_url=None,
         redirect_slashes=False,
-        dependencies=[Depends(_only_known)],
         exception_handlers={
             RequestValidationError: _invalid,
             HTTPException: _of_http,
@@ -81,26 +79,6 @@ def build_app(services: Services) -> FastAPI:
     app.add_api_route("/v1/openapi.json", contract, include_in_schema=False)
     app.add_api_route(PATH, page, methods=["GET", "HEAD"], include_in_schema=False)
     return app
-
-
-async def _only_known(request: Request) -> None:
-    """Raise `ProblemError` (422) for parameters that the contract lacks, but not for pages outside the contract."""
-    given = request.query_params.keys()
-    if not given:
-        return
-    operations = request.app.openapi()["paths"].get(request.scope["route"].path, {})
-    operation = operations.get(request.method.lower())
-    if operation is None:
-        return
-    known = [parameter["name"] for parameter in operation.get("parameters", []) if parameter["in"] == "query"]
-    unknown = [name for name in dict.fromkeys(given) if name not in known][:_MOST_SHOWN]
-    if unknown:
-        there_are = f"there are: {', '.join(known)}" if known else "this path takes none"
-        bad = [
-            BadInput(where=f"query.{name}", text=f"there is no such parameter{meant(name, known)}")
-            for name in unknown
-        ]
-        raise bad_input(bad, besides=f"; {there_are}")
 
 
 def _answer(request: Request, problem: ProblemError) -> Response:

@@ -8,7 +8,7 @@ from collections.abc import Awaitable, Callable
 from typing import Any, Generic, NamedTuple, TypeVar
 
 import msgspec
-from fastapi import APIRouter, Depends, Request, Response
+from fastapi import APIRouter, Depends, Request, Response, params
 
 from appliance.api.front.etags import etag
 from appliance.api.front.moments import in_full
@@ -20,6 +20,7 @@ Responses = dict[int | str, dict[str, Any]]
 ETAG = {"ETag": {"description": "the ETag for If-Match of the next change", "schema": {"type": "string"}}}
 _JSON = "application/json"
 _MOST_ERRORS = 50
+_MOST_SHOWN = 5
 
 
 class Tagged(NamedTuple, Generic[A]):
@@ -180,11 +181,15 @@ class Routes(APIRouter):
     def add_api_route(self, path: str, endpoint: Callable[..., Any], **options: Any) -> None:
         options["operation_id"] = options.get("operation_id") or options.get("name") or endpoint.__name__
         hints = typing.get_type_hints(endpoint, include_extras=True)
-        for hint in hints.values():
-            for part in getattr(hint, "__metadata__", ()):
-                if isinstance(getattr(part, "dependency", None), _Body):
-                    options["openapi_extra"] = part.dependency.schema()
-                    options["responses"] = part.dependency.responses() | (options.get("responses") or {})
+        roles: list[Any] = list(options.get("dependencies") or ())
+        for part in [part for hint in hints.values() for part in getattr(hint, "__metadata__", ())]:
+            if isinstance(getattr(part, "dependency", None), _Body):
+                options["openapi_extra"] = part.dependency.schema()
+                options["responses"] = part.dependency.responses() | (options.get("responses") or {})
+            elif isinstance(part, params.Depends):
+                roles.append(part)
+        # A request is judged only for its roles, whatever the order of the handler's parameters.
+        options["dependencies"] = [*roles, Depends(_only_known)]
         given = options.get("response_model") or hints.get("return")
         tagged = typing.get_origin(given) is Tagged
         kind = typing.get_args(given)[0] if tagged else given
@@ -194,6 +199,26 @@ class Routes(APIRouter):
             options["response_model"] = None
             endpoint = _encoded(endpoint)
         super().add_api_route(path, endpoint, **options)
+
+
+async def _only_known(request: Request) -> None:
+    """Raises `ProblemError` (422) for parameters that the contract lacks, but not for pages outside the contract."""
+    given = request.query_params.keys()
+    if not given:
+        return
+    operations = request.app.openapi()["paths"].get(request.scope["route"].path, {})
+    operation = operations.get(request.method.lower())
+    if operation is None:
+        return
+    known = [parameter["name"] for parameter in operation.get("parameters", []) if parameter["in"] == "query"]
+    unknown = [name for name in dict.fromkeys(given) if name not in known][:_MOST_SHOWN]
+    if unknown:
+        there_are = f"there are: {', '.join(known)}" if known else "this path takes none"
+        bad = [
+            BadInput(where=f"query.{name}", text=f"there is no such parameter{meant(name, known)}")
+            for name in unknown
+        ]
+        raise bad_input(bad, besides=f"; {there_are}")
 
 
 def _encoded(endpoint: Callable[..., Awaitable[Any]]) -> Callable[..., Awaitable[Response]]:

@@ -486,6 +486,20 @@ def roles_of(dependant: Any) -> Iterator[str | None]:
             yield from roles_of(one)
 
 
+def test_a_role_is_judged_before_the_request() -> None:
+    """An error of a request helps only those who may make it, and the first rejection is the final one."""
+    judged = 0
+    for path, roles in routes().items():
+        method, _, target = path.partition(" ")
+        target = re.sub(r"\{[a-z_]+\}", "a" * 20, target) + "?limit=wrong&dry_run=wrong"
+        for role in ROLES[: max((ROLES.index(role) for role in roles), default=0)]:
+            answer = world().asked(method, target, None if method in ("GET", "HEAD") else {"wrong": 1}, role)
+            assert answer.status_code == 403, (path, role, answer.text)
+            require_problem(answer, 403, "not-for-this-role")
+            judged += 1
+    assert judged > 80
+
+
 def test_every_order_has_its_way() -> None:
     assert {type(ordered(method, target, body).request) for method, target, body in REQUESTS} == CHANGES
 
