@@ -134,10 +134,26 @@ class Deliveries:
     def __init__(self, note: Callable[[Seen], None]) -> None:
         self.told: list[tuple[str, str, tuple[Value, ...]]] = []
         self._note = note
+        self._removed: dict[tuple[str, str], frozenset[str]] = {}
 
     def push(self, incarnation: Incarnation, call: NodeCall) -> None:
         self.told.append((incarnation.name, call.method, call.parameters))
         self._note(Told(incarnation, call))
+
+    def push_list(self, incarnation: Incarnation, topic: str, publishers: tuple[str, ...]) -> None:
+        if removed := self._removed.pop((incarnation.key, topic), None):
+            without: list[Value] = [one for one in publishers if one not in removed]
+            self.push(incarnation, NodeCall("publisherUpdate", (topic, without)))
+        self.push(incarnation, NodeCall("publisherUpdate", (topic, list(publishers))))
+
+    def remove_first(self, incarnation: Incarnation, topic: str, publishers: frozenset[str]) -> None:
+        self._removed[incarnation.key, topic] = publishers
+
+    def answered(self, incarnation: Incarnation, topic: str, publishers: tuple[str, ...]) -> None:
+        """Act as `Delivery`."""
+
+    def drop_list(self, incarnation: Incarnation, topic: str) -> None:
+        """Act as `Delivery`."""
 
     def drop(self, incarnation: Incarnation) -> None:
         self._note(Ended("drop what waits for", incarnation))

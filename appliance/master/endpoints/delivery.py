@@ -1,13 +1,16 @@
 """Deliver the calls that nodes expect from a master. A slow or dead node does not delay other nodes.
 
-Every list of publishers is delivered, even if a newer list waits, because roscpp must see a removal before the
-following addition. The two are some time apart, because rospy uses only the last of lists that arrive together, and
-takes an ending connection for a present one. Calls about other topics overtake a list that waits for this reason.
+If several lists of a topic's publishers wait for a node, it gets only the newest. If a publisher was removed and added
+again since the last one, the node first gets the list without it, because roscpp must see the removal. The two are
+some time apart, because rospy uses only the last of lists that arrive together, and takes an ending connection for a
+present one. Other calls overtake a list that waits for this reason.
 """
 
 import asyncio
+import math
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 
 import structlog
@@ -25,7 +28,6 @@ from roswire.xmlrpc import FaultReceived, Value
 _log = structlog.get_logger()
 MASTER_NAME = "/master"
 _APART_SECONDS = 0.3  # between a list that removes a publisher and a list that adds it
-_LISTS = "publisherUpdate"
 _SHORTEST_WAIT = 0.001  # seconds: a timer that ends a little early does not make the worker spin
 _CALL_BYTES = 200  # an empty call in Python's memory
 _TEXT_BYTES = 60  # an empty text in Python's memory
@@ -52,49 +54,95 @@ class NodeCall:
         return _CALL_BYTES + sum(_TEXT_BYTES + len(text) for text in texts if isinstance(text, str))
 
 
-@dataclass(slots=True)
-class _DeliveredList:
-    """The last delivered list of a topic; the `removed` publishers are not added before `free`."""
+@dataclass(slots=True, eq=False)
+class _List:
+    """The publishers of a topic that a node should know, and the removals that it does not know yet.
 
-    publishers: frozenset[object] | None = (
-        None  # None: unknown; the answer to the registration had the first list
-    )
-    removed: frozenset[object] | None = frozenset()  # None: all
-    free: float = 0.0
+    A publisher that a sent list removed is not added before `free`.
+    """
 
-    def follow(self, publishers: frozenset[object]) -> None:
+    topic: str
+    weight: int = 0  # of the waiting call, as that of a NodeCall; 0: none waits
+    _wanted: tuple[str, ...] | None = None  # None: unknown; the answer to the registration had the list
+    _untold: frozenset[str] | None = frozenset()  # removed since the last list that was sent; None: all
+    _removed: frozenset[str] | None = frozenset()  # None: all
+    _free: float = 0.0
+
+    def want(self, publishers: tuple[str, ...]) -> None:
+        if self._wanted is None:
+            self._untold = frozenset() if publishers else None
+        else:
+            self.remove(frozenset(self._wanted).difference(publishers))
+        self._wanted = publishers
+
+    def remove(self, publishers: frozenset[str]) -> None:
+        self._untold = _united(self._untold, publishers)
+
+    def next(self) -> tuple[str, ...]:
+        """Return the list to send next: the wanted one, or first that without the publishers to remove."""
+        return _without(self._wanted or (), self._untold)
+
+    def wait(self) -> float:
+        following = self.next()
+        adds = len(_without(following, self._removed)) < len(following)
+        return max(0.0, self._free - clock.now()) if adds else 0.0
+
+    @property
+    def call(self) -> NodeCall:
+        return _call(self.topic, self._wanted or ())
+
+    def take(self) -> "_Taken":
+        taken = _Taken(self, self.next(), self._untold)
+        self.weight, self._untold = 0, frozenset()
+        return taken
+
+    def sent(self, taken: "_Taken", *, arrived: bool) -> bool:
+        """Return whether another list follows."""
+        if not arrived:
+            self._untold = _united(self._untold, taken.removes)
+            return False
         now = clock.now()
-        if now >= self.free:
-            self.removed = frozenset()
-        if self.publishers is None and not publishers:
-            self.removed, self.free = None, now + _APART_SECONDS
-        elif self.publishers is not None and (gone := self.publishers - publishers):
-            self.removed = None if self.removed is None else self.removed | gone
-            self.free = now + _APART_SECONDS
-        self.publishers = publishers
+        if now >= self._free:
+            self._removed = frozenset()
+        if taken.removes is None or taken.removes:
+            self._removed = _united(self._removed, taken.removes)
+            self._free = now + _APART_SECONDS
+        return taken.publishers != self._wanted
 
-    def wait(self, publishers: frozenset[object]) -> float:
-        adds = publishers if self.removed is None else self.removed & publishers
-        return max(0.0, self.free - clock.now()) if adds else 0.0
+
+@dataclass(frozen=True, slots=True)
+class _Taken:
+    """A list on its way to a node, with the publishers whose removal it tells (None: all)."""
+
+    list: _List
+    publishers: tuple[str, ...]
+    removes: frozenset[str] | None
+
+    @property
+    def call(self) -> NodeCall:
+        return _call(self.list.topic, self.publishers)
+
+
+def _call(topic: str, publishers: tuple[str, ...]) -> NodeCall:
+    return NodeCall("publisherUpdate", (topic, list(publishers)))
+
+
+def _united(some: frozenset[str] | None, others: frozenset[str] | None) -> frozenset[str] | None:
+    return None if some is None or others is None else some | others
+
+
+def _without(publishers: tuple[str, ...], removed: frozenset[str] | None) -> tuple[str, ...]:
+    return () if removed is None else tuple(one for one in publishers if one not in removed)
 
 
 @dataclass(slots=True)
 class _Queue:
-    """The waiting calls for a node with their weights, and the sum of these weights."""
+    """The calls and lists that wait for a node, the oldest first, and the sum of their weights."""
 
     incarnation: Incarnation
-    calls: deque[tuple[NodeCall, int]] = field(default_factory=deque)
+    calls: deque[NodeCall | _List] = field(default_factory=deque)
     weight: int = 0
-
-    def put(self, call: NodeCall, weight: int) -> None:
-        self.calls.append((call, weight))
-        self.weight += weight
-
-    def take(self, position: int = 0) -> tuple[NodeCall, int]:
-        call, weight = self.calls[position]
-        del self.calls[position]
-        self.weight -= weight
-        return call, weight
+    more: asyncio.Event = field(default_factory=asyncio.Event)
 
 
 class Delivery:
@@ -128,7 +176,7 @@ class Delivery:
         self._tries = tries
         self._queues: dict[str, _Queue] = {}
         self._workers: dict[str, asyncio.Task[None]] = {}
-        self._lists: dict[str, dict[str, _DeliveredList]] = {}  # by node and topic
+        self._lists: dict[str, dict[str, _List]] = {}  # by node and topic
 
     @property
     def waiting(self) -> int:
@@ -139,23 +187,71 @@ class Delivery:
         return self._held.total
 
     def push(self, incarnation: Incarnation, call: NodeCall) -> None:
-        queue = self._queues.setdefault(incarnation.key, _Queue(incarnation))
-        weight = call.weight
-        queue.put(call, weight)
-        self._held.charge(incarnation.host, weight)
-        if len(queue.calls) > self._bound:
-            self._lose(queue, f"more than {self._bound} calls wait for it")
-        while why := self._held.refusal(incarnation.host, 0):
-            self._lose(self._heaviest(incarnation.host), why)
-        if incarnation.key not in self._workers:
-            worker = asyncio.get_running_loop().create_task(self._work(incarnation))
-            self._workers[incarnation.key] = worker
+        queue = self._queue(incarnation)
+        queue.calls.append(call)
+        self._weigh(queue, call.weight)
+        self._start(queue)
+
+    def push_list(self, incarnation: Incarnation, topic: str, publishers: tuple[str, ...]) -> None:
+        one = self._list(incarnation, topic)
+        one.want(publishers)
+        self._put(self._queue(incarnation), one)
+
+    def answered(self, incarnation: Incarnation, topic: str, publishers: tuple[str, ...]) -> None:
+        """The answer to a registration has this list: it replaces one that waits, which may be older."""
+        self._list(incarnation, topic).want(publishers)
+
+    def remove_first(self, incarnation: Incarnation, topic: str, publishers: frozenset[str]) -> None:
+        """Send the next list without these publishers first."""
+        self._list(incarnation, topic).remove(publishers)
+
+    def drop_list(self, incarnation: Incarnation, topic: str) -> None:
+        one = self._lists.get(incarnation.key, {}).pop(topic, None)
+        if one is not None and one.weight:
+            queue = self._queues[incarnation.key]
+            queue.calls.remove(one)
+            self._weigh(queue, -one.weight)
 
     def drop(self, incarnation: Incarnation) -> None:
         self._lists.pop(incarnation.key, None)
         queue = self._queues.pop(incarnation.key, None)
         if queue is not None:
             self._held.give_back(incarnation.host, queue.weight)
+
+    def close(self) -> None:
+        for worker in self._workers.values():
+            worker.cancel()
+
+    def _list(self, incarnation: Incarnation, topic: str) -> _List:
+        return self._lists.setdefault(incarnation.key, {}).setdefault(topic, _List(topic))
+
+    def _queue(self, incarnation: Incarnation) -> _Queue:
+        return self._queues.setdefault(incarnation.key, _Queue(incarnation))
+
+    def _put(self, queue: _Queue, one: _List) -> None:
+        before, one.weight = one.weight, one.call.weight
+        self._weigh(queue, one.weight - before)
+        if not before:
+            queue.calls.append(one)
+        self._start(queue)
+
+    def _start(self, queue: _Queue) -> None:
+        incarnation = queue.incarnation
+        if len(queue.calls) > self._bound:
+            self._lose(queue, f"more than {self._bound} calls wait for it")
+        while why := self._held.refusal(incarnation.host, 0):
+            self._lose(self._heaviest(incarnation.host), why)
+        queue.more.set()
+        if incarnation.key not in self._workers:
+            worker = asyncio.get_running_loop().create_task(self._work(incarnation))
+            self._workers[incarnation.key] = worker
+
+    def _weigh(self, queue: _Queue, change: int) -> None:
+        queue.weight += change
+        if change > 0:
+            self._held.charge(queue.incarnation.host, change)
+        else:
+            self._held.give_back(queue.incarnation.host, -change)
 
     def _heaviest(self, host: Address) -> _Queue:
         if self._held.held(host) <= self._held.bounds.host:
@@ -164,48 +260,49 @@ class Delivery:
         return max(queues, key=lambda queue: queue.weight)
 
     def _lose(self, queue: _Queue, why: str) -> None:
-        self._troubled(queue.incarnation, self._take(queue), f"{why}; the oldest was dropped")
+        taken = self._take(queue, 0)
+        if isinstance(taken, _Taken):
+            taken.list.sent(taken, arrived=False)
+        call = taken if isinstance(taken, NodeCall) else taken.call
+        self._troubled(queue.incarnation, call, f"{why}; the oldest was dropped")
 
     def _next(self, queue: _Queue) -> tuple[int, float]:
-        lists = self._lists.get(queue.incarnation.key, {})
-        waits: dict[str, tuple[int, float]] = {}
-        for position, (call, _weight) in enumerate(queue.calls):
-            topic = str(call.parameters[0]) if call.method == _LISTS else ""
-            if topic in waits:
-                continue
-            delivered = lists.get(topic)
-            seconds = delivered.wait(_publishers(call)) if delivered is not None else 0.0
+        """Return the position of the call to send next, and the seconds before that."""
+        soonest = 0, math.inf
+        for position, call in enumerate(queue.calls):
+            seconds = call.wait() if isinstance(call, _List) else 0.0
             if not seconds:
                 return position, 0.0
-            waits[topic] = position, seconds
-        return min(waits.values(), key=lambda wait: wait[1])
+            soonest = min(soonest, (position, seconds), key=lambda wait: wait[1])
+        return soonest
 
-    def _take(self, queue: _Queue, position: int = 0) -> NodeCall:
-        call, weight = queue.take(position)
-        self._held.give_back(queue.incarnation.host, weight)
-        return call
-
-    def close(self) -> None:
-        for worker in self._workers.values():
-            worker.cancel()
+    def _take(self, queue: _Queue, position: int) -> NodeCall | _Taken:
+        call = queue.calls[position]
+        del queue.calls[position]
+        self._weigh(queue, -call.weight)
+        return call.take() if isinstance(call, _List) else call
 
     async def _work(self, incarnation: Incarnation) -> None:
         try:
             while (queue := self._queues.get(incarnation.key)) is not None and queue.calls:
                 position, seconds = self._next(queue)
                 if seconds:
-                    await asyncio.sleep(max(seconds, _SHORTEST_WAIT))
+                    await _pause(queue.more, seconds)
                     continue
-                call = self._take(queue, position)
-                await self._deliver(incarnation, call)
-                if call.method == _LISTS:
-                    lists = self._lists.setdefault(incarnation.key, {})
-                    lists.setdefault(str(call.parameters[0]), _DeliveredList()).follow(_publishers(call))
+                taken = self._take(queue, position)
+                if isinstance(taken, NodeCall):
+                    await self._deliver(incarnation, taken)
+                    continue
+                arrived = await self._deliver(incarnation, taken.call)
+                more = taken.list.sent(taken, arrived=arrived)
+                if more and self._lists.get(incarnation.key, {}).get(taken.list.topic) is taken.list:
+                    self._put(self._queue(incarnation), taken.list)
             self._queues.pop(incarnation.key, None)
         finally:
             self._workers.pop(incarnation.key, None)
 
-    async def _deliver(self, incarnation: Incarnation, call: NodeCall) -> None:
+    async def _deliver(self, incarnation: Incarnation, call: NodeCall) -> bool:
+        """Return whether the node has taken the call, or rejected it."""
         pause = 0.1
         for attempt in range(self._tries):
             await self._turns.enter(incarnation.host)
@@ -214,9 +311,9 @@ class Delivery:
             except CallFailedError as error:
                 failure, heard = str(error), isinstance(error.__cause__, FaultReceived)
                 if call.method == "shutdown":
-                    return  # a successful shutdown: a node often dies before it answers, or was already dead
+                    return True  # a successful shutdown: a node often dies before it answers, or was already dead
             else:
-                return
+                return True
             finally:
                 self._turns.leave(incarnation.host)
             if attempt + 1 < self._tries:
@@ -226,8 +323,11 @@ class Delivery:
             _log.info("a node rejected a call", node=incarnation.name, call=call.method, why=failure)
         else:
             self._troubled(incarnation, call, failure)
+        return heard
 
 
-def _publishers(call: NodeCall) -> frozenset[object]:
-    publishers = call.parameters[1] if call.method == _LISTS else ()
-    return frozenset(publishers if isinstance(publishers, list) else ())
+async def _pause(unless: asyncio.Event, seconds: float) -> None:
+    unless.clear()
+    with suppress(TimeoutError):
+        async with asyncio.timeout(max(seconds, _SHORTEST_WAIT)):
+            await unless.wait()

@@ -68,10 +68,12 @@ class Subscribers:
         stated = self._stated.setdefault(node, {})
         if wanted is None:
             stated.pop((kind, resource), None)
+            if kind is Kind.SUBSCRIPTION:
+                self.delivery.drop_list(node, resource)
         elif stated.get((kind, resource)) != wanted:
             stated[kind, resource] = wanted
             if kind is Kind.SUBSCRIPTION:
-                self.delivery.push(node, _list(resource, wanted))
+                self.delivery.push_list(node, resource, wanted)
             else:
                 self._tell_parameter(node, resource)
 
@@ -89,6 +91,7 @@ class Subscribers:
     def list_for(self, subscriber: Incarnation, topic: str) -> tuple[str, ...]:
         uris = self._publishers_for(subscriber, topic)
         self._stated.setdefault(subscriber, {})[Kind.SUBSCRIPTION, topic] = uris
+        self.delivery.answered(subscriber, topic, uris)
         return uris
 
     def remind_all(self, concerned: Callable[[str], bool] = lambda _topic: True) -> None:
@@ -114,9 +117,8 @@ class Subscribers:
     def renew(self, subscriber: Incarnation, topic: str, absent: Collection[Incarnation]) -> None:
         """Have a subscriber drop these publishers first, because roscpp ignores an unchanged list."""
         if absent:
-            gone = {publisher.outer_uri(subscriber.told) for publisher in absent}
-            without = [uri for uri in self._publishers_for(subscriber, topic) if uri not in gone]
-            self.delivery.push(subscriber, _list(topic, without))
+            gone = frozenset(publisher.outer_uri(subscriber.told) for publisher in absent)
+            self.delivery.remove_first(subscriber, topic, gone)
         self.remind(subscriber, topic)
 
     def absent(
@@ -173,10 +175,6 @@ class Subscribers:
         value = {} if present is None else settled(present)
         if self.may_read_value(subscriber, key, value):
             self.delivery.push(subscriber, _param_update(key, value))
-
-
-def _list(topic: str, uris: Iterable[str]) -> NodeCall:
-    return NodeCall("publisherUpdate", (topic, list(uris)))
 
 
 def _param_update(key: str, value: Value) -> NodeCall:

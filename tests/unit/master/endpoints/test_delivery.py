@@ -1,5 +1,7 @@
 import asyncio
 import ipaddress
+from collections.abc import Callable
+from random import Random
 from typing import Any, cast
 
 import pytest
@@ -22,12 +24,16 @@ class Node:
         self.fails = False
         self.fault: Exception | None = None
         self.heard: list[Value] = []
+        self.lists: list[tuple[str, list[Value]]] = []
+        self.receives: Callable[[str, list[Value]], None] = lambda _topic, _publishers: None
 
-    async def call(self, _method: str, _caller: str, *parameters: Value) -> None:
+    async def call(self, _method: str, _caller: str, topic: str, publishers: list[Value]) -> None:
+        self.receives(topic, publishers)
         await self.answers.wait()
         if self.fails:
             raise CallFailedError("it does not answer") from self.fault
-        self.heard.append(parameters[0])
+        self.heard.append(topic)
+        self.lists.append((topic, publishers))
 
 
 class Post:
@@ -53,7 +59,7 @@ class Post:
 
     def push(self, *topics: str, publishers: list[str]) -> None:
         for topic in topics:
-            self.delivery.push(self.incarnation, NodeCall("publisherUpdate", (topic, list(publishers))))
+            self.delivery.push_list(self.incarnation, topic, tuple(publishers))
 
 
 async def test_lists_of_publishers_are_bounded_in_bytes() -> None:
@@ -99,16 +105,97 @@ async def test_a_call_that_a_node_answers_with_a_fault_has_arrived() -> None:
 async def test_a_publisher_is_added_some_time_after_its_removal() -> None:
     post = Post()
     post.node.answers.set()
+    began = asyncio.get_running_loop().time()
     for publishers in ([], ["a"], ["a", "b"], ["a"], ["a", "b", "c"]):
         post.push("/t", publishers=publishers)
     post.push("/other", publishers=["a"])
-    times, began = dict[int, float](), asyncio.get_running_loop().time()
-    while len(post.node.heard) < 6:
+    await asyncio.sleep(0.25)
+    assert post.node.lists == [("/t", []), ("/other", ["a"])]
+    post.push("/late", publishers=["a"])
+    await asyncio.sleep(0.01)
+    assert post.node.lists[2:] == [("/late", ["a"])]
+    while len(post.node.lists) < 4:
         await asyncio.sleep(0.01)
-        times.setdefault(len(post.node.heard), asyncio.get_running_loop().time() - began)
-    assert post.node.heard == ["/t", "/other", "/t", "/t", "/t", "/t"]
-    assert [count for count, at in times.items() if at < 0.25] == [2]
-    assert [count for count, at in times.items() if at < 0.55] == [2, 5]
+    assert post.node.lists[3:] == [("/t", ["a", "b", "c"])]
+    assert 0.29 < asyncio.get_running_loop().time() - began < 0.35
+
+
+async def test_a_slow_node_gets_only_the_newest_of_the_lists_that_wait() -> None:
+    post = Post()
+    post.push("/t", publishers=["a"])
+    await asyncio.sleep(1)
+    for number in range(500):
+        post.push("/t", publishers=["a", *map(str, range(number))])
+    assert post.delivery.waiting == 1
+    post.node.answers.set()
+    await post.world.settle()
+    assert [len(publishers) for _topic, publishers in post.node.lists] == [1, 500]
+
+
+async def test_the_answer_to_a_registration_replaces_a_list_that_waits() -> None:
+    """The node would otherwise drop the publishers that the answer has just named."""
+    post = Post()
+    post.push("/t", publishers=["a"])
+    await asyncio.sleep(1)
+    post.push("/t", publishers=[])
+    post.delivery.answered(post.incarnation, "/t", ("a", "b"))
+    post.node.answers.set()
+    await asyncio.sleep(1)
+    assert [publishers for _topic, publishers in post.node.lists] == [["a"], ["b"], ["a", "b"]]
+
+
+async def test_a_list_that_did_not_arrive_told_no_removal() -> None:
+    post = Post(tries=1)
+    post.node.answers.set()
+    post.push("/t", publishers=["a", "b"])
+    await asyncio.sleep(1)
+    post.node.fails = True
+    post.push("/t", publishers=["b"])
+    await asyncio.sleep(1)
+    post.node.fails = False
+    post.push("/t", publishers=["a", "b"])
+    await asyncio.sleep(1)
+    assert [publishers for _topic, publishers in post.node.lists] == [["a", "b"], ["b"], ["a", "b"]]
+
+
+async def test_no_list_is_sent_for_a_topic_that_is_not_subscribed_to_any_more() -> None:
+    post = Post()
+    post.push("/t", "/other", publishers=["a"])
+    await asyncio.sleep(1)
+    post.push("/t", "/other", publishers=["a", "b"])
+    post.delivery.drop_list(post.incarnation, "/t")
+    post.delivery.drop_list(post.incarnation, "/never")
+    post.node.answers.set()
+    await post.world.settle()
+    assert post.node.lists == [("/t", ["a"]), ("/other", ["a", "b"])]
+    assert (post.delivery.weight, post.delivery.waiting) == (0, 0)
+
+
+@pytest.mark.parametrize("seed", range(40))
+async def test_a_node_sees_each_removal_and_ends_with_the_newest_list(seed: int) -> None:
+    random = Random(seed)  # noqa: S311  reproducible
+    post = Post(tries=2)
+    wanted = {topic: list[Value]() for topic in ("/t", "/u")}
+    gone = {topic: set[Value]() for topic in wanted}  # removed since the node was last sent a list
+
+    def received(topic: str, publishers: list[Value]) -> None:
+        assert not gone[topic].intersection(publishers), "a publisher returned, and its removal was not told"
+        gone[topic].clear()
+
+    post.node.receives = received
+    for _ in range(60):
+        topic = random.choice(list(wanted))
+        publishers: list[Value] = [one for one in "abcd" if random.random() < 0.6]
+        gone[topic] |= {one for one in wanted[topic] if one not in publishers}
+        wanted[topic] = publishers
+        post.delivery.push_list(post.incarnation, topic, tuple(map(str, publishers)))
+        assert post.delivery.waiting <= 2
+        random.choice((post.node.answers.set, post.node.answers.clear))()
+        await asyncio.sleep(random.choice((0, 0, 0.05, 0.4)))
+    post.node.answers.set()
+    await asyncio.sleep(2)
+    assert dict(post.node.lists) == wanted
+    assert (post.delivery.weight, post.delivery.waiting, post.lost) == (0, 0, [])
 
 
 async def test_a_host_loses_only_its_own_calls() -> None:
@@ -116,7 +203,7 @@ async def test_a_host_loses_only_its_own_calls() -> None:
     post.push("/a", "/b", publishers=LONG)
     for number in range(200):
         guest = post.node_on("10.0.0.66", f"/guest_{number}")
-        post.delivery.push(guest, NodeCall("publisherUpdate", ("/t", list[Value](LONG[:100]))))
+        post.delivery.push_list(guest, "/t", tuple(LONG[:100]))
     assert post.delivery.weight <= 400_000
     assert post.lost
     assert {name.partition("_")[0] for name, _topic in post.lost} == {"/guest"}
@@ -134,10 +221,10 @@ async def test_silent_nodes_delay_no_call_to_other_hosts() -> None:
     ).call(*call)
     for number in range(2 * NODE_CALLS_UNDER_WAY.bounds.whole):
         guest = post.node_on("10.0.0.66", f"/guest_{number}")
-        post.delivery.push(guest, NodeCall("publisherUpdate", ("/t", [])))
+        post.delivery.push_list(guest, "/t", ())
     for _ in range(5):
         await asyncio.sleep(0)
-    post.delivery.push(post.node_on("10.0.0.5", "/robot"), NodeCall("publisherUpdate", ("/t", [])))
+    post.delivery.push_list(post.node_on("10.0.0.5", "/robot"), "/t", ())
     for _ in range(5):
         await asyncio.sleep(0)
     assert robot.heard == ["/t"]

@@ -77,12 +77,27 @@ class SlowNodes(Deliveries):
     def push(self, incarnation: Incarnation, call: NodeCall) -> None:
         self.waiting.append(Told(incarnation, call))
 
+    def answered(self, incarnation: Incarnation, topic: str, _publishers: tuple[str, ...]) -> None:
+        self.drop_list(incarnation, topic)
+
+    def drop_list(self, incarnation: Incarnation, topic: str) -> None:
+        self.waiting = [
+            one
+            for one in self.waiting
+            if (one.node, one.call.method, one.call.parameters[0]) != (incarnation, "publisherUpdate", topic)
+        ]
+
     def drop(self, incarnation: Incarnation) -> None:
         self.waiting = [one for one in self.waiting if one.node is not incarnation]
 
     def arrive(self) -> None:
         for one in self.waiting:
             assert one.node.life is Life.LIVE or one.call.method == "shutdown", f"to a node that ended: {one}"
+            if one.call.method == "publisherUpdate":
+                subscription = Kind.SUBSCRIPTION, str(one.call.parameters[0])
+                assert subscription in {*one.node.registrations, *one.node.shelf}, (
+                    f"not subscribed any more: {one}"
+                )
             super().push(*one)
         self.waiting.clear()
 
@@ -173,12 +188,13 @@ class History(ControlParts):
                 self.graph.forgotten(node)
 
     def _register(self, node: Incarnation, kind: Kind, topic: str) -> None:
-        """Earlier calls arrive before the answer, whose value is not sent again."""
+        """Earlier values arrive before the answer, whose value is not sent again. A list that waits is older."""
         if kind not in {Kind.SUBSCRIPTION, Kind.PARAMETER}:
             self.graph.registered(node, kind, topic, "4001")
             return
         self.sinks.flush()
-        self.slow.arrive()
+        if kind is Kind.PARAMETER:
+            self.slow.arrive()
         self.graph.registered(node, kind, topic, "4001")
         if kind is Kind.SUBSCRIPTION:
             answer: list[Value] = [*self.subscribers.list_for(node, topic)]

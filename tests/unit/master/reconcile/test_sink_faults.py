@@ -76,6 +76,12 @@ FAULTS = {
     "a subscription has an empty list": Fault(
         Subscribers, "_wanted", "if kind is Kind.SUBSCRIPTION else ()", "if 0 else ()"
     ),
+    "a list waits for a subscription that ended": Fault(
+        Subscribers, "_state", "self.delivery.drop_list(node, resource)", "pass"
+    ),
+    "an older list follows the answer": Fault(
+        Subscribers, "list_for", "self.delivery.answered(subscriber, topic, uris)", "pass"
+    ),
     "a list in an answer is sent again": Fault(
         Subscribers, "list_for", "self._stated.setdefault(subscriber, {})[Kind.SUBSCRIPTION, topic] = uris", "pass"
     ),
