@@ -1,0 +1,56 @@
+"""Without any one of the features, all other code works."""
+
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from appliance.features.table import FEATURES
+
+pytestmark = [pytest.mark.nightly, pytest.mark.timeout(1200)]
+ROOT = Path(__file__).parents[3]
+_TESTED = (
+    "configuration",
+    "supervisor",
+    "control",
+    "channel",
+    "test_imports.py",
+    "test_source_rules.py",
+)
+_EVERYTHING = """
+import importlib, pkgutil, appliance
+for module in pkgutil.walk_packages(appliance.__path__, "appliance."):
+    importlib.import_module(module.name)
+"""
+
+
+def without(name: str, copy: Path) -> None:
+    files = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, check=True).stdout
+    for file in filter(None, files.decode().split("\0")):
+        if f"/features/{name}/" not in file and (ROOT / file).is_file():
+            (copy / file).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(ROOT / file, copy / file)
+    for built in (ROOT / "appliance").rglob("*.so"):
+        shutil.copy2(built, copy / built.relative_to(ROOT))
+    for table in (copy / "appliance/features/table.py", copy / "appliance/features/views.py"):
+        text = table.read_text(encoding="utf-8")
+        text = re.sub(rf"from appliance\.features\.{name}\..*\n", "", text)
+        table.write_text(re.sub(rf"\b{name.upper()}(_VIEW)?\b(, |,)?", "", text), encoding="utf-8")
+
+
+@pytest.mark.parametrize("name", sorted(feature.name for feature in FEATURES))
+def test_the_rest_works_without_a_feature(name: str, tmp_path: Path) -> None:
+    without(name, tmp_path)
+    bin_folder = Path(sys.executable).parent
+    tests = [f"tests/unit/{one}" for one in _TESTED]
+    for command in (
+        [sys.executable, "-c", _EVERYTHING],
+        [str(bin_folder / "lint-imports"), "--no-cache"],
+        [sys.executable, "-m", "pytest", "--collect-only", "-q", "tests/unit"],
+        [sys.executable, "-m", "pytest", "-q", "-m", "not nightly and not real", *tests],
+    ):
+        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, f"{command}: {done.stdout[-3000:]}{done.stderr[-2000:]}"
