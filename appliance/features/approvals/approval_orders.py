@@ -1,7 +1,7 @@
 """Hold calls that need an approval, and give and end approvals.
 
-A lease on a topic or a parameter takes the path of a change of the policy. A service call is decided here,
-because the relay asks about each request. Nothing is stored: a restart or a takeover ends all approvals.
+A lease on a topic or a parameter is enforced like a change of the policy. A service call is decided here, because the
+relay asks about each request. Nothing is stored, so a restart or a takeover ends all approvals.
 """
 
 import asyncio
@@ -41,10 +41,9 @@ UNANSWERED_SECONDS = 600.0
 
 
 class ApprovalOrders:
-    """The operators' orders; they raise `SenselessError` and `UnknownThingError`.
+    """Answers operators and relays. Requests raise `SenselessError` or `UnknownThingError`.
 
-    `guards(topic)` returns the monitors with a safe message for a topic, or None if its relay does not answer. An
-    order or an end takes effect before it waits for anything, so a hanging relay delays no other order.
+    Each change takes effect before it waits for a relay, so a hanging relay delays no other order.
     """
 
     def __init__(
@@ -57,6 +56,7 @@ class ApprovalOrders:
         first: int,
         decide_again: Callable[[], int],
         carried_out: Callable[[Iterable[str]], Awaitable[None]],
+        # The monitors that have a safe message for a topic; None: its relay does not answer.
         guards: Callable[[str], Awaitable[list[str] | None]],
     ) -> None:
         self._policy = policy
@@ -139,7 +139,7 @@ class ApprovalOrders:
         )
 
     async def approve(self, request: requests.ApproveCall, who: str) -> requests.Approval:
-        """A lease may be given again to extend or shorten it."""
+        """Approve a held call, or give a lease a new time."""
         entry = self._entry(request.number)
         seconds = request.seconds
         if seconds is None and entry.lease and entry.call.category is Category.CALL:
@@ -164,7 +164,7 @@ class ApprovalOrders:
         return _shown(entry)
 
     async def refuse(self, request: requests.RefuseCall, who: str) -> requests.Approval:
-        """A refused call is not held again when it is repeated."""
+        """Refuse a held call, or end an approval. A refused call is not held again until its entry expires."""
         entry = self._entry(request.number)
         take_effect()
         if entry.state is ApprovalState.APPROVED:
@@ -185,8 +185,10 @@ class ApprovalOrders:
                 await asyncio.sleep(CHECK_SECONDS)
 
     async def check(self) -> None:
-        """End what is over, and leases of hosts that stopped publishing a motion, before any wait for a stop of
-        the robot.
+        """End expired approvals, and leases of silent hosts. All of them end before the first wait for a relay.
+
+        Silence only ends leases on motions: topics of a group of `[Authority]`, or with a safe message of an enabled
+        guard.
         """
         ended, still = [], []
         for entry in self._table.entries():
@@ -219,18 +221,13 @@ class ApprovalOrders:
         return "" if any(asking) else "the policy no longer asks"
 
     def _silence(self, entry: ApprovalEntry) -> str:
-        """Return why silence ends a lease on a motion now.
-
-        A topic is a motion if it is in a group of `[Authority]`, or if an enabled guard has a safe message for it.
-
-        """
         moved, group = self._last_message(entry), self._policy().commanded(entry.call.resource)
         seconds = SILENT_SECONDS if group is None else group.lease
         silent = moved > entry.since and clock.now() - moved >= seconds
         return f"its host was silent for {seconds:g} s" if silent else ""
 
     async def _end_if_guarded(self, entry: ApprovalEntry) -> None:
-        """Ask once in each silence whether a guard has a safe message for the topic."""
+        """End the lease if a guard has a safe message for its topic. `check` calls this once in each silence."""
         guards = await self._guards(entry.call.resource)
         present = self._table.entry(entry.number)
         if guards is None:
@@ -260,11 +257,10 @@ class ApprovalOrders:
         return differ
 
     async def _stop_motion(self, entry: ApprovalEntry) -> None:
-        """Let the guards stop the robot once its relay has cut the host off.
+        """Let the guards stop the robot once the relays have cut the host off.
 
-        They do so even if no message was reported, because relays report once a second, and forget the
-        traffic of a node that has ended.
-
+        They do so even if no message was reported, because relays report once a second, and forget the traffic of a
+        node that has ended.
         """
         call = entry.call
         if not entry.lease or call.category is not Category.PUBLISH:

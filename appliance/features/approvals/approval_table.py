@@ -1,8 +1,8 @@
-"""Keep the calls that wait for an approval, and the approvals. No I/O; times are monotonic seconds.
+"""Keep the calls that wait for an approval, and the approvals. Times are monotonic seconds.
 
 1. A call has one number while it waits, however often its host repeats it.
 2. An approval of one call is used once, by the same host, for the same service and arguments.
-3. Each entry is charged to the host that was charged when the call came.
+3. An entry keeps the charged host of its call, even if another one would be charged now.
 """
 
 from dataclasses import dataclass, replace
@@ -40,7 +40,7 @@ class HeldCall(NamedTuple):
 
 
 class ChargedHost(NamedTuple):
-    """A host and its quota's key: the network in the policy, or the host's address."""
+    """The key of a host's quota: its network in the policy, or its address."""
 
     network: str
     named: bool
@@ -55,11 +55,7 @@ class ChargedHost(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class ApprovalEntry:
-    """A call, and the operators' decision. `arguments` are its first bytes, of `size`.
-
-    `once`: the approval is for one call; otherwise it is a lease for all calls of the key from `since` to
-    `until`.
-    """
+    """A held call or an approval."""
 
     number: int
     call: HeldCall
@@ -67,11 +63,13 @@ class ApprovalEntry:
     caller_id: str
     type: str
     arguments: bytes
+    """The first bytes of the arguments, which have `size` bytes."""
     size: int
     since: float
     until: float
     state: ApprovalState = ApprovalState.WAITS
     once: bool = False
+    """An approval is for one call; otherwise it is a lease for all calls of this host and name until `until`."""
     who: str = ""
 
     @property

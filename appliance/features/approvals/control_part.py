@@ -1,4 +1,4 @@
-"""Make the part of approvals in control."""
+"""Build the part of control for approvals."""
 
 import secrets
 from functools import partial
@@ -19,11 +19,9 @@ if TYPE_CHECKING:
 
 
 async def inherit(base: "Foundation", parts: "Parts") -> FeaturePart:
-    """Begin without an approval, and stop motions that hosts commanded by an earlier approval.
+    """Begin without approvals, and stop motions that hosts commanded under earlier ones.
 
-    The first number is random, so an operator who answers late, after a restart, does not approve another
-    call.
-
+    The first number is random, so an operator who answers after a restart does not approve another call.
     """
     relay, policy = parts.endpoints.relay, base.policies.policy
     stop = MotionStop(relay.stop, base.trail, policy)

@@ -1,4 +1,4 @@
-"""Make the part of command authority in control."""
+"""Build the part of control for command authority."""
 
 from functools import partial
 from typing import TYPE_CHECKING, Any

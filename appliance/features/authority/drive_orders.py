@@ -1,8 +1,7 @@
-"""Hand groups of `[Authority]` over between hosts, by orders of operators, calls of nodes, and the end of a
-lease.
+"""Hand groups of `[Authority]` over: operators order it, nodes call for it, and leases expire.
 
-The earlier holder is cut off on every relay before the next host holds the group. Nothing is stored: after a
-restart or a takeover, each group is free.
+The earlier holder is cut off on every relay before the next host holds the group. Nothing is stored: after a restart
+or a takeover, each group is free.
 """
 
 import asyncio
@@ -27,10 +26,9 @@ CHECK_SECONDS = 0.25
 
 
 class DriveOrders:
-    """The operators' orders; they raise `SenselessError`, `UnavailableError` and `UnknownThingError`.
+    """Answers operators and nodes. Requests raise `SenselessError`, `UnavailableError` or `UnknownThingError`.
 
-    `carried_out(topics)` waits for the relays (None: all). Each group has its own turn, so a hanging relay delays
-    no other group.
+    Each group has its own lock, so a hanging relay delays no other group.
     """
 
     def __init__(
@@ -41,6 +39,7 @@ class DriveOrders:
         stop: MotionStop,
         *,
         decide_again: Callable[[], int],
+        # Waits until the relays of these topics (None: all relays) have applied the policy.
         carried_out: Callable[[Iterable[str] | None], Awaitable[None]],
         relays_ready: Callable[[], bool],
     ) -> None:
@@ -83,7 +82,7 @@ class DriveOrders:
         return self._state(group)
 
     async def ask(self, request: requests.DriveAsk, who: str) -> requests.GroupState:
-        """A host that may take a free group gets it at once."""
+        """Let a host wait for a group, or give it the group at once if it is free and the host may take it."""
         group, host = self._group(request.group), self._host(request.host)
         async with self._turn(group):
             await self._asked(group, host, who)
@@ -132,7 +131,7 @@ class DriveOrders:
                 await asyncio.sleep(CHECK_SECONDS)
 
     async def check(self) -> None:
-        """Every authority ends before this waits for a relay."""
+        """End each authority that is over. All of them end before the first wait for a relay."""
         groups = self._policy().authority
         if gone := self._groups.forget_others(frozenset(groups)):
             self._decide_again()
@@ -184,11 +183,10 @@ class DriveOrders:
     async def _hand_over(
         self, group: AuthorityGroup, to: Address | None, reason: str, who: str, *, stop: bool = False
     ) -> None:
-        """Cut the holder off on all relays, then let the next host hold the group, in one audit record.
+        """Cut the holder off on all relays, then let the next host hold the group, and record both as one event.
 
-        The group is freed in any case. Without `to`, the first waiting host follows, if all relays are ready. `stop`:
-        the guards of the group stop the robot in between.
-
+        Without `to`, the first waiting host that may take the group follows. With `stop`, the group's guards stop the
+        robot in between. If a relay is not ready in the end, the group stays free.
         """
         if to is not None and not self._relays_ready():
             raise UnavailableError(f"a relay starts, so {group.name} cannot be handed over: try again")

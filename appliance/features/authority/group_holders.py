@@ -1,8 +1,7 @@
 """Keep the holder of each group, and the hosts that wait for it. No I/O; times are monotonic seconds.
 
 1. `free` and `hold` are separate steps, so that the caller can cut the earlier holder off in between.
-2. A holder loses the group once it was silent for the group's lease, or once its nodes have ended.
-3. The first waiting host that may take the group follows. A host that may only ask never follows.
+2. The first waiting host that may take the group follows. A host that may only ask never follows.
 """
 
 from collections.abc import Callable
@@ -18,18 +17,18 @@ ClaimOf = Callable[[AuthorityGroup, Address], Claim | None]
 
 @dataclass(frozen=True, slots=True)
 class Holding:
-    """A holder; `renewed` is when the holder last took the group again, `had_node` whether it has had a node
-    since then.
-    """
+    """The host that holds a group."""
 
     host: Address
     since: float
     renewed: float
+    """The time when the host last took the group again."""
     had_node: bool = False
+    """Whether the host has had a live node; otherwise the end of its nodes does not end the authority."""
 
 
 class GroupHolders:
-    """The holders of all groups."""
+    """The holders and waiting hosts of all groups."""
 
     def __init__(self, claim_of: ClaimOf) -> None:
         self._claim_of = claim_of
@@ -76,12 +75,14 @@ class GroupHolders:
         self._waiting.get(group, {}).pop(host, None)
 
     def seconds_left(self, group: AuthorityGroup, now: float, moved: float) -> float | None:
-        """`moved` is the time of the last message from the holder on a topic of the group."""
+        """Return the seconds until silence ends the authority. `moved` is the time of the holder's last message to
+        the group.
+        """
         holding = self._held.get(group.name)
         return None if holding is None else max(holding.renewed, moved) + group.lease - now
 
     def loss(self, group: AuthorityGroup, now: float, *, moved: float, live: bool) -> str:
-        """`live`: the holder has a live node."""
+        """Return why the holder loses the group, or an empty string. `live` is whether it has a live node."""
         holding = self._held.get(group.name)
         if holding is None:
             return ""
