@@ -1,4 +1,6 @@
-"""Answer operators' requests about alarms; `control/operators/handled_alarms.py` keeps what they decide."""
+"""Answer operators' requests about alarms. `control/operators/handled_alarms.py` stores acknowledgements and
+silences.
+"""
 
 from collections.abc import Callable
 
@@ -30,7 +32,7 @@ def operate(context: OperatorContext) -> FeaturePart:
 
 
 class AlarmOrders:
-    """The operators' requests; `status()` returns the present status, with the handled alarms."""
+    """Answers requests about the alarms in `status()`."""
 
     def __init__(self, handled: HandledAlarms, trail: AuditTrail, status: Callable[[], Status]) -> None:
         self._handled = handled

@@ -35,10 +35,9 @@ class _PlainEntry(tarfile.TarInfo):
 
 @contextmanager
 def checked_archive(file: Path, room: int) -> Iterator[tuple[tarfile.TarFile, list[tarfile.TarInfo]]]:
-    """Check an archive, limited to `room` unpacked bytes.
+    """Open an archive and check it, with at most `room` unpacked bytes.
 
-    Raises `BackupError`, also for read errors inside the `with` block.
-
+    Raise `BackupError`, including for read errors inside the `with` block.
     """
     try:
         with open_given(file) as raw:

@@ -1,9 +1,10 @@
 """Restore a state directory from a backup.
 
 1. No file is overwritten, and writing starts only after the whole archive was checked.
-2. An incomplete restore never becomes an appliance's state: until everything is on the disk, there is a mark,
-   with which `rosrv up` rejects the directory.
-3. The files in a folder get their owner before the folder does. Otherwise that user could replace files by links.
+2. An incomplete restore never becomes an appliance's state: until everything is on the disk, a mark makes `rosrv up`
+   reject the directory.
+3. The files in a folder get their owner before the folder does. Otherwise the new owner could replace files with
+   links.
 """
 
 import os
@@ -49,7 +50,7 @@ def _room_in(state: Path) -> int:
 
 @contextmanager
 def _marked(state: Path) -> Iterator[None]:
-    """On an error, remove everything that was created."""
+    """Mark the directory as incomplete. On an error, remove everything that was created."""
     is_new = not state.exists()
     state.mkdir(mode=0o711, parents=True, exist_ok=True)
     state.chmod(0o711)

@@ -1,7 +1,4 @@
-"""Block hosts and lift their blocks, by operators' orders and at the end of a block's time.
-
-When a block ends, withdrawn registrations return.
-"""
+"""Block hosts, and lift blocks by order or when their time is over. Withdrawn registrations then return."""
 
 import asyncio
 import contextlib
@@ -78,10 +75,7 @@ async def inherit(base: Foundation, parts: Parts) -> FeaturePart:
 
 
 class BlockOrders:
-    """The operators' requests; `live()` returns the rights that a change of the policy may end.
-
-    `connected()` yields the two hosts of each connection, `remotes()` the real addresses of hosts in tunnels.
-    """
+    """Answers operators, and ends each block when its time is over."""
 
     def __init__(
         self,
@@ -90,10 +84,10 @@ class BlockOrders:
         store: StateStore,
         trail: AuditTrail,
         *,
-        live: Callable[[], list[LiveRight]],
-        connected: Callable[[], Iterable[Collection[str]]],
-        enrolled: Callable[[], Mapping[str, str]],
-        remotes: Callable[[], Mapping[str, str]],
+        live: Callable[[], list[LiveRight]],  # the rights that a change of the policy may end
+        connected: Callable[[], Iterable[Collection[str]]],  # the two hosts of each connection
+        enrolled: Callable[[], Mapping[str, str]],  # addresses of enrolled hosts and doors, by name
+        remotes: Callable[[], Mapping[str, str]],  # outer addresses of hosts in tunnels, by name
         carried_out: Callable[[], Awaitable[None]],
     ) -> None:
         self._blocks = blocks

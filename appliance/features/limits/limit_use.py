@@ -80,7 +80,7 @@ _MEMORY: dict[str, tuple[str, QuotaRow]] = {
     "queues": ("bytes waiting for subscribers", RELAY_QUEUES),
     "latched": ("bytes of latched messages", RELAY_LATCHED),
 }
-"""Each row has the relay that holds most."""
+"""The parts of a relay's memory. The answer shows the relay that holds most of each."""
 
 _WHOLE_MEMORY = sum(row.bounds.whole for _resource, row in _MEMORY.values())  # as `RelayMemory.of` divides it
 

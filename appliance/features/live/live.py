@@ -1,6 +1,6 @@
 """Answer `/v1/history` (the last hour), `/v1/live` (the present state) and `/v1/whoami` (the token's holder).
 
-A page that follows gets every change by one request, of which the audit log has one record.
+A page that follows the state makes one request, so the audit log has one record of it.
 """
 
 import asyncio

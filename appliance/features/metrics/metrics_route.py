@@ -62,7 +62,7 @@ def rendered(body: Measures, calls: Mapping[tuple[str, str], int]) -> bytes:
 
 
 def rendered_standby(state: Any, calls: Mapping[tuple[str, str], int]) -> bytes:
-    """A standby has only its own state and the numbers of REST calls."""
+    """Return the metrics of a standby, which has only its own state and the numbers of REST calls."""
     samples = {**pair_view().samples(state), "rosrv_rest_calls_total": calls.items()}
     return _page(samples, [metric for metric in METRICS if metric.name in samples])
 
@@ -191,7 +191,7 @@ def _tunnels(hosts: list[Host]) -> dict[str, _Samples]:
 
 
 def _named(processes: Sequence[ProcessInfo]) -> Iterator[tuple[str, ProcessInfo]]:
-    """One role may have two processes."""
+    """Give each process a unique name, because a role may have two processes."""
     return zip(process_names(processes), processes, strict=True)
 
 
