@@ -1,8 +1,7 @@
 """Convert CBOR frames of clients to JSON, within bounds.
 
-cbor2 knows many tags that a door does not need. So a scan of the heads comes first: it accepts only the kinds
-that JSON also has, byte strings, and the typed arrays of RFC 8746, and bounds depth and number of values, which a
-short frame could make large.
+cbor2 accepts tags that a door does not need, and a short frame can claim millions of values. So all heads are scanned
+first: only the kinds of JSON, byte strings and the typed arrays of RFC 8746 are accepted.
 """
 
 import struct
@@ -20,7 +19,7 @@ MOST_ITEMS = 50_000
 """The most values of one frame; a typed array is one value."""
 
 MOST_NUMBERS = 500_000
-"""The most numbers in the typed arrays of one frame, except those of `uint8`."""
+"""The most numbers in the typed arrays of one frame. Arrays of `uint8` do not count, because they become base64."""
 
 _CODES = {
     64: "B", 65: ">H", 66: ">I", 67: ">Q", 68: "B", 69: "<H", 70: "<I", 71: "<Q", 72: "b", 73: ">h", 74: ">i",
@@ -32,7 +31,10 @@ _OTHERS = frozenset({20, 21, 22, 25, 26, 27})  # false, true, null, floats of 16
 
 
 def json_of_cbor(frame: bytes) -> bytes:
-    """Byte strings and arrays of `uint8` become base64. NaN becomes null, which no field accepts."""
+    """Return a CBOR frame as JSON, or raise `MessageValueError`.
+
+    Byte strings and arrays of `uint8` become base64. NaN becomes null, which no field accepts.
+    """
     try:
         _scan(frame)
         return msgspec.json.encode(cbor2.loads(frame, tag_hook=_typed_array))

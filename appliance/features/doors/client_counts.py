@@ -20,7 +20,7 @@ class _Counts(NamedTuple):
 
 
 class CountedClient:
-    """A connection with its counts, and the queues of its protocol, once it has one."""
+    """A connection with its counts. `queues` gets the queue of its protocol once the protocol is known."""
 
     def __init__(self, session: DoorSession, peer: str, ticket: str, queues: list[ViewerQueue[Any]]) -> None:
         self.session = session

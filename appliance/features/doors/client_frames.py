@@ -1,7 +1,7 @@
-"""WebSocket frames for clients as they go over the wire: final and not masked (RFC 6455, section 5.2).
+"""Encode WebSocket frames for clients: final and not masked (RFC 6455, section 5.2).
 
-Clients of a door that get the same message share its frame. A large body is not copied: its frame is the head and the
-body.
+Clients that get the same message share its frame. The frame of a large body is a pair of head and body, so the body
+is not copied.
 """
 
 import struct
@@ -18,12 +18,11 @@ _MIDDLE, _LARGE = struct.Struct(">BBH"), struct.Struct(">BBQ")
 
 
 def text_frame(text: Body) -> ClientFrame:
-    """Return a frame of a text, which is UTF-8."""
+    """Return a text frame; `text` is UTF-8."""
     return _frame(_TEXT, b"", text)
 
 
 def binary_frame(head: bytes, body: Body = b"") -> ClientFrame:
-    """Return a frame of two parts."""
     return _frame(_BINARY, head, body)
 
 
@@ -47,7 +46,6 @@ def is_text(frame: ClientFrame) -> bool:
 
 
 def content(frame: ClientFrame) -> bytes:
-    """Return the content of a frame, such as for its compression."""
     data = _joined(frame)
     return data[_HEAD_BYTES.get(data[1], 2) :]
 

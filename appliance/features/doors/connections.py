@@ -40,7 +40,7 @@ class ConnectionLimits:
 
 
 class DoorConnections:
-    """Serves connections; `refused` counts those that came in excess."""
+    """Serves connections within the limits. `refused` counts the connections beyond them."""
 
     def __init__(self, limits: ConnectionLimits) -> None:
         self.refused = 0

@@ -1,4 +1,4 @@
-"""The part of control for doors: operators' orders, tickets, and people's connections."""
+"""Answer requests about doors in control, and pass people's connections to the processes of doors."""
 
 import asyncio
 import contextlib
@@ -34,7 +34,7 @@ _log = structlog.get_logger()
 
 
 async def keep(sections: Sections, store: StateStore, lifeline: ControlLifeline) -> KeptDoors:
-    """Read the doors before the policy names them, with addresses that no other program can use."""
+    """Read the doors, and let the firewall reserve their addresses before the policy names them."""
     settings = sections.of(Doors)
     table = DoorTable(store, settings)
     if table.live():
@@ -69,7 +69,7 @@ async def inherit(base: Foundation, parts: Any) -> FeaturePart:
 
 
 class DoorOrders:
-    """The operators' requests about doors."""
+    """Answers operators, signed-in people, and connections that show a ticket."""
 
     def __init__(
         self,

@@ -1,6 +1,6 @@
-"""The link between control and the process of a door.
+"""The messages between control and the process of a door.
 
-A door's process has no network of its own. Control makes its sockets, with the address of its identity: so a
+A door's process has no network of its own. Control makes its sockets, bound to the address of its identity. So a
 compromised door can use no other address, and reaches nothing but RVMaster, proxy endpoints and relays.
 """
 
@@ -20,10 +20,7 @@ class DoorStarted(Message, frozen=True):
 
 
 class DoorGiven(Message, frozen=True):
-    """The door that the process serves, and the pages that may connect.
-
-    Connections without a ticket of `tickets` end, because theirs may have expired without control.
-    """
+    """The door that the process serves, and the pages that may connect."""
 
     name: str
     added: float
@@ -33,16 +30,17 @@ class DoorGiven(Message, frozen=True):
     connections: int
     in_ten_seconds: int
     tickets: list[str]
+    """Connections with another ticket end, because it may have expired while control was down."""
 
 
 class TypesGiven(Message, frozen=True):
-    """The operator's definitions by `package/Type.msg` or `.srv`, at each change."""
+    """The operator's definitions changed. The keys are `package/Type.msg` and `package/Type.srv`."""
 
     definitions: dict[str, str]
 
 
 class PolicyChanged(Message, frozen=True):
-    """Another policy is in force, which may allow what the earlier one denied."""
+    """A new policy is in force, which may allow requests that were denied."""
 
 
 class DoorEnded(Message, frozen=True):
@@ -50,10 +48,11 @@ class DoorEnded(Message, frozen=True):
 
 
 class AgentListener(Message, frozen=True):
-    """The listening socket of the agent's port; only this address or network may connect."""
+    """The listening socket of the agent's port."""
 
     descriptors: ClassVar[int] = 1
     source: str
+    """Only this address or network may connect; empty: any host."""
 
 
 class ViewerGiven(Message, frozen=True):
@@ -65,7 +64,7 @@ class ViewerGiven(Message, frozen=True):
 
 
 class TicketEnded(Message, frozen=True):
-    """The connections of a ticket end now."""
+    """The ticket is over, so its connections end."""
 
     ticket: str
 
@@ -102,20 +101,19 @@ class ConnectionsChanged(Message, frozen=True):
 
 
 class DoorCounted(Message, frozen=True):
-    """The counts since the start of the process, except the present `connections`.
-
-    `refused` counts connections, and `refusals` requests of clients.
-
-    """
+    """Counts since the start of the process."""
 
     connections: int = 0
+    """The present number."""
     received: int = 0
     sent: int = 0
     dropped: int = 0
     refused: int = 0
+    """Connections beyond the limits."""
     received_bytes: int = 0
     sent_bytes: int = 0
     refusals: int = 0
+    """Refused requests of clients."""
 
 
 MOST_SHOWN = 50

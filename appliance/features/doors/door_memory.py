@@ -1,10 +1,9 @@
 """Divide the memory of one door among its clients and its node.
 
-The messages that wait for other nodes, and the arguments of calls that wait for answers, count as a client each.
-Large messages from other nodes have a memory of their own until they are whole, so that slow clients keep none
-from the others.
+Messages that wait for other nodes count as one client, and so do the arguments of calls that wait for answers. Large
+messages from other nodes have a memory of their own until they are complete, so slow clients cannot use it up.
 
-1. Each client may hold `least` bytes, whatever the others hold: half of the whole, divided by the most clients.
+1. Each client may always hold `least` bytes: half of the whole, divided by the maximum number of clients.
 2. Beyond `least`, clients share the other half. A client gets no more of it than it leaves for all others, and is
    disconnected if it does not read the frames that take it (`session.py`).
 """
@@ -29,7 +28,7 @@ class DoorMemory:
 
 
 class ClientMemory:
-    """The memory of one client, of which it holds `held` bytes."""
+    """One client's share of the memory; it holds `held` bytes."""
 
     def __init__(self, door: DoorMemory) -> None:
         self.held = 0
@@ -48,18 +47,17 @@ class ClientMemory:
             self._shared = shared
 
     def send(self, size: int) -> None:
-        """Hold these bytes, which are charged, until `sent`."""
+        """Mark charged bytes as taken from the queue; `sent` releases them."""
         self._leaving += size
 
     def sent(self) -> None:
-        """Give the bytes back that were sent."""
         if self._leaving:
             self.add(-self._leaving)
             self._leaving = 0
 
     @property
     def shares(self) -> bool:
-        """Whether this client holds memory of the shared half."""
+        """Return whether this client holds memory of the shared half."""
         return self._shared > 0
 
     def refusal(self, size: int) -> str:

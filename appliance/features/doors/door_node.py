@@ -1,7 +1,7 @@
 """The node of a door, which all connections of its identity share.
 
-Agents make a new connection for each call. So a topic stays registered for some seconds after its last client
-left. The master and the relay decide, as for any host.
+Agents make a new connection for each call, so a topic stays registered for some seconds after its last client has
+left. The master and the relay decide about a door as about any host.
 """
 
 import asyncio
@@ -115,10 +115,7 @@ class _Offer:
 
 
 class DoorNode:
-    """The requests of all connections of one door.
-
-    Arguments of calls are in the memory `calls`, because they may outlive their connection.
-    """
+    """Carries out the requests of all connections of one door."""
 
     def __init__(
         self,
@@ -127,7 +124,7 @@ class DoorNode:
         built_in: BuiltIn,
         *,
         most_topics: int,
-        calls: ClientMemory,
+        calls: ClientMemory,  # charged with arguments of calls, which may outlive their connection
     ) -> None:
         self.node = node
         self._most_topics = most_topics
@@ -448,7 +445,7 @@ def _written(writer: MessageWriter, values: Raw | bytes, memory: ClientMemory) -
 
 
 def _named(values: Raw, names: list[str]) -> bytes:
-    """A list gives the arguments in the order of the fields."""
+    """Return the arguments by name. A client may give them as a list in the order of the fields."""
     text = bytes(values)
     if not text.lstrip().startswith(b"["):
         return text

@@ -1,7 +1,7 @@
-"""The parameters of a door, with one subscription at the master for each, whatever connections use it.
+"""Read, write and follow parameters for the connections of a door, which share one subscription for each parameter.
 
-A read takes two calls for each parameter, of which a robot has hundreds. So a connection's further requests, such
-as a stop, do not wait for its reads.
+A read takes two calls for each of hundreds of parameters, so a connection's later requests, such as a stop, do not
+wait for it.
 """
 
 import asyncio
@@ -41,15 +41,17 @@ class ParameterClient(Protocol):
         """Take the refusal of a read."""
 
     def parameter_changed(self, subscribed: str, name: str, value: Value) -> None:
-        """`name` is the subscribed parameter or one below it; `{}` if it was deleted."""
+        """Take a new value. `name` is the subscribed parameter or a parameter below it; `value` is `{}` if it was
+        deleted.
+        """
 
 
 class DoorParameters:
-    """The requests about parameters. The names of the reads that wait are in the memory `calls`."""
+    """Carries out requests about parameters."""
 
     def __init__(self, node: RosNode, calls: ClientMemory) -> None:
         self._node = node
-        self._calls = calls
+        self._calls = calls  # charged with the names in waiting reads
         self._clients: dict[str, set[ParameterClient]] = {}
         self._lock = asyncio.Lock()  # for registrations
         self._reads: Counter[ParameterClient] = Counter()  # that wait

@@ -3,8 +3,8 @@
 1. A process gets only sockets with the address of its door, and connects only to RVMaster's port and to ports of
    proxy endpoints and relays. At most `_MOST_PENDING` requests for sockets wait at once.
 2. A process of a door that was removed or replaced gets `DoorEnded`, and nothing after it. A door that was added
-   again is another door, because its tickets and its agent's address are others.
-3. A process outlives control. It gets the valid tickets on each link, and ends the connections of all others.
+   again counts as a new door, because its tickets and its agent's address are new.
+3. A process outlives control. On each new link it gets the valid tickets, and ends connections with any other ticket.
 """
 
 import asyncio
@@ -43,7 +43,7 @@ class _Slot:
     trouble: str = ""
     started: bool = False
     ending: Channel | None = None
-    """To a process that got `DoorEnded`."""
+    """The channel to a process that got `DoorEnded`."""
     pending: int = 0
     definitions: Mapping[str, str] = field(default_factory=dict)
     restarts: int = 0
@@ -56,7 +56,7 @@ class _Slot:
 
 
 class DoorProcesses:
-    """The processes of all doors. `left(door, ticket)` is called when a connection ended."""
+    """The processes of all doors."""
 
     def __init__(
         self,
@@ -64,7 +64,7 @@ class DoorProcesses:
         table: DoorTable,
         *,
         tickets: Callable[[str], list[str]],
-        left: Callable[[str, str], None],
+        left: Callable[[str, str], None],  # called after connections of a door with a ticket ended
         definitions: Callable[[], Mapping[str, str]],
     ) -> None:
         self._base = base

@@ -1,8 +1,8 @@
 """The table of doors: identities, their addresses and processes.
 
-1. A name keeps its address for good, also after the removal of its door: records name hosts by address.
-2. The policy gets no address of a door unless the firewall reserves it: otherwise another host or program could
-   use the address. An address outside of `doors.network` is never reserved.
+1. A name keeps its address for good, even after its door was removed, because records name hosts by address.
+2. The policy gets a door's address only if the firewall reserves it. Otherwise another host or program could use it.
+   An address outside of `doors.network` is never reserved.
 """
 
 import ipaddress
@@ -23,13 +23,14 @@ _MOST_NAMES = 2000  # including removed ones
 
 
 class DoorTable:
-    """All doors that were ever added; `closed` is why the firewall does not reserve them."""
+    """All doors that were ever added."""
 
     def __init__(self, store: StateStore, settings: Doors) -> None:
         self._store = store
         self._network = ipaddress.IPv4Network(settings.network)
         self._gateway = settings.gateway
         self._rows = {row.name: row for row in store.doors.doors()}
+        # Why the firewall does not reserve the addresses, or empty.
         self.closed = "the firewall does not reserve doors.network yet"
 
     @property

@@ -1,7 +1,7 @@
-"""The tickets with which people's viewers open a door, because a viewer can carry nothing but a URL.
+"""Tickets that open a door. A viewer carries nothing but a URL, so the ticket is part of the URL.
 
-A ticket is `ID.SECRET`: 48 bits that name it in records, and 256 random bits, which cannot be guessed, so a fast
-hash is stored. Neither a step of the clock nor a restart gives it more time (`StoredDeadlines`).
+A ticket is `ID.SECRET`: 48 bits that name it in records, and 256 random bits, which cannot be guessed, so a fast hash
+is stored. Neither a step of the clock nor a restart gives it more time (`StoredDeadlines`).
 """
 
 import hashlib
@@ -37,7 +37,7 @@ class DoorTickets:
         return [row for row in self._rows.values() if door in (None, row.door)]
 
     def make(self, door: str, seconds: float, who: str) -> tuple[TicketRow, str]:
-        """The returned text is stored nowhere."""
+        """Return a new ticket and its text, which is stored nowhere."""
         if not 1 <= seconds <= LONGEST_SECONDS:
             raise SenselessError("a ticket is valid for one second to 30 days: write 8h or 7d")
         if len(self.valid()) >= _MOST:

@@ -1,7 +1,7 @@
 """The visits of signed-in people: the console opens the caller's own door, with a ticket for one connection.
 
-Nothing is stored. A visit ends with control's process, and with the last token and session of its person's name.
-A person has at most `_MOST_OF_PERSON` visits; a further one ends the oldest.
+Nothing is stored. A visit ends with control's process, and with the last token and session of its person's name. A
+person has at most `_MOST_OF_PERSON` visits; beyond them, a new visit ends the oldest.
 """
 
 from collections.abc import Callable
@@ -56,7 +56,7 @@ class DoorVisits:
         return [one.row for one in self._visits.values() if one.row.door == door and not one.over]
 
     def ended(self) -> list[TicketRow]:
-        """Return each visit once."""
+        """Remove and return the visits that are over."""
         if not self._visits:
             return []
         bearers = self._bearers()

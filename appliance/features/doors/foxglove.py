@@ -1,7 +1,7 @@
-"""Foxglove's WebSocket protocol of one connection, without I/O: `foxglove.websocket.v1` and `foxglove.sdk.v1`.
+"""Speak Foxglove's WebSocket protocol on one connection, without I/O: `foxglove.websocket.v1` and `foxglove.sdk.v1`.
 
-Channels carry the bytes of ROS messages unchanged. The door announces what its identity may see, and refuses in
-words: a status with the level error, or `serviceCallFailure`.
+Channels carry the bytes of ROS messages unchanged. The door announces only names that its identity may see. A refusal
+is a status with the level error, or `serviceCallFailure`.
 """
 
 import struct
@@ -334,7 +334,9 @@ class Foxglove:
     # --- what the door sees ---
 
     def surroundings(self, seen: DoorSurroundings) -> list[DoorRequest]:
-        """Return the ends of subscriptions to old channels, which clients end without a frame."""
+        """Announce changes, and return the ends of subscriptions to withdrawn channels, for which clients send no
+        frame.
+        """
         if seen.denial and (self._seen is None or self._seen.denial != seen.denial):
             self._refuse(seen.denial)
         first, self._seen = self._seen is None, seen

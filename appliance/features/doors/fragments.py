@@ -1,4 +1,4 @@
-"""Frames that a client sends in fragments: kept, within a limit of bytes, until they are complete."""
+"""Keep the fragments of a client's frames until the frames are complete, within a limit of bytes."""
 
 from dataclasses import dataclass, field
 

@@ -12,7 +12,7 @@ _SECONDS = 10.0
 
 
 class GivenNetwork:
-    """A `NodeNetwork`; `ask(message)` sends a request to control, and returns False without control."""
+    """A `NodeNetwork` with sockets from control. `ask(message)` sends a request, and returns False without a link."""
 
     def __init__(self, source: str, ask: Callable[[SocketWanted], bool]) -> None:
         self.source = source

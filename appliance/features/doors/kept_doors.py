@@ -27,10 +27,11 @@ class Orders(Protocol):
 
 
 class KeptDoors:
-    """The doors in the state, and later the orders about them."""
+    """The doors in the state."""
 
     def __init__(self, table: DoorTable) -> None:
         self.table = table
+        # These two are set once control has its other parts.
         self.orders: Orders
         self.usable: Callable[[], frozenset[str]]
 

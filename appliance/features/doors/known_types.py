@@ -27,7 +27,6 @@ _MOST_CHARACTERS = 500_000
 class DoorMessage:
     """A message that came on a topic, with its publisher's header.
 
-    `received` is the system time in nanoseconds. If several clients get the message, they share its frames in `shared`.
     Encoding raises `MessageValueError`, or `DefinitionError` if the definition cannot be used.
     """
 
@@ -35,8 +34,10 @@ class DoorMessage:
     body: Body
     header: Mapping[str, str]
     received: int
+    """The system time in nanoseconds."""
     codec_of: Callable[[Mapping[str, str]], MessageCodec] = field(repr=False)
     shared: "SharedFrames | None" = field(default=None, repr=False)
+    """The frames that other clients with this message share; None if there is only one client."""
 
     @property
     def codec(self) -> MessageCodec:
@@ -48,7 +49,7 @@ class DoorMessage:
 
 
 class SharedFrames:
-    """The frames that were made last, for the other clients of a door: at most `most` bytes with their messages."""
+    """Keeps the latest frames for other clients of the door: at most `most` bytes, with their messages."""
 
     def __init__(self, most: int = 16 << 20) -> None:
         self.bytes = 0
@@ -78,7 +79,7 @@ def _kept_bytes(message: DoorMessage, frame: DoorFrame) -> int:
 
 
 class KnownTypes:
-    """The types of one door, the most recently used. Methods raise `DefinitionError`."""
+    """The most recently used types of one door. Methods raise `DefinitionError` for types that cannot be used."""
 
     def __init__(self, standard: Definitions, limits: ValueLimits) -> None:
         self._standard = self._defined = standard

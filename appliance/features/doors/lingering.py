@@ -1,11 +1,11 @@
-"""Topics that no client uses any longer: each ends some seconds later, unless a client comes back."""
+"""End topics some seconds after their last client has left, unless a client comes back."""
 
 import asyncio
 from collections.abc import Callable
 
 
 class Lingering:
-    """The topics of a door that will end, with one timer: `end(topic)` is called `seconds` after `left(topic)`."""
+    """Calls `end(topic)` `seconds` after `left(topic)`, unless `used(topic)` comes first. All share one timer."""
 
     def __init__(self, seconds: float, end: Callable[[str], object]) -> None:
         self._seconds = seconds

@@ -1,7 +1,7 @@
 """Find the topics and services that a door's identity may see, with definitions and types.
 
-Viewers need definitions before they subscribe, so the door subscribes to a topic with an unknown one for a
-moment. The result is kept until the graph changes, and a denial at most until the policy changes.
+Viewers need a definition before they subscribe. If it is unknown, the door itself subscribes for a moment. A result
+is kept until the nodes of the topic or service change, and a denial at most until the policy changes.
 """
 
 import asyncio
@@ -24,7 +24,7 @@ _Thing = tuple[Literal["topic", "service"], str]
 
 
 class _Asked(NamedTuple):
-    """At the time `again`, the publishers or providers are asked again."""
+    """The nodes that were asked about a topic or service, and the time when they are asked again."""
 
     nodes: tuple[str, ...]
     again: float = math.inf

@@ -1,7 +1,7 @@
 """Write plain values as serialised messages.
 
-A schema of msgspec checks a whole message before anything is written, and names the path of the first error. As
-in rosbridge, missing fields are zero, a header without a stamp gets the present time, and so does the text `now`.
+A schema of msgspec checks a whole message before anything is written, and names the path of the first error. As in
+rosbridge, missing fields are zero; a header without a stamp, and a time that is `now`, get the present time.
 """
 
 import struct

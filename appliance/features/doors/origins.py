@@ -1,7 +1,7 @@
 """Decide which pages may open a WebSocket, by the Origin that a browser sends.
 
-Programs send no Origin, or the address they connect to. A page may have the name of any address (DNS rebinding),
-so an Origin that equals the Host is accepted only for an address or `localhost`.
+Programs send no Origin, or the address they connect to. An attacker's name may resolve to any address (DNS
+rebinding), so an Origin that equals the Host is accepted only for an address or `localhost`.
 """
 
 import ipaddress

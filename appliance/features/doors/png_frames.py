@@ -1,6 +1,7 @@
-"""Texts as PNG images, for rosbridge's compression `png`.
+"""Encode texts as PNG images, for rosbridge's compression `png`.
 
-The compression of a large text takes long, so it is divided into steps, between which a door serves its other clients.
+The compression of a large text takes long, so it is divided into steps, between which a door serves its other
+clients.
 """
 
 import base64
@@ -16,7 +17,7 @@ _STEP_BYTES = 3 << 14  # of the text, or of the image: about a millisecond
 
 
 class PngFrame:
-    """The frame of an image; `frame` is None until it is made. `size` is the memory that it takes at most."""
+    """A frame that is made in steps; `frame` is None until it is complete. `size` is the most memory that it takes."""
 
     def __init__(self, text: bytes) -> None:
         self.size = 2 * len(text)

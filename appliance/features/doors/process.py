@@ -286,7 +286,7 @@ class _Process:
     # --- reports ---
 
     def _ended(self, peer: str, ticket: str, reason: str) -> None:
-        """Control forgets a visit then."""
+        """Report the end of a connection. Control then forgets its visit."""
         self._changed(peer, ticket, ended=1, reason=reason)
         self._tickets[ticket] -= 1
         self._tickets = +self._tickets

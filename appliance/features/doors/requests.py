@@ -14,18 +14,16 @@ ClientId: TypeAlias = str | int | float | None
 
 @dataclass(frozen=True, slots=True)
 class AdvertiseTopic:
-    """Advertise a topic. Without a type, the topic has the type that its other nodes use.
-
-    `will` is published if the connection ends while the topic is advertised.
-
-    """
+    """Advertise a topic."""
 
     topic: str
     type: str | None
+    """None: the type that other nodes of the topic use."""
     latched: bool = False
     queue: int = 100
     reply_to: ClientId = None
     will: msgspec.Raw | None = None
+    """A message that is published if the connection ends while the topic is advertised."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +45,7 @@ class PublishMessage:
 
 @dataclass(frozen=True, slots=True)
 class SubscribeTopic:
-    """Subscribe to a topic, which must have the type if there is one."""
+    """Subscribe to a topic. If `type` is given, a topic of another type is refused."""
 
     topic: str
     type: str | None = None

@@ -1,4 +1,4 @@
-"""The services of rosapi, with its own service types, answered from the graph that the policy lets the door see.
+"""Answer the services of rosapi from the graph that the policy lets the door see.
 
 `get_ros_version` fails: it belongs to ROS 2, and clients call it to find out which ROS this is. A call that the
 policy denies fails with the master's words.
@@ -285,7 +285,7 @@ async def _fail(reason: str) -> Raw:
 
 
 def _as_value(text: str) -> Value:
-    """A text that is not JSON is a string, as in rosapi."""
+    """Return the value of a JSON text. A text that is not JSON is a string, as in rosapi."""
     try:
         value: Value = msgspec.json.decode(text)
     except (ValueError, RecursionError):

@@ -1,11 +1,10 @@
-"""The rosbridge protocol, version 2, of one connection, without I/O.
+"""Speak the rosbridge protocol, version 2, on one connection, without I/O.
 
-1. The requests of one frame are carried out in order. After a refused advertisement, its message is dropped.
-2. Every refusal is words: a `status` of the level error with the id of the operation, or a failed
+1. Every refusal has its reason: a `status` of level error with the id of the operation, or a failed
    `service_response`. Nothing else is sent without a request.
-3. Frames repeat the client's own spelling of a name; requests have the canonical name.
-4. Everything that a client can make grow has a limit.
-5. No fragments are sent: no client library reads them.
+2. Frames repeat the client's own spelling of a name; requests have the canonical name.
+3. Everything that a client can make grow has a limit.
+4. No fragments are sent: no client library reads them.
 """
 
 from collections.abc import Callable, Mapping

@@ -59,11 +59,12 @@ class PublishOp(_Operation, tag="publish"):
 
 
 class SubscribeOp(_Operation, tag="subscribe"):
-    """Subscribe to a topic; `throttle_rate` is the least number of milliseconds between two messages."""
+    """Subscribe to a topic."""
 
     topic: Name
     type: Name | None = None
     throttle_rate: Annotated[int, Meta(ge=0, le=86_400_000)] | None = 0
+    """The least number of milliseconds between two messages."""
     queue_length: _Count | None = 0
     compression: Compression = "none"
 
@@ -75,11 +76,12 @@ class UnsubscribeOp(_Operation, tag="unsubscribe"):
 
 
 class CallServiceOp(_Operation, tag="call_service"):
-    """Call a service; `timeout` is in seconds."""
+    """Call a service."""
 
     service: Name
     args: Raw = _NOTHING
     timeout: float | None = None
+    """In seconds."""
 
 
 class AdvertiseServiceOp(_Operation, tag="advertise_service"):
@@ -150,7 +152,10 @@ class Envelope(Struct):
 
 
 def publish_frame(message: DoorMessage, form: tuple[str, Compression]) -> DoorFrame:
-    """Return a message for clients that spell its topic and compress it in this form; raises `MessageValueError`."""
+    """Return the frame of a message in one form: the clients' spelling of its topic, and their compression.
+
+    Raise `MessageValueError` if the message does not fit its definition.
+    """
     topic, compression = form
     if compression == "cbor-raw":
         secs, nsecs = divmod(message.received, 1_000_000_000)
@@ -177,7 +182,7 @@ def json_frame(fields: dict[str, Any], reply_to: ClientId = None) -> ClientFrame
 
 
 def type_name(text: str) -> str:
-    """Remove further slashes, which rosbridge accepts."""
+    """Return `PACKAGE/NAME` without the additional slashes that rosbridge accepts."""
     parts = [part for part in text.split("/") if part]
     if len(parts) != 2:
         raise OperationError(f"{quoted(text)} is not a type; write PACKAGE/NAME")
@@ -193,7 +198,7 @@ _ENVELOPE = msgspec.json.Decoder(Envelope)
 
 
 def json_of_binary(frame: bytes) -> bytes:
-    """A binary frame is CBOR, unless it begins like a JSON object."""
+    """Return the JSON of a binary frame, which is CBOR unless it begins like a JSON object."""
     return frame if frame.lstrip()[:1] == b"{" else json_of_cbor(frame)
 
 

@@ -1,13 +1,14 @@
 """The WebSocket of one client: handshake, frames in both directions, and the end.
 
-1. A frame is at most `frame_bytes` long, also after inflation. A browser's Origin must be listed.
+1. A frame is at most `frame_bytes` long, even after inflation. A browser's Origin must be allowed (`origins.py`).
 2. The client's requests are carried out in order; calls of services and reads of parameters do not hold up later
    ones.
 3. Frames are sent only as fast as the client reads. In the meantime, its queue keeps the newest messages of each
-   topic, and its requests are carried out: a stop does not wait for pictures.
-4. A client that sends nothing, and does not answer pings, is disconnected: within seconds if it has a will.
-5. Once the session disconnects a client, it carries out no further request, and ends even if the client does not read.
-   Frames that the client does not take then are dropped.
+   topic, and its requests are carried out: a stop does not wait for images.
+4. A client that sends nothing, and does not answer pings, is disconnected; within seconds if it has a will, which the
+   door publishes when the client is gone.
+5. Once the session disconnects a client, it carries out no further request, and drops the frames that the client does
+   not take.
 6. A client that holds memory which all clients share (`door_memory.py`) must take frames: `_LEAST_TAKEN` bytes in
    `_TAKING_SECONDS`. Otherwise it is disconnected, because large messages of others may find no room.
 """
@@ -83,7 +84,7 @@ class ClientProtocol(Protocol):
 
     @property
     def wants_surroundings(self) -> bool:
-        """Whether the client gets the topics and services that the door sees."""
+        """Return whether the client gets the topics and services that the door sees."""
 
     def receive(self, frame: bytes, *, is_text: bool) -> Sequence[DoorRequest]:
         """Return the requests of a frame, whose text is UTF-8."""
@@ -322,7 +323,7 @@ class DoorSession:
                 self._disconnect(CloseCode.POLICY_VIOLATION, str(error))
 
     async def _carry_out(self, frame: bytes) -> None:
-        """After a refused advertisement, drop the messages of its topic."""
+        """Carry out a frame's requests in order. If an advertisement is refused, drop the messages of its topic."""
         self.received += 1
         requests = self._protocol.receive(frame, is_text=self._is_text)
         self._wake.set()
@@ -422,7 +423,7 @@ class DoorSession:
             await self._wait_for_room()
 
     def _write(self) -> int:
-        """Give frames to the connection, which alone keeps them; return their number of bytes."""
+        """Hand all frames over to the connection, and return their number of bytes."""
         self._pings = 0
         pieces, self._pieces = self._pieces + self._socket.data_to_send(), []
         size = sum(map(len, pieces))

@@ -39,9 +39,10 @@ class SeenService:
 
 @dataclass(frozen=True, slots=True)
 class DoorSurroundings:
-    """The surroundings of a door; `denial` has the reason if the policy permits no look."""
+    """The surroundings of a door."""
 
     graph: VisibleGraph
     topics: Sequence[SeenTopic]
     services: Sequence[SeenService]
     denial: str = ""
+    """The reason if the master did not give the graph, or empty."""

@@ -32,7 +32,7 @@ class MessageCodec:
         self.writer = MessageWriter(definitions, name, most_bytes=limits.message_bytes)
 
     def json(self, data: Body) -> msgspec.Raw:
-        """Write bytes as base64, NaN and infinity as null."""
+        """Return JSON with bytes as base64, and NaN and infinity as null."""
         self._check(data)
         return msgspec.Raw(msgspec.json.encode(self._json.read(data)))
 

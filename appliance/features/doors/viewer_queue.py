@@ -4,8 +4,8 @@ A client that reads slowly loses the oldest messages of its topics, never a repl
 
 1. At most `message_bytes` of messages wait. If more come, the topic with the most bytes loses its oldest message.
 2. At most `reply_bytes` of replies wait. A client that requests more without reading gets `ViewerStalledError`.
-3. All frames that wait, or that are taken and not sent, are charged to the client's part of the memory of its door.
-   Without room, the client's oldest messages are dropped, or the new one if that is not enough, and a reply ends the
+3. Frames that wait, or are taken but not sent, are charged to the client's share of its door's memory. If it is full,
+   the client's oldest messages are dropped, or the new one if that is not enough. A reply without room ends the
    connection.
 4. Topics take turns, so that a large topic delays a small one by one message.
 """
@@ -64,7 +64,6 @@ class ViewerQueue(Generic[Key]):
         self._turns: OrderedDict[Key, _Waiting] = OrderedDict()  # topics with messages, the next one first
 
     def reply(self, frame: ClientFrame) -> None:
-        """Add a reply. Raises `ViewerStalledError`."""
         if self.memory.closed:
             return
         size = frame_size(frame)
@@ -79,8 +78,9 @@ class ViewerQueue(Generic[Key]):
         self._replies.append(frame)
 
     def configure(self, key: Key, *, depth: int | None, interval: float) -> None:
-        """With a depth, a message that comes too early waits; without, it is dropped. Then only a few messages
-        wait, and a large message only until the next one comes.
+        """Set the limits of a topic. With a depth, a message that comes too early waits; without one, it is dropped.
+
+        Without a depth, only a few messages wait, and a large message only until the next one comes.
         """
         most, most_bytes = (_BURST, _BURST_BYTES) if depth is None else (depth, self._most_message_bytes)
         topic = self._topics.setdefault(key, _Waiting(most, most_bytes, interval))
@@ -127,10 +127,7 @@ class ViewerQueue(Generic[Key]):
             self._drop_from_largest()
 
     def take(self, now: float) -> "tuple[None, ClientFrame] | tuple[Key, Any] | None":
-        """Return the next reply (with the key None) or message; None if nothing may be sent now.
-
-        It stays charged until `memory.sent()`.
-        """
+        """Return the next reply (with the key None) or message; None if nothing may be sent now."""
         if self._replies:
             frame = self._replies.popleft()
             size = frame_size(frame)
