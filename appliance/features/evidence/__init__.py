@@ -1,1 +1,1 @@
-"""Signed bundles of the log, policies and recordings of an incident, made and sealed."""
+"""Evidence: signed bundles of the log, the policies and the recordings of an incident."""

@@ -1,7 +1,7 @@
 """Make an evidence bundle: one ZIP file with the records of a period, the policies and monitors, and the proof.
 
-1. Members are generated twice, for their hashes and to be written. If the two differ, the export fails.
-2. The manifest contains the hash of every member except itself and `proof.json`: the audit record of the export,
+1. Members are generated twice: first to hash them, then to write them. If the two differ, the export fails.
+2. The manifest has the hash of every member except itself and `proof.json`, which is the audit record of the export
    with the hash of the manifest. A signed checkpoint seals that record before the first byte is sent.
 3. Records are exported as they are stored, so `verify.py` computes their hashes without the appliance's code.
 4. A run of records is complete between its ends.
@@ -90,7 +90,7 @@ class RecordingSelection(NamedTuple):
 def export(log: Path, wanted: TimeSpan | RecordingSelection, ask: Ask, names: Names) -> Iterator[bytes]:
     """Record and seal an export, then yield the bytes of its bundle; `ask` queries the appliance.
 
-    Raises `BundleError` and `LogUnreadableError`, also during the iteration.
+    Raise `BundleError` or `LogUnreadableError`, even during the iteration.
     """
     recording: RecordingSummary | None = None
     bag = Path()
@@ -241,7 +241,7 @@ def _given(answer: AdminAnswer[A]) -> A:
 
 
 def _runs(sequences: list[int]) -> list[tuple[int, int]]:
-    """A gap of more than `_APART` begins a new run."""
+    """Return the first and last sequence of each run. A gap of more than `_APART` begins a new run."""
     runs: list[tuple[int, int]] = []
     for sequence in sequences:
         if runs and sequence - runs[-1][1] <= _APART:

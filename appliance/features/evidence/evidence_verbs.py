@@ -94,7 +94,7 @@ def export_evidence(
 
 @contextmanager
 def _naming(output: Path) -> Iterator[None]:
-    """Errors name the file that the operator named, not the unfinished one."""
+    """Let errors name the file that the operator named, not the unfinished one."""
     try:
         yield
     except OSError as error:
