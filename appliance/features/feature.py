@@ -52,40 +52,36 @@ class KeptHosts(Protocol):
 
 @dataclass(frozen=True)
 class FeatureContext:
-    """Objects of control that parts of features use. `robot` may be empty.
-
-    `charged_to(host)` returns the name that is charged for a host's acts. `in_force()` returns the revisions of
-    policy and specifications.
-
-    """
+    """Objects of control that parts of features use. `robot` may be empty."""
 
     sections: Sections
     trail: "AuditTrail"
     audit: "AuditLog"
     robot: str
     charged_to: Callable[[str], str]
+    """Returns the name that is charged for a host's acts."""
     in_force: Callable[[], tuple[int, int]]
+    """Returns the revisions of policy and specifications."""
 
 
 @dataclass(frozen=True)
 class OperatorContext:
-    """Objects of control that exist later, for operators' work.
-
-    `appliance` is the name of one of two appliances, empty on a single one. `received` notes that another machine
-    has all records up to a sequence. `bearers` returns the usable tokens and sessions by name.
-    """
+    """Objects of control that exist later, for operators' work."""
 
     core: FeatureContext
     appliance: str
+    """The name of one of two appliances; empty on a single one."""
     store: "StateStore"
     policies: "Policies"
     monitors: "SpecificationManager"
     hosts: "TunnelHosts"
     processes: "Callable[[], Sequence[ProcessInfo]]"
     received: Callable[[int], None]
+    """Notes that another machine has all records up to a sequence."""
     graph: "Callable[[], Graph]"
     tokens_changed: Callable[[], None]
     bearers: Callable[[], frozenset[str]]
+    """Returns the names of the usable tokens and sessions."""
     status: "Callable[[], Status]"
     handled_alarms: "HandledAlarms"
     kept: Mapping[str, KeptHosts]
@@ -93,34 +89,37 @@ class OperatorContext:
 
 @dataclass(frozen=True)
 class FeaturePart:
-    """A feature's part of control.
-
-    `links` are control's ends of the links to the feature's roles, with the accepted messages, of at most
-    `longest` bytes. `work` runs until control ends; its names go into error messages. `connected(door, ticket,
-    peer, descriptor)` passes a WebSocket of the api on; it returns an HTTP status and why it is refused. `called`
-    answers nodes' calls of services, by name without the appliance's own name. `holders` and `approved` are those
-    of `Policy`; `hold_call` holds a call that needs an approval, and `approve` decides about a request to a
-    service.
-
-    `status_fields()` returns the states of the feature by their fields in `rosrv status --json`. A state that is
-    None or missing is null there.
-    """
+    """A feature's part of control."""
 
     links: "Mapping[str, tuple[Link, Any]]" = field(default_factory=dict)
+    """Control's ends of the links to the feature's roles, with the messages that each accepts."""
     methods: "tuple[RequestMethod[Any], ...]" = ()
     longest: Mapping[str, int] = field(default_factory=dict)
+    """The most bytes of a message on the links to a role."""
     status_fields: Callable[[], Mapping[str, Any]] = dict
+    """Returns the states of the feature by their fields in `rosrv status --json`. A state that is missing is null
+    there.
+    """
     limits: "Callable[[], tuple[LimitUse, ...]]" = lambda: ()
     details: "RecordDetails | None" = None
     called: "Mapping[str, Callable[[OwnServiceCalled], Awaitable[OwnServiceAnswered]]]" = field(
         default_factory=dict
     )
+    """Answers nodes' calls of services, by name without the appliance's own name."""
     holders: "Callable[[], Mapping[str, Address]]" = dict
+    """See `Policy.holders`."""
     approved: "Callable[[], frozenset[Approval]]" = frozenset
+    """See `Policy.approved`."""
     hold_call: "Callable[[Request], str] | None" = None
+    """Holds a call that needs an approval, and returns the text for the denied caller."""
     approve: "Callable[[ApprovalWanted], Awaitable[ApprovalAnswered]] | None" = None
+    """Decides about one request to a service that needs approvals."""
     work: Mapping[str, Callable[[], Awaitable[None]]] = field(default_factory=dict)
+    """Runs until control ends. The names go into error messages."""
     connected: "Callable[[str, str, str, int], tuple[int, str]] | None" = None
+    """`connected(door, ticket, peer, descriptor)` passes on a WebSocket of the api, and returns an HTTP status and
+    the reason of a refusal.
+    """
     sessions: "Sessions | None" = None
     hosts: "TunnelHosts | None" = None
 
@@ -142,36 +141,38 @@ class ConsolePart(NamedTuple):
 class Feature:
     """All that a feature adds.
 
-    `operations` returns the requests of operators' tools, from which the admin socket, REST and the client
-    follow. `answers` are the `Answer`s (`module:name`) of operations over REST that are not just control's, and
-    `routes` is the function (`module:function`) that returns further routes; those in `without_token` need no
-    token. `recorded` is the function that gives `rosrv monitor replay` the messages of a period. `memory` makes
-    the memory that the supervisor shares with this number of relays.
-
-    `pairing(state)` returns what the start of one of two appliances needs; it raises `StartError`. `state_files`
-    are files in the state directory that may exist before the first start. Hooks of control are named by
-    `module:name`, so that their modules may import what imports the table: `may_start` is a `StartGate`,
-    `keep(sections, store, lifeline)` returns `KeptHosts` before the policy comes into force, and
-    `inherit(foundation, parts)` a `FeaturePart` before control serves.
+    Hooks of control are named by `module:name`, so that their modules may import what imports the table.
     """
 
     name: str
     settings: type[FeatureSection] | None = None
     roles: tuple[Role, ...] = ()
     operations: "Callable[[], tuple[type[AdminRequest[Any]], ...]]" = lambda: ()
+    """Returns the requests of operators' tools, from which the admin socket, REST and the client are derived."""
     answers: str | None = None
+    """`module:name` of the `Answer`s of REST operations that control alone cannot answer."""
     routes: str | None = None
+    """`module:function` that returns more REST routes."""
     without_token: tuple[str, ...] = ()
+    """Routes that need no token."""
     page: Callable[[Sections], Mapping[str, str]] = lambda _sections: {}
     verbs: Verbs = field(default_factory=dict)
     quotas: tuple[QuotaRow, ...] = ()
     recorded: str | None = None
+    """`module:function` that gives `rosrv monitor replay` the messages of a period."""
     console: tuple[ConsolePart, ...] = ()
     memory: Callable[[Sections, int], SharedMemory | None] = lambda _sections, _relays: None
+    """Makes the memory that the supervisor shares with this number of relays."""
     make: Callable[[FeatureContext], FeaturePart] | None = None
     operate: Callable[[OperatorContext], FeaturePart] | None = None
     pairing: "Callable[[Path], Pairing | None] | None" = None
+    """Returns what the start of one of two appliances needs, or raises `StartError`. The path is the state directory.
+    """
     state_files: tuple[str, ...] = ()
+    """Files in the state directory that may exist before the first start."""
     may_start: str | None = None
+    """Hook: a `StartGate`."""
     keep: str | None = None
+    """Hook: `keep(sections, store, lifeline)` returns `KeptHosts` before the policy comes into force."""
     inherit: str | None = None
+    """Hook: `inherit(foundation, parts)` returns a `FeaturePart` before control serves."""

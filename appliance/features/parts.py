@@ -72,7 +72,7 @@ class FeatureParts:
             self._parts.append(part)
 
     def link(self, role: str, index: int = 0) -> "tuple[Link, Any] | None":
-        """The second process of a role has the name `ROLE-2`."""
+        """Return the link to a process. The second process of a role has the name `ROLE-2`."""
         name = f"{role}-{index + 1}" if index else role
         return next((part.links[name] for part in self._parts if name in part.links), None)
 

@@ -25,23 +25,24 @@ class Trouble(NamedTuple):
 
 @dataclass(frozen=True)
 class StateView(Generic[S]):
-    """A field `kind` of `rosrv status --json`, described by `doc`.
-
-    It belongs to the status, or to its `audit`, before the field `before`, or at the end, and is null without a
-    state, unless `required`. `line(state)` returns what `rosrv status` prints: a name, and a text in rich's
-    markup; an empty name adds the text to the line of the audit log.
-    """
+    """A field of `rosrv status --json`, which is null without a state, unless `required`."""
 
     field: str
     kind: type[S]
     doc: str
+    """The description in the schema."""
     part: Literal["status", "audit"] = "status"
+    """The field belongs to the status, or to its `audit`."""
     before: str = ""
+    """The name of the field that follows; empty: the field is the last."""
     required: bool = False
     alarms: Callable[[S], Iterable[Trouble]] = lambda _state: ()
     metrics: tuple[Metric, ...] = ()
     samples: Callable[[S], Mapping[str, Samples]] = lambda _state: {}
     line: Callable[[S], tuple[str, Any]] | None = None
+    """Returns what `rosrv status` prints: a name, and a text in rich's markup. An empty name adds the text to the
+    line of the audit log.
+    """
 
 
 _NO_PAIRS = UserError("this appliance is one of two, which this rosrv cannot show: use one with `standby`")
