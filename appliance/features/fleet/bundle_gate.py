@@ -1,9 +1,9 @@
-"""Bring bundles of the fleet, which TUF has verified, into force through the same gate as local loads.
+"""Bring verified bundles of the fleet into force, through the same gate as local loads.
 
-1. Before the first change, a journal (`BundleRecord.trial`) with the way back is on the disk. If control or the
-   appliance ends during a trial, the next start goes back.
+1. Before the first change, `BundleRecord.trial` is on the disk, with the way back. If control or the appliance ends
+   during a trial, the next start rolls back.
 2. The bundle in force changes in one write, at the end of a trial in which the robot stayed healthy.
-3. Going back never undoes a change that an operator made during the trial.
+3. A rollback never undoes a change that an operator made during the trial.
 4. A refused bundle changes nothing; the last good one stays in force.
 5. A bundle whose monitors would hold topics that carry messages waits: the robot would get no command, not even a
    stop.
@@ -62,13 +62,14 @@ _UNCONFIRMED_CHANGE = "a local change waits for its confirmation; the bundle wai
 
 
 class Trial(msgspec.Struct, frozen=True):
-    """The bundle, and the state before (`hosts_back` is empty for hosts.yaml)."""
+    """A bundle in its commit-confirm period, and the state before it."""
 
     path: str
     sha256: str
     policy_back: int
     monitors_back: int
     hosts_back: str
+    """Empty: the robot's own hosts.yaml."""
     hosts_sha256: str
 
     @property
@@ -77,13 +78,7 @@ class Trial(msgspec.Struct, frozen=True):
 
 
 class BundleRecord(msgspec.Struct, frozen=True):
-    """The stored record; `policy_back` is the revision of the policy before the bundle.
-
-    `content` is the fingerprint of all parts: revision numbers do not tell whether a part was changed, because
-    going back makes a new revision of the same text. `interrupted` is the SHA-256 of the bundle whose last
-    `interruptions` trials ended with the process.
-
-    """
+    """The stored record."""
 
     in_force: str = ""
     sha256: str = ""
@@ -91,11 +86,16 @@ class BundleRecord(msgspec.Struct, frozen=True):
     policy: int = 0
     monitors: int = 0
     policy_back: int = 0
+    """The revision of the policy before the bundle."""
     refused: RefusedBundle | None = None
     trial: Trial | None = None
     interrupted: str = ""
+    """The SHA-256 of the bundle whose last `interruptions` trials ended with the process."""
     interruptions: int = 0
     content: str = ""
+    """The fingerprint of all parts. Revision numbers do not tell whether a part was changed, because a rollback makes
+    a new revision of the same text.
+    """
 
 
 def disabled_among(monitors: Iterable[str], switches: Switches) -> str:
@@ -104,9 +104,7 @@ def disabled_among(monitors: Iterable[str], switches: Switches) -> str:
 
 
 class BundleGate:
-    """Control's end of the link to the process `bundles`. `health(deprived)` leaves out denials of hosts for
-    which `deprived(host)` is true.
-    """
+    """Control's end of the link to the process `bundles`."""
 
     def __init__(
         self,
@@ -117,6 +115,7 @@ class BundleGate:
         hosts: TunnelHosts,
         store: StateStore,
         trail: AuditTrail,
+        # The health without denials of hosts for which the given function returns true.
         health: Callable[[Callable[[Address], bool]], RobotHealth],
     ) -> None:
         self._fleet = fleet
@@ -300,7 +299,7 @@ class BundleGate:
         )
 
     async def _put_in_force(self, trial: Trial, contents: BundleContents) -> None:
-        """After one of `_REFUSALS`, some parts may be in force."""
+        """Load all parts of a bundle. If one of `_REFUSALS` is raised, the parts before it are in force."""
         await self._monitors.take_bundle(_sources(contents), trial.who, "of the bundle")
         load = admin.PolicyLoad(contents.policy, "of the bundle", signature=contents.policy_signature)
         await self._policies.load_with(load, trial.who, _cases(contents))
@@ -319,8 +318,8 @@ class BundleGate:
             await asyncio.sleep(min(_TICK_SECONDS, max(0.0, deadline - clock.now())))
 
     def _health(self) -> RobotHealth:
-        """Leave out the effects that every activation of the bundle has: denials of hosts that lost a right, and
-        monitors that hold because they lost their state.
+        """Return the health without the expected effects of the bundle: denials of hosts that lost a right, and
+        monitors that hold topics because they lost their state.
         """
         old, new, lost = self._earlier, self._policies.current, self._lost
         if old is None:
@@ -355,7 +354,7 @@ class BundleGate:
             self._refuse(trial.path, trial.sha256, reason)
 
     async def _undo(self, trial: Trial) -> None:
-        """Go back to the state before the trial, except for parts that an operator has changed."""
+        """Roll back to the state before the trial, except for parts that an operator has changed."""
         while True:
             try:
                 if self._policies.in_force.who == trial.who and self._policies.revision > trial.policy_back:

@@ -24,8 +24,9 @@ _OF_ONE_HOST, _OF_OTHER_HOSTS = 3, 12
 def counted_denials(
     by_host: Mapping[str, int], policy: Policy, deprived: Callable[[Address], bool] = lambda _host: False
 ) -> int:
-    """`by_host` has the denials of all unknown hosts under an empty name. Addresses that the policy names as one
-    network count as one host.
+    """Return the number of denials that count. Addresses that the policy names as one network count as one host.
+
+    In `by_host`, an empty name has the denials of all unknown hosts.
     """
     own, others = 0, Counter[str]()
     for host, number in by_host.items():

@@ -1,4 +1,4 @@
-"""The link control <-> bundles."""
+"""The messages between control and the process `bundles`."""
 
 import msgspec
 
@@ -15,15 +15,13 @@ class BundleOffered(Message):
 
 
 class BundlePollReported(Message):
-    """The state of polling, after each change and each check.
-
-    `checked` is when the collector's metadata were last verified (seconds since the epoch; 0: not yet).
-    `rejected`: its files were not accepted.
-    """
+    """The state of polling, after each change and each check."""
 
     checked: float = 0.0
+    """The time when the collector's metadata were last verified (seconds since the epoch; 0: not yet)."""
     trouble: str = ""
     rejected: bool = False
+    """Whether the collector's files failed the verification."""
 
 
 class RefusedBundle(msgspec.Struct, frozen=True):
@@ -42,16 +40,14 @@ class BundleHealth(msgspec.Struct, frozen=True):
 
 
 class BundleStated(Message):
-    """The bundle in force, under commit-confirm, and refused last.
-
-    `changed`: an operator has since changed the policy, the specifications or the hosts on the robot.
-    """
+    """The bundles in force, under commit-confirm, and refused last."""
 
     in_force: str = ""
     sha256: str = ""
     trying: str = ""
     refused: RefusedBundle | None = None
     changed: bool = False
+    """Whether an operator has since changed the policy, the specifications or the hosts on the robot."""
     health: BundleHealth = BundleHealth()
 
 

@@ -1,9 +1,8 @@
-"""Connect to the collector over HTTPS with the robot's certificate. The collector and the network are not
-trusted.
+"""Connect to the collector over HTTPS with the robot's certificate. The collector and the network are not trusted.
 
 1. Only the configured collector is asked. httpcore follows no redirect, uses no proxy and expands nothing.
 2. An exchange has one deadline for all its parts. Answers have a size limit, and compressed ones are rejected.
-3. Each connection reads the certificate files, so replaced ones apply.
+3. Each new connection reads the certificate files again, so replaced files apply.
 """
 
 import ssl
@@ -37,12 +36,12 @@ _FAILURES = (httpcore.TimeoutException, httpcore.NetworkError, httpcore.Protocol
 
 
 class CollectorError(Exception):
-    """The collector gave no usable answer. `wait` is the number of seconds that it asks for; 0: none."""
+    """The collector gave no usable answer."""
 
     def __init__(self, reason: str, status: int | None = None, wait: float = 0.0) -> None:
         super().__init__(reason)
         self.status = status
-        self.wait = wait
+        self.wait = wait  # seconds that the collector asks for; 0: none
 
 
 class _Refusal(msgspec.Struct, frozen=True):

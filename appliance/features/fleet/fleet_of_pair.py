@@ -1,7 +1,7 @@
 """Notice after a takeover that only one appliance of a pair belongs to a fleet.
 
-An active appliance without the earlier one's fleet pushes no log, and the collector may believe that the robot is
-quiet.
+If the new active appliance is not in the fleet of the earlier one, it pushes no log, and the collector may believe
+that the robot is quiet.
 """
 
 import msgspec
@@ -14,7 +14,7 @@ _SETTING = "fleet of the active appliance"
 
 
 class FleetOfAppliance(msgspec.Struct, frozen=True):
-    """The fleet of an appliance; `robot` is empty without one."""
+    """The fleet of an appliance; `robot` is empty if it belongs to none."""
 
     name: str
     robot: str = ""

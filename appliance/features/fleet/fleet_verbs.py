@@ -151,7 +151,10 @@ def prepare_membership(folder: Path, invitation: Invitation) -> str:
 
 
 def _is_for(folder: Path, token: str) -> bool:
-    """A certificate that is not valid now was made before the clock was corrected: no collector has enrolled it."""
+    """Return whether the folder was made with this token and its certificate is valid now.
+
+    An invalid certificate was made before the clock was corrected, so no collector has enrolled it.
+    """
     try:
         same = (folder / _USED_FOR).read_text(encoding="ascii") == token
         return same and not untimely((folder / CERTIFICATE).read_bytes(), "this machine")

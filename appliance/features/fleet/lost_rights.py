@@ -1,4 +1,4 @@
-"""Find whether another policy takes a right from a host, by some names for each rule."""
+"""Find whether a new policy takes a right from a host, by deciding sample names for each rule."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -12,7 +12,7 @@ _ANY = "any_name"  # stands for the stars of a key
 
 
 class LostRights:
-    """Finds lost rights; blocks of hosts are ignored."""
+    """Compares two policies, without their blocks, holders and approvals."""
 
     def __init__(self, old: Policy, new: Policy) -> None:
         self.old, self.new = old, new

@@ -1,7 +1,7 @@
 """Poll the collector: verify its metadata, offer the selected bundle to control, and report the robot's state.
 
-Only bundles that `VerifiedBundles` has accepted are offered, and a refused one not again until the collector
-selects another one.
+Only bundles that `VerifiedBundles` has accepted are offered. A refused bundle is not offered again until the
+collector selects another one.
 """
 
 import random
@@ -133,5 +133,5 @@ def _offered(bundle: VerifiedBundle) -> BundleOffered:
 
 
 def _jittered(seconds: float) -> float:
-    """Robots must not ask at the same time."""
+    """Vary a pause, so that robots do not ask at the same time."""
     return seconds * random.uniform(1 - _JITTER, 1 + _JITTER)  # noqa: S311  spreads load, protects nothing

@@ -42,10 +42,9 @@ def main(lifeline_fd: int, config: Path) -> None:
 
 
 class PollLoop:
-    """One thread polls, the other listens to events, which only make the next poll earlier.
+    """Polls in one thread. The other thread listens to events, which only make the next poll earlier.
 
     Polls are spread over some seconds, because all robots start or are woken at the same time.
-
     """
 
     def __init__(self, poller: Poller, events: CollectorConnection, path: str) -> None:
@@ -57,7 +56,7 @@ class PollLoop:
 
     @property
     def alive(self) -> bool:
-        """An exception that ends a thread is a logged defect."""
+        """Return whether both threads run. Only a defect ends a thread early."""
         return all(thread.is_alive() for thread in self._threads)
 
     def start(self) -> None:

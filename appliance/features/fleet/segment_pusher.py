@@ -2,11 +2,10 @@
 
 1. The database is only read, so pushing never delays the log or loses its records.
 2. Memory is bounded by one record. The segment at work is a compressed file.
-3. A segment counts only with a receipt that the collector's key signed, and that is on this disk.
+3. A segment counts as pushed only with a receipt on this disk that the collector's key has signed.
 4. On each new connection the collector reports what it has: it may have been restored from a backup.
-5. Records that retention removed before they had a receipt are counted and reported (`missed`).
-6. If the log was restored from a copy, pushing continues from the last checkpoint that both have.
-7. While nothing waits, the robot states so every minute: a robot without records is not a silent one.
+5. If the log was restored from a copy, pushing continues from the last checkpoint that log and collector share.
+6. While nothing waits, the robot reports so every minute, because a robot without records is not silent.
 """
 
 import gzip
@@ -52,7 +51,7 @@ class PushPosition(msgspec.Struct, frozen=True):
 
 
 class StoredHead(msgspec.Struct, frozen=True):
-    """The collector's newest checkpoint of a log (number 0: none), with the hashes of all of this number."""
+    """The collector's newest checkpoint of a log (0: none), with the hashes of all checkpoints of this number."""
 
     robot: str
     log: str
@@ -119,11 +118,11 @@ class SegmentPusher:
         return kept.sequence if (kept.log, kept.number) == (log, number) else 0
 
     def _has_log(self) -> bool:
-        """Only an appliance that was never active has no log."""
+        """Return whether there is a log. Only an appliance that was never active has none."""
         return self.log.exists() or (self.folder / "position.json").exists()
 
     def _state_presence(self, position: PushPosition) -> bool:
-        """If the collector lacks the last segment, pushing begins again."""
+        """Report once a minute that nothing waits. If the collector lacks the last segment, begin again."""
         now = clock.now()
         if now < self._presence_due:
             return False
@@ -205,7 +204,7 @@ class SegmentPusher:
             )
 
     def _keep(self, receipt: SegmentReceipt) -> None:
-        """Keep only the last 16 to 32 MiB of receipts."""
+        """Append a receipt to the file. Only the last 16 to 32 MiB of receipts are kept."""
         file = self.folder / "receipts.ndjson"
         with file.open("a+b") as kept:
             if kept.tell():  # a kill or a full disk may have left a part of a line
@@ -270,7 +269,7 @@ def _sequence_of(log: Path, number: int, hashes: list[str]) -> int | None:
 
 
 def _is_passed_over(log: Path, number: int) -> bool:
-    """The checkpoint is not signed, but a later one is, so that it never will be."""
+    """Return whether the checkpoint will never be signed, because a later checkpoint is."""
     signed = signed_checkpoints(log, number - 1, 1)
     return bool(signed) and signed[0].number > number and next_segment(log, number - 1) == number
 

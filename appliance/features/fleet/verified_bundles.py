@@ -1,12 +1,11 @@
 """Verify bundles with TUF.
 
-The collector is not trusted. It can withhold a bundle, and choose one of those that the group's key has signed.
+The collector is not trusted. It can withhold a bundle, and choose among the bundles that the group's key has signed.
 It cannot change a bundle, bring back a withdrawn one, or give a robot the bundle of another site, group or later
 ring.
 
 1. Every check refreshes the metadata first. Expired, older or badly signed metadata end the check.
-2. The trusted metadata are on the disk before a bundle is used, so a power cut undoes nothing that the robot
-   knows.
+2. The trusted metadata are on the disk before a bundle is used, so a power cut undoes nothing that the robot knows.
 """
 
 import os
@@ -30,15 +29,13 @@ from appliance.formats.bundle_api import METADATA, SELECTION, TARGETS
 from appliance.formats.bundle_archive import LONGEST, BundleArchiveError, BundleContents, unpack
 from appliance.formats.terms import BundlePath, TermsError, terms_of
 
-"""The paths of the collector."""
-
 _LONGEST_TIMESTAMP = 1 << 14
 _LONGEST_SELECTION = 1024
 _UNFINISHED = "tmp*"  # the names that the TUF library gives to files that it has not finished
 
 
 class BundleRejectedError(Exception):
-    """A bundle is not accepted; the text has the reason."""
+    """The collector's metadata or bundle are not accepted; the text has the reason."""
 
 
 class BundleTooEarlyError(Exception):
@@ -93,10 +90,9 @@ class _Fetcher(FetcherInterface):
 
 
 class VerifiedBundles:
-    """The bundles of the robot's group. Not thread-safe.
+    """The bundles of the robot's group; the operator trusts the root metadata in `root`. Not thread-safe.
 
     Methods raise `BundleRejectedError`, `BundleFolderError` and `CollectorError`.
-
     """
 
     def __init__(
@@ -110,7 +106,6 @@ class VerifiedBundles:
         robot: str,
         clock: Callable[[], float] = clock.wall,
     ) -> None:
-        """The operator trusts the root metadata in `root`."""
         self._metadata = folder / "metadata"
         self._download = folder / "bundle.tar"
         self._root = root
@@ -142,7 +137,10 @@ class VerifiedBundles:
         self._updater = updater
 
     def selected(self) -> SelectedBundle | None:
-        """Call `refresh` before. Raises `BundleTooEarlyError`."""
+        """Return the bundle that the collector selects, or None. Call `refresh` before.
+
+        Raise `BundleTooEarlyError` if the robot's ring may not take the bundle yet.
+        """
         text = (
             self.connection.get_changed(self._selection, _LONGEST_SELECTION)
             .decode("utf-8", "replace")
@@ -191,7 +189,7 @@ class VerifiedBundles:
             raise BundleTooEarlyError(path, earliest)
 
     def _sync(self) -> None:
-        """Sync the library's files, which it replaces without syncing."""
+        """Sync the files that the TUF library replaces without syncing."""
         for path in (*self._metadata.rglob("*.json"), self._metadata / "root_history", self._metadata):
             descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
             try:
