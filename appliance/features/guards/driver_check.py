@@ -1,9 +1,9 @@
 """Measure whether a robot's own driver stops its base when commands end.
 
-1. A monitor withholds only motions, once, and at most for the given time, whatever happens to control. A stop by
-   a guard, an operator or a node passes, and ends the check.
-2. Control removes it after its line in the log, when a relay was replaced, when the client stops asking, and at
-   the start of control. If all of this fails, the load is rolled back as unconfirmed.
+1. A monitor withholds only motions, once, and at most for the given time, whatever happens to control. A stop by a
+   guard, an operator or a node passes, and ends the check.
+2. Control removes the monitor after its line in the log, when a relay was replaced, when the client stops asking, and
+   at the start of control. If all of this fails, the load is rolled back as unconfirmed.
 """
 
 import asyncio
@@ -39,7 +39,7 @@ _LOOK_SECONDS = 0.1
 _ANSWER_SECONDS = 1.0
 _ASKED_SECONDS = 3.0
 _FURTHER_SECONDS = 10.0
-"""The time after which the monitor's line no longer comes, because the relay is not running it."""
+"""The additional time to wait for the monitor's line. If it does not come, the relay is not running the monitor."""
 _LIMIT_SECONDS = 60.0
 _log = structlog.get_logger()
 

@@ -214,7 +214,7 @@ class GuardOrders:
         return guards[name], self._monitors.sources.files[self._monitors.checked.monitors[name]]
 
     def _acts_of(self, name: str) -> int:
-        """Also count what the guard would have done in shadow mode."""
+        """Return how often the guard acted, or would have acted in shadow mode."""
         before = "shadow " if self._monitors.switches.in_shadow(name) else ""
         return sum(self._monitors.records.counts[f"{before}{kind}", name] for kind in _ACTS)
 

@@ -1,7 +1,7 @@
-"""The types of commands and sensors that a preset works with, as rows: where each value of the preset's text is.
+"""Adapt the text of a preset to the message types of a robot's topics.
 
-A preset is a valid text for one type. For another type, the type and the pattern of the events are replaced. A
-value that the type lacks becomes a local variable.
+A preset is a valid text for one type. For another type, the type and the pattern of the events are replaced. A value
+that the type lacks becomes a local variable.
 """
 
 import re
@@ -14,7 +14,7 @@ _LEGS = ("linear.x", "linear.y", "linear.z", "angular.x", "angular.y", "angular.
 
 @dataclass(frozen=True)
 class TypeRow:
-    """The path of each value in a message type. `parameters` and `local` replace a value that is made of fields."""
+    """The path of each value in a message type."""
 
     paths: Mapping[str, str] = field(default_factory=dict)
     stops: bool = True
@@ -22,6 +22,7 @@ class TypeRow:
     cancelled.
     """
     parameters: str = ""
+    """The event's parameters if a value is made of several fields. `local` then makes the value."""
     local: str = ""
     element: str = ""
     """The type of the elements of `values`, in variables that keep them; empty: the type in the text."""

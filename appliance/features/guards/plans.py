@@ -17,7 +17,7 @@ def planned(  # noqa: PLR0917  one caller
     values: Mapping[str, str],
     kinds: Mapping[str, str],
 ) -> Guard:
-    """`kinds` are the user's types for topics that no node has yet."""
+    """Return the guard to make, or raise `GuardError`. `kinds` are the user's types for topics that no node has yet."""
     known = {one.name: one.type for one in graph if one.type != _UNKNOWN}
     given = preset.given_topics
     chosen = dict(topics)

@@ -1,6 +1,4 @@
-"""Check that the corners of a fence are those of an area: with crossing edges, a part inside would count as
-outside.
-"""
+"""Check that the corners of a fence enclose one area: with crossing edges, a part inside would count as outside."""
 
 from collections.abc import Sequence
 from itertools import combinations, pairwise
@@ -24,5 +22,5 @@ def _turn(a: Corner, b: Corner, c: Corner) -> int:
 
 
 def _cross(a: Corner, b: Corner, c: Corner, d: Corner) -> bool:
-    """Edges that only touch, as neighbours do, do not cross."""
+    """Return whether two edges cross. Edges that only touch, as neighbours do, do not cross."""
     return _turn(a, b, c) * _turn(a, b, d) < 0 and _turn(c, d, a) * _turn(c, d, b) < 0

@@ -47,7 +47,7 @@ class GuardError(UserError):
 
 @dataclass(frozen=True)
 class Parameter:
-    """A value that operators set. `loads`: it is in the text, so a new value needs a load."""
+    """A value that operators set."""
 
     name: str
     kind: str
@@ -57,6 +57,7 @@ class Parameter:
     most: str = ""
     what: str = ""
     loads: bool = False
+    """Whether it is part of the text, so that a new value loads the guard again."""
 
     def checked(self, value: str) -> str:
         if self.kind == "bool":
@@ -117,11 +118,13 @@ _FROM = Parameter(
 
 @dataclass(frozen=True)
 class Preset:
-    """The rows of each topic that has several types, and the parameters in the text."""
+    """A reviewed text in `FOLDER`."""
 
     name: str
     topics: Mapping[str, Mapping[str, TypeRow]]
+    """The rows of each topic with several types."""
     further: tuple[Parameter, ...] = ()
+    """The parameters that are part of the text."""
 
     @functools.cached_property
     def text(self) -> str:
@@ -191,11 +194,12 @@ DRIVER_CHECK = Preset("driver_check", {**_MOVES, "by": types.MOTIONS})
 
 @dataclass(frozen=True)
 class Guard:
-    """For each given topic, the topic and the type of its messages."""
+    """A guard to make."""
 
     name: str
     preset: Preset
     topics: Mapping[str, str] = field(default_factory=dict)
+    """The topics that are given to the preset, by its names for them; `types` has their message types."""
     types: Mapping[str, str] = field(default_factory=dict)
     values: Mapping[str, str] = field(default_factory=dict)
 
@@ -253,7 +257,7 @@ def _made_for(text: str) -> Iterator[tuple[str, str, str]]:
 
 
 def loaded_values(text: str) -> dict[str, str]:
-    """Return the values that are in the text, not given."""
+    """Return the values of the parameters that are part of the text."""
     preset = preset_of(text)
     return {one.name: _in_text(text, one) for one in (preset.parameters if preset else ()) if one.loads}
 

@@ -16,7 +16,7 @@ _SCAN_OF_A_CAMERA = re.compile(r"camera|depth", re.IGNORECASE)
 
 
 class TopicFacts(NamedTuple):
-    """The type of a topic, the nodes at both ends, and messages a second."""
+    """A topic with its type, the nodes at both ends, and its messages per second."""
 
     name: str
     type: str
@@ -27,12 +27,13 @@ class TopicFacts(NamedTuple):
 
 @dataclass(frozen=True)
 class Proposal:
-    """`measured` are values from the present rates, and all others are defaults."""
+    """A guard that fits the graph."""
 
     preset: str
     name: str
     topics: Mapping[str, str]
     measured: Mapping[str, str] = field(default_factory=dict)
+    """Values from present rates; `values` are others that fit the topics."""
     values: Mapping[str, str] = field(default_factory=dict)
 
     @property
@@ -50,7 +51,7 @@ class Proposal:
 
 
 def proposals(graph: Iterable[TopicFacts]) -> list[Proposal]:
-    """Return the guards in the order in which they act."""
+    """Return guards for all topics that command a base or an arm, in the order in which they act."""
     topics = list(graph)
     bases = [one for one in topics if one.type in types.VELOCITIES and _commands_a_base(one, topics)]
     arms = [one for one in topics if one.type in types.TRAJECTORIES and one.subscribers]
@@ -116,7 +117,7 @@ def _sources(
     prefer: "re.Pattern[str] | None" = None,
     avoid: "re.Pattern[str] | None" = None,
 ) -> list[TopicFacts]:
-    """Topics in the namespace of the command come first."""
+    """Return the topics with publishers and such a type. Topics near the command's namespace come first."""
     found = [one for one in topics if one.type in rows and one.publishers and not _COMMAND.search(one.name)]
 
     def order(one: TopicFacts) -> tuple[bool, bool, int, str]:

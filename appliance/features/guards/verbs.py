@@ -292,7 +292,7 @@ def _say_changed(appliance: Appliance, body: Replacement) -> None:
 
 
 def _folder(appliance: Appliance, loaded: Monitors) -> Path | None:
-    """Return None over REST, whose folder may be on another machine."""
+    """Return the folder of specifications, or None. Over REST it may be on another machine."""
     if loaded.folder is None or appliance.place is not None:
         return None
     return Path(loaded.folder) if Path(loaded.folder).is_dir() else None
