@@ -116,7 +116,7 @@ DENIALS: dict[str, str | Callable[[AuditRecord], DecidedRequest]] = {
     "tunnel refused": "a tunnel needs a valid certificate of this appliance (rosrv host list)",
     "packets refused": "replayed packets, and packets with the address of another host, are never accepted",
 }
-"""The functions that derive the request from a record, or why no policy would allow it, by event.
+"""By event, the function that derives the request from a record, or the reason why no policy would allow it.
 
 Every event that can be a denial has a row.
 """

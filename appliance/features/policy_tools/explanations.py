@@ -32,7 +32,10 @@ _GRANTED = (
 
 
 def granted(record: AuditRecord, current: PolicyKnown, *, whole_tool: bool = False) -> Granted:
-    """`whole_tool`: the change also has all other rights that the stock tool of the record needs."""
+    """Return the change that would allow a denied request, or raise `UngrantableError`.
+
+    With `whole_tool`, the change also has all other rights that the stock tool of the record needs.
+    """
     known, asked = PolicyContext.of(msgspec.structs.asdict(current)), asked_of(record)
     tool = stock_tool(asked.request.caller_id)
     if whole_tool:
@@ -59,7 +62,7 @@ def explained(
     in_full: LogEntry | None = None,
     host_in_words: HostInWords = str,
 ) -> Why:
-    """`in_full`: the record that a record of repetitions continues."""
+    """Explain a record. `in_full` is the record that a record of repetitions continues."""
     found, refusal = None, ""
     try:
         if current is not None:

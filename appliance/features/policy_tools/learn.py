@@ -30,15 +30,14 @@ _SHOWN_NODES = 3
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """A recorded request that passed, perhaps with an approval (`asked`).
-
-    `key` is the parameter of the call on the wire.
-    """
+    """A recorded request that passed."""
 
     request: Request
     call: str = ""
     key: str = ""
+    """The parameter of the call on the wire."""
     asked: bool = False
+    """Whether it passed with an approval."""
 
 
 @dataclass(slots=True)

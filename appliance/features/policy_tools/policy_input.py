@@ -43,7 +43,7 @@ Enrolled = Annotated[
 
 
 def read_text(file: Path) -> str:
-    """Invalid UTF-8 becomes U+FFFD, which policies allow only in comments."""
+    """Return the text of a file. Invalid UTF-8 becomes U+FFFD, which policies allow only in comments."""
     try:
         return read_given_text(file, errors="replace")
     except OSError as error:
@@ -148,7 +148,7 @@ def live_now(appliance: Appliance) -> list[LiveRight]:
 
 
 def requests_of_audit_log(appliance: Appliance) -> Iterator[Request]:
-    """Leave out folded records, which do not name their requests."""
+    """Yield the decided requests, except those of folded records, which do not name their requests."""
     decided = Filter(decision=("allow", "deny", "would deny"))
     try:
         for entry in appliance.audit().export(decided):

@@ -14,17 +14,16 @@ from appliance.policy.rights import decide, decide_right, rights_of
 
 @dataclass(frozen=True, slots=True)
 class HostAnswer:
-    """An answer for some hosts; `network` is None for hosts that no network of the policy contains.
-
-    `through` are the words of the deciding rule. `near`: only another right is missing, such as the right to the
-    command.
-    """
+    """An answer for some hosts."""
 
     network: Network | None
+    """None: all hosts that no network of the policy contains."""
     names: tuple[str, ...]
     decision: Decision
     through: tuple[str, ...]
+    """The words of the deciding rule."""
     near: bool
+    """Whether only another right is missing, such as the right to the command."""
 
     @property
     def hosts(self) -> str:
