@@ -29,7 +29,7 @@ _U32, _U64, _STAMP = struct.Struct("<I"), struct.Struct("<Q"), struct.Struct("<I
 
 
 class MessagePosition(NamedTuple):
-    """A position; `chunk` is an offset in the file, `offset` one in the chunk."""
+    """The position of a message: `chunk` is an offset in the file, `offset` in the chunk."""
 
     time: int
     chunk: int
@@ -79,7 +79,7 @@ class BagReader:
     @classmethod
     @contextmanager
     def of(cls, path: Path) -> Iterator[Self]:
-        """Raise `OSError` and `ValueError`, even while the bag is read in the block."""
+        """Open a bag. Raise `OSError` or `ValueError`, even while the bag is read in the block."""
         with path.open("rb") as file:
             try:
                 yield cls(file)

@@ -1,4 +1,4 @@
-"""Make the recorder's part of control: plan, orders, and the link to the process."""
+"""Build the recorder's part of control: plan, orders, and the link to the process."""
 
 from typing import Any
 
@@ -13,7 +13,6 @@ from appliance.features.recorder.settings import RecorderRules
 
 
 def make(core: FeatureContext) -> FeaturePart:
-    """The recorder checks its own disk space, so its orders need no room in the store."""
     rules = core.sections.of(RecorderRules)
     plan = RecordingPlan(rules, core.charged_to, IdSource().next)
     orders = RecordingOrders(rules, core.trail, core.in_force, plan)
@@ -28,6 +27,7 @@ def make(core: FeatureContext) -> FeaturePart:
 
 
 def request_methods(orders: RecordingOrders) -> tuple[RequestMethod[Any], ...]:
+    """Orders are accepted on a full disk, because the recorder checks its own disk space."""
     return (
         RequestMethod(recording_requests.RecordingsWanted, orders.recordings),
         RequestMethod(recording_requests.RecordingWanted, orders.recording),

@@ -1,8 +1,7 @@
 """Exclude topics from recordings: `recorder.never` has globs for names of topics and types.
 
-A type is only a claim of the publisher. A topic whose md5sum differs from the known definition is recorded
-anyway. A claim with the right md5sum may still be false, so each recording lists the topics that it left out
-because of one.
+A type is only a claim of the publisher. A topic whose md5sum differs from the known definition is recorded anyway. A
+claim with the right md5sum may still be false, so each recording lists the topics that were left out by type.
 """
 
 from collections.abc import Collection, Iterable, Mapping

@@ -15,7 +15,10 @@ _OF_SENDER = ("md5sum", "callerid", "host", "latching")
 
 
 def as_mcap(bag: Path) -> Iterator[bytes]:
-    """The bag may be removed during the iteration. Raises `OSError`, and `ValueError` for an invalid bag."""
+    """Yield the file in pieces; the bag may be removed in the meantime.
+
+    Raise `OSError`, or `ValueError` for an invalid bag.
+    """
     opened = ExitStack()
     return _pieces(opened, opened.enter_context(BagReader.of(bag)))
 

@@ -252,7 +252,7 @@ def remove(appliance: Appliance, recording: _Id) -> None:
 
 
 def bag_of(appliance: Appliance, recording: str, part: Path) -> Path:
-    """Record the request. Over REST, write the bag to `part`."""
+    """Return the bag's path once the request is recorded. Over REST, the bag is written to `part`."""
     way = appliance.way
     if isinstance(way, AdminSocket):
         return _bag(way, appliance.ask_or_exit(recording_requests.RecordingFetch(recording)))

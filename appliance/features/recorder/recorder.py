@@ -200,7 +200,7 @@ class Recorder:
         return found
 
     def _begin_to_follow(self) -> Follower:
-        """Begin at the start of the memory, because an earlier recorder may not have read the log so far."""
+        """Begin `before` seconds ago, because an earlier recorder may not have read the log to its end."""
         since = max(self._memory, self._clock() - int(self._rules.before * _SECOND))
         first = search(self._log, Filter(since=since), "0", 1, newest_first=False).entries
         self._follower = Follower(self._log, Filter(), first[0].sequence - 1 if first else None)

@@ -71,7 +71,7 @@ def require_recorded(known: Recordings, topics: Mapping[str, str]) -> None:
 
 @contextmanager
 def pieces_of(appliance: Appliance, known: Recordings, span: Span) -> Iterator[list[Piece]]:
-    """The files stay open in the block, so that a recording that is removed remains readable."""
+    """Yield the bags that cover the span. They stay open in the block, so a removed recording remains readable."""
     found: list[tuple[Span, Recording]] = []
     for row in sorted(known.recordings, key=lambda row: row.began):
         since = max(row.began, found[-1][0].until + 1 if found else span.since)
@@ -138,7 +138,7 @@ def _cover(
 
 
 def gaps(parts: Sequence[Span], span: Span) -> Iterator[Span]:
-    """The parts must be in order."""
+    """Yield the periods of `span` that no part covers. The parts must be in order."""
     at = span.since
     for part in parts:
         if part.since > at:

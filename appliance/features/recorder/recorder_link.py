@@ -1,4 +1,4 @@
-"""The link control <-> recorder, and the terms of the shared memory of relays and recorder."""
+"""The messages between control and the recorder, and the terms of the memory that relays and recorder share."""
 
 import msgspec
 
@@ -7,22 +7,20 @@ from appliance.features.recorder.recording_answers import OpenRecording, Recordi
 
 
 class RingTerms(msgspec.Struct, frozen=True):
-    """The terms of the memory of relay `index`, made at `since` (nanoseconds since the epoch).
-
-    `never` has globs for topics and types. `sums` lists the known md5sums of such types; a topic that claims one
-    must have its md5sum.
-    """
+    """The terms of the memory of relay `index`, made at `since` (nanoseconds since the epoch)."""
 
     index: int
     since: int
     seconds: float
     topics: list[str]
     never: list[str]
+    """Globs for topics and types."""
     sums: dict[str, str] = msgspec.field(default_factory=dict)
+    """The known md5sums of excluded types. A topic with another md5sum is recorded."""
 
 
 class RecordingsAsked(Message, frozen=True):
-    """Control asks for the list, and for a new report of what it has not noted."""
+    """Control asks for all recordings, and for the reports that it has not noted."""
 
 
 class RecordingsStated(Message, frozen=True):
@@ -43,7 +41,7 @@ class RevisionsWanted(Message, frozen=True):
 
 
 class RevisionsStated(Message, frozen=True):
-    """The revisions in force."""
+    """The revisions of policy and specifications in force."""
 
     policy: int
     monitors: int
@@ -62,7 +60,7 @@ class RecordingNoted(Message, frozen=True):
 
 
 class RecordingRequested(Message, frozen=True):
-    """Control asks for a recording around a trigger, in seconds."""
+    """Control asks for a recording from `before` to `after`: seconds before and after a trigger."""
 
     number: int
     trigger: Trigger
@@ -113,7 +111,7 @@ class MemoryLent(Message, frozen=True):
 
 
 class RecordingRefused(Message, frozen=True):
-    """The recorder refuses a request; `unknown`: there is no such recording."""
+    """The recorder refuses a request. `unknown` is true if there is no such recording or period."""
 
     number: int
     reason: str
@@ -121,14 +119,12 @@ class RecordingRefused(Message, frozen=True):
 
 
 class RecordingMissed(Message, frozen=True):
-    """A trigger made no recording; only some are reported.
-
-    `planned` is the recording that the trigger's audit record promised.
-    """
+    """A trigger made no recording; only some are reported."""
 
     trigger: Trigger
     reason: str
     planned: str = ""
+    """The recording that the trigger's audit record promised."""
 
 
 RecorderLink = (

@@ -19,9 +19,9 @@ _NOTHING = memoryview(b"")
 
 
 class RecorderRing:
-    """Writes after the data of the previous process.
+    """Continues after the data of the previous process.
 
-    A message has the time at which monitors judged it, so that a replay judges it at the same time.
+    A message gets the time at which monitors judged it, so that a replay judges it at the same time.
     """
 
     def __init__(self, given: RingTerms, descriptor: int, now: Callable[[], int]) -> None:

@@ -56,22 +56,22 @@ class TopicCount(msgspec.Struct):
 
 
 class Progress(msgspec.Struct):
-    """The progress of a recording; times are nanoseconds since the epoch.
-
-    `memory` is when the rings were created. For each ring, `places` has the position in each stream, `following`
-    the number of each stream's next message, and `not_there` the losses before the recording.
-    """
+    """The progress of a recording; times are nanoseconds since the epoch."""
 
     id: str
     memory: int
+    """The time when the rings were created."""
     began: int
     ends: int
     triggers: list[Trigger]
     size: int = 0
     connections: list[dict[str, str]] = []
     places: list[dict[int, ReadPosition]] = []
+    """For each ring, the position in each stream."""
     following: list[dict[int, int]] = []
+    """For each ring, the number of each stream's next message."""
     not_there: list[tuple[int, int]] = []
+    """For each ring, the losses before the recording."""
     topics: list[TopicCount] = []
     torn: list[str] = []
     unconnected: int = 0
@@ -79,7 +79,7 @@ class Progress(msgspec.Struct):
     why_not: str = ""
     charged_to: str = OPERATORS
     hold: int = 0
-    """The time that an act extends the recording, in nanoseconds."""
+    """An act extends the recording to this number of nanoseconds after it."""
     latest: int = 0
     left_out: list[LeftOutTopic] = []
     claims: int = 0

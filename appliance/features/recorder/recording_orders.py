@@ -38,7 +38,7 @@ _M = TypeVar("_M", recorder_link.RecordingStarted, recorder_link.RecordingRemove
 
 
 class RecordingOrders:
-    """Operators' orders; they raise `UnavailableError`, `UnknownThingError` and `SenselessError`."""
+    """Answers operators and nodes. Requests raise `UnavailableError`, `UnknownThingError` and `SenselessError`."""
 
     def __init__(
         self,
@@ -115,7 +115,7 @@ class RecordingOrders:
     async def _begin(
         self, what: TriggerKind, reason: str, text: str, who: str, span: tuple[float, float], **caller: Any
     ) -> recorder_link.RecordingStarted:
-        """`span` is seconds before and after now."""
+        """Record the order, and let the recorder begin. `span` is seconds before and after now."""
         before, after = span
         record = self._trail.happened(
             "recording ordered", reason, who=who, before=before, after=after, **caller
@@ -133,7 +133,7 @@ class RecordingOrders:
         return await self._given_out(request.id, "recording fetched", f"by {who}", who)
 
     async def read(self, request: recording_requests.RecordingRead, who: str) -> Recording:
-        """Repetitions within a few seconds are only counted."""
+        """Record who reads messages. Repetitions within a few seconds are only counted."""
         topics = request.topics
         if len(topics) > _MOST_TOPICS or any(len(topic) > _LONGEST_NAME for topic in topics):
             raise SenselessError(f"at most {_MOST_TOPICS} topics at once, of {_LONGEST_NAME} characters each")

@@ -50,10 +50,9 @@ class RecordingSpan:
 def span(
     rules: RecorderRules, now: int, ended: int, before: float | None = None, after: float | None = None
 ) -> RecordingSpan:
-    """The host's last recording ended at `ended`.
+    """Return the span of a recording that an act at `now` begins. The host's last recording ended at `ended`.
 
     `before` and `after` are the seconds of an order, whose period may overlap the last recording.
-
     """
     began = now - int((rules.before if before is None else before) * _SECOND)
     hold = int((rules.after if after is None else after) * _SECOND)
@@ -64,10 +63,12 @@ def span(
 
 
 class HourlyLimit:
-    """At most `most` recordings an hour for each host and kind of trigger."""
+    """At most `most` recordings an hour for each host and kind of trigger.
+
+    The recordings in `kept` count, so a restart does not reset the limit.
+    """
 
     def __init__(self, most: int, kept: Iterable[Recording]) -> None:
-        """Count the recordings in `kept`, so that a restart does not reset the limit."""
         self._most = most
         self._begun: dict[tuple[str, str], deque[int]] = {}
         for recording in kept:
@@ -170,7 +171,7 @@ class RecordingPlan:
             del self._ended[next(iter(self._ended))]
 
     def missed(self, charged_to: str, recording_id: str, why: str, now: int) -> None:
-        """Acts in the next minute get the same reason."""
+        """End a recording that the recorder could not make. Acts in the next minute get the same reason."""
         self._close(recording_owner(charged_to), recording_id)
         self._obstacle = why, now + 60 * _SECOND
 

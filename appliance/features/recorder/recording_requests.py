@@ -81,7 +81,7 @@ class RecordingRead(WaitingRequest[Recording], frozen=True, tag="recording read"
     problems=_NO_RECORDING,
 )  # fmt: skip
 class RecordingOfMemory(WaitingRequest[Recording], frozen=True, tag="recording memory"):
-    """Make a recording of the data in memory, which can be fetched for ten minutes, or until the next such request."""
+    """Make a recording of the data in memory, which can be fetched for ten minutes, or until four later requests."""
 
     since: int | None = None  # nanoseconds since the epoch; None: all that there is
     until: int | None = None

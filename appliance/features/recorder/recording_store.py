@@ -4,13 +4,12 @@ A removed recording stays as `.ID.gone/`, without its bag, until its removal is 
 garbage.
 
 1. A folder is renamed to its recording's id only when its whole content is on disk.
-2. Recordings never exceed `disk` bytes: room for the largest possible one is made before one begins. Hosts other
+2. Recordings never exceed `disk` bytes: room for the largest possible recording is made before it begins. Hosts other
    than the robot have at most three quarters, each a quarter, and never replace recordings of the robot or of
-   operators. The first to be removed is the oldest of the kind of trigger that uses the most bytes. Descriptions
-   are limited, because control gets all of them in one message.
+   operators. The first to be removed is the oldest of the kind of trigger that uses the most bytes.
 3. The file `noted` marks a recording that is in the audit log. Other recordings are reported again.
-4. The file `lent` marks a temporary recording, which does not count in `disk`. A further one replaces the oldest,
-   unless its reader may not have opened it yet.
+4. The file `lent` marks a temporary recording, which does not count in `disk`. A new one replaces the oldest of
+   `MOST_TEMPORARY`, unless its reader may not have opened it yet.
 5. Whenever the recorder dies, a recording either still exists, or its removal is reported: the folder is renamed
    atomically before anything in it is removed.
 """
@@ -33,7 +32,7 @@ MOST_KEPT = 500
 TEMPORARY_SECONDS = 600
 MOST_TEMPORARY = 4
 _OPENING_SECONDS = 30
-_MOST_DESCRIBED = 32 << 20
+_MOST_DESCRIBED = 32 << 20  # bytes; control gets all descriptions in one message
 _NOTED, _TEMPORARY, _REMOVED, _SINCE = "noted", "lent", "removed", "since"
 _ID = re.compile(r"[0-9a-f]{20}")
 _PART, _GONE, _REST = (re.compile(rf"\.([0-9a-f]{{20}})\.{kind}") for kind in ("part", "gone", "rest"))
@@ -185,8 +184,8 @@ class RecordingStore:
     def in_the_way(self, charged_to: str, making: Sequence[str] = ()) -> tuple[Recording | None, str]:
         """Return the next recording to remove in favour of a new one of this host, and the reason.
 
-        None with a reason: none may be removed; None without one: there is room. `making` has the hosts of the
-        recordings in progress.
+        A reason without a recording means that none may be removed. Without either there is room. `making` has the
+        hosts of the recordings in progress.
         """
         held = self._sizes(lambda found: found.charged_to)
         held.update({name: number * self.largest for name, number in Counter((*making, charged_to)).items()})

@@ -4,20 +4,20 @@ One relay writes the memory, and one recorder reads it. Each connection to a pub
 header blocks (the connection's TCPROS header) and a chain of data blocks, numbered from 0. The data are records,
 which may span blocks: number of frames, size in bytes, time, number of the first frame, frames.
 
-1. A block is valid up to `used`, which is stored after the data, and its row while the word `birth` is not 0,
-   which is stored last. So a writer that is killed at any instruction leaves at most one torn record at the end
-   of a chain, which the reader ignores.
+1. A block is valid up to `used`, which is stored after its data. A row is valid while `birth`, which is stored last,
+   is not 0. So a writer that is killed at any instruction leaves at most one torn record at the end of a chain, which
+   the reader ignores.
 2. Before a block is reused, its `birth` is set to 0. The reader discards a copy if `birth` has changed.
-3. Without a free block, the first of these is reused: the oldest block, if it is too old; the oldest of the
-   writing topic or host, if that has used its quota; the oldest of a topic or host above its quota; the oldest of
-   all. A block that an active stream is filling counts as new.
+3. Without a free block, the first of these is reused: the oldest block, if it is too old; the oldest of the writing
+   topic or host, if that has used its quota; the oldest of a topic or host above its quota; the oldest of all. A
+   block that an active stream is filling counts as new.
 4. The reader trusts no content: it bounds every number by the memory's own size.
 5. Header blocks take at most a quarter of the memory, and of the quota of a host. A new header replaces closed
    streams, the oldest first. Streams without room are counted (`REFUSED`), and so are messages in a record larger
    than its topic's quota (`MISSED`).
 
-`used` and `birth` are aligned words of 64 bits. If the processor reorders stores (ARM), the reader may see a
-record's data only at its next check.
+`used` and `birth` are aligned words of 64 bits. If the processor reorders stores (ARM), the reader may see a record's
+data only at its next check.
 """
 
 import struct
@@ -82,7 +82,7 @@ class BlockRow(NamedTuple):
 
     @property
     def sound(self) -> bool:
-        """The numbers of a compromised writer must not overflow a word."""
+        """Return whether the numbers are possible: those of a compromised writer must not overflow a word."""
         return (
             0 < self.birth < _MOST_NUMBER
             and 0 < self.stream < _MOST_NUMBER
@@ -146,7 +146,7 @@ class RingStream:
         self._used = 0  # the index of the block's word
 
     def write(self, frames: memoryview, messages: int, first: int, judged: int = 0) -> None:
-        """`first` is the first frame's number, `judged` the time when monitors got the frames, or 0."""
+        """Append a record of frames from number `first`. `judged` is the time when monitors got them, or 0."""
         ring = self._ring
         size = len(frames)
         now = self.written = ring.clock(judged)
@@ -201,19 +201,16 @@ class RingStream:
 
 
 class RingWriter:
-    """Writes shared memory, and keeps the data of earlier writers.
-
-    `topic_share` and `host_share` are what one topic and one host may keep when others need it. Blocks older than
-    `seconds` are reused first.
-    """
+    """Writes shared memory, and keeps the data of earlier writers."""
 
     def __init__(
         self,
         memory: memoryview,
         *,
+        # The fractions that one topic and one host may keep when others need memory.
         topic_share: float,
         host_share: float,
-        seconds: float,
+        seconds: float,  # older blocks are reused first
         clock: Callable[[int], int] = lambda judged: judged or clock.wall_ns(),
     ) -> None:
         self.geometry = geometry(len(memory))
@@ -293,7 +290,7 @@ class RingWriter:
             self._forget(stream, chain)
 
     def _give_up(self, chain: _Chain, old: int) -> None:
-        """Blocks written before the time `old` are too old (invariant 3)."""
+        """Free a block by invariant 3. A block written before the time `old` is too old."""
         oldest = self._oldest(old)
         if self._order[oldest][1] >= old or self._in_use(oldest, old):
             full = (share for share in chain.shares if len(share.blocks) >= share.most)
@@ -302,7 +299,7 @@ class RingWriter:
         self._push_out(oldest)
 
     def _in_use(self, block: int, old: int) -> bool:
-        """A slow stream may have all its data in the block."""
+        """Return whether an active stream is filling the block, which may have all data of a slow stream."""
         writer = self._chains[self._order[block][0]].writer
         return writer is not None and writer.block == block and writer.written >= old
 

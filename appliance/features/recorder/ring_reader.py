@@ -48,12 +48,13 @@ class RecordedFrames(NamedTuple):
 
 
 class StreamFrames(NamedTuple):
-    """The batches of a stream; `torn`: frames before or between them were overwritten or are damaged."""
+    """The batches of a stream."""
 
     stream: int
     header: dict[str, str]
     batches: list[RecordedFrames]
     torn: bool
+    """Whether frames before or between the batches were overwritten or are damaged."""
 
 
 @dataclass(slots=True)
@@ -78,8 +79,10 @@ class RingReader:
         return self._words[MISSED], self._words[REFUSED]
 
     def read(self, since: int, until: int) -> Iterator[StreamFrames]:
-        """A message after `until` (ns since the epoch) is left for a later call, but skipped if the stream
-        continues with an earlier one, because then the clock was set back.
+        """Yield the new frames of each stream, up to `until` (ns since the epoch).
+
+        A later message is left for another call, but skipped if an earlier one follows it: then the clock was set
+        back.
         """
         headers: dict[int, _Blocks] = {}
         data: dict[int, _Blocks] = {}
@@ -109,7 +112,7 @@ class RingReader:
         return _readable(header) if header.keys() >= _NEEDED else None
 
     def _copy(self, block: int, row: BlockRow) -> bytes | None:
-        """The current `used` applies: while the table was copied, the block may have been filled."""
+        """Copy a block up to its current `used`, because it may have been filled while the table was copied."""
         start = self._geometry.data + block * self._geometry.block
         part = bytes(self._memory[start : start + min(self._words[used_at(block)], self._geometry.block)])
         return part if self._words[birth_at(block)] == row.birth else None

@@ -1,7 +1,7 @@
 """Keep the memory (rings) in which relays store the last messages; the memory survives a relay.
 
 The recorder gets read-only descriptors, and no process can shrink a ring, so reading never fails. All memory is
-allocated at the start, so a lack shows then and not during an incident, and a relay never waits for pages.
+allocated at the start: a shortage shows then, not during an incident, and a relay never waits for pages.
 """
 
 import fcntl

@@ -106,9 +106,10 @@ def timeline(
 ) -> Timeline:
     """Return the timeline; `since` and `until` are ns since the epoch.
 
-    It lists the first events, or those around the event of the audit record with the id `record`. `log` is the
-    audit log, for repetitions that it counted only after the recording's end. Raises `OSError`,
-    `LogUnreadableError`, and `ValueError`.
+    It lists the first events, or those around the event of the audit record with the id `record`. `log` is the audit
+    log, for repetitions that it counted only after the recording's end.
+
+    Raise `OSError`, `LogUnreadableError`, or `ValueError`.
     """
     start = recording.began if since is None else max(since, recording.began)
     end = recording.ended if until is None else min(until, recording.ended)
@@ -304,11 +305,10 @@ def _last_until(reader: BagReader, time: int, wanted: Collection[int]) -> Messag
 def _place_of_record(
     reader: BagReader, recording: Recording, record: str, wanted: Collection[int]
 ) -> MessagePosition | int:
-    """Return the record's time if the bag lacks the message.
+    """Return the position of the message that a record is about, or the record's time if the bag lacks it.
 
-    A record of a monitor and its message have the same time. So have messages that were received together, so
+    A monitor's record has the time of its message. Messages that were received together also have the same time, so
     their first bytes are compared as well.
-
     """
     said, time = next((found for found in _records(reader) if found[0].id == record), (None, 0))
     if said is None:
