@@ -132,10 +132,9 @@ def _last(appliance: Appliance) -> int | None:
 
 
 def _recorded(appliance: Appliance, before: int, caller: str, refusal: str) -> bool:
-    """The record follows the sequence `before`, or has the id in `refusal`.
+    """Return whether the log has the call: a record after the sequence `before`, or with the id in `refusal`.
 
-    Raises `LogUnreadableError` or `NotRunningError` if the last query failed.
-
+    Raise `LogUnreadableError` or `NotRunningError` if the last query failed.
     """
     source, deadline, pause = appliance.audit(), clock.now() + _RECORD_SECONDS, _FIRST_PAUSE
     while True:

@@ -31,7 +31,7 @@ _CHARON = Path("/usr/sbin/charon-systemd")
 
 
 def machine(settings: Settings, *, running: bool) -> Iterator[SelftestFinding]:
-    """`running`: an appliance with these settings already uses its ports."""
+    """Check this machine. `running` is whether an appliance with these settings already uses its ports."""
     yield from run_check("python", _python)
     yield from run_check("programs", _programs)
     yield from run_check("users", _users)

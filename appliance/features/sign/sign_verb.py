@@ -63,7 +63,7 @@ def _private(file: Path) -> Ed25519PrivateKey:
 
 
 def _text(file: Path) -> str:
-    """The appliance requires UTF-8 with LF."""
+    """Read a file to sign, which must be UTF-8 with LF, as the appliance requires."""
     try:
         text = read_given(file).decode("utf-8")
     except OSError as error:
