@@ -1,8 +1,8 @@
 """Verify an ID token (OpenID Connect Core 1.0, 3.1.3.7). No I/O; the time is a parameter.
 
-Only a key of the provider that fits the token's algorithm verifies it: the kind, the curve, the use. `jwk`, `jku`
-and `x5u` in the token are ignored, and a symmetric key is never used. Issuer, audience, nonce, subject, expiry
-and time of issue are required.
+Only a key of the provider that fits the token's algorithm in kind, curve and use verifies it. `jwk`, `jku` and `x5u`
+in the token are ignored, and a symmetric key is never used. Issuer, audience, nonce, subject, expiry and time of
+issue are required.
 """
 
 import base64

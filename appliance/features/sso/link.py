@@ -1,4 +1,4 @@
-"""The link control <-> sso."""
+"""The messages between control and the process `sso`."""
 
 import msgspec
 
@@ -7,7 +7,7 @@ from appliance.channel.messages.message import Message
 
 
 class SessionKeys(msgspec.Struct, frozen=True):
-    """A session's id, which a browser chose, and the verifiers of its keys, as of a token."""
+    """A session's id, which a browser chose, and the verifiers of its keys."""
 
     id: str
     reading: bytes
@@ -15,26 +15,27 @@ class SessionKeys(msgspec.Struct, frozen=True):
 
 
 class SignedInPerson(msgspec.Struct, frozen=True):
-    """A person; `ends` is seconds since the epoch.
-
-    `subject` is the provider's `sub`. `mail` is empty unless it is verified. `doors` are groups of doors.
-    """
+    """A person; `ends` is seconds since the epoch."""
 
     subject: str
+    """The provider's `sub`."""
     name: str
     mail: str
+    """Empty unless it is verified."""
     role: TokenRole
     doors: tuple[str, ...]
+    """Groups of doors."""
     ends: float
 
 
 class SignOnWanted(Message, frozen=True):
-    """A browser begins to sign in; `again`: the person must prove who they are again."""
+    """A browser begins to sign in."""
 
     number: int
     keys: SessionKeys
     address: str
     again: bool
+    """Whether the person must prove who they are again."""
 
 
 class SignOnBegun(Message, frozen=True):
@@ -64,11 +65,12 @@ class SignOnConfirmed(Message, frozen=True):
 
 
 class SignOnFailed(Message, frozen=True):
-    """The sign-on failed; `refused`: the person or the browser is not accepted, otherwise the provider fails."""
+    """The sign-on failed."""
 
     number: int
     reason: str
     refused: bool
+    """Whether the person or the browser is not accepted; otherwise the provider fails."""
 
 
 SsoLink = SignOnWanted | SignOnBegun | SignOnReturned | SignOnConfirmed | SignOnFailed

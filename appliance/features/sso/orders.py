@@ -24,7 +24,7 @@ _TEXT = 500
 
 
 class SsoOrders:
-    """Operators' and browsers' requests; `changed()` is called when the usable sessions have changed."""
+    """Answers operators and browsers. `changed()` is called when the usable sessions have changed."""
 
     def __init__(self, trail: AuditTrail, changed: Callable[[], None], *, configured: bool) -> None:
         self.link = Link(self._received)

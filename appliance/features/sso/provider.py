@@ -1,8 +1,8 @@
 """Fetch the provider's endpoints and keys, and bound their age.
 
 1. A discovery document of another issuer is not used (OpenID Connect Discovery 1.0, 4.3).
-2. Keys are fetched for each ID token, so an added or withdrawn key counts at once. While the provider serves
-   none, the last ones are used for `keys_seconds`.
+2. Keys are fetched for each ID token, so an added or withdrawn key counts at once. While the provider serves no keys,
+   the last ones are used for `keys_seconds`.
 """
 
 import json

@@ -42,7 +42,7 @@ Exchange = Callable[[str, str, Headers, bytes], Awaitable[ProviderAnswer]]
 
 
 class ProviderConnection:
-    """Each exchange has its own connection."""
+    """Sends requests to the provider, each on its own connection."""
 
     def __init__(self, wanted: Sso) -> None:
         self._wanted = wanted

@@ -21,7 +21,7 @@ _PORTS = {"https": 443, "http": 80}
 
 
 def origin_of(url: str) -> Origin:
-    """Raise `ValueError` for `http` except on the loopback."""
+    """Return the origin of a URL, or raise `ValueError`: `http` is accepted only on the loopback."""
     try:
         parts = urlsplit(url)
         port = parts.port or _PORTS.get(parts.scheme, 0)

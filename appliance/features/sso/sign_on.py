@@ -1,10 +1,10 @@
 """Carry out sign-ons: OpenID Connect, authorization code with PKCE (RFC 7636, RFC 9700).
 
 1. Each sign-on has its own random state, nonce and code verifier. A state is accepted once.
-2. The keys of the browser's session are bound to the sign-on when it begins. So a stolen code, state or URL gives
-   no other browser a session.
-3. Beyond `_MOST` sign-ons, a further one replaces the oldest of the address that has most, so that a flood from
-   one address ends only its own.
+2. The keys of the browser's session are bound to the sign-on when it begins. So a stolen code, state or URL gives no
+   other browser a session.
+3. Beyond `_MOST` sign-ons, a new one replaces the oldest of the address that has most, so a flood from one address
+   ends only its own.
 """
 
 import base64
