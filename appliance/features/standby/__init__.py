@@ -1,1 +1,1 @@
-"""Two appliances, of which the robot admits one, by a lease that the robot's own computer holds."""
+"""Two appliances, of which the robot admits one, by a lease on the robot's own computer."""

@@ -72,7 +72,9 @@ class ApplianceTable(Appliances):
         self._save(_row(key, self._endpoint, self._pin, made))
 
     async def introduce(self, other: Introduction, authority: StoredAuthority) -> None:
-        """Further introductions are ignored in the meantime: the standby repeats its own."""
+        """Certify the other appliance's tunnel key if needed. In the meantime, its repeated introductions are
+        ignored.
+        """
         if self._introducing.locked():
             return
         async with self._introducing:

@@ -36,10 +36,11 @@ class _Active(msgspec.Struct, frozen=True):
 
 
 class _Copies(msgspec.Struct, frozen=True):
-    """The stored copies of states; `at` is the time of the states (ns), 0 if the relays passed no message since."""
+    """The stored copies of states."""
 
     epoch: int
     at: int
+    """The time of the states (ns), or 0 if the relays passed no message since."""
 
 
 def _save_copies(store: StateStore, epoch: int, contents: Iterable[tuple[int, bytes]], at: int) -> None:
@@ -85,15 +86,16 @@ async def leave_state(pair: Pair, store: StateStore, rollout: Rollout) -> None:
 
 
 def keep_state(store: StateStore, rollout: Rollout) -> None:
-    """The states that the relays left become void."""
+    """Void the states that relays left for a switchover, and let messages pass again."""
     store.save_setting(_COPIES, "")
     rollout.pass_again()
 
 
 class StateCopies:
-    """Copies the states of monitors for an unplanned takeover; `followed()`: the standby gets changes now."""
+    """Copies the states of monitors for an unplanned takeover."""
 
     def __init__(self, pair: Pair, store: StateStore, rollout: Rollout, followed: Callable[[], bool]) -> None:
+        # `followed()` returns whether the standby gets changes now.
         self._epoch = pair.epoch
         self._store = store
         self._rollout = rollout
@@ -106,7 +108,7 @@ class StateCopies:
             await asyncio.sleep(await self.copy_once())
 
     async def copy_once(self) -> float:
-        """Return the seconds until the next time."""
+        """Copy the changed states, and return the seconds until the next copy."""
         if not self._rollout.has_state() or not self._followed():
             self._void()
             return _COPY_SECONDS

@@ -22,10 +22,7 @@ _SHUT = "rosrv-witness-shut.service"
 
 @dataclass(frozen=True, kw_only=True)
 class PairPlan:
-    """The decisions of an operator; `address` and `name` are those of the appliance that has all data.
-
-    `ports` are such as `11311` and `19001-26000`. `epoch` exceeds that of any earlier lease.
-    """
+    """The decisions of an operator; `address` and `name` are those of the appliance that has all data."""
 
     name: str
     address: str
@@ -35,8 +32,10 @@ class PairPlan:
     fixed: str
     port: int
     ports: tuple[str, ...]
+    """Ports and ranges, such as `11311` and `19001-26000`."""
     master_port: int
     epoch: int
+    """Greater than that of any earlier lease."""
     followers: Mapping[str, str]
 
 

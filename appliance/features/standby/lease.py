@@ -3,19 +3,18 @@
 All times are from the appliance's own clock, which must run while the machine sleeps (CLOCK_BOOTTIME); clocks are
 never compared.
 
-1. The active appliance stays active for 0.8 of an expiry after it *sent* a renewal that was granted, or a request
-   for a promise that was given. The witness and the other appliance count a whole expiry from a later time.
-2. A passive appliance becomes active only by a grant of the witness, and after the end of its promise not to
-   claim.
-3. A passive appliance gives no promise while the witness says that the lease has expired: the active appliance is
-   cut off from the robot, which then needs this one. So it asks the witness also during a promise.
+1. The active appliance stays active for 0.8 of an expiry after it *sent* a renewal that was granted, or a request for
+   a promise that was given. The witness and the other appliance count a whole expiry from a later time.
+2. A passive appliance becomes active only by a grant of the witness, and after the end of its promise not to claim.
+3. A passive appliance gives no promise while the witness says that the lease has expired: the active appliance is cut
+   off from the robot, which then needs this one. So it asks the witness even during a promise.
 4. An appliance that starts may have given a promise before, so it claims one expiry later.
 5. Only the witness makes epochs. An active appliance believes no later epoch: by 1 and 2 there is none. A passive
-   one believes it until the witness answers, unless the epoch is beyond `FARTHEST`.
-6. The active appliance answers without the standby only after the witness has removed the standby from the
-   in-sync set. It waits for the standby again before it asks the witness to add it.
-7. The active appliance also gives up if the witness answers only the other one for an expiry: otherwise a promise
-   of that one would delay its claim.
+   appliance believes it until the witness answers, unless the epoch is beyond `FARTHEST`.
+6. The active appliance answers without the standby only after the witness has removed the standby from the in-sync
+   set. It waits for the standby again before it asks the witness to add it.
+7. The active appliance also gives up if the witness answers only the other one for an expiry: otherwise a promise of
+   the other one would delay its claim.
 8. The active appliance gives its lease up only if the other one, by its promises, could claim it at once.
 """
 
@@ -52,7 +51,7 @@ class WitnessRequest:
 
 @dataclass(frozen=True)
 class WitnessAnswer:
-    """The lease after a request. `expired`: no appliance has renewed it in time."""
+    """The lease after a request."""
 
     ok: bool
     reason: str
@@ -60,6 +59,7 @@ class WitnessAnswer:
     holder: str
     in_sync: frozenset[str]
     expired: bool
+    """Whether no appliance has renewed the lease in time."""
     trouble: str = ""
 
 
@@ -74,17 +74,14 @@ class PromiseRequest:
 
 @dataclass(frozen=True)
 class ClaimPromise:
-    """The answer to a `PromiseRequest`, which it repeats.
-
-    `unheard`: the seconds since the sender's last request that the witness answered. An earlier version leaves
-    the last two fields out.
-    """
+    """The answer to a `PromiseRequest`, which it repeats. An earlier version leaves the last two fields out."""
 
     epoch: int
     session: str
     number: int
     able: bool = True
     unheard: float = 0.0
+    """The seconds since the sender's last request that the witness answered."""
 
 
 @dataclass(frozen=True)
@@ -165,7 +162,7 @@ class ApplianceLease:
         return self.held is not None and self._promised_until <= now < self._valid_until
 
     def may_be_renewed(self, now: float) -> bool:
-        """Whether a lapsed lease may be renewed in its epoch, so no other appliance was active since."""
+        """Return whether a lapsed lease may be renewed in its epoch: no other appliance can have been active since."""
         if self.held is None or self._switching_until is not None:
             return False
         return self.answers_alone or now < self._valid_until + _RENEWABLE
@@ -188,7 +185,7 @@ class ApplianceLease:
         return True
 
     def tick(self, now: float, *, waiting_since: float | None, caught_up: bool) -> Outgoing:
-        """`waiting_since`: the time of the oldest change that waits for the standby."""
+        """Return the due messages. `waiting_since` is the time of the oldest change that waits for the standby."""
         if now < self._next_round:
             return self._remove(now, waiting_since)
         self._next_round = now + RENEW_SECONDS
@@ -298,9 +295,9 @@ class ApplianceLease:
         return (self._to_witness("release", now),)
 
     def _give_up(self, now: float, *, released: bool) -> None:
-        """Tell the other appliance a round later, when the processes of this one have heard of it.
+        """Become passive. The other appliance hears of it a round later, after the processes of this one.
 
-        `released`: the witness need not be asked first.
+        With `released`, the witness need not be asked first.
         """
         self._valid_until = now
         self._next_round = now + CLAIM_SECONDS
@@ -308,7 +305,7 @@ class ApplianceLease:
         self._switching_until, self._released = now + 2 * EXPIRY, released
 
     def _is_cut_off(self, now: float) -> bool:
-        """Whether only the other appliance reaches the robot. A witness that has ended answers neither."""
+        """Return whether only the other appliance reaches the robot. A witness that has ended answers neither."""
         other = self._other_witnessed
         return (
             self.is_active(now)

@@ -22,7 +22,7 @@ class HandOverError(UnavailableError):
 
 
 class LeaseClient:
-    """The last report of the lease."""
+    """Control's view of the lease: the last report, and orders to the process `lease`."""
 
     def __init__(self) -> None:
         self.state: lease_link.LeaseState | None = None

@@ -1,8 +1,8 @@
-"""The link control <-> lease, of an appliance that is one of two (docs/standby.md).
+"""The messages between control and the process `lease` of one of two appliances (docs/standby.md).
 
-A standby in the in-sync set has every answered change. So control answers without it only after a `LeaseState`
-with `alone` and a new `permission`, and waits for it again before it reports `caught_up`, after which the witness
-may add it.
+A standby in the in-sync set has every answered change. So control answers without it only after a `LeaseState` with
+`alone` and a new `permission`, and waits for it again before it reports `caught_up`, after which the witness may add
+it.
 """
 
 from typing import Annotated
@@ -15,26 +15,27 @@ _Epoch = Annotated[int, msgspec.Meta(ge=0, lt=1 << 62)]
 
 
 class LeaseState(Message):
-    """The lease, after each change and at least once a second; times are seconds of CLOCK_BOOTTIME.
-
-    This appliance may answer until `until`; 0: it is passive. `alone`: the witness has removed the other
-    appliance from the in-sync set. `permission` counts these messages with `alone`. `answered` is the time of the
-    witness's last answer, `heard` of the other appliance's last message. `handover_obstacle` is why that one
-    could not claim now, `trouble` why the witness could not save a takeover.
-    """
+    """The lease, after each change and at least once a second; times are seconds of CLOCK_BOOTTIME."""
 
     until: float
+    """The end of this appliance's right to answer; 0: it is passive."""
     epoch: _Epoch
     alone: bool
+    """Whether the witness has removed the other appliance from the in-sync set."""
     permission: int
+    """Counts the times at which `alone` was granted."""
     in_sync: bool
     holder: str
     refusal: str
     answered: float | None
+    """The time of the witness's last answer."""
     heard: float | None
+    """The time of the other appliance's last message."""
     other_witnessed: float | None
     handover_obstacle: str
+    """Why the other appliance could not claim now."""
     trouble: str
+    """Why the witness could not save a takeover."""
 
 
 class HandOverAnswered(Message):
@@ -44,15 +45,14 @@ class HandOverAnswered(Message):
 
 
 class ReplicationReported(Message):
-    """The replication, after each change, and every 0.2 s while a change waits.
-
-    `waiting_since` is the time (CLOCK_BOOTTIME) of the oldest answer that waits for the standby; it is 0 after a
-    takeover, until the standby connects or is removed.
-    """
+    """The replication, after each change, and every 0.2 s while a change waits."""
 
     permission: int
     caught_up: bool
     waiting_since: float | None
+    """The time (CLOCK_BOOTTIME) of the oldest answer that waits for the standby; after a takeover 0, until the
+    standby connects or is removed.
+    """
 
 
 class EpochSeen(Message):
@@ -70,14 +70,11 @@ class ControlUnready(Message):
 
 
 class ControlServes(Message):
-    """Control serves, or an obstacle prevents it; this is reported repeatedly.
-
-    `keeps_state`: a monitor holds its topics if its state is lost, as it is at an unplanned takeover.
-
-    """
+    """Control serves, or an obstacle prevents it; this is reported repeatedly."""
 
     obstacle: str
     keeps_state: bool
+    """Whether a monitor holds its topics if its state is lost, as at an unplanned takeover."""
 
 
 class HandOverWanted(Message):

@@ -83,7 +83,7 @@ class LeaseWatch(ServiceGate):
             self._changes.passivate()
 
     def not_renewable(self) -> None:
-        """The next process gets the lease only in a new epoch."""
+        """Note the end of the process `lease`: its successor gets the lease only in a new epoch."""
         self._renewable = False
         if self.suspended:
             self.ended()

@@ -32,29 +32,32 @@ class MembershipError(ValueError):
 class Membership(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """This appliance, the other one, and the witness on the robot.
 
-    `address` and `other_address` are the IPv4 addresses of the appliances as the robot and each other see
-    them. `fixed` is the address at which the robot's nodes reach the active appliance. The keys (hexadecimal)
-    authenticate datagrams to the witness and to the other appliance; the certificates (PEM) and the key (PEM)
-    are those of the replication. A process gets only the secrets that it needs; the others are empty. The
-    sealed certificate and key are the tunnels' authority, encrypted by a passphrase; only the file for the
-    other appliance has them.
+    A process gets only the secrets that it needs; the others are empty.
     """
 
     name: _Name
     other: _Name
     address: str
+    """The IPv4 address of this appliance, as the robot and the other appliance see it."""
     other_address: str
     fixed: str
+    """The address at which the robot's nodes reach the active appliance."""
     witness: str
     witness_port: _Port
     port: _Port = PORT
     witness_key: _Key
+    """Authenticates datagrams to the witness (hexadecimal)."""
     peer_key: _Key
+    """Authenticates datagrams to the other appliance (hexadecimal)."""
     certificate: str
     key: str
+    """The key of `certificate`, which is for the replication (PEM)."""
     other_certificate: str
     sealed_certificate: str = ""
     sealed_key: str = ""
+    """With `sealed_certificate`, the tunnels' authority, encrypted with a passphrase. Only the other appliance's file
+    has it.
+    """
 
     def __post_init__(self) -> None:
         for text in (self.address, self.other_address, self.fixed, self.witness):

@@ -1,4 +1,4 @@
-"""The views of two appliances. Methods import what only one of the processes and commands needs."""
+"""The views of two appliances. Each method imports its view, which only one process or command needs."""
 
 from collections.abc import Callable, Mapping
 from pathlib import Path

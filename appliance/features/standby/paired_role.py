@@ -1,4 +1,4 @@
-"""The role of the active one of two appliances."""
+"""Connect control to the replication, the tunnels and the lease of a pair, while this appliance is active."""
 
 from collections.abc import Awaitable, Callable
 

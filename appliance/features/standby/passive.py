@@ -1,7 +1,4 @@
-"""Stand by: follow the changes of the active appliance until this one is activated.
-
-Only the replica's file changes.
-"""
+"""Stand by: follow the active appliance until this one is activated. Only the file of the replica changes."""
 
 import asyncio
 import socket
@@ -45,7 +42,7 @@ _log = structlog.get_logger()
 
 
 class PassiveControl:
-    """Control of a standby; `folder` is closed to other users: it gets the key of the link."""
+    """Control of a standby."""
 
     def __init__(
         self,

@@ -17,7 +17,7 @@ PURPOSES: dict[type[PeerMessage], bytes] = {
 
 
 class PeerChannel:
-    """One end of these datagrams."""
+    """Seals and unseals the datagrams of one end."""
 
     def __init__(self, name: str, other: str, key: bytes) -> None:
         self._name = name

@@ -251,7 +251,7 @@ class LeaseProcess:
 
 
 def stored_epoch(path: Path) -> int:
-    """Raise `ValueError` if the file is damaged, because then nothing is safe."""
+    """Return the stored epoch, or 0 for a new appliance. Raise `ValueError` if the file is damaged."""
     try:
         text = path.read_text("ascii").strip()
     except FileNotFoundError:

@@ -36,16 +36,13 @@ LARGEST_STATE = 1 << 30
 
 
 class Replica:
-    """The state file of a standby. Methods raise `StoreError` and wait for the disk: call them in a thread.
-
-    `failed` is called if changes of an earlier run cannot be written.
-    """
+    """The state file of a standby. Methods raise `StoreError` and wait for the disk: call them in a thread."""
 
     def __init__(
         self, path: Path, schema: str, *, failed: Callable[[str], None], largest: int = LARGEST_STATE
     ) -> None:
         self._path = path
-        # Opening writes the changes that a killed process left.
+        # Opening writes the changes that a killed process left; `failed` is called if they cannot be written.
         database = Database(path, schema, failed=failed, drive=InCaller)
         database.close()
         self._tables = database.tables

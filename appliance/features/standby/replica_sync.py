@@ -26,7 +26,10 @@ class ReplicaSync:
         self._boot = boot if boot is not None else Path(BOOT_ID).read_text("ascii").strip()
 
     async def run(self, followed: Callable[[], bool], complete: Callable[[], None]) -> None:
-        """`followed()`: the active appliance has sent what was missing."""
+        """Sync the replica after each change, and call `complete` once no change can be missing.
+
+        `followed()` returns whether the active appliance has sent the missing changes.
+        """
         loop = asyncio.get_running_loop()
         end, marked, synced = loop.time() + WAIT_SECONDS, False, None
         while True:
@@ -41,7 +44,7 @@ class ReplicaSync:
             await asyncio.sleep(_SYNC_SECONDS)
 
     def _is_complete(self) -> bool:
-        """Whether the machine has not restarted since; a new replica is complete."""
+        """Return whether the machine has not restarted since the mark; a new replica is complete."""
         try:
             return self._mark.read_text("ascii") == self._boot
         except FileNotFoundError:

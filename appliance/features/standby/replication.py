@@ -36,7 +36,9 @@ _ADMITTED_SECONDS = 2.0  # after the next answer, until all followers admit this
 
 
 class RobotAdmission:
-    """The times of the witness's answers (seconds of CLOCK_BOOTTIME)."""
+    """Derives from the witness's answers (times of CLOCK_BOOTTIME) whether the robot may have shut this appliance
+    out.
+    """
 
     def __init__(self) -> None:
         self._answered = self._admitted = clock.since_boot()
@@ -69,21 +71,19 @@ _log = structlog.get_logger()
 
 
 class Pair(NamedTuple):
-    """The lease and the replication of an active appliance in its epoch.
-
-    `taken_over`: this process stood by before, and opened the links `api` and `tunnels` then. `away_seconds` is
-    the time since it last followed the other appliance (None: never), `copy_age` the age of the copies of
-    monitors' state then.
-    """
+    """The lease and the replication of an active appliance in its epoch."""
 
     membership: Membership
     lease: LeaseClient
     epoch: int
     api: Channel | None
     taken_over: bool
+    """Whether this process stood by before, and then opened the links `api` and `tunnels`."""
     tunnels: StandbyTunnels
     away_seconds: float | None = None
+    """At the takeover, the seconds since this process last followed the other appliance; None: it never did."""
     copy_age: float | None = None
+    """The age of the copies of monitors' state at the takeover."""
 
 
 def state_of(
@@ -135,9 +135,6 @@ class Replication:
         taken_over: bool,
         folder: Path,
     ) -> None:
-        """After a takeover the first answers would wait for the earlier active appliance in vain. So its removal
-        is requested as soon as this appliance serves; until then, it may take the lease back.
-        """
         self._membership = membership
         self._lease = lease
         self._database = database
@@ -181,12 +178,16 @@ class Replication:
                 task.cancel()
 
     def begin(self) -> None:
+        """Serve the standby. After a takeover, request the removal of the earlier active appliance.
+
+        Otherwise the first answers would wait for it in vain. Before this call it may take the lease back.
+        """
         self._lease.present()
         self._absent, self._taken_over = self._taken_over, False
         self.report()
 
     def close(self) -> None:
-        """A change that is not answered yet gets no answer."""
+        """Stop. A change that is not answered yet gets no answer."""
         self.sender.close()
 
     async def _listening(self) -> socket.socket:
@@ -248,8 +249,9 @@ class Replication:
         )
 
     async def require_ready(self) -> None:
-        """An answer of the witness from before the order proves nothing: the standby's cable may just have been
-        unplugged.
+        """Raise `HandOverError` unless the standby can take over.
+
+        The witness must answer the standby after the order, because its cable may just have been unplugged.
         """
         if not self._in_sync() or not self._connected():
             raise HandOverError(

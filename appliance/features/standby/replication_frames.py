@@ -1,7 +1,7 @@
 """The messages between an active appliance and its standby, and the frames that carry them.
 
-A frame is a length (4 bytes) and one message as MessagePack. The standby sends its position as `Stored`, then one
-for each message. The active appliance sends the later `Changes`, at least one a second, or a snapshot.
+A frame is a length (4 bytes) and one message as MessagePack. The standby sends its position as `Stored`, first and
+after each message. The active appliance sends the later `Changes`, at least one message a second, or a snapshot.
 """
 
 import asyncio
@@ -48,16 +48,14 @@ class SwitchoverRefused(msgspec.Struct, frozen=True, array_like=True, tag="switc
 
 
 class Introduction(msgspec.Struct, frozen=True, array_like=True, tag="introduction"):
-    """The standby asks for a certificate for its own tunnel key, with a signing request (PEM).
-
-    `endpoint` is the address or name at which hosts reach the standby, and `pin` that of its REST server (empty:
-    REST is off).
-    """
+    """The standby asks for a certificate for its own tunnel key, with a signing request (PEM)."""
 
     request: Annotated[bytes, msgspec.Meta(max_length=16 << 10)]
     key: Fingerprint
     endpoint: Annotated[str, msgspec.Meta(pattern=r"^[0-9A-Za-z.:-]{1,253}\Z")]
+    """The address or name at which hosts reach the standby."""
     pin: Annotated[str, msgspec.Meta(pattern=r"^(sha256//[A-Za-z0-9+/]{43}=)?\Z")]
+    """The pin of the standby's REST server; empty: REST is off."""
 
 
 class ObstacleFound(msgspec.Struct, frozen=True, array_like=True, tag="obstacle"):

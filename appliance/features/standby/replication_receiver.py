@@ -32,19 +32,15 @@ _SILENCE_SECONDS = 10.0  # the active appliance sends something every second
 
 
 class ReplicationReceiver:
-    """The standby's end; `accepts` decides whether an appliance of this epoch may be the active one.
-
-    `revised()` is called after a change of the policy or the specifications.
-
-    """
+    """The standby's end of the replication."""
 
     def __init__(
         self,
         replica: Replica,
-        accepts: Callable[[int], bool],
+        accepts: Callable[[int], bool],  # whether an appliance of this epoch may be the active one
         introduction: Callable[[], Introduction | None] = lambda: None,
         obstacle: Callable[[], str] = lambda: "",
-        revised: Callable[[], None] = lambda: None,
+        revised: Callable[[], None] = lambda: None,  # called after a change of policy or specifications
     ) -> None:
         self._replica = replica
         self._accepts = accepts
@@ -116,14 +112,14 @@ class ReplicationReceiver:
             await link.send(introduction)
 
     async def _report_obstacle(self, link: ReplicationLink[FromActive]) -> None:
-        """An earlier version does not know this message, and ends the link."""
+        """Report a new obstacle. An earlier version ends the link at this message."""
         obstacle = self._obstacle()
         if obstacle != self._reported:
             self._reported = obstacle
             await link.send(obstacle_of(obstacle))
 
     async def _take(self, message: FromActive) -> None:
-        """A few small changes take less time than a thread, and an answer waits for them."""
+        """Store a message. A few small changes take less time than a thread, and an answer waits for them."""
         if isinstance(message, Changes) and _is_small(message):
             self._replica.take(message)
         else:

@@ -55,18 +55,16 @@ _log = structlog.get_logger()
 
 
 class ReplicationLag(NamedTuple):
-    """How far the standby is behind; `waiting_since` (time of the loop) is set while an answer waits.
-
-    `obstacle` is why the connected standby could not serve after a takeover.
-
-    """
+    """How far the standby is behind."""
 
     connected: bool
     changes: int
     bytes: int
     waiting_since: float | None
+    """The time of the event loop at which the oldest waiting answer began to wait."""
     reason: str
     obstacle: str = ""
+    """Why the connected standby could not serve after a takeover."""
 
     @property
     def caught_up(self) -> bool:
@@ -74,7 +72,7 @@ class ReplicationLag(NamedTuple):
 
 
 class ReplicationSender:
-    """The changes of `database` for the standby.
+    """Sends the changes of `database` to the standby.
 
     Create it in the event loop, before the first change that the standby needs.
     """
@@ -312,7 +310,7 @@ class ReplicationSender:
 
 
 async def _in_thread(function: Callable[..., T], *arguments: Any) -> T:
-    """Wait for the end even if cancelled, because its connection is closed then."""
+    """Call a function in a thread. Wait for its end even if cancelled: the caller then closes its connection."""
     task = asyncio.ensure_future(asyncio.to_thread(function, *arguments))
     try:
         return await asyncio.shield(task)

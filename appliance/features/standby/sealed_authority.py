@@ -1,7 +1,6 @@
-"""Bring the encrypted key of an authority to the other appliance.
+"""Bring the key of an authority, encrypted with a passphrase, to the other appliance.
 
-Only a key that the passphrase encrypts is brought. The other appliance keeps it beside its own authority
-(`ipsec/brought_authority.py`).
+The other appliance keeps it beside its own authority (`ipsec/brought_authority.py`).
 """
 
 import contextlib

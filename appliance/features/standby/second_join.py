@@ -26,7 +26,7 @@ _VERB = "rosrv standby"
 
 
 def join_second(file: Path, state: Path, *, again: bool, as_json: bool) -> None:
-    """The appliance must be stopped, or later changes would be lost."""
+    """Make this appliance the second of a pair. It must be stopped, or later changes would be lost."""
     membership = _given(file)
     directory = StateDirectory(state)
     try:

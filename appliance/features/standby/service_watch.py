@@ -47,7 +47,9 @@ class ServiceWatch:
         self._obstacle = obstacle
 
     def fault(self, now: float, *, active: bool, present: bool = True) -> str:
-        """`present`: control stands by or serves."""
+        """Return why the lease is to be given away, or an empty string. `present` is whether control stands by or
+        serves.
+        """
         if active and not self._active:
             self._served, self._cold = now, not present
             self._ready = None

@@ -40,15 +40,13 @@ class SingleAppliance:
 
 
 class ActiveAppliance:
-    """The `StandbySource` of the active appliance; `leaving()` makes the last changes before the switchover; if
-    it fails, `staying()` is called.
-    """
+    """The `StandbySource` of the active appliance."""
 
     def __init__(
         self,
         replication: Replication,
-        leaving: Callable[[], Awaitable[None]],
-        staying: Callable[[], None],
+        leaving: Callable[[], Awaitable[None]],  # makes the last changes before the switchover
+        staying: Callable[[], None],  # called if the switchover fails
     ) -> None:
         self._replication = replication
         self._leaving = leaving
@@ -68,7 +66,7 @@ class ActiveAppliance:
 
 
 class StandbyOrders:
-    """The answers of an appliance in service, which raise `UnknownThingError` without a pair."""
+    """Answers operators of an appliance in service. Requests raise `UnknownThingError` without a pair."""
 
     def __init__(self, source: StandbySource, trail: AuditTrail) -> None:
         self._source = source
@@ -78,7 +76,7 @@ class StandbyOrders:
         return _state_of(self._source)
 
     async def promote(self, _request: standby_requests.StandbyPromote, who: str) -> StandbyState:
-        """The order is on disk before the hand-over begins, which ends this process."""
+        """Hand over to the standby. The order is on the disk before, because the hand-over ends this process."""
         other = _state_of(self._source).other
         self._trail.happened(
             "switchover ordered", f"{other.name} ({other.address}) is to become the active appliance", who=who

@@ -1,8 +1,8 @@
 """Move the times in the state to this appliance's clocks when it takes over from the other one.
 
-All ends move by the difference between both clocks, in one write, so that each duration has the same time left.
-If this appliance did not follow the other one before, the difference may include time off. Durations then
-continue from the last reading, so no block ends early. The ends of tokens stay, because they are dates.
+All ends move by the difference between both clocks, in one write, so that each duration has the same time left. If
+this appliance did not follow the other one before, the difference may include time off. Then durations continue from
+the last reading, so no block ends early, and the ends of tokens stay, because they are dates.
 """
 
 import asyncio
@@ -30,7 +30,7 @@ class _Reading(msgspec.Struct, frozen=True):
 
 
 def adopt_times(store: StateStore, pair: Pair, age: Callable[[], int]) -> None:
-    """Call this before any part reads the times."""
+    """Move the times if the other appliance was active. Call this before any part reads them."""
     text = store.settings().get(_SETTING)
     if text is None:
         return

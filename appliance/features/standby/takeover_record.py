@@ -52,8 +52,9 @@ class TakeoverRecorder:
         self._replicated = 0  # the number of the newest replicated checkpoint
 
     async def took_over(self, epoch: int) -> None:
-        """A restart within the epoch does not repeat the record. The state gets the takeover once the record is
-        on the disk.
+        """Record the takeover, unless an earlier process did so in this epoch.
+
+        The state gets the takeover once the record is on the disk.
         """
         own = await asyncio.to_thread(self._last_recorded)
         if own is None or own.epoch != epoch:
@@ -75,11 +76,10 @@ class TakeoverRecorder:
             self._store.save_setting(_LAST_TAKEOVER, msgspec.json.encode(last).decode())
 
     async def handed_over(self, epoch: int) -> None:
-        """Return when the state has the sealed log.
+        """Record the hand-over, and return when the state has the sealed log.
 
-        If the hand-over fails, the event `switchover failed` revokes this record. The signer may be slow or away:
-        the caller bounds the wait.
-
+        If the hand-over fails, the event `switchover failed` revokes this record. The caller bounds the wait, because
+        the signer may be slow or away.
         """
         self._trail.happened(
             "handed over",

@@ -60,13 +60,7 @@ class TakeoverFinding(msgspec.Struct, frozen=True):
 
 
 class TakeoverProof(msgspec.Struct, frozen=True, kw_only=True):
-    """A takeover with its proof; `sequence` is its record in the log of `appliance`.
-
-    `link`: "proven" (the named checkpoint is in the other log), "removed" (retention removed its records since),
-    "none" (no checkpoint was replicated), or "wrong". The checkpoint sealed the other log `through` that record;
-    the `tail` are its later records, of which `tail_signed` are sealed by later checkpoints. `overlap`:
-    "excluded", "found", or "unknown".
-    """
+    """A takeover with its proof; `sequence` is its record in the log of `appliance`."""
 
     epoch: int
     appliance: str
@@ -75,9 +69,15 @@ class TakeoverProof(msgspec.Struct, frozen=True, kw_only=True):
     sequence: int
     time: int
     link: Link
+    """"proven": the named checkpoint is in the other log; "removed": retention removed its records since; "none": no
+    checkpoint was replicated.
+    """
     through: int
+    """The last record of the other log that the named checkpoint sealed."""
     tail: int
+    """The number of the other log's later records, until its next takeover."""
     tail_signed: int
+    """The number of these records that later checkpoints seal."""
     overlap: Overlap
 
 
@@ -116,7 +116,7 @@ def verify_takeovers(first: VerifiedLog, second: VerifiedLog) -> PairVerificatio
 
 
 def verify_alone(log: VerifiedLog, absent: str) -> PairVerification:
-    """Verify a log whose other one does not exist: then its own records name none."""
+    """Verify a log without the log of the other appliance: no record may name that log."""
     kind = TakeoverFindingKind.LOG_MISSING
     findings: list[TakeoverFinding] = []
     with reading(log.path, advice="") as connection:
@@ -316,7 +316,7 @@ _WRONG = {
 
 
 def _wrong_checkpoint(named: SignedCheckpoint, log: TakeoverLog) -> tuple[TakeoverFindingKind, str] | None:
-    """Return None also if the records were removed."""
+    """Return the fault of a named checkpoint; None if it is right, or if its records were removed."""
     first, last, key = log.result.removed + 1, log.result.last, log.result.key or "no key"
     known = KnownLog(log.result.log, key, first, last, log.hash_at, log.checkpoint_text)
     fault = named.fault_in(known)
@@ -355,11 +355,10 @@ def _proof(
 
 
 def _overlap(before: _Placed, active: list[_Placed], back: _Placed) -> int | None:
-    """Return the nanoseconds by which one appliance's silence is too short for the other's epochs.
+    """Return the nanoseconds by which one appliance's silence is too short for the other's epochs, or None.
 
-    `before` and `back` are takeovers of the one, `active` those of the other between them. `active` ends with the
-    last decision of each epoch; the silence is the time from the last decision before to `back`.
-
+    `before` and `back` are takeovers of the first appliance, `active` those of the other between them. `active` ends
+    with the last decision of each epoch; the silence is the time from the last decision before to `back`.
     """
     silent, busy = before.own, active[0].own
     last = silent.last_decision(before.takeover.sequence, back.takeover.sequence)

@@ -1,7 +1,7 @@
 """Define the records of takeovers between two appliances, and read them from a log.
 
-A record names the other chain's last replicated checkpoint, and the takeover before it, so that a removed record
-leaves a gap, although the epochs of a lease may have gaps.
+A record names the other chain's last replicated checkpoint, and the takeover before it. So a removed record is
+noticed, although epochs may have gaps.
 """
 
 import sqlite3

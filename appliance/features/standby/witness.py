@@ -18,11 +18,12 @@ This file runs alone, with the standard library of Python 3.5 to 3.12 and the pr
 5. A full disk prevents no change: the file of the lease keeps its size. Each answer says why a regular write
    failed: a disk that cannot be written would prevent the next takeover.
 
-The firewall translates one fixed address to the holder, and rejects all other traffic of the other appliance with
-TCP resets. For an idle connection, the witness sends its local socket a segment outside its window; the firewall
-rejects the acknowledgement with a reset. A socket that still waits for the answer to its first packet repeats
-that only after 1, 3 and 7 seconds, so it gets such a packet itself. Tunnels, ping, resets and requests to the
-witness pass. The rules are for IPv4: give the appliances no IPv6 address that the robot reaches.
+The firewall translates one fixed address to the holder, and rejects all other traffic of the other appliance with TCP
+resets. For an idle connection, the witness sends its local socket a segment outside its window; the firewall rejects
+the acknowledgement with a reset. A socket that still waits for the answer to its first packet repeats that packet
+only after 1, 3 and 7 seconds; the witness sends it such a packet, whose answer is rejected likewise. Tunnels, ping,
+resets and requests to the witness pass. The rules are for IPv4: give the appliances no IPv6 address that the robot
+reaches.
 """
 
 import argparse
@@ -127,7 +128,7 @@ WitnessSettings = NamedTuple(
 
 @functools.lru_cache(maxsize=64)
 def tag_of(key: bytes) -> bytes:
-    """Return the first bytes of all datagrams with this key: most forged ones cost no authentication."""
+    """Return the first bytes of all datagrams with this key, so most forged datagrams cost no authentication."""
     return hmac.new(key, b"rosrv lease tag 1\0", hashlib.sha256).digest()[:_TAG]
 
 
@@ -140,7 +141,7 @@ def seal(purpose: bytes, name: str, key: bytes, body: Dict[str, Any]) -> bytes:
 
 
 def name_in(datagram: bytes) -> str:
-    """The name is not authenticated yet."""
+    """Return the name in a datagram, which is not authenticated yet, or an empty string."""
     if not _TAG + 1 + _MAC < len(datagram) <= LONGEST:
         return ""
     name = datagram[_TAG + 1 : _TAG + 1 + datagram[_TAG]].decode("ascii", "replace")
@@ -234,7 +235,7 @@ class LeaseFile:
             return False
 
     def write(self, record: LeaseRecord) -> None:
-        """After a `WitnessError` the old lease stays; any other error leaves it uncertain."""
+        """Save the lease. After a `WitnessError` the old lease stays; any other error leaves it uncertain."""
         body = {
             "epoch": record.epoch,
             "holder": record.holder,
@@ -293,7 +294,7 @@ def write_synced(path: str, content: bytes) -> None:
 
 
 class DiskCheck:
-    """The regular check that the disk of the lease can be written, in a thread: a slow disk delays no answer."""
+    """Checks regularly that the disk of the lease can be written, in a thread: a slow disk delays no answer."""
 
     def __init__(self, lease: LeaseFile, clock: Callable[[], float]) -> None:
         self._lease = lease
@@ -466,7 +467,7 @@ class WitnessGate:
         return seal(ANSWER, name, peer.key, self._answer(name, body))
 
     def _allowed(self, name: str, body: Dict[str, Any]) -> bool:
-        """A follower cannot change the lease, so no rule depends on it."""
+        """Return whether this peer may request the operation. A follower cannot change the lease."""
         return name in self._appliances or body["do"] == "look"
 
     def _well_formed(self, body: Dict[str, Any]) -> bool:
@@ -511,11 +512,8 @@ class WitnessFollower:
 
     It admits an appliance only for 0.9 of the time that its lease has left, counted from the time the request was
     *sent*; the rest allows for clocks of different speeds. So while the robot admits one appliance, no follower
-    admits the other one, unless that one has given the lease up. Without answers, both are shut out after at most
-    one expiry.
-
-    `epoch` is the greatest that was saved; a smaller one, of a witness that was restored from an old disk, is not
-    accepted. `clock` also runs while the computer sleeps.
+    admits the other, unless the first has given the lease up. Without answers, both are shut out after at most one
+    expiry.
     """
 
     def __init__(
@@ -525,10 +523,10 @@ class WitnessFollower:
         key: bytes,
         appliances: Iterable[str],
         session: str,
-        epoch: int,
+        epoch: int,  # the greatest saved; no smaller one, of a witness restored from an old disk, is accepted
         save: Callable[[int], None],
         admit: Callable[[str], None],
-        clock: Callable[[], float],
+        clock: Callable[[], float],  # runs also while the computer sleeps
     ) -> None:
         self.epoch = epoch
         self.refusal = ""
@@ -615,7 +613,7 @@ class WitnessFollower:
 
 
 def nft_rules(settings: WitnessSettings, admitted: str) -> str:
-    """With these rules, the kernel drops a request without the tag of its sender's key."""
+    """Return the rules that admit one appliance. They also drop requests without the tag of the sender's key."""
     names = sorted(settings.appliances)
     control = "{ %s }" % ", ".join(map(str, (*_TUNNEL_PORTS, settings.listen[1])))
     local = 'iif "lo" ip daddr %s udp dport %d drop' % settings.listen  # no appliance is on this computer
@@ -670,8 +668,10 @@ def nft_rules(settings: WitnessSettings, admitted: str) -> str:
 
 
 def iptables_rules(settings: WitnessSettings, admitted: str, present: Dict[str, List[str]]) -> str:
-    """The filter comes first: until the translation follows, connections to the fixed address are rejected or go
-    to the new holder. Our jump becomes the first rule, before any that accepts established connections.
+    """Return the input of iptables-restore that admits one appliance.
+
+    The filter comes first: until the translation follows, connections to the fixed address are rejected or go to the
+    new holder. Our jump becomes the first rule, before any that accepts established connections.
     """
     names = sorted(settings.appliances)
     control = ",".join(map(str, (*_TUNNEL_PORTS, settings.listen[1])))
@@ -802,8 +802,10 @@ class LeaseFirewall:
         self._written = self._present()
 
     def intact(self) -> bool:
-        """Another program may have changed the rules before they were read for the first time. So the jumps,
-        which must be first, and the number of rules are compared with what was written.
+        """Return whether the rules are still those that were written.
+
+        Another program may have changed them before they were first read. So the jumps, which must be first, and the
+        number of rules are compared with the written text.
         """
         try:
             present = self._present()
@@ -867,7 +869,7 @@ def segment(connection: Ends, flags: int, number: int) -> bytes:
 
 
 class IdleConnections:
-    """Reset local connections, even idle ones, with an appliance that is no longer admitted."""
+    """Resets local connections with an appliance that is no longer admitted, even idle ones."""
 
     def __init__(self, settings: WitnessSettings) -> None:
         self._settings = settings
@@ -881,8 +883,10 @@ class IdleConnections:
         return sockets_with(self._addresses(""), _socket_tables(), _CONNECTING)
 
     def reset(self, admitted: str, connecting: Iterable[Ends] = ()) -> None:
-        """`connecting` wait for a first answer since before the rules changed, so the connection tracker leads
-        their first packet to the earlier appliance for good.
+        """Begin to reset the connections.
+
+        `connecting` wait for a first answer since before the rules changed, so the connection tracker leads their
+        first packet to the earlier appliance for good.
         """
         addresses = self._addresses(admitted)
         self._left = sockets_with(addresses, _socket_tables())
@@ -926,7 +930,7 @@ def _socket_tables() -> List[str]:
 
 
 def read_settings(path: str) -> WitnessSettings:
-    """Raise `WitnessError` unless only root can read the file, since it has the keys."""
+    """Raise `WitnessError` if other users can read the file, since it has the keys."""
     try:
         with open(path, encoding="utf-8") as file:
             if stat.S_IMODE(os.fstat(file.fileno()).st_mode) & 0o077:
@@ -1095,7 +1099,7 @@ def serve(settings: WitnessSettings, backend: str, lease: LeaseFile) -> None:
 
 
 def _note_trouble(witness: Witness, lease: LeaseFile, disk: DiskCheck, log: BoundedLog) -> None:
-    """Give the answers the reason why the next change would not be saved. If the file has no room, make it."""
+    """Let answers carry the reason why the next change would not be saved. If the file has no room, try to make it."""
     if witness.record is not None and not lease.has_room():
         with contextlib.suppress(WitnessError):  # reported as the trouble
             lease.write(witness.record)
@@ -1223,7 +1227,7 @@ def _boot_seconds() -> float:
 
 
 def followed_epoch(lease: LeaseFile, log: BoundedLog) -> int:
-    """Return the greatest epoch that this follower saved. If it is damaged, no answer is new enough."""
+    """Return the greatest epoch that this follower saved. If the file is damaged, no answer is new enough."""
     if not os.path.exists(lease.path):
         return 0
     try:

@@ -55,7 +55,10 @@ class WitnessChannel:
         return seal(REQUEST, self._name, self._key, body)
 
     def read(self, datagram: bytes) -> tuple[WitnessRequest, WitnessAnswer] | None:
-        """An answer to a request with an old nonce or number has the present ones: the next request uses them."""
+        """Return an answer with its request.
+
+        If the nonce or number of the request was old, the answer has only the present ones, for the next request.
+        """
         if name_in(datagram) != self._name:
             return None
         try:
