@@ -2,8 +2,7 @@
 
 1. The database is only read, so forwarding never delays the log or loses its records.
 2. The position advances only when the receiver has the batch.
-3. Records that retention removed before they were sent are counted and reported (`missed`).
-4. If the log was restored from a copy, new records that reuse sequence numbers of sent records are also sent.
+3. If the log was restored from a copy, new records that reuse sequence numbers of sent records are also sent.
 """
 
 from collections.abc import Callable
@@ -37,15 +36,14 @@ _log = structlog.get_logger()
 class ForwardingPosition(msgspec.Struct, frozen=True):
     """The last record and checkpoint that the receiver has.
 
-    It is stored after the receiver has both, so after a crash some records are sent again. `record` is an id: if
-    the log was restored from a copy, another record may have the same sequence.
-
+    It is stored after the receiver has both, so after a crash some records are sent again.
     """
 
     log: str
     sequence: int = 0
     checkpoint: int = 0
     record: str = ""
+    """An id: if the log was restored from a copy, another record may have the same sequence."""
 
 
 def load_position(path: Path) -> ForwardingPosition | None:
@@ -176,8 +174,10 @@ def _extent(path: Path) -> tuple[int, int, str]:
 
 
 def _in_log(path: Path, position: ForwardingPosition) -> ForwardingPosition:
-    """A log that was restored from a copy continues with sequences that were already used. Ids are ordered by
-    time, so every record with a later id than the last sent record is new.
+    """Return the position in a log that may have been restored from a copy.
+
+    Such a log continues with sequences that were already used. Ids are ordered by time, so every record with a later
+    id than the last sent record is new.
     """
     with reading(path, advice="") as connection:
 

@@ -101,7 +101,7 @@ class StreamReceiver:
 
 
 def tls_context(ca: Path | None, certificate: Path | None, key: Path | None) -> ssl.SSLContext:
-    """Without `ca`, the system's authorities verify the receiver."""
+    """Return a new context. Without `ca`, the system's authorities verify the receiver."""
     try:
         with nullcontext() if ca is None else path_for_library(ca) as authority:
             context = ssl.create_default_context(cafile=authority)
@@ -120,7 +120,7 @@ def tls_context(ca: Path | None, certificate: Path | None, key: Path | None) -> 
 
 
 def _await_objection(connection: socket.socket) -> None:
-    """In TLS 1.3, the server's rejection of our certificate comes after our handshake."""
+    """Wait for the server's rejection of our certificate, which in TLS 1.3 comes after our handshake."""
     select.select([connection], [], [], _OBJECTION_SECONDS)
     _require_open(connection)
 

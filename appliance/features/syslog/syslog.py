@@ -58,7 +58,7 @@ class Formatter:
         return _message(head, ELEMENT, named, _shortened(text, room))
 
     def checkpoint(self, signed: SignedCheckpoint) -> bytes:
-        """`rosrv audit verify --checkpoints` finds the message in the receiver's file."""
+        """Return a message that `rosrv audit verify --checkpoints` finds in the receiver's file."""
         head = self._head(Severity.NOTICE, signed.time, "checkpoint signed")
         fields = {
             name: str(value) for name, value in msgspec.structs.asdict(signed).items() if value is not None

@@ -14,16 +14,14 @@ _COUNTED = "repetitions folded"
 
 @dataclass(frozen=True, slots=True)
 class PastPublisher:
-    """A publisher; `since` is nanoseconds since the epoch, and `sequence` the record of the registration or of
-    the node's return.
-
-    Both are None if the log has only the end of the registration.
-    """
+    """A publisher at a time in the past."""
 
     node: str
     host: str
     since: int | None
+    """Nanoseconds since the epoch; None if the log has only the end of the registration."""
     sequence: int | None
+    """The record of the registration, or of the node's return."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +35,7 @@ class PastPublishers:
 def publishers_at(
     export: Callable[[Filter], Iterable[LogEntry]], first: LogEntry | None, topic: str, at: int
 ) -> PastPublishers:
-    """`first` is the first record of the log."""
+    """Return the publishers of a topic at a time (ns since the epoch). `first` is the first record of the log."""
     registrations = (Filter(event=event, category="publication", resource=topic) for event in _REGISTRATIONS)
     others = (Filter(event=event, until=at + 1) for event in (*_NODES, *_LOG))
     gaps = (Filter(event=event) for event in ("records lost", _COUNTED))

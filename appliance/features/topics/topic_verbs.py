@@ -31,7 +31,7 @@ _AT_ONCE = 20  # messages in one request
 
 
 def _resolved(topic: str) -> str:
-    """Like the stock tools: `odom` is /odom."""
+    """Resolve a name like the stock tools: `odom` is /odom."""
     try:
         return resolve(topic, "")
     except InvalidNameError as error:
