@@ -125,8 +125,10 @@ class Certification:
         self.changed()
 
     async def finish(self, name: str, kept: dict[str, str] | None = None) -> KitParts:
-        """If charon does not confirm in time, the kit has a warning. `kept` are the options stored with the
-        host's token.
+        """Return the parts of the kit once charon has the certificate, or with a warning if it does not confirm in
+        time.
+
+        `kept` are the options stored with the host's token.
         """
         taken = (
             await self.tunnels.until_taken()
@@ -196,7 +198,7 @@ class Certification:
         return True
 
     def each_hour(self) -> None:
-        """Record once each certificate that ends soon."""
+        """Take renewed certificates once the earlier ones have ended, and record each certificate that ends soon."""
         now = clock.wall()
         self.table.revoked.forget_ended()
         for row in self.table.enrolled():

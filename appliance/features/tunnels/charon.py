@@ -1,7 +1,6 @@
 """Provision and watch charon over vici, with blocking calls.
 
-Only differences are applied. When a host's certificate is replaced, its tunnel is also closed. charon's
-confirmation is not trusted: each check closes again whatever remains of a closed tunnel.
+Only differences are applied. When a host's certificate is replaced, its tunnel is also closed.
 """
 
 import base64
@@ -49,7 +48,7 @@ class ViciClient:
             self._session.load_key({"type": "any", "data": key})
 
     def provision(self, stated: TunnelsStated) -> None:
-        """Close revoked tunnels before new ones are loaded."""
+        """Apply the differences. Revoked tunnels are closed before new ones are loaded."""
         before = self._stated
         if before is None or before.authority != stated.authority:
             with self._said("the authority's certificate"):
@@ -77,8 +76,10 @@ class ViciClient:
         self._stated = stated
 
     def seen(self) -> list[TunnelSeen]:
-        """Tunnels of removed hosts, or with a replaced certificate, are closed again: a rekeying during the first
-        close can keep such a tunnel open.
+        """Return the open tunnels. charon's confirmation of a close is not trusted.
+
+        Tunnels of removed hosts, or with a replaced certificate, are closed again: a rekeying during the first close
+        can keep such a tunnel open.
         """
         for _ in range(_LISTS):
             found = self._standing()

@@ -1,4 +1,4 @@
-"""The part of control for hosts in tunnels: enrolment, certificates, and the checks of ports."""
+"""Build the part of control for hosts in tunnels: enrolment, certificates, and the checks of ports."""
 
 from functools import partial
 

@@ -1,9 +1,8 @@
 """Answer a host's own requests, without a bearer token: enrolment, renewal, authority, revocations.
 
-1. A host that sends wrong tokens must wait, and all such hosts share one limit. A host that sent no wrong token
-   never waits, so an attacker with many addresses cannot keep out a valid token.
-2. Only a host in its tunnel can renew. Control compares the peer's address with the virtual address of the name,
-   which the firewall accepts only through IPsec. The signer checks the signature by the host's present key.
+1. A host that sends wrong tokens must wait, and all such hosts share one limit. A host that sent no wrong token never
+   waits, so an attacker with many addresses cannot keep out a valid token.
+2. Only a host in its tunnel can renew (`self_service.py`).
 3. This module does not parse signing requests.
 """
 

@@ -35,18 +35,15 @@ from appliance.store.host_tables import EnrolmentTokenRow
 
 
 class HostEnrolment(TunnelHosts):
-    """The operators' requests, which raise `HostRefusedError`, `HostsChangedError` and `StoreError`.
-
-    `expel(address, reason)` returns the number of removed registrations and grants. `carried_out()` waits for the
-    relays: the answer comes after the connections of an expelled host close.
-    """
+    """Answers operators. Requests raise `HostRefusedError`, `HostsChangedError` and `StoreError`."""
 
     def __init__(
         self,
         certification: Certification,
         find_endpoint: Callable[[], Awaitable[answers.Endpoint]],
         *,
-        expel: Callable[[Address, str], int],
+        expel: Callable[[Address, str], int],  # returns the number of removed registrations and grants
+        # Waits until the relays have closed the connections of an expelled host.
         carried_out: Callable[[], Awaitable[None]],
         machines: Callable[[], dict[str, int]],
         in_words: HostInWords,
@@ -217,7 +214,7 @@ class HostEnrolment(TunnelHosts):
         return answers.Revoked(self._table.revision, name, row.address, row.serial, taken)
 
     async def reload(self, request: host_requests.HostsReload, who: str) -> answers.Reloaded:
-        """An invalid file changes nothing."""
+        """Read hosts.yaml again. An invalid file changes nothing."""
         self._table.require(request.expected)
         return await self._declare(self._table.declared.reload, who)
 
@@ -225,7 +222,7 @@ class HostEnrolment(TunnelHosts):
         await self.reload(host_requests.HostsReload(), who)
 
     async def take_bundle(self, text: str, who: str) -> answers.Reloaded:
-        """An empty text stands for hosts.yaml."""
+        """Put a bundle's hosts into force. An empty text stands for hosts.yaml."""
         declared = self._table.declared
         return await self._declare(partial(declared.take, text) if text else declared.reload, who)
 

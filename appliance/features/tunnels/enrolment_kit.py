@@ -21,17 +21,15 @@ _SCRIPTS = ("join.sh", "leave.sh", "keep.sh", "renew.sh", "README")
 
 @dataclass(frozen=True)
 class Kit:
-    """The data of a kit; `key` is None if the host made its own key.
-
-    `endpoint` is the address or name of the appliance, `host.second` that of the other one of two; `protect` is
-    an nftables file.
-
-    """
+    """The data of a kit."""
 
     host: KitParts
     endpoint: str
+    """The address or name of the appliance; `host.second` is that of the other one of two."""
     protect: str
+    """An nftables file."""
     key: str | None
+    """None if the host made its own key."""
 
     @property
     def remotes(self) -> dict[str, str]:
@@ -64,7 +62,7 @@ def members(kit: Kit) -> list[tuple[str, str, int]]:
 
 
 def filled(script: str, values: Mapping[str, str]) -> str:
-    """`@stop@` stands for the file `stop.inc`."""
+    """Return a script with these values. `@stop@` stands for the file `stop.inc`."""
     folder = files("appliance.features.tunnels").joinpath("kit_files")
     text, stop = (folder.joinpath(name).read_text(encoding="utf-8") for name in (script, "stop.inc"))
     return _Template(text.replace("@stop@\n", stop)).substitute(values)

@@ -1,8 +1,7 @@
 """Keep the one-time tokens with which hosts enrol themselves. A host with an unused token is *awaited*.
 
 1. Only the hash of a token's secret is stored. The secret has 256 random bits, so a fast hash is enough.
-2. A token is valid once, for one name, until it expires or a newer token for the name replaces it. It is used up
-   before the certificate is requested, so if two hosts send the same token, only one gets a certificate.
+2. A token is valid once, for one name, until it expires or a newer token for the name replaces it.
 """
 
 import hashlib

@@ -19,7 +19,7 @@ _NEVER = PortsSeen("unknown", None, [], "")
 
 
 def soon(table: HostTable, row: HostRow, now: float) -> bool:
-    """Whether a certificate ends within 14 days, or within a third of its life if that is shorter."""
+    """Return whether a certificate ends within 14 days, or within a third of its life if that is shorter."""
     certificate = table.certificates.get(row.name)
     life = row.expires - certificate.made if certificate is not None else SOON_SECONDS * 3
     return row.expires - now < min(SOON_SECONDS, life / 3)

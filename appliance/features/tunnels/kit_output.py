@@ -21,7 +21,7 @@ _LONGEST_REQUEST = 16 << 10
 
 
 def wishes_of(appliance: str | None, ports: str, opened: list[str] | None) -> KitOptions:
-    """The endpoint is empty if the appliance must choose it."""
+    """Return the options of a kit. The endpoint is empty if the appliance must choose it."""
     if appliance is not None and not _ENDPOINT.fullmatch(appliance):
         raise usage_error(f"--appliance {appliance!r} is neither an address nor a name")
     try:

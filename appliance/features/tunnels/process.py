@@ -201,7 +201,9 @@ class TunnelProcess:
                 await self._say_how_it_stands(self._vici)
 
     async def _say_how_it_stands(self, vici: ViciClient) -> None:
-        """List again if a tunnel changed in the meantime, because the list may be older."""
+        """Report the tunnels. They are listed again if a tunnel changed in the meantime, because the list may be
+        older.
+        """
         for _ in range(_LISTINGS):
             changes = self._changes
             seen = await self._in_turn(vici.seen)

@@ -144,7 +144,7 @@ def _remove(as_json: bool) -> None:
 
 @dataclass(frozen=True)
 class _CheckTarget:
-    """The machine to check; `name` is used in the report, or else the address."""
+    """The machine to check. The report has `name`, or else the address."""
 
     host: str
     name: str | None

@@ -42,7 +42,7 @@ _LONGEST = 400
 
 @dataclass(frozen=True)
 class Refusal:
-    """A refusal in charon's log; `packet`: a tunnel's packet was dropped, not a request."""
+    """A refusal in charon's log. `packet`: a packet of a tunnel was dropped; otherwise a request was refused."""
 
     remote: str
     reason: str

@@ -13,14 +13,14 @@ NO_TUNNELS = (
 
 @dataclass(frozen=True)
 class RestAddress:
-    """The ports of REST; `port` is for other machines; without it, `trouble` gives the reason and the remedy.
-
-    `inner_port` is for hosts in tunnels, at the appliance's tunnel address.
-    """
+    """The ports of REST."""
 
     port: int | None
+    """For other machines."""
     trouble: str
+    """The reason and the remedy if there is no port for other machines."""
     inner_port: int | None
+    """For hosts in tunnels, at the appliance's tunnel address."""
 
 
 def rest_address(settings: Settings) -> RestAddress:

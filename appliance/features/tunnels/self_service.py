@@ -1,13 +1,11 @@
 """Serve a host's own requests: enrol with a one-time token, renew its certificate through its tunnel.
 
-1. A token is used up before the authority is asked. If no certificate is issued, the token becomes valid again,
-   unless its name was revoked in between.
-2. A host that renews must send from the virtual address of its name, which the firewall accepts through IPsec
-   only, and prove that it has the name's present key.
-3. The present certificate stays valid until the host reports that it has installed the next one. If the host
-   loses its connection in between, it can use either certificate.
-4. A host can renew once in a twentieth of its certificate's life, because each renewal makes the list of revoked
-   certificates longer.
+1. A token is used up before the authority is asked, so if two hosts send the same token, only one gets a certificate.
+   If no certificate is issued, the token becomes valid again, unless its name was revoked in between.
+2. A host that renews must send from the virtual address of its name, which the firewall accepts only through IPsec.
+   The signer checks the signature by the name's present key.
+3. The present certificate stays valid until the host reports that it has installed the next one. If the host loses
+   its connection in between, it can use either certificate.
 """
 
 import asyncio
