@@ -105,7 +105,7 @@ class FeaturePart:
     called: "Mapping[str, Callable[[OwnServiceCalled], Awaitable[OwnServiceAnswered]]]" = field(
         default_factory=dict
     )
-    """Answers nodes' calls of services, by name without the appliance's own name."""
+    """Answers nodes' calls of the services whose names end with `/` and the key."""
     holders: "Callable[[], Mapping[str, Address]]" = dict
     """See `Policy.holders`."""
     approved: "Callable[[], frozenset[Approval]]" = frozenset

@@ -83,7 +83,7 @@ def _extract(archive: tarfile.TarFile, entry: tarfile.TarInfo, state: Path) -> N
 
 
 def _hand_over(state: Path) -> None:
-    """Give each part to its role's user; the group of its files is the role that may read them."""
+    """Give each part to its role's user, and the group of its files to the role that may read them."""
     for role in (role for role in ROLES if role.part in KEPT_PARTS):
         account = account_of(role.user)
         group = account.gid if role.readable_by is None else account_of(role.readable_by).gid

@@ -18,7 +18,7 @@ class _Incomplete:
 
 
 class FragmentStore:
-    """The incomplete frames of one client, of at most `most_bytes` together."""
+    """The incomplete frames of one client, with at most `most_bytes` in total."""
 
     def __init__(self, most_bytes: int, memory: ClientMemory) -> None:
         self._memory = memory

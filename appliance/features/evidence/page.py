@@ -49,7 +49,7 @@ class Names(NamedTuple):
 
 
 class Page:
-    """The page collects its rows while the records are written."""
+    """A page that collects its rows while the records are written."""
 
     def __init__(self, recording: RecordingSummary | None, names: Names) -> None:
         self._recording = recording

@@ -250,7 +250,7 @@ def _checked(path: str, answer: httpcore.Response) -> httpcore.Response:
 
 
 def reason_in(refusal: bytes) -> str:
-    """Return the `detail` of a collector's refusal; the body of another server, in printable characters."""
+    """Return the reason of a refusal in printable characters: a collector's `detail`, or the body of another server."""
     try:
         text = msgspec.json.decode(refusal[:_LONGEST_REFUSAL], type=_Refusal).detail
     except ValueError:

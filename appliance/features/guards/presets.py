@@ -199,7 +199,7 @@ class Guard:
     name: str
     preset: Preset
     topics: Mapping[str, str] = field(default_factory=dict)
-    """The topics that are given to the preset, by its names for them; `types` has their message types."""
+    """The given topics, by the preset's names for them. `types` has the types of their messages."""
     types: Mapping[str, str] = field(default_factory=dict)
     values: Mapping[str, str] = field(default_factory=dict)
 

@@ -77,9 +77,9 @@ def explained(
 
 
 def judge_text(text: str | None, current: PolicyKnown, *, cases: bool) -> PolicyJudgement:
-    """With `cases`, also run the test cases beside the policy file.
+    """Judge a text. With `cases`, also run the test cases beside the policy file.
 
-    Raises `ProblemError` with every finding if the text or the cases are invalid.
+    Raise `ProblemError` with every finding if the text or the cases are invalid.
     """
     text, file = (current.text, current.file) if text is None else (text, "policy")
     known = PolicyContext.of(msgspec.structs.asdict(current))

@@ -144,7 +144,7 @@ class BagWriter:
 
 
 def read_fields(file: BinaryIO) -> dict[str, bytes]:
-    """Return the fields of a record; the file is then at the length of its data."""
+    """Return the fields of a record. The file is then positioned at the length of the record's data."""
     data = file.read(_U32.unpack(file.read(4))[0])
     return fields_of(data)
 

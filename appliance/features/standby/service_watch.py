@@ -1,13 +1,13 @@
 """Judge whether the control of an active appliance serves the robot, by its reports.
 
-An appliance that holds the lease without serving is worse than none, because the other one sees a healthy holder.
-So the lease is given away when control reports an obstacle (a full disk), is silent, or does not get ready.
+An appliance that holds the lease without serving is worse than none, because the other one sees a healthy holder. So
+the lease is given away when control reports an obstacle (a full disk), is silent, or does not get ready.
 
 A control that died has `RESTART_SECONDS`, because topics and monitors need no control. After a lapse there are no
 relays, so the other appliance takes over sooner, unless a monitor would lose its state and hold its topics.
 
-If the lease is given away soon, all limits are doubled the next time: two appliances that both cannot serve must
-not pass it back and forth.
+If the lease is given away soon, all limits are doubled the next time, so that two appliances that cannot serve do not
+keep passing it back and forth.
 """
 
 from appliance.features.standby.witness import EXPIRY

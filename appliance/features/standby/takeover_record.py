@@ -1,7 +1,7 @@
 """Record takeovers of a pair of appliances, and replicate the newest signed checkpoint of this appliance's log.
 
-The record of a takeover names the newest replicated checkpoint of the other chain and the last takeover. A
-checkpoint that is not valid, or of this appliance's chain, is not named.
+The record of a takeover names the newest replicated checkpoint of the other chain, if it is valid and really of that
+chain, and the last takeover.
 """
 
 import asyncio

@@ -14,7 +14,7 @@ from appliance.store.stored_deadlines import StoredDeadlines
 
 
 def machines(base: Foundation, parts: Parts) -> dict[str, int]:
-    """Return the number of live nodes by address; a door's node runs on the appliance."""
+    """Return the number of live nodes by address, without nodes of doors, which run on the appliance."""
     doors = {str(address) for address in base.features.addresses().values()}
     nodes = parts.core.registry.machines()
     return {address: number for address, number in nodes.items() if address not in doors}

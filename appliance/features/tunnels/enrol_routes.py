@@ -3,7 +3,7 @@
 1. A host that sends wrong tokens must wait, and all such hosts share one limit. A host that sent no wrong token never
    waits, so an attacker with many addresses cannot keep out a valid token.
 2. Only a host in its tunnel can renew (`self_service.py`).
-3. This module does not parse signing requests.
+3. Signing requests are not parsed here: only the signer does so.
 """
 
 import base64

@@ -1,9 +1,9 @@
 """Run charon, the IPsec daemon of the tunnels, which only this process talks to.
 
 1. The private key stays in this process's own directory (mode 0600) and in charon.
-2. charon has the privileges of this process: its own user, and the capabilities to change the network and to bind
-   the ports 500 and 4500. Each dies with the other, and the supervisor starts both again.
-3. The only untrusted input parsed here is charon's log; at most `REFUSALS_PER_SECOND` are passed on.
+2. charon has the privileges of this process: its own user, and the capabilities to change the network and to bind the
+   ports 500 and 4500. Each dies with the other, and the supervisor starts both again.
+3. The only untrusted input parsed here is charon's log; at most `REFUSALS_PER_SECOND` of its refusals are passed on.
 4. Calls to charon are made one at a time: two calls on one session would read each other's answers.
 """
 
