@@ -4,7 +4,7 @@
    proxy endpoints and relays. At most `_MOST_PENDING` requests for sockets wait at once.
 2. A process of a door that was removed or replaced gets `DoorEnded`, and nothing after it. A door that was added
    again counts as a new door, because its tickets and its agent's address are new.
-3. A process outlives control. On each new link it gets the valid tickets, and ends connections with any other ticket.
+3. On each new link, a process gets the valid tickets, and ends connections with any other ticket.
 """
 
 import asyncio

@@ -1,4 +1,4 @@
-"""The network of a door's node: control makes each socket, with the address of the identity (`door_link.py`)."""
+"""The network of a door's node, which gets each socket from control (`door_link.py`)."""
 
 import asyncio
 import os

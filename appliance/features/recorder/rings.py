@@ -1,4 +1,4 @@
-"""Keep the memory (rings) in which relays store the last messages; the memory survives a relay.
+"""Keep the memory (rings) in which relays store the last messages.
 
 The recorder gets read-only descriptors, and no process can shrink a ring, so reading never fails. All memory is
 allocated at the start: a shortage shows then, not during an incident, and a relay never waits for pages.

@@ -1,8 +1,7 @@
 """The messages between control and the process `lease` of one of two appliances (docs/standby.md).
 
-A standby in the in-sync set has every answered change. So control answers without it only after a `LeaseState` with
-`alone` and a new `permission`, and waits for it again before it reports `caught_up`, after which the witness may add
-it.
+For invariant 6 of `lease.py`, control answers without the standby only after a `LeaseState` with `alone` and a new
+`permission`, and waits for it again before it reports `caught_up`.
 """
 
 from typing import Annotated

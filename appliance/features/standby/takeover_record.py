@@ -1,7 +1,6 @@
 """Record takeovers of a pair of appliances, and replicate the newest signed checkpoint of this appliance's log.
 
-The record of a takeover names the newest replicated checkpoint of the other chain, if it is valid and really of that
-chain, and the last takeover.
+A record names no checkpoint that is not valid, or not of the other chain.
 """
 
 import asyncio
