@@ -79,7 +79,12 @@ def followed(appliance: Appliance, ros: RosSession, folder: Path) -> Trace:
         def recorded() -> Trace | None:
             known = steps(appliance)
             there = [what for what, _, _ in known]
-            return known if (there.count("opened"), there.count("loaded")) == (opened, revision - 1) else None
+            last_end = next(
+                what for what in reversed(["closed", *there]) if what in ("opened", "closed", "revoked")
+            )
+            # More are opened where a listener that had connected by itself is reminded to connect.
+            ready = there.count("opened") >= opened and last_end == "opened"
+            return known if ready and there.count("loaded") == revision - 1 else None
 
         known = eventually(recorded, appliance.story)
         trace.extend(known[sum(what != "heard" for what, _, _ in trace) :])
@@ -114,7 +119,8 @@ def test_a_run_is_an_execution_of_the_model(trace: Trace, tmp_path: Path) -> Non
         ("heard", 1, 1), ("loaded", 2, 1), ("heard", 2, 2), ("heard", 2, 2), ("heard", 2, 2), ("loaded", 3, 0),
         ("heard", 3, 3),
     ]  # fmt: skip
-    assert (happened.count("opened"), happened.count("revoked")) == (3, 1)
+    assert happened.count("opened") >= 3
+    assert happened.count("revoked") == 1
     assert accepts(tmp_path, bounds(trace), trace), trace
 
 

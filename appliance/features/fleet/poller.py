@@ -68,15 +68,16 @@ class Poller:
             if selected is not None and _is_news(selected, stated):
                 self.offer(_offered(self.bundles.get(selected)))
         except BundleTooEarlyError as error:
-            self.progress = BundlePollReported(self.clock())
-            return _jittered(min(self.interval, max(1.0, error.at - self.clock())))
+            pause = max(1.0, error.at - self.clock())
         except (BundleRejectedError, BundleFolderError, CollectorError) as error:
             return self._failed(error)
+        else:
+            pause = self.interval
         if self._failures:
             _log.warning("the collector's bundles are verified again")
         self._failures = 0
         self.progress = BundlePollReported(self.clock())
-        return _jittered(self.interval)
+        return _jittered(min(self.interval, pause))
 
     def _failed(self, error: Exception) -> float:
         if not self._failures:

@@ -190,13 +190,16 @@ def set_values(
         _replay(appliance, row, with_values(text, _in_force(row, preset) | checked), since)
         return
     in_text = {each: value for each, value in checked.items() if preset.parameter(each).loads}
+    constants: dict[str, GivenValue] = {each: value for each, value in checked.items() if each not in in_text}
     if in_text:
         changed = with_values(text, in_text)
-        order = admin.MonitorLoad({row.file: changed}, note=described(changed), shadow=row.shadow, hold=hold)
+        order = admin.MonitorLoad(
+            {row.file: changed}, note=described(changed), shadow=row.shadow, hold=hold,
+            given={name: constants} if constants else {},
+        )  # fmt: skip
         _say_changed(appliance, appliance.ask_or_exit(order))
         _write(appliance, loaded, row.file, changed)
-    constants: dict[str, GivenValue] = {each: value for each, value in checked.items() if each not in in_text}
-    if constants:
+    elif constants:
         answer = appliance.answer_or_exit(admin.MonitorGive(name, constants))
         say(
             f"{name}: set {', '.join(f'{each}={constants[each]}' for each in answer.changed) or 'no difference'}"

@@ -75,7 +75,7 @@ class SignOut(AdminRequest[SignedOn], frozen=True, tag="sso sign out"):
 
 @rest(
     "admin", "DELETE", "/v1/sso/people/{name}", name="end_sessions", tag="tokens",
-    problems={404: "Nobody of this name is signed in."},
+    problems={404: "No person of this name is signed in."},
 )  # fmt: skip
 class SessionsEnd(AdminRequest[SignedOnList], frozen=True, tag="sso end"):
     """End all sessions of a person now. They can sign in again unless the provider refuses it; for admins."""

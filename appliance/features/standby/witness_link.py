@@ -1,8 +1,6 @@
-"""The datagrams between an appliance and the witness, and the socket that carries them."""
+"""The datagrams between an appliance and the witness."""
 
-import asyncio
-from collections.abc import Callable
-from typing import Annotated, Any
+from typing import Annotated
 
 import msgspec
 
@@ -75,30 +73,3 @@ class WitnessChannel:
             body.ok, body.reason, body.epoch, body.holder, body.in_sync, body.expired, body.trouble
         )
         return request, answer
-
-
-class WitnessLink(asyncio.DatagramProtocol):
-    """The socket to the witness."""
-
-    def __init__(
-        self, channel: WitnessChannel, answered: Callable[[WitnessRequest, WitnessAnswer], None]
-    ) -> None:
-        self._channel = channel
-        self._answered = answered
-        self._transport: asyncio.DatagramTransport | None = None
-
-    def connection_made(self, transport: Any) -> None:
-        self._transport = transport
-
-    def datagram_received(self, data: bytes, addr: object) -> None:  # noqa: ARG002  asyncio passes it
-        answer = self._channel.read(data)
-        if answer is not None:
-            self._answered(*answer)
-
-    def error_received(self, exc: Exception) -> None:
-        """Ignore an unreachable witness, because the lease counts only on answers."""
-
-    def send(self, request: WitnessRequest) -> None:
-        """Without a socket or a route the request is lost; the lease asks again."""
-        if self._transport is not None:
-            self._transport.sendto(self._channel.write(request))

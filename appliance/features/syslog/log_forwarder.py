@@ -129,7 +129,7 @@ class LogForwarder:
             sequence=through,
             checkpoint=last,
             behind=head - through,
-            seconds=self._waited(entries) if head > through else 0.0,
+            seconds=self._waited(entries[-1:]) if head > through else 0.0,
             missed=self.progress.missed + missed,
         )
         return head > through or len(ready) == _BATCH

@@ -1,4 +1,3 @@
-import asyncio
 import contextlib
 import errno
 import os
@@ -12,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from appliance.features.standby import witness
-from appliance.features.standby.lease import WitnessAnswer, WitnessRequest
-from appliance.features.standby.witness_link import WitnessChannel, WitnessLink
+from appliance.features.standby.lease import WitnessRequest
+from appliance.features.standby.witness_link import WitnessChannel
 from examples.landshark.lab import Lab
 from tests.support.features.standby.witness_site import (
     ADDRESSES,
@@ -29,7 +28,7 @@ from tests.support.features.standby.witness_site import (
     forged,
     seconds_until_reset,
 )
-from tests.support.processes import LIMIT, Process
+from tests.support.processes import Process
 from tests.support.requirements import need_program, need_root
 from tests.support.waiting import eventually
 
@@ -209,32 +208,6 @@ def test_forged_datagrams_take_no_room_from_a_renewal(site: Site) -> None:
     found = a.channel.read(a.socket.recv(1024))
     assert found is not None
     assert found[1].ok
-
-
-def test_the_appliances_socket_gets_the_lease(site: Site) -> None:
-    site.serve()
-
-    async def claimed() -> WitnessAnswer:
-        answers: asyncio.Queue[WitnessAnswer] = asyncio.Queue()
-        link = WitnessLink(
-            WitnessChannel("a", KEYS["a"], "session"), lambda _, answer: answers.put_nowait(answer)
-        )
-        with site.hosts["a"].entered():
-            own = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        own.setblocking(False)
-        own.connect((ROBOT, WITNESS))
-        link.send(WitnessRequest("claim", 1, 1, 0.0))  # before there is a socket: lost
-        transport, _ = await asyncio.get_running_loop().create_datagram_endpoint(lambda: link, sock=own)
-        with contextlib.closing(transport):
-            async with asyncio.timeout(LIMIT):
-                while True:
-                    link.send(WitnessRequest("claim", 1, 2, 0.0))
-                    with contextlib.suppress(TimeoutError):
-                        answer = await asyncio.wait_for(answers.get(), 0.3)
-                        if answer.ok:
-                            return answer
-
-    assert asyncio.run(claimed()).holder == "a"
 
 
 def test_the_units_start_the_witness_and_shut_out_both_before_the_network() -> None:

@@ -1,5 +1,6 @@
 import ast
 import json
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -487,6 +488,21 @@ def test_it_runs_on_python_3_5() -> None:
     command = [str(Path(sys.executable).with_name("vermin")), "--no-tips", "--target=3.5-", program.__file__]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout
+
+
+def test_its_patterns_compile_on_python_3_5() -> None:
+    """Before 3.11 the `re` module has no possessive quantifiers, and the witness would end at its start."""
+    newer = re.compile(r"[*+?}]\+|\(\?>")
+    assert newer.search(r"\d++") is not None
+    patterns = [
+        node.args[0].value
+        for node in ast.walk(ast.parse(SOURCE))
+        if isinstance(node, ast.Call)
+        and ast.unparse(node.func).startswith("re.")
+        and isinstance(node.args[0], ast.Constant)
+    ]
+    assert patterns
+    assert [one for one in patterns if newer.search(one)] == []
 
 
 def test_it_imports_only_the_standard_library() -> None:
