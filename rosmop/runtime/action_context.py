@@ -1,10 +1,10 @@
-"""Bound a specification's actions, and collect their output: log lines, published messages, faults.
+"""Bound a specification's actions, and collect their output.
 
 1. Between two calls of `begin` a specification spends at most its budget of instructions. Loops, calls, long copies
-   and reads of many elements are charged before they run. If processor time is bounded (`Turn.limit`), the clock is
-   read every `STEP` instructions, and every `PART` elements.
-2. The values of a specification never exceed `MAX_BYTES` plus `UNMEASURED` bytes. Code that makes long values calls
-   `allocate`; after `UNMEASURED` bytes the live values are measured.
+and reads of many elements are charged before they run. With `Turn.limit`, processor time is read every `STEP`
+instructions and every `PART` elements.
+2. The values of a specification never exceed `MAX_BYTES` plus `UNMEASURED` bytes, after which `allocate` measures the
+live values.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -35,7 +35,7 @@ Measure = Callable[[object], int]
 
 
 class FaultError(Exception):
-    """A fault stops an action."""
+    """A runtime error, which stops an action. Its `site` is a position in the specification, or -1."""
 
     def __init__(self, site: int, text: str) -> None:
         super().__init__(text)
@@ -44,7 +44,7 @@ class FaultError(Exception):
 
 
 class MalformedError(Exception):
-    """The bytes of a message are not of its type."""
+    """A message whose bytes do not fit its type."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +57,6 @@ class LogLine:
 
 
 def line_of(level: str, text: bytes, monitor: str) -> LogLine:
-    """Replace bytes that are not UTF-8 by U+FFFD."""
     return LogLine(level, text.decode("utf-8", "replace").rstrip("\n"), monitor)
 
 
@@ -122,7 +121,7 @@ class Turn:
 
 
 class Context:
-    """The bounds and the output of one specification."""
+    """The budgets and the output of one specification."""
 
     __slots__ = (
         "_allocated",

@@ -1,7 +1,6 @@
-"""Name the functions that the intermediate form (`form/nodes.py`) may call.
+"""The functions that the intermediate form (`form/nodes.py`) may call, by name.
 
-A first parameter `context` is the running specification's, which pays for the call; a last parameter `site` is the
-position of a fault.
+A first parameter `context` pays for the call. A last parameter `site` is the position of a fault.
 """
 
 import inspect

@@ -1,14 +1,14 @@
-"""`sin`, `cos`, `atan2` and `hypot` give the same bits on every machine, because they use IEEE operations only.
+"""`sin`, `cos`, `atan2` and `hypot` from IEEE operations only, so that every machine gives the same bits.
 
-The algorithms are those of fdlibm (Sun Microsystems, 1993) and, for `hypot`, of musl; the error is below one unit in
-the last place. `check/library_functions.py` has the same operations in the same order, for modules and proofs.
+The algorithms are those of fdlibm (Sun Microsystems, 1993) and, for `hypot`, of musl; the error is below one
+unit in the last place. `check/library_functions.py` has the same operations in the same order.
 """
 
 import math
 from math import copysign, fabs, inf, sqrt
 
 LARGEST = 1048576.0
-"""The C library reduces larger angles."""
+"""The largest angle of which this holds: the C library computes larger angles."""
 
 _EIGHTH = 7.85398163397448278999e-01
 _WHOLE = 1.5 * 2.0**52  # adding and subtracting it rounds to a whole number

@@ -74,7 +74,6 @@ def join_all(context: Context, pieces: tuple[bytes, ...], site: int) -> bytes:
 def formatted(
     context: Context, template: bytes, arguments: tuple[object, ...], size: int, site: int
 ) -> bytes:
-    """The cost is charged in advance. `size` is the length of the text without its strings."""
     size += sum(len(argument) for argument in arguments if isinstance(argument, bytes))
     if size > _LONG:
         context.allocate(size, site)

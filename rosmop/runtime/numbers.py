@@ -32,7 +32,7 @@ def f32_of_integer(value: int) -> float:
 
 
 def truncate(value: float, least: int, most: int) -> int:
-    """Clamp the number to the limits; NaN becomes 0."""
+    """Truncate toward zero, within the limits; NaN becomes 0."""
     if value != value:  # noqa: PLR0124  NaN
         return 0
     if value <= least:
@@ -46,7 +46,6 @@ def wrap(value: int, bits: int, signed: bool) -> int:
 
 
 def divide(left: int, right: int, site: int) -> int:
-    """Round toward zero."""
     if right == 0:
         raise FaultError(site, "division by zero")
     result = abs(left) // abs(right)
@@ -54,7 +53,7 @@ def divide(left: int, right: int, site: int) -> int:
 
 
 def remainder(left: int, right: int, site: int) -> int:
-    """The remainder has the sign of `left`."""
+    """Return the remainder, which has the sign of `left`."""
     if right == 0:
         raise FaultError(site, "division by zero")
     result = abs(left) % abs(right)
@@ -62,7 +61,7 @@ def remainder(left: int, right: int, site: int) -> int:
 
 
 def ratio(left: float, right: float) -> float:
-    """Division by zero gives infinity or NaN."""
+    """Divide as IEEE: division by zero gives infinity or NaN."""
     try:
         return left / right
     except ZeroDivisionError:
@@ -72,8 +71,6 @@ def ratio(left: float, right: float) -> float:
 
 
 def _total(function: Callable[..., float]) -> Callable[..., float]:
-    """Return C's results wherever Python's function raises."""
-
     def answer(*arguments: float) -> float:
         try:
             return float(function(*arguments))
@@ -108,7 +105,6 @@ def power(base: float, exponent: float) -> float:
 
 
 def round_half_away(value: float) -> float:
-    """Round as C's `round`."""
     if not math.isfinite(value):
         return value
     whole = math.floor(abs(value))
@@ -116,7 +112,6 @@ def round_half_away(value: float) -> float:
 
 
 def round_half_even(value: float) -> float:
-    """Round as C's `rint`."""
     return math.copysign(float(round(value)), value) if math.isfinite(value) else value
 
 
@@ -166,7 +161,6 @@ def fmax(left: float, right: float) -> float:
 
 
 def positive_difference(left: float, right: float) -> float:
-    """C's `fdim`."""
     if math.isnan(left) or math.isnan(right):
         return math.nan
     return left - right if left > right else 0.0

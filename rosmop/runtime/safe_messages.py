@@ -1,4 +1,4 @@
-"""Compare, send and insert safe messages; they are serialized when the specification is compiled."""
+"""Compare safe messages with received ones, and stamp them for sending."""
 
 import struct
 

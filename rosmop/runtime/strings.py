@@ -133,7 +133,6 @@ def replace(context: Context, text: bytes, start: int, count: int, added: bytes,
 
 
 def shorten(context: Context, text: bytes, site: int) -> bytes:
-    """`text.pop_back()`."""
     if not text:
         raise FaultError(site, "pop_back of an empty string")
     return charged(context, text, site)[:-1]
@@ -182,7 +181,7 @@ def _allocate(context: Context, buffer: bytes, site: int) -> None:
 
 
 def parse_integer(text: bytes, base: int, least: int, most: int, site: int) -> int:
-    """`std::stoi` and similar functions; fault where C++ throws."""
+    """`std::stoi` and similar functions, which fault where C++ throws."""
     found = _INTEGERS[base].match(text[:1000])
     if found is None:
         raise FaultError(site, "the string does not begin with a number")
@@ -195,7 +194,7 @@ def parse_integer(text: bytes, base: int, least: int, most: int, site: int) -> i
 
 
 def parse_floating(text: bytes, bits: int, site: int) -> float:
-    """`std::stod` or `std::stof`; fault where C++ throws."""
+    """`std::stod` or `std::stof`, which fault where C++ throws."""
     found = _FLOATING.match(text[:1000])
     if found is None:
         raise FaultError(site, "the string does not begin with a number")

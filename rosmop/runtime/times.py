@@ -11,21 +11,19 @@ MAX_DURATION = (1 << 31) * BILLION - 1
 
 
 def time(nanoseconds: int, site: int) -> int:
-    """Fault where C++ throws, because messages cannot hold the time."""
+    """Return the time, or fault where C++ throws because messages cannot hold it."""
     if 0 <= nanoseconds <= MAX_TIME:
         return nanoseconds
     raise FaultError(site, "the time is out of range: from 0 to 2^32 seconds")
 
 
 def duration(nanoseconds: int, site: int) -> int:
-    """Fault where C++ throws, because messages cannot hold the duration."""
     if MIN_DURATION <= nanoseconds <= MAX_DURATION:
         return nanoseconds
     raise FaultError(site, "the duration is out of range: 2^31 seconds")
 
 
 def nanoseconds(seconds: float, site: int) -> int:
-    """Round as ROS, which splits off the whole seconds first."""
     if not math.isfinite(seconds) or abs(seconds) > 1 << 33:
         raise FaultError(site, f"{seconds} seconds are out of range")
     whole = math.floor(seconds)

@@ -27,10 +27,7 @@ BILLION = 1_000_000_000
 
 
 def struct_code(kind: Type) -> str | None:
-    """Return the code of a type, or None for a type without a fixed size.
-
-    A time has two codes: for seconds and for nanoseconds.
-    """
+    """Return the `struct` code of a type: two for a time, None for a type without a fixed size."""
     if isinstance(kind, value_types.BoolType):
         return "?"
     if isinstance(kind, value_types.IntegerType):

@@ -1,6 +1,6 @@
-"""Operations on vectors, which are Python lists, charge for long values first.
+"""Operations on vectors, which are Python lists. Long values are charged before they are made.
 
-`width` is the size of an element in C++ in bytes, which counts towards the memory limit.
+`width` is the size of an element in C++ in bytes, for the memory limit.
 """
 
 import math
@@ -50,7 +50,7 @@ def weighed(context: Context, values: Values, measure: Callable[[Values], int], 
 
 
 def same(left: Any, right: Any) -> bool:
-    """A NaN equals nothing, not even itself."""
+    """Whether two values are equal as in C++, where NaN equals nothing, not even itself."""
     return left == right and _numbers(left)
 
 
@@ -113,7 +113,6 @@ def _made(context: Context, count: int, make: Callable[[], Any]) -> Values:
 def resized(  # noqa: PLR0917  the arguments are C++'s
     context: Context, values: Values, count: int, make: Callable[[], Any], width: int, site: int
 ) -> None:
-    """`values.resize(count)`."""
     more = count - len(values)
     if more <= 0:
         del values[count:]
@@ -140,7 +139,6 @@ def filled_with(  # noqa: PLR0917  the arguments are C++'s
 
 
 def fixed(values: Values, count: int, site: int) -> Values:
-    """Fault if the number of elements differs."""
     if len(values) != count:
         raise FaultError(site, f"{len(values)} elements for an array of exactly {count}")
     return values
@@ -152,7 +150,6 @@ def _check_span(values: Values, first: int, last: int, site: int) -> None:
 
 
 def erase(context: Context, values: Values, first: int, last: int | None, site: int) -> None:
-    """`values.erase(first)`, `values.erase(first, last)`."""
     last = first + 1 if last is None else last
     _check_span(values, first, last, site)
     context.spend((len(values) - first) // 64, site)
@@ -167,7 +164,6 @@ def insert(context: Context, values: Values, at: int, value: Any, width: int, si
 
 
 def sort(context: Context, values: Values, first: int, last: int, site: int) -> None:
-    """`std::sort`."""
     _check_span(values, first, last, site)
     steps = (last - first).bit_length()
     context.spend((last - first) * steps, site)
@@ -177,7 +173,6 @@ def sort(context: Context, values: Values, first: int, last: int, site: int) -> 
 
 
 def reverse(context: Context, values: Values, first: int, last: int, site: int) -> None:
-    """`std::reverse`."""
     _check_span(values, first, last, site)
     context.spend((last - first) // 4, site)
     values[first:last] = values[first:last][::-1]
@@ -207,7 +202,6 @@ def accumulate(  # noqa: PLR0917  the arguments are C++'s, and how to add
     start: Any,
     add: Callable[[Any, Any], Any],
 ) -> Any:
-    """`std::accumulate`."""
     _check_span(values, first, last, site)
     context.spend(last - first, site)
     for index in range(first, last):

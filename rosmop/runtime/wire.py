@@ -50,7 +50,7 @@ def numbers(buffer: Buffer, start: int, number: int, code: str, size: int) -> tu
 
 
 def moments(buffer: Buffer, start: int, number: int, code: str) -> tuple[list[int], int]:
-    """Return times (code `I`) or durations (`i`) as nanoseconds, and their end."""
+    """Return times (code `I`) or durations (`i`) in nanoseconds, and the position after them."""
     pairs, end = numbers(buffer, start, 2 * number, code, 4)
     return [pairs[i] * 1_000_000_000 + pairs[i + 1] for i in range(0, len(pairs), 2)], end
 
@@ -62,7 +62,6 @@ def elements(
     decode: Callable[[Buffer, int], tuple[Any, int]],
     check: Callable[[], None],
 ) -> tuple[list[Any], int]:
-    """Return `number` values, and their end. `check` is called from time to time."""
     if number > _MAX_DECODED:
         raise MalformedError(
             f"an array of {number} elements; at most {_MAX_DECODED} that are not numbers are read"
@@ -77,7 +76,6 @@ def elements(
 
 
 def skip(buffer: Buffer, start: int, number: int, end: Callable[[Buffer, int], int], context: Context) -> int:
-    """Return the end of `number` elements. Many are charged first."""
     if number > FEW:
         context.walk(number)
     return _skipped(buffer, start, number, end, context)
@@ -86,7 +84,7 @@ def skip(buffer: Buffer, start: int, number: int, end: Callable[[Buffer, int], i
 def skip_inner(
     buffer: Buffer, start: int, number: int, end: Callable[[Buffer, int], int], context: Context
 ) -> int:
-    """Like `skip`, but within a skipped element: there may be many such calls, so even a few elements are charged."""
+    """Like `skip` within a skipped element: there may be many such calls, so even a few elements are charged."""
     context.walk(number + 1)
     return _skipped(buffer, start, number, end, context)
 
@@ -120,10 +118,10 @@ def put_moments(values: list[int], code: str, out: bytearray) -> None:
 class WireMessage:
     """The message of an event, with all changes so far.
 
-    Numbers are written in place, and only the replaced bytes are kept, so a large image is not copied when its stamp
-    changes. `touched` has a bit for each statement (of the sites in `marks`) whose write changed bytes; it is cleared
-    after each event. `cause` is the site of the statement that dropped the message; `stopped` that which replaced it
-    by the safe one of its `channel`.
+    Numbers are written in place, and only the replaced bytes are kept, so a large image is not copied when
+    its stamp changes. `touched` has a bit for each statement (by the sites in `marks`) that changed bytes
+    since the last event. `cause` is the site that dropped the message, and `stopped` the site that replaced
+    it with the safe message of its `channel`.
     """
 
     __slots__ = (
@@ -171,7 +169,7 @@ class WireMessage:
         return self.written or ()
 
     def patch(self, start: int, new: bytes, by: int = 1) -> None:
-        """Replace bytes with the same number of new ones. If they differ, `touched` gets the bits `by`."""
+        """Replace bytes with the same number of new bytes, and set the bits `by` of `touched` if they differ."""
         end = start + len(new)
         old = self.buffer[start:end]
         if old == new:
@@ -188,7 +186,7 @@ class WireMessage:
         self.buffer[start:end] = new  # type: ignore[index]  # it is a bytearray or a writable memoryview
 
     def splice(self, edits: list[tuple[int, int, bytes, int]]) -> None:
-        """An edit has start, end, new bytes and bits (see `patch`)."""
+        """Apply edits, each with start, end, new bytes and bits (see `patch`). The length may change."""
         if all(len(new) == end - start for start, end, new, _ in edits):
             for start, _, new, by in edits:
                 self.patch(start, new, by)
@@ -205,7 +203,7 @@ class WireMessage:
         self.buffer = bytearray(b"".join(pieces))
 
     def stop(self, safe: SafeMessage, site: int) -> None:
-        """A header keeps its `seq` and `stamp`."""
+        """Replace the message with a safe message; a header keeps its `seq` and `stamp`."""
         first = HEAD if safe.stamped and len(self.buffer) >= HEAD else 0
         new = safe.data[first:] if first else sent(safe, self.time)
         self.splice([(first, len(self.buffer), new, 0)])
@@ -227,7 +225,7 @@ def whole(
     pending: tuple[tuple[bool, tuple[int | str, ...], Any], ...],
     site: int,
 ) -> list[Any]:
-    """`pending` are the fields that the action assigned: (assigned, path, value)."""
+    """Return the decoded message, with the fields that the action assigned: `pending` has (assigned, path, value)."""
     context.allocate(len(message.buffer), site)
     value: list[Any] = decode(message.buffer, 0)[0]
     for assigned, path, new in pending:

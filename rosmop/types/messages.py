@@ -1,4 +1,4 @@
-"""Look up message types: fields in order, their types, and constants."""
+"""Look up message types, with their fields and constants."""
 
 import difflib
 from collections.abc import Iterable, Mapping
@@ -38,7 +38,7 @@ PRIMITIVES: Mapping[str, Type] = MappingProxyType(
 
 @dataclass(frozen=True)
 class FieldSlot:
-    """A field; `index` is its index in the list of the message's values."""
+    """A field of a message type, and its `index` in the list of a message's values."""
 
     index: int
     name: str
@@ -47,18 +47,17 @@ class FieldSlot:
 
 
 class UnknownNameError(Exception):
-    """A name is unknown; the text suggests a similar one."""
+    """An unknown name; the text suggests a similar name."""
 
 
 class MessageTypes:
-    """The message types of a set of definitions."""
+    """Looks up the message types of a set of definitions. Unknown and unusable names raise `UnknownNameError`."""
 
     def __init__(self, definitions: Definitions) -> None:
         self.definitions = definitions
         self._slots: dict[str, dict[str, FieldSlot]] = {}
 
     def definition(self, name: str) -> MessageDefinition:
-        """Raises `UnknownNameError` unless the definition is complete and usable."""
         try:
             self.definitions.layout(name)
             return self.definitions.message(name)
@@ -80,7 +79,6 @@ class MessageTypes:
         return self._slots[name]
 
     def slot(self, name: str, field: str) -> FieldSlot:
-        """Raises `UnknownNameError` with the nearest name."""
         slots = self.slots(name)
         if field not in slots:
             paths = self._paths_to(name, field)
@@ -90,7 +88,6 @@ class MessageTypes:
         return slots[field]
 
     def constant(self, name: str, constant: str) -> Constant:
-        """Raises `UnknownNameError`."""
         constants = {known.name: known for known in self.definition(name).constants}
         if constant not in constants:
             raise UnknownNameError(f"{name} has no constant {shown(constant)}{nearest(constant, constants)}")

@@ -1,4 +1,4 @@
-"""Resolve the type names of a specification."""
+"""Resolve the type names of a specification. Unknown names raise `SpecificationError`."""
 
 from rosmop.form.findings import Position, SpecificationError
 from rosmop.text import tree
@@ -50,7 +50,6 @@ def named_type(parts: tuple[str, ...]) -> Type | None:
 
 
 def resolve(name: tree.TypeName, messages: MessageTypes) -> Type:
-    """Raises `SpecificationError`; `auto` is not resolved here."""
     if name.element is not None:
         element = resolve(name.element, messages)
         if element in (value_types.VOID, value_types.CHARACTERS):
@@ -115,7 +114,6 @@ def _meant(parts: tuple[str, ...], messages: MessageTypes) -> str:
 
 
 def record(position: Position, name: str, messages: MessageTypes) -> value_types.RecordType:
-    """Raises `SpecificationError`."""
     try:
         messages.definition(name)
     except UnknownNameError as error:

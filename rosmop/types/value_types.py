@@ -1,7 +1,7 @@
 """The types of values: C++'s arithmetic types, strings, times, vectors and messages.
 
-The text of a type is its C++ spelling. Values are `bool`, `int` and `float` for numbers; bytes for strings and `char
-*` buffers; integer nanoseconds for times and durations; lists for vectors, and for the fields of messages in order.
+A type prints as in C++. Values are `bool`, `int` and `float`; bytes for strings and buffers; integer
+nanoseconds for times and durations; lists for vectors and for the fields of messages.
 """
 
 import msgspec
@@ -23,7 +23,7 @@ class VoidType(_Kind, frozen=True):
 
 
 class IteratorType(_Kind, frozen=True):
-    """A position in a vector; no variable holds it."""
+    """A position in a vector; variables cannot hold it."""
 
     def __str__(self) -> str:
         return "an iterator"
@@ -37,7 +37,7 @@ class BoolType(_Kind, frozen=True):
 
 
 class IntegerType(_Kind, frozen=True):
-    """`name` is only for error messages, because `long` and `long long` are the same type."""
+    """An integer type. Its `name` serves only error messages, because `long` and `long long` are the same type."""
 
     bits: int
     signed: bool
