@@ -19,7 +19,8 @@ from rosmop.types.value_types import Type
 class EventCode:
     """A compiled event: its function and its trigger.
 
-    `service_type` is that of the service; `type` is that of the message, request or response.
+    For an event of a service, `type` is the type of the request or response, and `service_type` that of the
+    service.
     """
 
     name: str
@@ -34,7 +35,7 @@ class EventCode:
     key: str = ""
     creates: bool = False
     plain: bool = False
-    """The event has neither an action nor a `when`, so its key alone decides."""
+    """The key alone decides: there is neither an action nor a `when`."""
     acts: bool = False
 
     @property
@@ -44,10 +45,10 @@ class EventCode:
 
 @dataclass(frozen=True)
 class Comparison:
-    """A comparison. `when_true` and `when_false` each name the variables (double) for its two sides.
+    """A comparison whose closest true and closest false results are noted in variables.
 
-    The left variable is infinite until the comparison is evaluated. `threshold` is the constant side (0: left, 1:
-    right).
+    `when_true` and `when_false` name the variables (double) for the left and the right side; the left one is
+    infinite until the comparison is evaluated. `threshold` is the constant side (0: left, 1: right), if any.
     """
 
     position: Position
@@ -62,7 +63,7 @@ class Comparison:
 
 @dataclass(frozen=True)
 class Withholding:
-    """A topic that hosts in `networks` do not get while a variable, named as in the code, is true."""
+    """A topic that hosts in `networks` do not receive while a variable is true; `condition` is its name in the form."""
 
     topic: str
     networks: tuple[str, ...]
@@ -73,7 +74,7 @@ class Withholding:
 class Publication:
     """A topic that a specification publishes or a service that it calls, and the position of the statement.
 
-    `safe`: only its safe message is published.
+    If it is `safe`, only the topic's safe message is published.
     """
 
     specification: str
@@ -110,7 +111,7 @@ class Given:
 
 @dataclass(frozen=True)
 class GivenTopic:
-    """A topic that a load may replace; `name` is that in the text."""
+    """A topic that operators may replace when they load the set; `name` is its name in the text."""
 
     name: str
     topic: str
@@ -119,9 +120,9 @@ class GivenTopic:
 
 @dataclass(frozen=True)
 class Slicing:
-    """The parameters of slices (name in the text, name in the code, type), and their own variables.
+    """The parameters of slices (name in the text, name in the code, type), and the variables of each slice.
 
-    `enforces`: the specification drops, changes or publishes messages.
+    A specification `enforces` if it drops, changes or publishes messages.
     """
 
     parameters: tuple[tuple[str, str, value_types.Type], ...]
@@ -208,7 +209,6 @@ class Compiled:
         return [group for group in sharing(uses) if not group.isdisjoint(names)]
 
     def without(self, names: Collection[str]) -> "Compiled":
-        """Also leave out specifications that share variables with `names`."""
         gone = {name for group in self.groups(names) for name in group}
         return self.part({one.name for one in self.specifications} - gone)
 

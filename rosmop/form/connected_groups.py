@@ -4,7 +4,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 
 
 def sharing(uses: Mapping[str, Collection[str]]) -> list[set[str]]:
-    """`uses` maps each specification to those whose variables it uses."""
+    """Group specifications; `uses` maps each to those whose variables it uses."""
     names = list(uses)
     return [
         {names[number] for number in group} for group in connected([(name, *uses[name]) for name in names])
@@ -30,5 +30,5 @@ def connected(keys: Sequence[Iterable[object]]) -> Iterable[Sequence[int]]:
 
 
 def channel_of(service: str, part: str) -> str:
-    """Name a part of a service in place of a topic; the name contains a blank, as no topic does."""
+    """Return the name of a part of a service in place of a topic. It contains a blank, which no topic does."""
     return f"{service} {part}"

@@ -9,7 +9,7 @@ Severity = Literal["error", "warning"]
 
 @dataclass(frozen=True, order=True)
 class Position:
-    """Line and column count from 1; a column is a character (a tab is one)."""
+    """A position in a file. Lines and columns count from 1, and a column is a character (a tab is one)."""
 
     file: str
     line: int

@@ -1,14 +1,12 @@
 """The form: typed expressions, statements and functions, without names to look up or types to infer.
 
-Every expression has a type (`types/value_types.py`); conversions are explicit. Values are as in C++ on a 64-bit
-machine: integers wrap at their width, floats have 32 or 64 bits, strings are bytes. Times and durations are
-nanoseconds. Vectors and messages are references, so copies are also explicit (`Copy`).
+Conversions are explicit, and so are copies (`Copy`), because vectors and messages are references. Values are
+as in C++ on a 64-bit machine: integers wrap, floats have 32 or 64 bits, strings are bytes; times and
+durations are nanoseconds. Reading beyond the end of the message is a fault, and so is exceeding a budget.
 
-Names belong to the set of specifications (`g…`) or to one call of one function. A *site* is the number of a position
-in the text, for reports of faults; -1 means the statement's own site. A `Spot` is an offset from the start of the
-message, or from a position that an earlier statement named. Reading beyond the end is a fault, and so is exceeding
-the budgets of instructions and bytes. Each back end has a table with a row for each kind of node: an implementation,
-or `Left`.
+Names belong to the set of specifications (`g…`) or to one call of one function. A *site* is the number of a
+position in the text, for reports of faults; -1 means the statement's own site. Each back end has a table with
+a row for each kind of node: an implementation, or `Left`.
 """
 
 from collections.abc import Iterator, Mapping
@@ -34,7 +32,7 @@ class FormNode(msgspec.Struct, frozen=True, tag=True, tag_field="node", array_li
 class Literal(FormNode, frozen=True):
     """A constant. An array of numbers is given by its bytes in a message.
 
-    Its type is void for None and for the name of a part of a time, which are not values of the language.
+    The type is void for None and for the name of a part of a time.
     """
 
     type: Type
@@ -57,9 +55,9 @@ class Assign(FormNode, frozen=True):
 
 
 class Convert(FormNode, frozen=True):
-    """A number of another type: integers wrap, floating-point numbers are truncated toward zero or rounded.
+    """A number converted to another type. Integers wrap, and every number except zero is true.
 
-    Truncation stays within the limits (NaN is 0). Every number other than zero is true.
+    Floats are rounded to the width of the type, or truncated to an integer within its limits (NaN is 0).
     """
 
     type: Type
@@ -88,7 +86,7 @@ class Unary(FormNode, frozen=True):
 
 
 class Moment(FormNode, frozen=True):
-    """An exact sum or difference of times and durations; a fault if the type cannot hold the result."""
+    """An exact sum or difference of times and durations, which faults if the type cannot hold the result."""
 
     type: Type
     operator: str
@@ -98,7 +96,7 @@ class Moment(FormNode, frozen=True):
 
 
 class MomentOf(FormNode, frozen=True):
-    """A time or duration from seconds and nanoseconds (both `long`); a fault if the type cannot hold the result."""
+    """A time or duration from seconds and nanoseconds (both `long`), which faults if the type cannot hold it."""
 
     type: Type
     seconds: "Expression"
@@ -117,10 +115,9 @@ class Compare(FormNode, frozen=True):
 
 
 class CompareTexts(FormNode, frozen=True):
-    """A comparison of strings.
+    """A comparison of strings, which charges the length of the left string.
 
-    The left string is charged by its length, unless either string is `short` or the right one is a variable with few
-    bytes.
+    It does not charge if either string is `short`, or if the right string is a variable with few bytes.
     """
 
     operator: str
@@ -228,7 +225,7 @@ class Call(FormNode, frozen=True):
 
 
 class Accumulate(FormNode, frozen=True):
-    """The sum of `start` and a vector's elements from `first` to before `last`, each step in the type `wide`."""
+    """The sum of `start` and a vector's elements from `first` to before `last`, calculated in the type `wide`."""
 
     type: Type
     vector: "Expression"
@@ -391,36 +388,36 @@ class Leave(FormNode, frozen=True):
 
 
 class Charge(FormNode, frozen=True):
-    """Takes from the budget."""
+    """Charge instructions to the budget."""
 
     site: int
     instructions: int
 
 
 class Allocate(FormNode, frozen=True):
-    """Charge for the bytes of a new value. None stands for the bytes of the message, if they are many."""
+    """Charge for the bytes of a new value. None means the bytes of the message, if they are many."""
 
     site: int
     size: int | None
 
 
 class LimitDepth(FormNode, frozen=True):
-    """Faults if the recursion is too deep."""
+    """Fault if the recursion is too deep."""
 
     site: int
     name: str
 
 
 class Drop(FormNode, frozen=True):
-    """Drops the message. A deadline has no message to drop."""
+    """Drop the message. A deadline has no message to drop."""
 
     site: int
 
 
 class SafeMessage(FormNode, frozen=True):
-    """The message that a monitor sends on a topic, and passes, while it cannot judge; `site` is its declaration.
+    """The only message that a monitor sends or passes on a topic while it cannot judge. Its declaration is at `site`.
 
-    A `stamped` message begins with a header whose `seq` and `stamp` do not count and are set when it is sent.
+    If it is `stamped`, the `seq` and `stamp` of its header are not compared, and are set when it is sent.
     """
 
     topic: str
@@ -432,7 +429,7 @@ class SafeMessage(FormNode, frozen=True):
 
 
 class StopMessage(FormNode, frozen=True):
-    """Replace the message by the safe one of its topic. Without such a message, publish all of `safes`."""
+    """Replace the message with the safe message of its topic, or publish all of `safes` if it has none."""
 
     site: int
     safes: tuple[SafeMessage, ...]
@@ -477,7 +474,7 @@ class AfterText(FormNode, frozen=True):
 
 
 class Count(FormNode, frozen=True):
-    """Names the number of elements of the array at `at`; a fault if they, of `least` bytes each, do not fit."""
+    """Name the number of elements of the array at `at`. Faults if they, at `least` bytes each, exceed the message."""
 
     site: int
     name: str
@@ -496,7 +493,7 @@ class AfterElements(FormNode, frozen=True):
 
 
 class Skip(FormNode, frozen=True):
-    """Names the position after `count` elements of variable size; `skipper` measures each (None: strings).
+    """Name the position after `count` elements of variable size: strings, unless a `skipper` measures each.
 
     The elements are charged if there are many, or if they are `inner` (within a skipped element).
     """
@@ -510,7 +507,7 @@ class Skip(FormNode, frozen=True):
 
 
 class NotPast(FormNode, frozen=True):
-    """The event does not happen, and this is reported, unless there are more elements than `index`."""
+    """Let the event happen only if there are more elements than `index`. Otherwise it is reported."""
 
     site: int
     count: str
@@ -543,9 +540,10 @@ class Require(FormNode, frozen=True):
 
 
 class Write(FormNode, frozen=True):
-    """Assigns a value (of the field's type) to a field if `flag` is set; `end` names the end of a variable field.
+    """Assign a value (of the field's type) to a field if the variable `flag` is set.
 
-    `path` is its path in the message: numbers of fields and elements, and `sec` or `nsec` at the end.
+    `end` names the end of a field of variable size. `path` has the numbers of fields and elements, and
+    perhaps `sec` or `nsec` at the end.
     """
 
     flag: str
@@ -564,9 +562,9 @@ class Pending(FormNode, frozen=True):
 
 
 class WriteBack(FormNode, frozen=True):
-    """Writes all assigned fields to the message or, if that faults, none. `name` is a variable for spliced bytes.
+    """Write all assigned fields to the message or, if that faults, none. The variable `name` is for spliced bytes.
 
-    A dropped or replaced message is not changed, and the event has happened.
+    If the message was dropped or replaced, leave it unchanged; the event has happened.
     """
 
     site: int
@@ -595,9 +593,8 @@ class Skipper(FormNode, frozen=True):
 class Function(FormNode, frozen=True):
     """A function of any kind. An event has happened from the statement with the number `happens` on.
 
-    `context` names the specification whose budget is charged. `shared` are the shared variables that the function
-    assigns. `same_as` is a function of `runtime/builtin_functions.py` with the same results, which is faster in
-    Python.
+    `context` names the specification that pays, and `shared` the shared variables that the function assigns.
+    `same_as` is an equivalent function of `runtime/builtin_functions.py`, which is faster in Python.
     """
 
     name: str
@@ -613,10 +610,9 @@ class Function(FormNode, frozen=True):
 
 
 class PropertyClock(FormNode, frozen=True):
-    """The clock of a property: the table for events more than `within` ns after its start, and the deadline of each
-    state.
+    """The clock of a property, and the deadline of each state, counted from the clock's start (-1: none).
 
-    A deadline counts from the clock's start (-1: none).
+    For events more than `within` ns after the start, `late` replaces the table.
     """
 
     late: tuple[int, ...]
@@ -635,10 +631,10 @@ class HandledCategory(FormNode, frozen=True):
 class Advance(FormNode, frozen=True):
     """The step of a property at an event: the next state for each state (-1: no table).
 
-    `property` is its number among those with tables; `event` is the event's number in its specification. `handlers`
-    run in their order, and may restart the property in its state `initial`. With a `clock`, an entry is twice the
-    next state, plus one where the clock restarts, or -1 where a handler runs. A property that `suppresses` undoes the
-    step when the message is dropped.
+    `property` counts the properties with tables, and `event` the events of the specification. `handlers` run
+    in their order, and may restart the property in its state `initial`. With a `clock`, an entry is twice the
+    next state, plus one where the clock restarts, or -1 where a handler runs. A property that `suppresses`
+    undoes the step when the message is dropped.
     """
 
     property: int | None

@@ -32,7 +32,6 @@ class Site:
 
     @property
     def compared(self) -> list[SiteVariable]:
-        """Return the variables of a condition that can explain it later: their values do not change in place."""
         return [variable for variable in self.variables if variable.steady]
 
 

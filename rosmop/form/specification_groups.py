@@ -11,11 +11,10 @@ from rosmop.logics.interface import ClockedProperty, FiniteProperty
 
 @dataclass(frozen=True)
 class SpecificationGroup:
-    """A component, with the indices of its specifications, of its properties with tables, and of the events on each
-    channel.
+    """A component, with the indices of its specifications, properties with tables, and events on each channel.
 
-    A property is a pair (specification, property), an event a pair (specification, event). Topics of parametric
-    specifications have no events here: the engine processes their messages.
+    A property or event is a pair that begins with its specification. Topics of parametric specifications have
+    no events here: the engine processes their messages.
     """
 
     component: nodes.Component

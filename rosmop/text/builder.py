@@ -33,7 +33,7 @@ MAX_PERIOD_NS = 10**18
 
 
 class _LiteralError(Exception):
-    """A literal is invalid; the text has the correct form."""
+    """An invalid literal; the text shows the correct form."""
 
 
 class _Unsaid:

@@ -119,7 +119,7 @@ _Advice = str | Callable[[re.Match[str]], str]
 
 @dataclass(frozen=True)
 class _Shape:
-    """A construct outside the grammar; `depths` are the braces around it (0: outside all specifications)."""
+    """A construct outside the grammar, at these numbers of open braces (2 means two or more)."""
 
     pattern: re.Pattern[str]
     advice: _Advice

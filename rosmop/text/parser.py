@@ -37,7 +37,7 @@ class _ForbiddenWordError(Exception):
 
 
 def parse(text: str, file: str) -> tree.SpecificationFile:
-    """`file` is the text's name in positions. Raises `SpecificationError`."""
+    """Return the tree of a file; `file` is its name in positions. Raises `SpecificationError`."""
     start = Position(file, 1, 1)
     if len(text) > MAX_CHARACTERS:
         raise SpecificationError.at(
@@ -83,7 +83,6 @@ def _parse(text: str, file: str) -> Tree[Token]:
 
 
 def _ended_early(text: str, offset: int) -> int | None:
-    """Return where the last comment before an error ends if a name such as `/*/cmd_vel` began it, or None."""
     comments = [piece for piece in _PREPROCESSED.finditer(text, 0, offset) if piece["comment"]]
     last = comments[-1] if comments else None
     if last is None or not last[0].startswith("/*") or not last[0][2:].endswith("/*/"):
@@ -92,7 +91,6 @@ def _ended_early(text: str, offset: int) -> int | None:
 
 
 def start_of(file: str, text: str, offset: int) -> Position:
-    """The end of the text is the position after the last non-blank character."""
     if offset >= len(text):
         offset = len(text.rstrip())
     return Position(file, 1, 1).within(text, offset)
@@ -125,7 +123,6 @@ def _allow(token: Token) -> Token:
 
 @lru_cache(maxsize=1)
 def _parser() -> Lark:
-    """Build the parser at the first use; it keeps no state between files."""
     return Lark(
         GRAMMAR,
         start="file",
@@ -137,7 +134,6 @@ def _parser() -> Lark:
 
 
 def _check_directives(text: str, file: str) -> None:
-    """Raise `SpecificationError` for `#if` around anything but comments, and for each macro that is used."""
     macros: dict[str, int] = {}
     used: set[str] = set()
     conditions: list[tuple[str, int]] = []

@@ -1,6 +1,6 @@
 """The tree of an ``.rv`` file: frozen dataclasses, each with the position of its first character.
 
-Strings are bytes, as in C++. A name is the tuple of its parts (`std::string` is `("std", "string")`), and is not
+Strings are bytes, as in C++. A name is the tuple of its parts, such as `("std", "string")`, and is not
 resolved.
 """
 
@@ -40,7 +40,8 @@ def walk(root: object) -> Iterator[SyntaxNode]:
 class TypeName(SyntaxNode):
     """A type as written: `name` is ("unsigned", "int"), ("std", "string"), ("std", "vector"), ("[]",), ("auto",), …
 
-    `element` is the element type of a vector or of an array `T[]`. `pointer`: `char *`; `reference`: `&`.
+    `element` is the element type of a vector or of an array `T[]`. `pointer` stands for `char *`, `reference`
+    for `&`.
     """
 
     name: tuple[str, ...]
@@ -260,7 +261,7 @@ class IfStatement(Statement):
 
 @dataclass(frozen=True)
 class WhileStatement(Statement):
-    """`while (condition) body`; with `at_end`: `do … while`."""
+    """`while (condition) body`, or with `at_end`, `do body while (condition);`."""
 
     condition: Expression
     body: Statement
@@ -289,7 +290,7 @@ class RangeForStatement(Statement):
 
 @dataclass(frozen=True)
 class SwitchCase(SyntaxNode):
-    """The statements after one `case value:` (None: `default:`), up to the next case."""
+    """The statements after `case value:`, up to the next case. For `default:`, the value is None."""
 
     value: Expression | None
     statements: tuple[Statement, ...]
@@ -315,7 +316,7 @@ class ContinueStatement(Statement):
 
 @dataclass(frozen=True)
 class ReturnStatement(Statement):
-    """`return value;`; without a value, an action drops the message."""
+    """`return value;`. In an action, `return;` drops the message."""
 
     value: Expression | None
 
@@ -405,7 +406,7 @@ class TimerTrigger(SyntaxNode):
 
 @dataclass(frozen=True)
 class EventDefinition(SyntaxNode):
-    """An event; `after` are the statements that follow an action that does not drop the message."""
+    """An event. The statements in `after` follow an action that does not drop the message."""
 
     modifiers: tuple[Name, ...]
     name: str
