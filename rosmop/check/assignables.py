@@ -9,23 +9,22 @@ from rosmop.types.value_types import Type
 
 @dataclass(eq=False)
 class Variable:
-    """A variable: its names in the text and in the code.
-
-    `flag` is the code's name for "was assigned"; only for parameters that are bound to fields. `alias` is the value
-    that a reference refers to. `shared` variables belong to the set, other variables to one function.
-    """
+    """A variable: its names in the text and in the code."""
 
     name: str
     type: Type
     code: str
     position: Position
     shared: bool = False
+    """Whether it belongs to the set, and not to one function."""
     constant: bool = False
     known: bool | int | float | None = None
     table: bytes | None = None
     """The elements of a `const` array of numbers that are known, as in a message."""
     flag: str | None = None
+    """The code's name for "was assigned"; only for parameters that are bound to fields."""
     alias: "Value | None" = None
+    """The value that a reference refers to."""
     copied: bool = False
     """Whether a `char *` or `T name[]` holds a copy of another array, where C++ would point to it."""
     used: bool = False
@@ -35,20 +34,20 @@ class Variable:
 
 @dataclass(frozen=True)
 class Value:
-    """A compiled expression: its form, and the facts known about it.
-
-    `place` is set if the value can be assigned. `owned`: nothing else refers to the value, so it needs no copy.
-    `constant` is the value if it is known at compile time. `first` lists the expressions at the start of the form
-    that are evaluated before the place is known. For an iterator, `vector` is the vector that it points into.
-    """
+    """A compiled expression: its form, and the facts known about it."""
 
     form: Expression
     position: Position
     place: "Lvalue | None" = None
+    """Set if the value can be assigned."""
     owned: bool = True
+    """Whether nothing else refers to the value, so that it needs no copy."""
     constant: bool | int | float | bytes | None = None
+    """The value, if it is known at compile time."""
     first: tuple[Expression, ...] = ()
+    """The expressions at the start of the form that are evaluated before the place is known."""
     vector: "Value | None" = None
+    """For an iterator, the vector that it points into."""
 
     @property
     def pure(self) -> bool:

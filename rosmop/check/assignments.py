@@ -20,7 +20,7 @@ from rosmop.types import value_types
 
 
 def require_place(target: Value, what: str) -> Lvalue:
-    """Reject constants and values without a place."""
+    """Return the place to assign; constants and values without a place are rejected."""
     if target.place is None:
         raise SpecificationError.at(target.position, f"{what} needs a variable, a field or an element")
     variable = root(target)
@@ -98,7 +98,6 @@ def _store(scope: FunctionScope, place: Lvalue, value: nodes.Expression) -> node
 
 
 def _store_part(scope: FunctionScope, place: Lvalue, value: nodes.Expression) -> nodes.Expression:
-    """Store the whole, because strings and times do not change in place."""
     assert isinstance(place, CharacterLvalue | TimePartLvalue)  # the remaining kinds of places
     inner, base = require_place(place.base, "an assignment"), place.base.form
     if isinstance(place, TimePartLvalue):

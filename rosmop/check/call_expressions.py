@@ -246,7 +246,7 @@ def stream_of(node: tree.Expression) -> str | None:
 def streamed(
     scope: FunctionScope, node: tree.SyntaxNode, level: str, chain: tree.Expression, *, headed: bool = False
 ) -> Value:
-    """Compile the output of `a << b << c`; `headed`: the first operand is the stream itself."""
+    """Compile the output of `a << b << c`. If it is `headed`, the first operand is the stream itself."""
     parts: list[tree.Expression] = []
     while isinstance(chain, tree.BinaryExpression) and chain.operator == "<<":
         parts.append(chain.right)

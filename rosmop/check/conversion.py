@@ -9,7 +9,7 @@ from rosmop.types.value_types import Type
 
 
 def convert(scope: FunctionScope, value: Value, target: Type, site: int | None = None) -> nodes.Expression:
-    """Return a converted value, to which nothing else refers. Rejects impossible conversions."""
+    """Return the value in another type, copied if anything else refers to it."""
     check_convertible(value, target)
     if value_types.is_number(target):
         return number(value.form, target)

@@ -17,7 +17,7 @@ ALGORITHMS = frozenset({"sort", "reverse", "accumulate"})
 
 
 def moved(operator: str, left: Value, right: Value, position: Position) -> Value | None:
-    """Return None unless it is `begin + n`, `end - n` or `end - begin`."""
+    """Return the value of `begin + n`, `end - n` or `end - begin`, and None for other operations."""
     if left.vector is None or operator not in ("+", "-"):
         return None
     if value_types.is_number(right.type):

@@ -73,7 +73,7 @@ _COUNTS = {
 def _bringing(compiled: CompiledProperty, graph: VerdictGraph, category: str) -> set[str]:
     """Return the events that lead to the category from a state without it.
 
-    If dropped messages do not count for the property, only states that other messages reach are considered.
+    If dropped messages do not count, only states that other messages reach are considered.
     """
     reached, brings = {graph.initial}, set[str]()
     waiting = [graph.initial]
@@ -90,7 +90,6 @@ def _bringing(compiled: CompiledProperty, graph: VerdictGraph, category: str) ->
 
 
 def topics_of_remedy(names: SpecificationNames, compiled: CompiledProperty) -> list[str]:
-    """Raises `SpecificationError` if the remedy is not suitable."""
     name = compiled.remedy
     if name is None:
         return []
@@ -109,7 +108,6 @@ def topics_of_remedy(names: SpecificationNames, compiled: CompiledProperty) -> l
 
 
 def with_remedy(compiled: CompiledProperty, node: tree.Property) -> list[tree.Handler]:
-    """The handler of `enforced` calls the remedy first."""
     handlers = list(node.handlers)
     if compiled.remedy is None:
         return handlers

@@ -1,8 +1,8 @@
 """Compile `age(event)`, `seen(event)`, `host(event)` and `caller(event)`.
 
-Variables of the specification keep the time when the event last happened (-1: never), and its sender, so they are
-saved, restored and undone, and each slice has its own. They are assigned after the action, unless it dropped the
-message or faulted. In the action itself, `host` and `caller` are the sender of its message.
+Variables keep the time when the event last happened (-1: never), and its sender, so they are saved, restored
+and undone, and each slice has its own. They are assigned after the action, unless it dropped the message or
+faulted. In the action itself, `host` and `caller` are the sender of its message.
 """
 
 import math

@@ -172,10 +172,7 @@ def _bind(
 def _binds_nothing(
     scope: FunctionScope, binding: tree.Binding, parameters: dict[str, tree.ParameterDeclaration], kind: str
 ) -> bool:
-    """Whether a variable of a pattern is not a parameter of the event; ROSMOP accepts this, so it is only a warning.
-
-    Raises `SpecificationError` if the message has no such field.
-    """
+    """Whether a variable of a pattern is not a parameter. ROSMOP accepts this, so it is only a warning."""
     name = binding.variable or ""
     if name in parameters or name in scope.names.parameters:
         return False
@@ -221,7 +218,6 @@ def _bind_one(
 
 
 def constant_of_field(scope: FunctionScope, binding: tree.Binding, field: Type) -> bool | int | float | bytes:
-    """Return the constant of a binding as its field holds it. Raises `SpecificationError`."""
     assert binding.constant is not None  # the caller checks this
     constant = scope.value_of(binding.constant).constant
     held = None if constant is None else _held(constant, field)
@@ -253,7 +249,6 @@ def _held(constant: bool | int | float | bytes, field: Type) -> bool | int | flo
 def _body(
     scope: FunctionScope, event: tree.EventDefinition, trigger: tree.MessageTrigger
 ) -> tuple[list[nodes.Statement], list[nodes.Statement], list[nodes.Statement]]:
-    """The `when`, the action and the rest are compiled first: they determine the needed fields."""
     when = trigger.when
     with scope.nested() as conditions:
         if when is not None:

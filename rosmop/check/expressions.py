@@ -35,7 +35,6 @@ _MAX_DIGITS = 400
 
 
 def value_of(scope: FunctionScope, node: tree.Expression) -> Value:
-    """Compile an expression. Rejects expressions without a meaning."""
     return _KINDS[type(node)](scope, node)
 
 

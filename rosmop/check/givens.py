@@ -1,7 +1,7 @@
 """Compile the givens of a specification: constants that operators set while it runs, and topics that a load replaces.
 
-A constant is a variable of the set that no function assigns, so code and proofs hold for all of its values. First
-values and `init` cannot read it, because they would keep the value of the start.
+A constant is a variable of the set that no function assigns, so code and proofs hold for all of its values.
+First values and `init` cannot read it, because they would keep the value of the start.
 """
 
 from collections.abc import Iterator, Mapping
@@ -98,7 +98,6 @@ def _renamed(node: Any, topics: Mapping[str, str]) -> Any:
 def given_topics(
     shared: CompilationContext, specification: tree.Specification, given: Mapping[str, str]
 ) -> tuple[GivenTopic, ...]:
-    """Report invalid topics."""
     found: dict[str, GivenTopic] = {}
     for node in specification.givens:
         if isinstance(node, tree.TopicDeclaration):
@@ -115,7 +114,7 @@ def given_topics(
 
 
 def with_given(identity: bytes, topics: tuple[GivenTopic, ...]) -> bytes:
-    """The state of a specification belongs to its text and to the topics that replace defaults."""
+    """Return the identity of a state, which belongs to the text and to the topics that replace defaults."""
     changed = [(one.name, one.topic) for one in topics if one.topic != one.default]
     return sha256(identity + repr(changed).encode()).digest() if changed else identity
 

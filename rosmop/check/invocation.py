@@ -46,7 +46,6 @@ class MemberCall:
         return number(value.form, value_types.ULONG)
 
     def text(self, position: int) -> nodes.Expression:
-        """A character becomes a string of length 1."""
         value = self.arguments[position]
         if value.type == value_types.CHAR:
             return nodes.Call(value_types.STRING, "t_byte", (value.form,))

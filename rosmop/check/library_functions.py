@@ -1,7 +1,7 @@
 """The functions of the library that are written in the language itself.
 
-Interpreter, module and proof take them like helper functions, so they give the same bits. Each specification has its
-own copy of the functions that it calls, one for each type of the `auto` parameters.
+Interpreter, module and proof treat them as helper functions, so they give the same bits. Each specification
+has its own copy of the functions that it calls, one for each type of the `auto` parameters.
 """
 
 from collections.abc import Sequence
@@ -169,7 +169,7 @@ def is_quaternion(kind: Type) -> bool:
 
 
 def invoke(scope: FunctionScope, name: str, values: Sequence[Value]) -> nodes.Expression:
-    """Arguments for parameters that are not `auto` must already have the right types."""
+    """Call a function. Arguments for parameters that are not `auto` must already have the right types."""
     function = _instance(scope, functions()[name], [value.type for value in values])
     given = [
         number(value.form, parameter.type) if value_types.is_number(parameter.type) else value.form

@@ -18,7 +18,6 @@ _PARTS_OF_TIME = {"sec": 0, "nsec": 4}
 
 
 def type_of_path(messages: MessageTypes, record: str, path: tuple[tree.PathStep, ...]) -> Type:
-    """The error for an invalid path suggests the nearest name."""
     kind: Type = value_types.RecordType(record)
     for step in path:
         kind = _step(messages, kind, step)
@@ -66,7 +65,7 @@ class MessageCursor:
         return self.start_of(len(self._layout.parts))
 
     def find(self, path: tuple[tree.PathStep, ...]) -> Spot | None:
-        """Return the position of a path, after writing the checks of indices; None for a message without fields."""
+        """Return the position of a path, after writing the checks of indices, or None if there are no fields."""
         names = []
         for position, step in enumerate(path):
             names.append(step.name)
@@ -143,7 +142,7 @@ class FieldLocator:
         return Spot(end, 0)
 
     def element(self, item: FixedField | ArrayPart, start: Spot, step: tree.PathStep) -> Spot:
-        """If the element does not exist, the event does not happen."""
+        """Return the position of an element. If it does not exist, the event does not happen."""
         index = step.index or 0
         if isinstance(item, FixedField):
             return start.plus(index * (item.size // (item.count or 1)))

@@ -19,7 +19,7 @@ Write = Callable[[FunctionScope, tree.Statement], None]
 """Writes a statement. Loops take it as a parameter because statements and loops contain each other."""
 
 MAX_NESTED = 15
-"""Python allows 20."""
+"""The most loops within each other."""
 
 
 def charge(scope: FunctionScope, node: tree.SyntaxNode) -> None:

@@ -1,7 +1,8 @@
 """Note how close comparisons of numbers came: both sides when they were nearest, while true and while false.
 
-The noting expression has the same value, compares the sides in the same type as C++, and charges nothing. Comparisons
-in `when`, first values and `init` are not noted, nor are loop conditions, whose distance from the end means nothing.
+The noting expression has the same value, compares the sides in the same type, and charges nothing.
+Comparisons in `when`, first values and `init` are not noted, nor are loop conditions, whose distance from the
+end means nothing.
 """
 
 from dataclasses import replace

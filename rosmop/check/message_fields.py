@@ -1,7 +1,7 @@
 """Generate code that reads bound fields from the bytes of a message, and code that writes assigned fields.
 
-Numbers at known distances are read together. A changed number is written in place; a new buffer is made only for a
-changed string, array or message of a different size.
+Numbers at known distances are read together. Only a changed string, array or message of a different size
+needs a new buffer.
 """
 
 from dataclasses import dataclass
@@ -145,7 +145,6 @@ def check_overlaps(bound: list[PatternField], written: list[PatternField]) -> No
 
 
 def _overlap(one: tree.Binding, other: tree.Binding) -> bool:
-    """An array without an index means all its elements."""
     return all(
         step.name == beside.name and (step.index == beside.index or None in (step.index, beside.index))
         for step, beside in zip(one.path, other.path, strict=False)

@@ -29,7 +29,6 @@ _SHAPE = "`globally: a as A forbids b {x < @A.x}`, or `b as B requires a {x < @B
 
 
 def with_references(specification: tree.Specification) -> tree.Specification:
-    """Raises `SpecificationError`."""
     for number, node in enumerate(specification.properties, 1):
         if _refers(node):
             specification = _Rewriting(specification, node, number).done()

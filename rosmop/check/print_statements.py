@@ -19,7 +19,6 @@ _TEXTS = (value_types.StringType, value_types.CharactersType)
 
 
 def formatted(scope: FunctionScope, template: Value, arguments: Sequence[Value]) -> nodes.Expression:
-    """Rejects conversions that do not fit their arguments."""
     if not isinstance(template.constant, bytes):
         if arguments or not isinstance(template.type, _TEXTS):
             raise SpecificationError.at(
@@ -134,7 +133,6 @@ def _integer(letter: bytes, size: bytes | None, value: Value) -> nodes.Expressio
 def _integer_head(
     flags: bytes, width: bytes, precision: bytes | None, letter: bytes, value: nodes.Expression
 ) -> tuple[bytes, nodes.Expression]:
-    """Return the Python format and the argument; where C differs from Python, the text is formatted as in C."""
     if letter in _UNSIGNED:
         flags = flags.replace(b"+", b"").replace(b" ", b"")
     if precision is not None:

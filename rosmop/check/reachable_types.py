@@ -1,4 +1,4 @@
-"""Find the message types that a specification uses: only if they are unchanged, its state survives new definitions.
+"""Find the message types that a specification uses. Its state survives new definitions only if they are unchanged.
 
 The result may include an unused type, if a string equals the name of a type.
 """

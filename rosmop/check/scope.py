@@ -93,7 +93,7 @@ class LoopScope:
 
 @dataclass
 class StatementList:
-    """A list of statements under construction, and the site of the next one."""
+    """A list of statements under construction, and the site of the next statement."""
 
     found: list[nodes.Statement] = field(default_factory=list)
     site: int = -1
@@ -270,7 +270,6 @@ class FunctionScope:
 
     @contextmanager
     def looking(self) -> Iterator[None]:
-        """Do not note comparisons written in the block."""
         before, self.notes = self.notes, False
         try:
             yield

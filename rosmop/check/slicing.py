@@ -1,7 +1,6 @@
-"""Compile parametric specifications: their parameters as variables, and the parameters that each event binds.
+"""Compile parametric specifications, whose parameters an event binds if it has them by name and type.
 
-An event binds a parameter of the same name and type. A second function of the event returns the bound values, and
-reads nothing else of the message.
+A second function of the event returns the bound values, and reads nothing else of the message.
 """
 
 from collections.abc import Iterable, Sequence
@@ -111,7 +110,7 @@ def binds(names: SpecificationNames, event: tree.EventDefinition) -> tuple[int, 
 
 
 def creates(specification: tree.Specification, event: tree.EventDefinition) -> bool:
-    """Whether a slice may begin with an event: without a `creation event`, with any."""
+    """Whether a slice may begin with an event: with any event unless there is a `creation event`."""
 
     def marked(event: tree.EventDefinition) -> bool:
         return any(modifier.parts == ("creation",) for modifier in event.modifiers)

@@ -66,7 +66,7 @@ def compile_files(
     margins: bool = False,
     topics: Topics = MappingProxyType({}),
 ) -> Compiled:
-    """Raises `SpecificationError` with all errors.
+    """Compile parsed files. Raises `SpecificationError` with all errors.
 
     With `margins`, comparisons of numbers are noted (`margins.py`). `topics` replace the topics in the files.
     """
@@ -97,9 +97,7 @@ def compile_files(
 
 
 def findings_of(files: Sequence[tree.SpecificationFile], definitions: Definitions) -> list[Diagnostic]:
-    """Return the errors of these files while other files of the set, which may declare unknown names, cannot be
-    parsed.
-    """
+    """Return the errors of these files if other files of the set, which may declare unknown names, are unreadable."""
     shared = CompilationContext(MessageTypes(definitions), value_of)
     shared.partial = True
     pairs = [(file, specification) for file in files for specification in file.specifications]
@@ -171,7 +169,6 @@ def _check_names(shared: CompilationContext, specifications: Sequence[tree.Speci
 
 
 def _same_names(specifications: Sequence[SpecificationNames]) -> Iterator[Diagnostic]:
-    """Warn about equal names only in specifications that use each other's variables."""
     places = {names.name: place for place, names in enumerate(specifications)}
     pairs = {
         tuple(sorted((place, places[used])))

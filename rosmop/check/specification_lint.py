@@ -107,7 +107,7 @@ def _for_good(compiled: CompiledProperty) -> set[str]:
 
 
 def unused_events(specification: tree.Specification, properties: Sequence[_HasProperty]) -> list[Diagnostic]:
-    """`default` counts as a use of every event. Without properties nothing is reported."""
+    """Find unused events. `default` is a use of every event, and without properties nothing is reported."""
     if not properties:
         return []
     named = {word for code in properties for word in _WORD.findall(code.property.formula)}
@@ -153,7 +153,6 @@ def _assigned(condition: tree.Expression) -> Iterator[Diagnostic]:
 
 
 def _acts(expression: tree.Expression) -> bool:
-    """Each call may have an effect."""
     acting = (tree.Assignment, tree.IncrementExpression, tree.CallExpression, tree.NewExpression)
     return stream_of(expression) is not None or any(
         isinstance(node, acting) for node in tree.walk(expression)

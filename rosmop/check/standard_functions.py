@@ -55,7 +55,7 @@ Function = Callable[[Arguments], Value]
 
 
 def find_function(parts: tuple[str, ...], *, is_library: bool = False) -> Function | None:
-    """Take a name that may begin with `std::`. `is_library`: the call is in a library function."""
+    """Return a function by its name, with or without `std::`. The library itself (`is_library`) also has `INTERNAL`."""
     if parts[0] == "std" and len(parts) == 2:
         parts = parts[1:]
     if len(parts) != 1:

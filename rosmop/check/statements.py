@@ -1,4 +1,4 @@
-"""Compile statements. After an error, compilation continues with the next one, so that one check finds many errors."""
+"""Compile statements. Compilation continues after an error, so that one check finds many errors."""
 
 import struct
 from collections.abc import Callable, Mapping
@@ -333,7 +333,6 @@ def _call_service(scope: FunctionScope, node: tree.CallStatement) -> None:
 
 
 def check_topic(topic: str, position: Position) -> None:
-    """Reject names that are not global and canonical."""
     if not names.is_global_name(topic):
         hint = f"; write `/{topic}`" if names.is_global_name("/" + topic) else "; write for example `/a/b`"
         raise SpecificationError.at(position, f"{shown(topic)} is not a global name{hint}")

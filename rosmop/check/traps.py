@@ -134,7 +134,7 @@ def _assigned(statement: tree.ExpressionStatement) -> str:
 
 
 def _passed_nan(event: tree.EventDefinition) -> Iterator[Diagnostic]:
-    """Each comparison with NaN is false, and `std::min` may return it."""
+    """Warn of bounds that NaN passes: each comparison with NaN is false, and `std::min` may return it."""
     numbers = {one.name for one in event.parameters if one.type.name in _FLOATING}
     if isinstance(event.trigger, tree.MessageTrigger) and event.trigger.when is not None:
         yield from _bounds(event.trigger.when, event.action, numbers)
@@ -202,7 +202,7 @@ def _assigned_in(statement: tree.Statement) -> set[str]:
 
 
 def rival_changes(specifications: Sequence[tree.Specification], phases: Phases) -> Iterator[Diagnostic]:
-    """The later specification decides. Pairs in `phases` are intended."""
+    """Warn of fields that two specifications change, where the later decides. Pairs in `phases` are intended."""
     changed = [
         (specification, topic, field, binding)
         for specification in specifications
