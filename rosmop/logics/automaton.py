@@ -11,13 +11,13 @@ from typing import TypeVar
 
 MAX_STATES = 10_000
 MAX_TRANSITIONS = 500_000
-"""Minimising takes about 300 bytes for each transition."""
+"""Bounds the memory: minimising takes about 300 bytes for each transition."""
 
 State = TypeVar("State", bound=Hashable)
 
 
 class TooManyStatesError(Exception):
-    """The automaton exceeds its limit."""
+    """An automaton has too many states or transitions."""
 
     def __init__(self, limit: int, what: str = "states") -> None:
         super().__init__(f"more than {limit} {what}")
@@ -136,7 +136,7 @@ def _split(blocks: list[set[int]], block_of: list[int], cut: int, members: list[
 
 
 def reachable(automaton: Automaton) -> list[int]:
-    """Return the states that a trace can enter, nearest first; the initial state only if one enters it again."""
+    """Return the states that a trace can enter, nearest first. The initial state must be entered again."""
     seen: dict[int, None] = {}
     frontier = [automaton.initial]
     while frontier:
@@ -151,8 +151,7 @@ def reachable(automaton: Automaton) -> list[int]:
 def letter_classes(events: Sequence[str], named: Sequence[str]) -> tuple[list[int], list[int]]:
     """Group the events that a formula cannot distinguish: all events that it does not name form one class.
 
-    Returns the class of each event, and the index of each class in ``named`` (-1 for unnamed events), in the order of
-    events.
+    Returns the class of each event and, for each class, its index in ``named`` (-1 for unnamed events).
     """
     position = {name: index for index, name in enumerate(named)}
     classes: dict[int, int] = {}

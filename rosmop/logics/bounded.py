@@ -1,17 +1,17 @@
 """Monitors for mtl formulas about a bounded future (`past_monitors.py` implements the part about the past).
 
-Subformulas that only look back are computed at their event (`FoldedProgram`). Each other one has a *cell*: its value
-at one event while the value is open. A decided cell notifies its *users*. Cells exist only where needed: for `fire =>
-eventually[0,1s] safe`, only the waiting `fire` events are kept.
+Subformulas that only look back are computed at their event (`FoldedProgram`). Every other subformula has a
+*cell* for each event at which its value is open and needed: for `fire => eventually[0,1s] safe`, only the
+waiting `fire` events are kept. A decided cell notifies its *users*.
 
 - `until` over operands known at once decides the oldest waiting event first, so the cost of a step does not depend on
-  their number.
-- `until` and `since` over open operands keep *rows*, one for each relevant event. A result is certain if it is the
-  same whether all open operands fail or all hold, because both operators are monotonic. When an operand is decided,
-  `until` visits only the rows that it may decide; `since` visits all rows.
+their number.
+- `until` and `since` over open operands keep *rows*, one for each relevant event. Both operators are monotonic, so a
+result is certain if it is the same whether all open operands fail or all hold. When an operand is decided, `until`
+visits only the rows that it may decide; `since` visits all rows.
 
-To undo a step, `BoundedRun.mark` copies the operators' rows, and `FormulaCell.touch` copies each cell before its
-first change. Rows do not change after their step.
+To undo a step, `BoundedRun.mark` copies the operators' rows, and `FormulaCell.touch` copies each cell before
+its first change. Rows do not change after their step.
 """
 
 from abc import ABC, abstractmethod
@@ -37,8 +37,8 @@ _LATER = ("until", "next")
 class FormulaCell:
     """The open value of a subformula at one event.
 
-    `tells` is the number of the event (`BoundedRun.place`) if the subformula is the whole formula; otherwise it is 0.
-    With a `kind` the value is computed from `operands`, of which `missing` are open.
+    `tells` is the number of the event if the subformula is the whole formula, and otherwise 0. With a `kind`
+    the value is computed from `operands`, of which `missing` are open.
     """
 
     __slots__ = ("journal", "kind", "missing", "operands", "tells", "users", "value")
@@ -222,10 +222,10 @@ class _Rows(_Operator):
 class _OpenUntil(_Rows):
     """`until` over values that may be open. Bounds up to the time `passed` have expired.
 
-    The undecided rows (`pending`) are decided from sorted lists of marks: the events where the right operand holds
-    (`holds`) or may hold (`hopes`), and where the left operand fails (`fails`) or may fail (`doubts`). A new value
-    concerns only the rows for which it was the first or last of its kind. They are found by their times, so a step
-    costs only the rows that it decides.
+    The undecided rows (`pending`) are decided from sorted marks of events: where the right operand holds
+    (`holds`) or may hold (`hopes`), and where the left operand fails (`fails`) or may fail (`doubts`). A new
+    value concerns only the rows for which it was the first or last of its kind. They are found by their
+    times, so a step costs only the rows that it decides.
     """
 
     def __init__(self, run: "BoundedRun", number: int, instruction: PastInstruction) -> None:
@@ -513,7 +513,6 @@ class BoundedProperty(CompiledProperty):
         return found
 
     def _decided_late(self) -> set[str]:
-        """An `until` or `next` fails when its bound expires: a `violation`, or a `validation` if it is negated."""
         signs: dict[int, set[bool]] = {self.program.result: {False}}
         for number in sorted(self.later, reverse=True):
             instruction = self.program.instructions[number]
@@ -527,7 +526,6 @@ class BoundedProperty(CompiledProperty):
         return {VERDICTS[sign] for signs_of in found for sign in signs_of}
 
     def blocking_refused(self, category: str) -> str | None:
-        """A deadline may decide the category without a message."""
         super().blocking_refused(category)
         if category not in self._failing:
             return None
@@ -572,7 +570,6 @@ class BoundedRun:
 
     @property
     def as_new(self) -> bool:
-        """Whether no event waits and the part about the past is in its initial state."""
         operators = self.operators.values()
         return (
             all(type(operator) in _FORWARD and not operator.rows for operator in operators)

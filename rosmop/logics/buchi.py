@@ -1,14 +1,13 @@
-"""Translate linear temporal logic to generalised Büchi automata, by way of alternating automata (Gastin, Oddoux, CAV
-2001).
+"""Translate linear temporal logic to generalised Büchi automata (Gastin, Oddoux, CAV 2001).
 
-A state of the Büchi automaton is an *obligation set*: nodes (``ltl_nodes``) that must all hold from here on.
+A state of the automaton is an *obligation set*: nodes (``ltl_nodes``) that must all hold from here on.
 Invariants:
 
 - A transition fulfils an until in two cases: the until is not an obligation after it, or the step could also have
-  discharged the until with the same obligations left.
+discharged the until with the same obligations left.
 - An infinite run is accepting if its transitions fulfil each until infinitely often.
 - ``live`` keeps exactly the states from which some infinite word is accepted. ``after`` and ``live`` drop a set that
-  includes another set, because only the union of languages counts there. The search for accepting runs keeps such sets.
+includes another set, because only the union of languages counts there. The search for accepting runs keeps such sets.
 """
 
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
@@ -44,7 +43,6 @@ class Automata:
         self._work = 0
 
     def translate(self, formula: Formula, atoms: Mapping[str, int]) -> Sets:
-        """Return the initial states. ``atoms`` are the letters of each event."""
         return self._choices(FormulaTranslation(self._nodes, atoms).node(formula, True))
 
     def _choices(self, node: int) -> Sets:
@@ -106,7 +104,7 @@ class Automata:
         return self._product((right, frozenset((*left, *stay))))
 
     def _transitions(self, state: Obligations, letter: int) -> Sets:
-        """Return the transitions, even to sets that include another one, because acceptance needs them."""
+        """Return the transitions. Sets that include another set are kept, because acceptance needs them."""
         known = self._steps.get((state, letter))
         if known is None:
             targets: set[Obligations] = {0}

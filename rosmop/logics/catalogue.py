@@ -1,4 +1,4 @@
-"""Map names to logics."""
+"""Compile properties by the names of their logics."""
 
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType

@@ -47,7 +47,6 @@ class GrammarRun(UntimedRun):
         self.frame: EarleySet | None = recogniser.initial
 
     def step(self, event: int, _time_ns: int) -> Categories:
-        """If this raises `RunFaultError`, the run is unchanged."""
         if self.frame is None:
             return FAIL
         after = self._step(self.frame, event)

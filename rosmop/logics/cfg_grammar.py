@@ -24,7 +24,6 @@ class Grammar:
 
 
 def read_grammar(source: Source) -> Grammar:
-    """Return the grammar as written. Raises `FormulaError`."""
     return _GrammarReader(source).grammar()
 
 
@@ -144,8 +143,8 @@ class _GrammarReader:
 def prepare(grammar: Grammar) -> Grammar:
     """Keep only useful symbols, each of which derives more than the empty word.
 
-    ``A -> A x A`` becomes ``A -> A x B``, where ``B`` has the other rules of ``A``: both mean the same, but only the
-    second form is unambiguous. The start symbol may still derive the empty word; if it derives nothing else, no rule
+    ``A -> A x A`` becomes ``A -> A x B``, where ``B`` has the other rules of ``A``, because only the second
+    form is unambiguous. The start symbol may still derive the empty word; if it derives nothing else, no rule
     remains.
     """
     rules = _flat_repetitions(grammar)

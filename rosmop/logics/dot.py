@@ -10,7 +10,7 @@ from rosmop.logics.tfsm import TimedStateMachine
 
 @dataclass(frozen=True)
 class Box:
-    """A drawn state; `double` is its border."""
+    """A drawn state, with a single or a double border."""
 
     name: str
     other_categories: str

@@ -16,7 +16,7 @@ MAX_WORK = 8_000_000
 
 
 class TooMuchWorkError(Exception):
-    """The derivatives exceed their limit."""
+    """The derivatives of an expression take too much work."""
 
 
 @dataclass(frozen=True)
@@ -171,8 +171,6 @@ def with_fail(automaton: Automaton) -> Automaton:
 
 
 class _ExpressionReader:
-    """Letters are the events that the expression names."""
-
     def __init__(self, source: Source) -> None:
         self._tokens = TokenReader(source, ("|", "&", "~", "*", "+", "^", "(", ")", "?", "||", "&&", "!"))
         self._source = source

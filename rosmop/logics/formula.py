@@ -25,7 +25,7 @@ BOOLEAN_SIGNS = ("(", ")", "!", "&&", "/\\", "||", "\\/", "++", "^", "=>", "->",
 
 @dataclass(frozen=True)
 class Formula:
-    """A formula; an ``event`` has a ``name``, a timed operator ``bounds``."""
+    """A formula. An ``event`` has a ``name``, and a timed operator has ``bounds``."""
 
     operator: str
     operands: tuple["Formula", ...] = ()
@@ -36,9 +36,7 @@ class Formula:
 
 @dataclass(frozen=True)
 class Level:
-    """Binary operators of equal precedence: ``flat`` ones associate, ``left`` ones group leftwards, ``once`` ones do
-    not chain.
-    """
+    """Binary operators of equal precedence, which associate (``flat``), group leftwards, or do not chain (``once``)."""
 
     operators: Mapping[str, str]
     chain: Literal["flat", "left", "once"]
@@ -46,7 +44,7 @@ class Level:
 
 @dataclass(frozen=True)
 class Syntax:
-    """The operators of a temporal logic: unary ones, which bind tightest, then levels of binary ones, tightest first.
+    """The operators of a temporal logic: unary operators bind tightest, then each level of binary operators.
 
     ``bounded`` operators may be followed by ``[from,to]``.
     """
@@ -64,7 +62,6 @@ class Syntax:
 
 
 def read_formula(source: Source, syntax: Syntax) -> Formula:
-    """Return the formula as written. Raises `FormulaError`."""
     reader = _FormulaReader(source, syntax)
     formula = reader.formula(0)
     reader.end()

@@ -12,7 +12,7 @@ TIMEOUT = "timeout"
 
 @dataclass
 class StateText:
-    """Only tfsm has timeouts."""
+    """A state as written. Only a tfsm has timeouts."""
 
     moves: dict[str, FormulaToken] = field(default_factory=dict)
     default: FormulaToken | None = None
@@ -21,7 +21,7 @@ class StateText:
 
 @dataclass
 class StateMachineText:
-    """``order`` are the states in source order."""
+    """A state machine as written."""
 
     states: dict[str, StateText]
     aliases: dict[str, list[str]]
@@ -56,7 +56,6 @@ def machine_automaton(source: Source, machine: StateMachineText) -> Automaton:
 
 
 def read_state_machine(source: Source, *, timed: bool) -> StateMachineText:
-    """Raises `FormulaError` with all errors."""
     reader = TokenReader(source, ("->", "[", "]", "=", ","))
     machine = StateMachineText({}, {})
     used: list[FormulaToken] = []

@@ -3,15 +3,16 @@
 Contract for the caller of a run:
 
 1. ``property.start(now)`` returns a fresh run. ``now`` is the time when monitoring begins, or when ``__RESET;`` took
-   effect.
+effect.
 2. Before a step at time ``t``: while ``run.deadline`` is not None and ``run.deadline < t``, call ``run.expire()``. An
-   event exactly at the deadline is in time, so a deadline expires only when no event at or before it can still come.
-   The expiry takes effect at the deadline.
-3. ``run.step(event, t)`` returns the categories after the event. Their handlers run in this order, also after
-   ``expire()`` (``timeout`` before the new state).
+event exactly at the deadline is in time, so a deadline expires only when no event at or before it can still come. The
+expiry takes effect at the deadline.
+3. ``run.step(event, t)`` returns the categories after the event. Their handlers run in this order. ``run.expire()``
+does the same, and has ``timeout`` before the new state.
 4. Times are integer nanoseconds and never decrease: an earlier time than the last counts as the last time.
-5. A `FormulaRun` can undo a dropped message: call `mark` before its first step, and `take_back` with that mark if it is
-   dropped. The time is not undone. No deadline expires between the two calls.
+5. A `FormulaRun` can undo a dropped message: call `mark` before its first step, and `take_back` with that mark if it
+is dropped. The time is not undone. No deadline expires between the two calls.
+6. If a step raises `RunFaultError`, only the time of the run has changed.
 """
 
 from abc import ABC, abstractmethod
@@ -34,14 +35,11 @@ class FormulaError(Exception):
 
 
 class RunFaultError(Exception):
-    """A trace needs more memory than a run may have."""
+    """A step needs more memory or work than a run may have."""
 
 
 class Run(Protocol):
-    """One run of a property; the head of this module has the contract.
-
-    A copy (`copy.copy`) is an independent run, except that of a `BoundedRun`.
-    """
+    """One run of a property; the head of this module has the contract. A copy (`copy.copy`) is an independent run."""
 
     @property
     def as_new(self) -> bool:
@@ -200,7 +198,7 @@ Move = tuple[int, bool]
 
 
 class Wait(NamedTuple):
-    """After ``after`` nanoseconds on the clock, the move and the categories."""
+    """The move and the categories after ``after`` nanoseconds on the clock."""
 
     after: int
     move: Move

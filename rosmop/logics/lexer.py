@@ -107,7 +107,6 @@ class TokenReader:
         return self._tokens[min(self._next + count, len(self._tokens) - 1)]
 
     def take(self) -> FormulaToken:
-        """Return the next token; the end can be read repeatedly."""
         token = self._tokens[self._next]
         if token.kind != "end":
             self._next += 1
@@ -120,7 +119,7 @@ class TokenReader:
         return False
 
     def expect(self, kind: str, what: str) -> FormulaToken:
-        """Raises `FormulaError` for a token of another kind: ``what`` was expected."""
+        """Take a token of this kind. The error says that ``what`` was expected."""
         if self.token.kind != kind:
             raise self.unexpected(what)
         return self.take()

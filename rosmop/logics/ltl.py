@@ -1,13 +1,13 @@
-"""``ltl``: linear temporal logic over infinite traces, as MOP's LTL plugin reads it, with the three verdicts of LTL3.
+"""``ltl``: linear temporal logic over infinite traces, as MOP's LTL plugin reads it, with the verdicts of LTL3.
 
-Theory of operation (Bauer, Leucker, Schallhart). The formula and its negation each become a generalised Büchi
-automaton (``buchi``), without states that accept no word. Both are determinised side by side: an empty left side is a
-violation, an empty right side a validation. The result is minimised.
+The formula and its negation each become a generalised Büchi automaton (``buchi``), without states that accept
+no word. Both are determinised side by side: an empty left side is a violation, an empty right side a
+validation (Bauer, Leucker, Schallhart).
 
-An operator about the past is replaced by a proposition, whose value is guessed at each position. A formula about the
-future is added that only the correct guesses satisfy (``_Past``). Every trace has exactly one correct guess, so the
-formula and its negation keep exactly their traces. An event is the set of all letters that differ only in the
-guesses.
+An operator about the past is replaced by a proposition, whose value is guessed at each position. A formula
+about the future is added that only the correct guesses satisfy (``_Past``). Every trace has exactly one
+correct guess, so the formula and its negation keep exactly their traces. An event is the set of all letters
+that differ only in the guesses.
 """
 
 from rosmop.logics.automaton import TooManyStatesError, explore, letter_classes, spread
@@ -45,7 +45,7 @@ _PAST = {"previously", "dual previously", "historically", "once", "since", "dual
 _FUTURE = {"next", "always", "eventually", "until", "release"}
 VERDICTS = ("violation", "validation")
 MOST_LETTERS = 1024
-"""Each operator about the past doubles the classes of events."""
+"""Bounds the number of past operators: each of them doubles the classes of events."""
 
 
 def compile_ltl(source: Source) -> FiniteProperty:
@@ -94,8 +94,6 @@ _SOMETHING: Sets = frozenset((0,))
 
 
 class _Past:
-    """Replaces past operators; `right` collects the constraints on the guesses."""
-
     def __init__(self) -> None:
         self.propositions: dict[Formula, str] = {}
         self.right: list[Formula] = []

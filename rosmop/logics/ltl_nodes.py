@@ -1,8 +1,7 @@
 """Formulas of linear temporal logic in negation normal form, each stored once and identified by a number.
 
-At each position exactly one letter holds, so an atom, or a boolean combination of atoms, is one node ``letters``: the
-bit set of the letters at which it holds. The other nodes are ``and`` and ``or`` (flat), ``next``, ``until`` and
-``release``.
+Exactly one letter holds at each position, so a boolean combination of atoms is one node ``letters``: the bit
+set of its letters. The other nodes are ``and`` and ``or`` (flat), ``next``, ``until`` and ``release``.
 """
 
 from collections.abc import Iterable, Mapping
@@ -19,7 +18,6 @@ class FormulaNodes:
         self._nodes: list[tuple[str, tuple[int, ...]]] = []
 
     def __getitem__(self, node: int) -> tuple[str, tuple[int, ...]]:
-        """Return the kind of a node, and its letters (a bit set) or operands."""
         return self._nodes[node]
 
     def _intern(self, kind: str, parts: tuple[int, ...]) -> int:

@@ -183,7 +183,6 @@ class EarleyRecogniser:
         return shape
 
     def _canonical(self, items: set[Entry], done: set[int]) -> Step:
-        """Number references in sorted order, so that equal sets give equal shapes."""
         references = sorted({reference for _, reference in items} | done)
         number = {reference: index for index, reference in enumerate(references)}
         shape = self._shape(

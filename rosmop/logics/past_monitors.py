@@ -1,9 +1,9 @@
 """Monitors for formulas about the past: ptltl, and the past part of mtl (`bounded.py` has the future part).
 
-A formula becomes a *program*: its distinct subformulas, each after its operands, with ``previously`` and ``since`` as
-the only temporal operators. A step computes all from the event and from the values that the last step kept (Havelund
-and Rosu, 2002). The program is folded in advance, for each event, into the operations that remain, as data
-(`FoldedProgram`). Without time bounds it is a finite automaton, which is built if it is small enough.
+A formula becomes a *program*: its distinct subformulas, each after its operands, with ``previously`` and
+``since`` as the only temporal operators. A step computes all from the event and from the values that the last
+step kept (Havelund and Rosu, 2002). For each event, the program is folded in advance into the operations that
+remain (`FoldedProgram`). Without time bounds it is a finite automaton, which is built if it is small enough.
 """
 
 import copy
@@ -182,8 +182,6 @@ def fold(program: PastProgram, wanted: Sequence[int]) -> FoldedProgram:
 
 
 class _Fold:
-    """Folds instructions for an event, or for any. ``kept`` are the places of those that look back."""
-
     def __init__(self, chosen: dict[int, PastInstruction], kept: dict[int, int], event: int | None) -> None:
         self._chosen = chosen
         self._kept = kept
@@ -351,7 +349,6 @@ class SinceWindow:
         self._intervals: deque[tuple[int, int]] = deque()
 
     def step(self, unbroken: bool, anchor: bool, now: int) -> bool:
-        """``unbroken`` is the left operand, ``anchor`` the right operand."""
         intervals = self._intervals
         if intervals and not unbroken:
             intervals.clear()

@@ -1,9 +1,9 @@
 """``pattern``: properties in near-English, after Dwyer's scopes and patterns, with HPL's meaning (Santos et al.).
 
-Theory of operation. A run is in a *mode*: the scope has not opened, is over, or is open and either *quiet* or
-*stirred*. For ``some`` and ``requires``, a run is stirred once the good event came; for ``causes``, while an answer
-is due; for ``forbids``, once the first event came. The mode and the time of one event are the whole state. Whether a
-mode settles the verdict follows from the modes that are reachable from it.
+A run is in a *mode*: the scope has not opened, is over, or is open and either *quiet* or *stirred*. A run is
+stirred once the good event has come (``some``, ``requires``), while an answer is due (``causes``), or once
+the first event has come (``forbids``). The mode and the time of one event are the whole state. Whether a mode
+settles the verdict follows from the modes that are reachable from it.
 """
 
 from dataclasses import dataclass
@@ -48,7 +48,7 @@ class Pattern:
         return "quiet" if self.opens is None else "waiting"
 
     def after_event(self, mode: Mode, event: int, *, late: bool) -> Mode:
-        """``late``: more than ``within_ns`` after the start of the mode's clock."""
+        """Return the next mode. A ``late`` event comes more than ``within_ns`` after the start of the mode's clock."""
         if mode == "waiting":
             return "quiet" if event == self.opens else "waiting"
         if mode in ("over", "violated"):
@@ -95,7 +95,7 @@ class Pattern:
 
 
 def verdicts(pattern: Pattern, events: int) -> dict[Mode, Categories]:
-    """Return `violation` or `validation` for each mode if either is certain.
+    """Return the verdict of each mode, if it is certain.
 
     A due event can always come or be published later, unless it is the event that closes the scope.
     """
@@ -167,7 +167,6 @@ class TimedPattern(ClockedProperty):
         return tuple(table)
 
     def blocking_refused(self, category: str) -> str | None:
-        """A deadline may decide the category without a message."""
         super().blocking_refused(category)
         kind = self.pattern.kind
         comes_along = kind == "no" or self.pattern.enforced

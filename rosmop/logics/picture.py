@@ -1,7 +1,7 @@
 """Draw automata, for Graphviz or as SVG, which needs no installed program.
 
-Colours and sizes are attributes, not styles: they also work on pages whose content security policy forbids styles.
-The column of a state is its distance from the start.
+Colours and sizes are attributes, because a content security policy may forbid styles. The column of a state
+is its distance from the start.
 """
 
 from collections import Counter, deque

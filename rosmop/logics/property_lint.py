@@ -1,7 +1,7 @@
-"""Find facts about a property before it runs, such as handlers that never run and constant verdicts.
+"""Find certain facts about a property before it runs, such as handlers that never run and constant verdicts.
 
-Only certain facts are reported: none for a grammar that needs a stack, nor for a formula with several time bounds or
-with bounds about the future.
+A grammar that needs a stack has none, nor has a formula with several time bounds or with bounds about the
+future.
 """
 
 from collections import deque

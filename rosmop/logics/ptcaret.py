@@ -82,7 +82,6 @@ class CaretRun(UntimedRun):
         return made
 
     def step(self, event: int, _time_ns: int) -> Categories:
-        """If this raises `RunFaultError`, the run is unchanged."""
         compiled, values, stack = self._compiled, self._values, self._stack
         abstract = compiled.folded.abstract
         if event == compiled.begin:

@@ -1,6 +1,4 @@
-"""``srs``: string rewriting systems, as MOP's SRS plugin reads them, with a limit of length and of work for one
-event.
-"""
+"""``srs``: string rewriting systems, as MOP's SRS plugin reads them, bounded in length and in work for one event."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,7 +11,7 @@ CATEGORIES: Categories = ("fail", "succeed")
 MAX_RULES = 1_000
 MAX_STRING = 100_000
 MAX_WORK = 200_000
-"""The limit of rules tried and symbols moved for one event; sixteen comparisons of symbols count as one move."""
+"""The most rules tried and symbols moved for one event. Sixteen compared symbols count as one moved symbol."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +54,6 @@ class RewritingRun(UntimedRun):
         self.verdict: Categories = ()
 
     def step(self, event: int, _time_ns: int) -> Categories:
-        """If this raises `RunFaultError`, the run is unchanged."""
         if not self.verdict:
             self.string, self.verdict = self._rewritten([*self.string, event])
         return self.verdict

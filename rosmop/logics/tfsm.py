@@ -47,12 +47,11 @@ class TimedStateMachine(ClockedProperty):
             self.waits = (*silent, *[None] * size)
 
     def categories_after(self, event: int) -> frozenset[str]:
-        """A ``timeout`` needs no event, and is left out."""
         verdicts = self.automaton.verdicts
         return frozenset(name for row in self.automaton.table for name in verdicts[row[event]])
 
     def blocking_refused(self, category: str) -> str | None:
-        """Only ``timeout`` comes without a message: an event may stay in a state that only a timeout enters."""
+        """Refuse only ``timeout``: an event may come in a state that only a timeout enters, and stay there."""
         super().blocking_refused(category)
         if category == TIMEOUT:
             return "`timeout` happens when no message comes, so there is none to drop"
