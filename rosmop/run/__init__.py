@@ -1,1 +1,1 @@
-"""Run specifications: interpreter, engine, slices, timers, explanations. No I/O, no clock."""
+"""Run specifications, without I/O or a clock."""

@@ -1,9 +1,9 @@
-"""The running monitors: `MonitorSet` decides what happens to each message. It does no I/O and reads no clock.
+"""The running monitors: `MonitorSet` decides what happens to each message.
 
-The caller gives the time, in nanoseconds, with every message; due ticks and deadlines (`timers.py`) happen before it.
-While no message comes, the caller calls `advance` at `next_due`. A lane of the fast path (`fast_path.py`) has the
-same results. Specifications in shadow mode are in separate sets (`shadows`), so that they do not affect others; after
-a message is passed on, the caller gives its copies to them (`ShadowCopy.give`).
+The caller gives the time, in nanoseconds, with every message; due ticks and deadlines (`timers.py`) happen
+before it, or in `advance`, which the caller calls at `next_due`. A lane of the fast path (`fast_path.py`) has
+the same results. Specifications in shadow mode are in separate sets (`shadows`), so that they do not affect
+others; after a message is passed on, the caller gives its copies to them (`ShadowCopy.give`).
 """
 
 import sys
@@ -79,8 +79,8 @@ class ShadowCopy(NamedTuple):
 class KeptGroup:
     """A group of specifications, and its state as data that the caller keeps.
 
-    The state is `base`; or `base` and newer `cells` of `size` bytes. The slices of parametric specifications are in
-    parts, of the specifications in `part_names`.
+    The state is `base`, perhaps with newer `cells` of `size` bytes. Slices are in parts; `part_names` has the
+    specification of each part.
     """
 
     def __init__(
@@ -212,10 +212,10 @@ class MonitorSet:
         deadlines: int = sys.maxsize,
         holder_of: HolderOf = no_holder,
     ) -> "MonitorSet":
-        """Put all specifications that share variables with those in `shadows` into shadow mode.
+        """Return a set in which `shadows`, and specifications that share variables with them, are in shadow mode.
 
-        When something is due, `patience()` (in shadow mode: `shadow_patience()`) returns a function that returns
-        whether the work takes too long. A parametric specification has at most `slices` slices.
+        When something is due, `patience()` (in shadow mode: `shadow_patience()`) returns a function that
+        returns whether the work takes too long. A parametric specification has at most `slices` slices.
         """
         shadowed = []
         for group in compiled.groups(shadows):
@@ -324,13 +324,12 @@ class MonitorSet:
         )
 
     def _is_true(self, monitor: MonitorInstance, variable: str) -> bool:
-        """Do not move the state of the monitor."""
         if monitor.home is not None:
             return monitor.home.is_true(variable)
         return bool(self.interpreter.variables[variable])
 
     def type_of(self, topic: str, *, shadowed: bool = False) -> str | None:
-        """Return None without enabled events. Shadow mode counts only if `shadowed`."""
+        """Return None if the topic has no enabled event. Shadow mode counts only if `shadowed`."""
         steps = self.steps.get(topic, ())
         return next((step.event.type for step in steps if shadowed or not isinstance(step, _Tap)), None)
 
@@ -338,7 +337,6 @@ class MonitorSet:
         return self.compiled.is_stamped(self.type_of(topic, shadowed=True))
 
     def service_type_of(self, service: str, *, shadowed: bool = False) -> str | None:
-        """Return None without enabled events. Shadow mode counts only if `shadowed`."""
         for part in ("request", "response"):
             for step in self.steps.get(channel_of(service, part), ()):
                 if shadowed or not isinstance(step, _Tap):
@@ -348,13 +346,13 @@ class MonitorSet:
     def limit_time(self, clock: Callable[[], float], seconds: float) -> None:
         """Bound the processor time of all monitors together for one message; `clock` returns seconds.
 
-        Exceeding it is a fault. The same bound holds for ticks, deadlines, and monitors in shadow mode.
+        A monitor that exceeds the bound faults. It also holds for ticks, deadlines, and monitors in shadow
+        mode.
         """
         for part in (self, *self.shadows):
             part.interpreter.turn.limit(clock, seconds)
 
     def hurry(self, part: float) -> None:
-        """Limit messages to this fraction of the time of `limit_time`."""
         self.interpreter.turn.part = part
 
     @property
@@ -383,7 +381,7 @@ class MonitorSet:
 
     @property
     def area(self) -> memoryview | None:
-        """Return memory to receive frames in, so that lanes need no copy; None without lanes."""
+        """Return the memory to receive frames in, so that lanes need no copy, or None without lanes."""
         return self._lanes.area
 
     def contexts(self, topic: str) -> tuple[Context, ...]:
@@ -397,22 +395,18 @@ class MonitorSet:
         return not self._agenda.has_come(time_ns) and not self._broken and lane.ready()
 
     def monitor(self, name: str) -> MonitorInstance:
-        """Raises `KeyError`."""
         for monitor in self._monitors:
             if monitor.name == name:
                 return monitor
         raise KeyError(name)
 
     def value(self, name: str, variable: str) -> Any:
-        """Raises `KeyError`."""
         monitor = self.monitor(name)
         monitor.move_to_python()
         return self.interpreter.variables[monitor.code.variables[variable]]
 
     def take_margins(self) -> Iterator[Margin]:
-        """Yield the closest true and the closest false result of each comparison since the last call, if compiled
-        with `margins`.
-        """
+        """Yield the closest true and false results of comparisons since the last call, if compiled with `margins`."""
         return taken_margins(self.monitors, self.interpreter.variables)
 
     @staticmethod
@@ -422,7 +416,7 @@ class MonitorSet:
         )
 
     def replaced_topics(self, before: "MonitorSet | None") -> frozenset[str]:
-        """Return `topics_of` the monitors, of either set, that do not continue unchanged after `succeed`."""
+        """Return the topics of all monitors, in either set, that do not continue unchanged after `succeed`."""
         earlier = before.monitors if before is not None else ()
         present = {monitor.name for monitor in self._monitors}  # `names` also has those in shadow mode
         kept = {monitor.name for monitor in earlier}.intersection(present) - set(self.began)
@@ -447,7 +441,7 @@ class MonitorSet:
         return self._with_shadows(outcome, [shadow.start(time_ns, expected) for shadow in self.shadows])
 
     def kept_groups(self) -> "list[KeptGroup]":
-        """Note changes of slices from now on."""
+        """Return the groups, and note changes of slices from now on."""
         return [
             KeptGroup(group, self.interpreter.variables, self._types, _slice_parts(group))
             for group in self.groups
@@ -458,8 +452,9 @@ class MonitorSet:
     ) -> Outcome:
         """Start with the state of earlier processes: for each specification, the last state in `kept`.
 
-        A specification restarts if its state is `lost` (with the reason; key "": all) or unusable; `hold_lost`
-        decides whether it holds its topics. With `restarted`, specifications declared `hold` always hold them.
+        A specification restarts if its state is unusable, or `lost` (reasons by name, where "" means all).
+        `hold_lost` decides whether it holds its topics. With `restarted`, specifications declared `hold`
+        always hold them.
         """
         states, slices, unread = states_of(kept)
         fresh, reasons = [], {**lost, **unread}
@@ -496,14 +491,11 @@ class MonitorSet:
         return self._with_shadows(outcome, [shadow.start(time_ns) for shadow in self.shadows])
 
     def hold_lost(self, monitor: MonitorInstance, why: str) -> None:
-        """Hold the topics of a restarted monitor that is declared `hold`, or depends on a state and is not declared
-        `begin`.
-        """
         if self.holds_if_lost(monitor.code):
             self.hold(monitor, why)
 
     def hold(self, monitor: MonitorInstance, why: str) -> None:
-        """Drop the messages of its topics, and send its safe messages, until `resume`."""
+        """Drop the messages on the monitor's topics, and send its safe messages, until `resume`."""
         monitor.touch()
         monitor.hold(why)
         self._agenda.schedule()
@@ -526,7 +518,6 @@ class MonitorSet:
         return code.hold or (code.name in self._guards.names and not code.begins)
 
     def identity(self, code: SpecificationCode) -> bytes:
-        """A state belongs to the text of its specification and to the definitions of its message types."""
         return code.identity + self._types[code.name]
 
     def _start(
@@ -550,13 +541,12 @@ class MonitorSet:
     def succeed(
         self, before: "MonitorSet", time_ns: int, incomplete: Collection[str] = frozenset()
     ) -> Outcome:
-        """Replace another set between two messages, and start; `began` names the specifications that start with this
-        set.
+        """Replace another set between two messages. `began` names the specifications that start with this set.
 
-        Specifications with the same text keep their state, also into and out of shadow mode, and `init` does not run
-        again. They restart if the definition of a message type has changed, or if they leave shadow mode and are
-        `incomplete`, because they missed messages there. A specification that restarts still holds its topics if it
-        is still declared `hold`; in shadow mode it holds none.
+        Specifications with the same text keep their state, even into and out of shadow mode, without another
+        `init`. They restart if the definition of a message type has changed, or if they leave shadow mode and
+        are `incomplete`, because they missed messages there. A specification that restarts still holds its
+        topics if it is still declared `hold`; in shadow mode it holds none.
         """
         known = {
             monitor.name: (monitor, part.interpreter.variables)
@@ -644,7 +634,7 @@ class MonitorSet:
         return tuple(changed)
 
     def give(self, values: GivenValues) -> None:
-        """Set given constants; the others get their defaults. The state stays.
+        """Set given constants, and all others to their defaults, without resetting the state.
 
         Unknown names, and values outside their ranges, are ignored, because the caller has checked them.
         """
@@ -661,7 +651,6 @@ class MonitorSet:
                         present[given.code] = value
 
     def resume(self, name: str) -> None:
-        """Let a specification that holds its topics pass messages again. Raises `KeyError`."""
         monitor = self.monitor(name)
         monitor.resume()
         monitor.touch()
@@ -716,7 +705,6 @@ class MonitorSet:
         return self._agenda.due
 
     def advance(self, time_ns: int) -> list[Outcome]:
-        """Process the ticks up to this time and the deadlines before it, in order of time."""
         outcomes = self._agenda.advance(time_ns, self._follow_up)
         self._agenda.schedule()
         return outcomes
@@ -728,10 +716,11 @@ class MonitorSet:
             self._judge_published(outcome)
 
     def _judge_published(self, outcome: Outcome) -> None:
-        """Give published messages to the monitors after their publisher, and theirs to later ones.
+        """Process published messages with the monitors after their publisher, and the messages that those publish.
 
-        A message that a remedy publishes at a deadline also goes to its own monitor if that is `ordered`. There is
-        still no loop: each other message goes only further back, and its deadlines are later than a message.
+        A message that a remedy publishes at a deadline is also processed by its own monitor if that is
+        `ordered`. There is still no loop: all other messages only go to later monitors, and new deadlines are
+        later than the message.
         """
         judged: dict[int, Outcome] = {}
         for number, message in enumerate(outcome.published):

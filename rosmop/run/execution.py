@@ -1,9 +1,9 @@
-"""Processes one message, tick or deadline: events, properties, handlers, faults. No I/O, no clock.
+"""Process one message, tick or deadline: events, properties, handlers, faults.
 
-For formulas (`CompiledProperty.suppresses`) a dropped message does not count: in all specifications they undo their
-steps, so their trace is the one that subscribers saw. Variables, output and other properties keep the effects.
-`STOP;`, and a fault of a monitor with a safe message on the topic, replace the message: formulas undo their steps,
-and the events behind this one process the safe message.
+For formulas (`CompiledProperty.suppresses`) a dropped message does not count: in all specifications they undo
+their steps, so that their trace has only messages that subscribers saw. Variables, output and other
+properties keep the effects. `STOP;`, and a fault of a monitor with a safe message on the topic, replace the
+message: formulas undo their steps, and the events behind this one process the safe message.
 """
 
 import struct
@@ -44,7 +44,7 @@ class MonitorExecution:
         """A fault of an event's function in `judging` only drops the message (`Guards.judging`)."""
         self._judging = judging
         self._function: str | None = None
-        """None for a tick or deadline."""
+        """The function of the event that runs, or None for a tick or deadline."""
         self.on_fault: OnFault = on_fault
         self.asked: Asked | None = None
         """Chooses the verdicts to explain, given the source of the message; None chooses all."""
@@ -59,9 +59,7 @@ class MonitorExecution:
         self._passed: int | None = None
 
     def begin(self, monitors: Sequence[MonitorInstance], time_ns: int) -> Outcome:
-        """Start monitors in common stages (constants, first values, `init`), because one may read another's
-        variables.
-        """
+        """Start monitors in common stages (constants, first values, `init`), as one may read another's variables."""
         outcome = Outcome(time=time_ns)
         self._turn.now, self._turn.until = time_ns, inf  # no time limit: operators wait for it
         for monitor in monitors:
@@ -127,7 +125,6 @@ class MonitorExecution:
         self._finish(message, writers, outcome)
 
     def tick(self, step: Step, time_ns: int) -> Outcome:
-        """The caller must call `collect`."""
         self._sender, self._function = NOBODY, None
         self._taking_back.clear()
         step.monitor.move_to_python()
@@ -157,7 +154,6 @@ class MonitorExecution:
         return outcome
 
     def send_safe(self, monitor: MonitorInstance, sender: SafeSender, time_ns: int) -> Outcome:
-        """All but the first message of a series are `repeated`."""
         safe = sender.safe
         outcome = Outcome(time=time_ns)
         outcome.timer, outcome.repeated = f"{monitor.name}.safe", sender.due is not None
@@ -220,7 +216,6 @@ class MonitorExecution:
         return [outcome] if whole else []
 
     def _catch_up(self, monitor: MonitorInstance, behind: Sequence[Slice], outcome: Outcome) -> None:
-        """Process overdue deadlines of slices before a message, after there were too many to process in time."""
         turn, go_on = self._turn, monitor.context.put_off()
         kept = turn.log, turn.published, turn.looked, self._sender, self._bound, self._function
         turn.log, turn.published, turn.looked = [], [], {}
@@ -457,8 +452,9 @@ class MonitorExecution:
             outcome.changed_at = tuple([sites[site].position for _, at in writers for site in at])
 
     def _first(self, monitor: MonitorInstance, message: WireMessage, outcome: Outcome) -> bool:
-        """Whether the monitor drops its first message, or one on a topic that it holds, unjudged. It passes the safe
-        message.
+        """Whether the monitor does not judge the message, because it holds its topics or failed to start.
+
+        It then drops all messages except the safe message.
         """
         if monitor.held:
             why = f" ({monitor.why_held})" if monitor.why_held else ""
@@ -610,7 +606,6 @@ class MonitorExecution:
         outcome.faults = (*outcome.faults, fault)
 
     def _past(self, step: Step, message: WireMessage) -> None:
-        """Count events that did not happen because an index was past the end, and report them now and then."""
         step.past += 1
         now = message.time
         if step.told is None or now - step.told >= FOLDED_NS:

@@ -1,12 +1,13 @@
-"""Explain a verdict by few past events that suffice for it. Each explanation is tested: its events must give the
-verdict.
+"""Explain a verdict by few past events that suffice for it.
+
+Each explanation is tested: its events must give the verdict.
 
 1. With tables, `Exits` stores for each state the event that left it last. From the initial state these events lead to
-   the present state: the trace without its loops, however long it is.
-2. For other properties, `Steps` keeps the last events and the run before them. If the events give the verdict to a
-   new run, they explain it alone; otherwise only with that run (`Explanation.since`). A run about the future cannot
-   be copied, but knows at which event the decided formula was evaluated. The events from there on suffice, unless the
-   formula also looks back; then there is no explanation.
+the present state: the trace without its loops, however long it is.
+2. For other properties, `Steps` keeps the last events and the run before them. If the events do not give the verdict
+to a new run, they explain it only with that run (`Explanation.since`). A run about the future is not copied, but
+knows at which event the decided formula was evaluated. The events from there on suffice, unless the formula also
+looks back; then there is no explanation.
 3. For a parametric specification, the last `TRAIL` events must explain a slice's verdict alone.
 """
 
@@ -40,7 +41,8 @@ ENTRY = struct.Struct("<qqI4x")
 RUNS, RING = 4, 256
 """The runs and steps kept for a property with a clock.
 
-They are twice the needed ones, so that a message that the module leaves to the engine overwrites no needed entry.
+They are twice as many as needed, so that a message that the module leaves to the engine overwrites no needed
+entry.
 """
 
 _COUNT = struct.Struct("<q")
@@ -56,8 +58,8 @@ CLOCKED_ROOM = _COUNT.size + _RUN.size * RUNS + ENTRY.size * RING
 class Bound(NamedTuple):
     """An event of a parametric specification that happened: parameters by number, and their values after True.
 
-    `everywhere`: it happened in each of its slices. (A `when` may depend on the slice, and a message that one slice
-    drops reaches no other slice.) `passed`: its message was not dropped.
+    It happened `everywhere` if in each of its slices: a `when` may depend on the slice, and a message that
+    one slice drops reaches no other slice. It is `passed` if its message was not dropped.
     """
 
     event: int
@@ -97,10 +99,10 @@ class Exits:
         return run.expire()
 
     def begin(self, time_ns: int) -> None:
-        """A path from the initial state never has earlier events."""
+        """Do nothing: a path from the initial state never has earlier events."""
 
     def mark(self) -> None:
-        """A path from the initial state never has an undone step."""
+        """Do nothing: a path from the initial state never has an undone step."""
 
     def take_back(self, mark: object) -> None: ...
 
@@ -108,7 +110,7 @@ class Exits:
         self.room, self.owner = room[: len(self.room)], owner
 
     def forget(self, run: Any, _time_ns: int) -> None:
-        """The run continues a run of another process."""
+        """Forget all exits, because the run continues a run of another process."""
         self._at = run.state
         for state in range(len(self._automaton)):
             ENTRY.pack_into(self.room, ENTRY.size * state, 0, _EVENT, 0)
@@ -199,14 +201,13 @@ class Steps:
         del self._steps[size:]
 
     def step(self, run: Run, event: int, time_ns: int, sender: MessageSender) -> Categories:
-        """Raises `RunFaultError`."""
         self._make_room(run)
         categories = run.step(event, time_ns)
         self._steps.append(EventOccurrence(event, time_ns, sender))
         return categories
 
     def forget(self, run: Run, time_ns: int) -> None:
-        """The run continues a run of another process, so explain only from the present state on."""
+        """Explain only from the present state on, because the run continues a run of another process."""
         self.begin(time_ns)
         self._before = None if isinstance(run, BoundedRun) else copy.copy(run)
 
@@ -333,8 +334,6 @@ def _step_at(number: int) -> int:
 
 
 class _Trial:
-    """Tests whether events lead to a category, at the last event, or at a deadline if it has `ended`."""
-
     def __init__(
         self, compiled: CompiledProperty, before: Run | None, started: int, category: str, ended: int | None
     ) -> None:
@@ -396,8 +395,8 @@ def of_slice(
 ) -> Explanation | None:
     """Return the events that caused a verdict in the slice of a binding (parameters by number).
 
-    The last event, or the deadline that has `passed`, gave the verdict. None if it is unknown whether a needed event
-    happened in this slice.
+    The last event, or the deadline that has `passed`, gave the verdict. Returns None if it is unknown whether
+    a needed event happened in this slice.
     """
     own: dict[EventOccurrence, bool] = {}
     happened: list[EventOccurrence] = []

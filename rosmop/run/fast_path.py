@@ -1,6 +1,4 @@
-"""The interface between the engine and compiled code (`rosmop/fast/wasm_runner.py`), which the caller passes to the
-set.
-"""
+"""The interface between the engine and compiled code (`rosmop/fast/wasm_runner.py`)."""
 
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
@@ -17,22 +15,22 @@ MESSAGE_FUEL = FUEL_PER_SECOND // 100
 
 
 class BatchResult(NamedTuple):
-    """The result of one batch.
-
-    `position` is the offset of the first message that was not processed, `run` the offset after the last dropped
-    message. `dropped` counts dropped messages for each event of the lane, `told` counts verdicts; both are empty if
-    all counts are zero. `sooner`: a deadline is earlier than before. `output` has the printed lines in order, each
-    with the offset of its message. `paused`: the fuel is used up; the next batch may begin with the message at
-    `position`.
-    """
+    """The result of one batch."""
 
     position: int
+    """The offset of the first message that was not processed."""
     run: int
+    """The offset after the last dropped message."""
     dropped: Sequence[int]
+    """The dropped messages for each event of the lane; empty if all counts are zero."""
     told: Sequence[int] = ()
+    """The verdicts; empty if all counts are zero."""
     sooner: bool = False
+    """Whether a deadline is earlier than before."""
     output: Sequence[tuple[int, LogLine]] = ()
+    """The printed lines in order, each with the offset of its message."""
     paused: bool = False
+    """Whether the fuel is used up; the next batch may begin with the message at `position`."""
 
 
 class BatchOptions(NamedTuple):
@@ -59,14 +57,15 @@ class PreparedState(Protocol):
 class NativeCall(NamedTuple):
     """The addresses with which compiled code passes frames through a lane without Python.
 
-    `invoke` is wasmtime's `wasmtime_func_call_unchecked`, to be called with `context`, `function` and three slots of
-    16 bytes: the address of the first frame in the module, the address after the last one, and the time (ns). Its
-    result is the module's answer (`rosmop.fast.abi`). If it returns an error, or a trap, `failure(error, trap)` frees
-    them and returns the exception that a lane raises for it. If the bytes at `options` are not `packed(options)` of
-    the batch's options, call `home.prepare` first.
+    `invoke` is wasmtime's `wasmtime_func_call_unchecked`, to be called with `context`, `function` and three
+    slots of 16 bytes: the address of the first frame in the module, the address after the last one, and the
+    time (ns). Its result is the module's answer (`rosmop.fast.abi`). If it returns an error, or a trap,
+    `failure(error, trap)` frees them and returns the exception for the lane. If the bytes at `options` are
+    not `packed(options)` of the batch, call `home.prepare` first.
 
-    The other fields are offsets in `memory`, which does not grow: of the frames, of the first effect, of the lines of
-    output (0: the lane prints nothing) and of the word with their end, and offset and size of each part of the state.
+    The other fields are offsets in `memory`, which does not grow: of the frames, of the first effect, of the
+    lines of output (0: the lane prints nothing) and of the word with their end, and offset and size of each
+    part of the state.
     """
 
     invoke: int
@@ -140,13 +139,12 @@ class FastLane(Protocol):
         prepared: BatchOptions,
         answer: int | Exception | None = None,
     ) -> BatchResult | None:
-        """Process messages until one needs the engine. Return None if the lane processed all of them, and all of them
-        stay in their buffer.
+        """Process messages until one needs the engine. Return None if all are processed and stay in their buffer.
 
-        `answer` is the module's answer, or the exception, if it was already called for these messages (`native`).
-        Call this only while the lane is `ready` and nothing in the set is due. `view` has whole frames and is
-        writable. It is in other memory, or begins like `Lanes.area`. Bytes before a dropped message are appended to
-        `pieces`.
+        `answer` is the module's answer, or the exception, if it was already called for these messages
+        (`native`). Call this only while the lane is `ready` and nothing in the set is due. `view` has whole
+        frames and is writable. It is in other memory, or begins like `Lanes.area`. Bytes before a dropped
+        message are appended to `pieces`.
         """
 
     def process_one(  # noqa: PLR0917  as `process_batch`
@@ -162,15 +160,15 @@ class FastLane(Protocol):
         """`paused` means that the fuel was not enough."""
 
     def native(self) -> NativeCall | None:
-        """Return how to call the module for batches in `Lanes.area`; None if its state is more than numbers."""
+        """Return how to call the module for batches in `Lanes.area`, or None if its state is more than numbers."""
 
     def process_message(
         self, message: Buffer, time_ns: int, prepared: BatchOptions, fuel: int = MESSAGE_FUEL
     ) -> Outcome | None:
-        """Return None for a message that is left to the engine. Verdicts are not explained, and changes have no
-        positions.
+        """Return None for a message left to the engine. Verdicts are not explained, and changes have no positions.
 
-        The conditions are those of `process_batch`. Use separate options for this method, and do not call `happened`.
+        The conditions are those of `process_batch`. Use separate options for this method, and do not call
+        `happened`.
         """
 
 

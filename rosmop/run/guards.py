@@ -1,6 +1,6 @@
-"""Find the *guards*, whose actions on messages depend on variables or properties.
+"""Find the *guards*: specifications whose actions on messages depend on variables or properties.
 
-If its state is lost, or an event that keeps the state up to date faults, a guard cannot judge.
+A guard cannot judge if its state is lost, or if an event that keeps the state up to date faults.
 """
 
 from collections.abc import Iterator, Mapping

@@ -1,13 +1,12 @@
-"""The interpreter defines the meaning of the intermediate form (`form/nodes.py`); every faster implementation is
-compared with it.
+"""The definition of the intermediate form (`form/nodes.py`), with which every faster implementation is compared.
 
-Each expression becomes a Python function of a call's variables. Each statement becomes a function that returns how the
-block ends, or None if the block goes on. Strings are bytes, vectors and messages are lists, times and durations are
-integers. This is one file because it is the definition. Invariants:
+Each expression becomes a Python function of a call's variables. Each statement becomes a function that
+returns how the block ends, or None if the block goes on. Strings are bytes, vectors and messages are lists,
+times and durations are integers. This is one file because it is the definition. Invariants:
 
 1. A name is a variable of the monitor set (`g…`) or of one call. Only variables of the set, and the values they refer
-   to, outlive a call. In a call, `m` is the message, `b` its original bytes, `p` the start of a skipped element, and
-   `n` the depth of a recursion.
+to, outlive a call. In a call, `m` is the message, `b` its original bytes, `p` the start of a skipped element, and `n`
+the depth of a recursion.
 2. `_site` is the site of the running statement. A fault stops the function and all its callers.
 """
 
@@ -64,7 +63,7 @@ _RESULT = "result"
 
 @dataclass(frozen=True)
 class LastFailure:
-    """The last error. `happened`: the event had already happened."""
+    """The last error, and whether its event had already `happened`."""
 
     error: Exception | None = None
     site: int = -1
@@ -107,7 +106,6 @@ class Interpreter:
         self._made.clear()
 
     def value(self, name: str, variables: Mapping[str, Any]) -> Any:
-        """`variables` are those of a call. Raises `KeyError`."""
         return variables[name] if name in variables else self.variables[name]
 
     def function(self, name: str) -> Callable[..., Any]:
@@ -165,7 +163,6 @@ class Interpreter:
 
 
 def constant_of(node: nodes.Expression) -> bool | int | float:
-    """Raises `FaultError`."""
     nowhere = nodes.Function("", "", (), ())
     maker = _Maker(_nobody(), nowhere)
     value: bool | int | float = maker.value(node)({})
@@ -845,7 +842,6 @@ def _is_shared(name: str) -> bool:
 def conversion(  # noqa: PLR0911  one for each kind
     source: Type, target: Type
 ) -> Callable[[Any], Any] | None:
-    """Return None if nothing changes."""
     if source == target:
         return None
     if isinstance(target, value_types.BoolType):

@@ -61,7 +61,7 @@ class StateHolder(Protocol):
 class MonitorGroup:
     """Monitors that share topics or variables: a message changes the state of at most one group.
 
-    `changed`: the state may have changed outside the module since it was last saved.
+    It is `changed` if the state may have changed outside the module since it was last saved.
     """
 
     monitors: tuple["MonitorInstance", ...]
@@ -109,8 +109,7 @@ class RunningProperty:
 class Step:
     """One event's processing of a message.
 
-    Since the last report (`told`), `past` counts how often the event did not happen because an index was past the
-    end.
+    Since the last report (`told`), the event did not happen `past` times because an index was past the end.
     """
 
     monitor: "MonitorInstance"
@@ -136,7 +135,7 @@ class Timer:
 
 @dataclass(eq=False, slots=True)
 class SafeSender:
-    """Sends a safe message while its monitor cannot judge. `due` is None before the first one."""
+    """Sends a safe message while its monitor cannot judge. `due` is None before the first message."""
 
     safe: SafeMessage
     due: int | None = None
@@ -178,7 +177,6 @@ class MonitorInstance:
         return self.broken or self.faults >= FAILING_AFTER
 
     def picture(self) -> str | None:
-        """Return None if no automaton is finite."""
         from rosmop.logics.picture import svg_of  # noqa: PLC0415  only tools draw
 
         return svg_of([code.property for code in self.code.properties])
@@ -192,7 +190,7 @@ class MonitorInstance:
     def sending(self, *, passes: bool) -> list[SafeSender]:
         """Return the senders that send now: all while no message can be judged, else those of `starting` topics.
 
-        `passes`: faults pass messages, even those of the start.
+        With `passes`, faults pass messages, even faults of the start.
         """
         if not self.safes or not self.enabled:
             return []
@@ -219,7 +217,6 @@ def monitors_of(
     slices: int,
     holder_of: HolderOf,
 ) -> tuple[MonitorInstance, ...]:
-    """Each monitor has at most `slices` slices, which are charged to `holder_of(source)`."""
     return tuple(_monitor(interpreter, code, time_ns, slices, holder_of) for code in compiled.specifications)
 
 

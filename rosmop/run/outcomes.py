@@ -1,6 +1,6 @@
 """Outcomes of messages, ticks and deadlines: as values, as data (records, the CLI, REST), and as text.
 
-Data about causes are limited in size, and use the words of the specification. `who` names the source of a message.
+Data about causes are limited in size. `who` names the source of a message.
 """
 
 import datetime
@@ -54,7 +54,7 @@ class EventOccurrence(NamedTuple):
 
 
 class Explanation(NamedTuple):
-    """Events that alone give a verdict. `fewest`: none of them can be left out.
+    """Events that alone give a verdict. They are the `fewest` if none of them can be left out.
 
     With `since` (ns), the events lead to the verdict from the property's state at that time.
     """
@@ -83,9 +83,10 @@ class Verdict:
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """A fault stopped an action. `values` are those of the variables involved.
+    """A runtime error that stopped an action, with the `values` of the variables involved.
 
-    `outdates`: the monitor's state may be out of date, because an event that it observes did not take effect.
+    If it `outdates`, the monitor's state may be out of date, because an event that it observes did not take
+    effect.
     """
 
     monitor: str
@@ -107,54 +108,53 @@ def bound(verdict: Verdict) -> str:
 
 
 class Outcome:
-    """The result of a message, tick or deadline.
-
-    `buffer` is the message to relay: the buffer that came in (changed in place where possible), or another buffer.
-    `events` are named `specification.event`. `timer` names the source of a tick or deadline (`specification.tick`,
-    `specification.timeout`, `specification.deadline`, `specification.safe`). `time` is in nanoseconds. `before` has
-    the outcomes of ticks and deadlines that were due before this message; `shadowed` those of the sets in shadow mode
-    when a set starts.
-
-    `changed_by` are, in order, the events whose actions changed bytes of the message (none if they assigned the same
-    value), and `changed_at` the positions of the statements. `dropped_by` is the specification that dropped the
-    message: at its last event, after a fault (`fatal`), or for `reason` (the topic is held, or the start failed).
-    `dropped_at` is the position of the statement, the action or the specification. `handling` has the verdicts whose
-    handlers dropped the message (key `DROPPED`) or published messages (keys: their indices in `published`).
-
-    `began_holding` are the monitors that hold their topics from now on, because of a fault. `judged` has the outcomes
-    of published messages after the monitors behind their publisher, by their indices in `published`. `repeated`: the
-    outcome only repeats a safe message, so it needs no report.
-
-    `looked` are the conditions that were met, by site, with the values that they compared: each `when` of an event
-    that happened, and each `if` around a statement that dropped, changed or published a message. For a dropped
-    message, `overwritten` has the original bytes that actions overwrote (position and bytes, in order).
-    """
+    """The result of a message, tick or deadline."""
 
     result: Result = "passed"
     timer: str | None = None
+    """The source of a tick or deadline: `specification.tick`, `.timeout`, `.deadline` or `.safe`."""
     events: Sequence[str] = ()
+    """Named `specification.event`."""
     verdicts: Sequence[Verdict] = ()
     published: Sequence[Published] = ()
     log: Sequence[LogLine] = ()
     faults: Sequence[Fault] = ()
     before: Sequence["Outcome"] = ()
+    """The outcomes of ticks and deadlines that were due before this message."""
     shadowed: Sequence["Outcome"] = ()
+    """When a set starts, the outcomes of its sets in shadow mode."""
     reason: str | None = None
+    """Why the message was dropped without an event: the topic is held, or the start failed."""
     changed_by: Sequence[str] = ()
+    """In order, the events whose actions changed bytes of the message."""
     changed_at: Sequence[Position] = ()
+    """The positions of the statements that changed bytes."""
     dropped_by: str = ""
+    """The specification that dropped the message: at its last event, after a fault (`fatal`), or for `reason`."""
     fatal: Fault | None = None
     dropped_at: Position | None = None
+    """The position of the statement, the action or the specification."""
     handling: Mapping[int, Verdict] = MappingProxyType({})
+    """The verdicts whose handlers dropped the message (key `DROPPED`) or published messages (keys: their indices)."""
     looked: Mapping[int, tuple[Any, ...]] = MappingProxyType({})
+    """The conditions that were met, by site, with the values that they compared.
+
+    They are each `when` of an event that happened, and each `if` around a statement that dropped, changed or
+    published a message.
+    """
     began_holding: Sequence[str] = ()
+    """The monitors that a fault made hold their topics."""
     judged: Mapping[int, "Outcome"] = MappingProxyType({})
+    """The outcomes of published messages after the monitors behind their publisher, by index."""
     sites: Sequence[Site] = ()
     overwritten: Sequence[tuple[int, bytes]] = ()
+    """For a dropped message, the original bytes that actions overwrote (position and bytes, in order)."""
     repeated: bool = False
+    """Whether this only repeats a safe message, and so needs no report."""
 
     def __init__(self, buffer: Buffer = b"", time: int = 0) -> None:
         self.buffer = buffer
+        """The message to relay: the buffer that came in (changed in place where possible), or another buffer."""
         self.time = time
 
     def restore(self, buffer: memoryview) -> None:

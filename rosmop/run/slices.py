@@ -197,8 +197,7 @@ class Slices:
     # The slices of an event
 
     def step(self, event: int, key: Key) -> bool | None:
-        """Step the slice of an event that binds all parameters; return None, and do nothing, if that does more than
-        new states.
+        """Step the slice of an event that binds all parameters, if that only changes states; else return None.
 
         Return False if the slice is over, so that the event does not happen.
         """
@@ -357,7 +356,7 @@ class Slices:
     def settle(
         self, slice_: Slice, runs: tuple[Run, ...], values: tuple[Any, ...], *, happened: bool
     ) -> None:
-        """A slice that begins with this event is kept only if the event `happened`."""
+        """Store the state of a slice. A new slice is kept only if the event with which it begins `happened`."""
         slice_.runs, slice_.values = runs, values
         if slice_.gone:
             return
@@ -376,9 +375,7 @@ class Slices:
             self._await(slice_)
 
     def forgotten(self, time_ns: int) -> str:
-        """Return the number of slices forgotten for newer ones of the same host; empty within `FOLDED_NS` of the last
-        report.
-        """
+        """Report the slices forgotten for newer ones of the same host, at most once in `FOLDED_NS`."""
         number = self._forgotten
         if not number or (self._told is not None and time_ns - self._told < FOLDED_NS):
             return ""
@@ -468,9 +465,9 @@ class Slices:
         live: Sequence[Slice],
         ended: Sequence[tuple[Binding, Holder]],
     ) -> None:
-        """Continue with the slices of another process, in the order in which they began or ended (keys: `of_nan`).
+        """Continue with the slices of another process, in the order in which they began or ended.
 
-        Raises `KeyError` for an impossible binding.
+        Their keys are made by `of_nan`. Raises `KeyError` for an impossible binding.
         """
         for code, value in zip(self._parameters, zero, strict=True):
             self._namespace[code[1]] = value

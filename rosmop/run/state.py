@@ -1,8 +1,8 @@
 """Keep the state of monitors as data that outlives their process, group by group, and read it back under limits.
 
-The state is everything that affects later messages: variables, runs of properties, timers, and whether a monitor
-holds its topics; not the events that explain a verdict. If the variables of a group are numbers, its state is the
-bytes in the module's memory, which `CellNames` describes. Times are those of the caller's clock, which the next
+The state is everything that affects later messages: variables, runs of properties, timers, and whether a
+monitor holds its topics; not the events that explain a verdict. If the variables of a group are numbers, its
+state is the bytes in the module's memory (`CellNames`). Times are those of the caller's clock, which the next
 process continues.
 """
 
@@ -56,7 +56,6 @@ class MonitorSnapshot(msgspec.Struct, frozen=True, array_like=True):
 
 
 def encoded(states: Sequence[MonitorSnapshot]) -> bytes:
-    """Raises `StateTooLargeError`."""
     data = msgspec.msgpack.encode(states)
     if len(data) > MOST_BYTES:
         raise StateTooLargeError(f"its state has {len(data)} bytes; {MOST_BYTES} are kept")
@@ -124,7 +123,6 @@ def _with_cells(states: list[MonitorSnapshot], cells: bytes, names: CellNames) -
 
 
 def kept_monitor(monitor: MonitorInstance, variables: Mapping[str, Any], types: bytes) -> MonitorSnapshot:
-    """Raises `StateTooLargeError`."""
     slices = monitor.slices
     first: tuple[list[Any], list[Any]] = ([], [])
     if slices is not None:

@@ -16,7 +16,7 @@ from rosmop.logics.interface import ClockedRun, CompiledProperty, FiniteRun, Run
 from rosmop.logics.parsing import EarleySet, EarleyShape
 
 MOST_PARTS = 5_000
-"""More than a hundred times the usual number of objects of one run."""
+"""Limits the objects of one run, of which there are usually a hundred times fewer."""
 
 _CONTAINERS: Mapping[str, Callable[[list[Any]], Any]] = MappingProxyType(
     {"l": list, "t": tuple, "d": deque, "s": set}
@@ -32,14 +32,13 @@ class StateTooLargeError(Exception):
 
 
 def kept(run: Any) -> list[Any]:
-    """Raises `StateTooLargeError`."""
     if isinstance(run, FiniteRun | ClockedRun):
         return [[*run.saved()], []]
     return _Writer(run).written()
 
 
 def run_of(compiled: CompiledProperty, data: Any, time_ns: int) -> Run:
-    """Raises `ValueError` for invalid data."""
+    """Read the data of `kept`. Raises `ValueError`."""
     run = compiled.start(time_ns)
     try:
         _Reader(compiled, run, data).read()
@@ -50,8 +49,6 @@ def run_of(compiled: CompiledProperty, data: Any, time_ns: int) -> Run:
 
 
 class _Writer:
-    """Writes each part of a run once."""
-
     def __init__(self, run: Any) -> None:
         self._run = run
         self._numbers: dict[int, int] = {}
@@ -149,7 +146,7 @@ class _Reader:
             self._fill(run.operators[number], fields)
 
     def _fill_run(self, fields: list[Any]) -> None:
-        """Each value has the type of the new run's value, but a grammar's frame may be gone."""
+        """Fill the run with values of the types that it has; only a grammar's frame may become None."""
         before = self._run.saved()
         self._fill(self._run, fields)
         for first, value in zip(before, self._run.saved(), strict=True):

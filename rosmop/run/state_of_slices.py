@@ -1,6 +1,6 @@
 """Keep the slices of a running parametric specification as data, in `BUCKETS` parts by their bindings.
 
-A part with a changed slice is written completely or not at all, so a message costs a hundredth of all slices.
+Only the parts with a changed slice are written, so a message costs a hundredth of all slices.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -19,7 +19,7 @@ BUCKETS = 128
 class SliceSnapshot(msgspec.Struct, frozen=True, array_like=True):
     """A slice: `domain` has the parameters as bits, and `holder` is charged.
 
-    `number` counts slices in the order in which they began or ended; an ended one has no state.
+    `number` counts slices in the order in which they began or ended; an ended slice has no state.
     """
 
     number: int
@@ -54,7 +54,7 @@ class SliceParts:
         slices.keep()
 
     def changed(self) -> dict[int, bytes]:
-        """Return the changed parts by number. A part that cannot be saved is replaced by the reason."""
+        """Return the changed parts by number. Once a slice cannot be saved, each part is replaced by the reason."""
         bindings, dirty = self._slices.changed or {}, set()
         self._slices.changed = {}
         for binding, holder in bindings.items():
@@ -105,7 +105,7 @@ def restore_slices(
     fits: Callable[[Type, Any], bool],
     time_ns: int,
 ) -> None:
-    """Raises `ValueError`. `first` has the initial values of parameters and of the slices' own variables."""
+    """Restore slices, and the initial values (`first`) of parameters and of own variables. Raises `ValueError`."""
     assert code.slicing is not None  # noqa: S101  it is parametric
     parameters = [kind for _, _, kind in code.slicing.parameters]
     own = [types[name] for name in code.slicing.own]

@@ -25,9 +25,9 @@ _MOST = 8
 
 
 def deciding(source: Source, events: Sequence[int], times: Sequence[int]) -> list[str]:
-    """Return the subformulas; empty for other logics, and for formulas about the future.
+    """Return the subformulas, or none for other logics and for formulas about the future.
 
-    `events` are the numbers of the events in the source, `times` their times (ns).
+    `events` are numbers in the source, and `times` are in nanoseconds.
     """
     syntax = _SYNTAXES.get(source.logic)
     if syntax is None or not 0 < len(events) <= _MOST_EVENTS:
@@ -127,8 +127,6 @@ class Meaning:
 
 
 class _Words:
-    """Formats formulas in the syntax of a logic."""
-
     def __init__(self, syntax: Syntax) -> None:
         levels = [syntax.unary, *(level.operators for level in syntax.levels)]
         self._spelled = {meant: word for words in levels for word, meant in reversed([*words.items()])}

@@ -3,8 +3,8 @@
 All ticks up to the present time happen, and all deadlines before it. Ticks beyond the caller's `patience` are
 skipped, which is logged; deadlines wait for the next call.
 
-Senders choose the bindings of slices, and thereby how many deadlines pass at one time. So `advance` processes at most
-`most` deadlines; the others stay due. A slice processes no message before its own deadlines (`MonitorExecution`).
+Senders choose the bindings of slices, and thereby how many deadlines pass at one time. So `advance` processes
+at most `most` deadlines, and the others stay due; a slice processes its own deadlines before a message.
 """
 
 from collections.abc import Callable, Sequence
@@ -16,7 +16,7 @@ from rosmop.run.outcomes import Outcome
 Patience = Callable[[], Callable[[], bool]]
 
 MAX_TICKS = 100_000
-"""After a larger jump of the clock between two messages the rest is skipped."""
+"""The most ticks of a timer between two messages. After a larger jump of the clock, the others are skipped."""
 
 
 class Agenda:
@@ -29,7 +29,6 @@ class Agenda:
         patience: Patience,
         most: int,
     ) -> None:
-        """When something is due, `patience()` returns a function that returns whether the work takes too long."""
         self.due: int | None = None
         self._monitors = monitors
         self._execution = execution
@@ -43,7 +42,6 @@ class Agenda:
         )
 
     def let_go(self) -> None:
-        """Break the reference cycle that would keep the set alive."""
         for monitor in self._monitors:
             monitor.steps, monitor.timers, monitor.home, monitor.group = (), (), None, None
         self._monitors = ()
@@ -52,7 +50,7 @@ class Agenda:
         return self.due is not None and self.due <= time_ns
 
     def schedule(self) -> None:
-        """A deadline passes after its last nanosecond."""
+        """Compute `due`. A deadline passes after its last nanosecond."""
         if not self._timed:
             return
         timer, deadline = self._next_timer(), self._next_deadline()
@@ -68,7 +66,6 @@ class Agenda:
         self.due = min(times, default=None)
 
     def when_due(self, *, anew: bool) -> int | None:
-        """With `anew`, compute the time again, because lanes may have moved deadlines."""
         if anew:
             self.schedule()
         return self.due
