@@ -25,7 +25,7 @@ MOST_KEPT = 1024
 MOST_KEPT_ARRAY = 16 << 10
 
 BEYOND = 0xFFFFFFFF
-"""The value in place of the length of a string or array that is longer."""
+"""Stands for the length of a string or array that is longer than `most_kept`."""
 
 
 def kept_size(kind: Type) -> int:
@@ -41,7 +41,7 @@ def most_kept(kind: Type) -> int:
 
 
 SENDER = 16 + 2 * MOST_KEPT
-"""Address and length of its host and caller, and then their bytes."""
+"""The bytes of a sender: address and length of its host and caller, and then their bytes."""
 
 AREA = 512 << 10
 """The bytes of frames in one batch; one read takes the same number."""
@@ -83,24 +83,23 @@ class Cells:
 
 @dataclass(frozen=True)
 class TopicCode:
-    """The code for a topic: its export, whether it may drop or change messages, and the address of its counters.
-
-    `verdicts` has for each verdict the indices of an event, of its step of a property, and of the handler. `log` is
-    the address of the log of patches. `undo` has the addresses of variables, and of their values before the current
-    message. `brief`: the code has no loops. `says`: the code may print lines; those before the address stored at
-    `SURE` are final.
-    """
+    """The code for a topic: its export, whether it may drop or change messages, and the address of its counters."""
 
     name: str
     drops: bool
     changes: bool
     verdicts: Sequence[tuple[int, int, int]]
+    """For each verdict, the indices of an event, of its step of a property, and of the handler."""
     counters: int
     log: int
+    """The address of the log of patches."""
     undo: tuple[tuple[int, int], ...]
+    """The addresses of variables, and of their values before the current message."""
     brief: bool
+    """Whether the code has no loops."""
     functions: Sequence[int]
     says: bool
+    """Whether the code may print lines; those before the address stored at `SURE` are final."""
     settle: str
 
 
@@ -125,7 +124,7 @@ class CompiledModule:
 
 @dataclass(frozen=True, eq=False)
 class SetPart:
-    """The part of a set that one process runs; the module has those that are not in shadow mode."""
+    """The part of a set that one process runs. Its module has the specifications that are not in shadow mode."""
 
     compiled: Compiled
     module: CompiledModule

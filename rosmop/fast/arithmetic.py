@@ -199,7 +199,6 @@ class ArithmeticCodegen(FunctionBuilder):
         return compared + (I32_EQZ if operator.startswith("!") else b"")
 
     def _least(self, node: nodes.Call) -> bytes:
-        """Select the same argument as `std::min` or `std::max`; `fmin` and `fmax` also prefer a number to NaN."""
         machine = machine_type(node.type)
         one, other = (f"{side} {machine} {len(self._locals)}" for side in ("first", "second"))
         code = b"".join(
@@ -256,7 +255,6 @@ class ArithmeticCodegen(FunctionBuilder):
         return self._limited(node.type, self._of_parts(old + self._seconds(), value))
 
     def _nanoseconds(self) -> bytes:
-        """The nanoseconds of a time are never negative."""
         code, value = self._set("moment", I64), self._get("moment", I64)
         whole = self._get("whole", I64)
         code += value + constant(I64, BILLION) + I64_REM_S + self._set("whole", I64)

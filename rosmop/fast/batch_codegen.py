@@ -1,19 +1,18 @@
-"""Write the WebAssembly module of a set of specifications: a loop over received frames runs the events of every
-message.
+"""Write the WebAssembly module of a set: a loop over received frames runs the events of every message.
 
-For each topic the module exports `feed(at, end, now)` for the frames (a length of 4 bytes, little-endian, and the
-message) from `at` to before `end`. The result has the address of the first frame that is left (i64: the low 32 bits),
-the number of effects (the next 24 bits), and `LEFT` if that frame is for the interpreter.
+For each topic the module exports `feed(at, end, now)` for the frames (a length of 4 bytes, little-endian, and
+the message) from `at` to before `end`. The result has the address of the first frame that is left (i64: the
+low 32 bits), the number of effects (the next 24 bits), and `LEFT` if that frame is for the interpreter.
 
 - A message is either processed, with all consequences, or left; `TopicCode.undo` lists the data to restore then.
-  After a trap, that message begins at the address stored at `POSITION` (0: no message had begun).
+After a trap, that message begins at the address stored at `POSITION` (0: no message had begun).
 - A dropped or replaced message does not change the states of properties that suppress it
-  (`nodes.Advance.suppresses`).
+(`nodes.Advance.suppresses`).
 - The options at `Cells.source` are: the sender; *told*, the events (by bit) whose drops are left, and with `LOUD`
-  also all changes; *enabled*, the topic's specifications; *counted*, the verdicts that are only counted. A message
-  with any other verdict is left.
+also all changes; *enabled*, the topic's specifications; *counted*, the verdicts that are only counted. A message with
+any other verdict is left.
 - An effect is 16 bytes: a set of events (i64) and the number (i64) of consecutive messages that they changed. For
-  dropped frames it is -1 and their start and end (i32, i32).
+dropped frames it is -1 and their start and end (i32, i32).
 - If a message gives a property a deadline before the time at `Cells.until`, the loop ends after it with `SOONER`.
 - `TopicCode.counters` counts the events that happened, then the drops of each event, then the verdicts (`TOLD`).
 """
@@ -377,7 +376,6 @@ class TopicCodegen:
         return any(written.drops for written in (self._written[number], *run))
 
     def _table(self, number: int, place: int) -> int | None:
-        """Return None if the step does nothing. An entry of -1 marks a handler that is not compiled."""
         advance = self._events[number].advances[place]
         left: set[int] = set()
         for index, handled in enumerate(advance.handlers):
@@ -514,7 +512,6 @@ class TopicCodegen:
         return code + END
 
     def _drop(self, number: int, condition: bytes) -> bytes:
-        """Stop processing the message if a condition is not 0 (dropped: 1, left: 5)."""
         dropped = condition + constant(I32, 0) + I32_NE
         hidden = local_get(_TOLD) + constant(I64, 1 << number) + I64_AND + I64_EQZ
         code = dropped + hidden + I32_EQZ + I32_AND + br_if(5)
@@ -574,7 +571,6 @@ class TopicCodegen:
         return code + again + END
 
     def _advance_clock(self, number: int, clock: nodes.PropertyClock, event: int, table: int) -> bytes:
-        """`ClockedRun` and `ClockedSteps` define the steps."""
         state, (since, now, count) = (
             self._states[number],
             range(self._clocks[number], self._clocks[number] + 3),

@@ -110,13 +110,7 @@ MOST_SAFE = 1024
 
 @dataclass(frozen=True)
 class WasmFunction:
-    """A function of the module.
-
-    `brief`: it has no loops. `passes`: conditions may end it early for some messages. `says`: it may print lines.
-    `early`: it may write to the first bytes of the message, where a header is. `changes_elements`: it may change an
-    element of an array. `references` pairs each reference parameter with the address where the function stores its
-    value before it returns. `names` are those of the local variables, by number.
-    """
+    """A function of the module."""
 
     number: int
     parameters: tuple[int, ...]
@@ -126,13 +120,19 @@ class WasmFunction:
     writes: int
     drops: bool
     brief: bool
+    """Whether it has no loops."""
     passes: bool
+    """Whether conditions may end it early for some messages."""
     says: bool
+    """Whether it may print lines."""
     early: bool
+    """Whether it may write to the first bytes of the message, where a header is."""
     changes_elements: bool
     replaces: bool = False
     references: tuple[tuple[str, int], ...] = ()
+    """Each reference parameter, with the address where the function stores its value before it returns."""
     names: tuple[str, ...] = ()
+    """The names of the local variables, by number."""
 
 
 class ModuleCodegen(MemoryLayout):
@@ -150,7 +150,6 @@ class ModuleCodegen(MemoryLayout):
         self.left.setdefault(function, []).append(error)
 
     def event(self, name: str, channel: str = "") -> WasmFunction:
-        """Raises `NotCompiledError`."""
         function = self.functions[name]
         return self.function(function, {"at": I32, "size": I32}, I32, function.context, channel=channel)
 
@@ -178,18 +177,15 @@ class ModuleCodegen(MemoryLayout):
     def routine(
         self, key: tuple[object, ...], parameters: tuple[int, ...], write: Callable[[], bytes], result: int
     ) -> int:
-        """Return the number of a function with these parameters. The function is written only once."""
         if key not in self._numbers:
             self._numbers[key] = self._added(parameters, write(), result)
         return self._numbers[key].number
 
     def routine_of(self, write: Callable[..., bytes]) -> int | None:
-        """Return the number of the function that `write` writes without arguments; None if the module has none."""
         written = self._numbers.get((write,))
         return None if written is None else written.number
 
     def settling(self, cells: Cells) -> int:
-        """Return the function that copies the strings of variables, all of which must be known before."""
         cells.settle = self._added((), settling(self, cells)).number
         return cells.settle
 
@@ -238,7 +234,6 @@ class _FunctionCodegen(StringCodegen):
             self._local(name, I32)
 
     def written(self) -> WasmFunction:
-        """Raises `NotCompiledError`."""
         body = self._block(self._function.body)
         if isinstance(self._function, nodes.Skipper):
             body += self._position(self._function.end) + RETURN
@@ -382,7 +377,6 @@ class _FunctionCodegen(StringCodegen):
         return self._when(differs, self._elsewhere) + constant(I32, 1) + self._set("replaced")
 
     def _put_safe(self, safe: nodes.SafeMessage, site: int) -> bytes:
-        """Write the safe message, but keep `seq` and `stamp` of the message."""
         code, offset = b"", safe_messages.HEAD if safe.stamped else 0
         self._early = self._early or offset < EARLY
         while offset < len(safe.data):
@@ -438,7 +432,6 @@ class _FunctionCodegen(StringCodegen):
         return code
 
     def _put_field(self, write: nodes.Write, site: int) -> bytes:
-        """Write only a number whose bits differ. NaNs, strings and arrays are left to Python."""
         try:
             return self._put_number(write)
         except NotCompiledError as error:
@@ -538,7 +531,6 @@ class _FunctionCodegen(StringCodegen):
         return code + self._noted_line(line, cost) + stores + constant(I32, 0)
 
     def _noted_line(self, line: OutputLine, cost: bytes) -> bytes:
-        """The local variable `line` is the address of the stored head."""
         known = self._layout.lines
         code = load(I32, SAID) + self._set("line")
         end = self._get("line") + constant(I32, line.size) + I32_ADD

@@ -1,7 +1,7 @@
 """Code that reads a message: positions, numbers, and strings, arrays and messages in place.
 
-Local variables hold the address and the number of elements; for an array of strings, the address of a table with the
-address of each string.
+Local variables hold the address and the number of elements; for an array of strings, the address of a table
+of their addresses.
 """
 
 from collections.abc import Iterator
@@ -78,7 +78,6 @@ class MessageAccess(ArithmeticCodegen):
         return self._within(node.at, 4) + end + self._set(node.name, I64)
 
     def _count(self, node: nodes.Count) -> bytes:
-        """A message that is too short for its number of elements (64 bits) is left to the interpreter."""
         code = self._within(node.at, 4) + self._length_at(node.at)
         number = self._get(node.name, I64)
         room = self._get("size") + I64_EXTEND_I32_U + self._position(node.at.plus(4)) + I64_SUB
@@ -185,7 +184,6 @@ class MessageAccess(ArithmeticCodegen):
 
     @contextmanager
     def _apart(self, *looked_at: nodes.Expression) -> Iterator[None]:
-        """Raise `NotCompiledError` if code written in the block changes the values that are read."""
         names = {
             root_of(node)
             for node in looked_at

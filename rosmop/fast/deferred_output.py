@@ -1,8 +1,8 @@
 """Lines of output: the module stores their values, and Python formats them later.
 
-A stored line has its number among the module's lines, the address of the frame (i32 each), and 8 bytes for each
-value: an integer, a double, or a string's address (the low 32 bits) and length. The highest possible cost of the line
-is charged, because a text must be paid for before it is made.
+A stored line has its number among the module's lines, the address of the frame (i32 each), and 8 bytes for
+each value: an integer, a double, or a string's address (the low 32 bits) and length. The highest possible
+cost is charged, because a text must be paid for before it is made.
 """
 
 import struct
@@ -86,7 +86,6 @@ def is_text(node: nodes.Expression) -> bool:
 
 
 def _goes_on(node: nodes.Call) -> bool:
-    """Whether formatting cannot fault, because the precision is a constant within bounds."""
     if node.function not in FAULTING:
         return True
     digits = node.arguments[1]

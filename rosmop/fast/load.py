@@ -8,11 +8,10 @@ from rosmop.form.compiled import Compiled
 
 
 def prepare() -> None:
-    """Load the WebAssembly library, which takes time. Raises `WasmError`."""
     load()
 
 
 def loaded(data: bytes) -> tuple[Compiled, WasmFastPath]:
-    """Without data, the set is empty. Raises `ValueError` if the data are not a part."""
+    """Load a part, or the empty set without data. Raises `ValueError` for other data."""
     part = decoded_part(data) if data else SetPart.empty()
     return part.compiled, WasmFastPath(part.module)

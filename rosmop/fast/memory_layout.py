@@ -15,7 +15,7 @@ LINES = 64 << 10
 
 
 class NotCompiledError(Exception):
-    """A function or a node cannot be compiled. The site is -1 for the whole function."""
+    """A function or a node that cannot be compiled. The site is -1 for the whole function."""
 
     def __init__(self, reason: str) -> None:
         super().__init__(reason)
@@ -38,7 +38,6 @@ def reason_of(error: NotCompiledError | RecursionError) -> NotCompiledError:
 
 
 def machine_type(kind: Type) -> int:
-    """Raises `NotCompiledError`."""
     if isinstance(kind, value_types.BoolType) or (
         isinstance(kind, value_types.IntegerType) and kind.bits <= 32
     ):
@@ -84,7 +83,7 @@ class MemoryLayout:
         return cells.variables.setdefault(name, (place, kind))[0]
 
     def size(self, kind: Type) -> int:
-        """Raises `NotCompiledError` if values of this type have different sizes in a message."""
+        """Return the size of values of this type in a message. Raises `NotCompiledError` if it varies."""
         code = struct_code(kind)
         if code is not None:
             return struct_size(code)
@@ -95,16 +94,12 @@ class MemoryLayout:
         raise NotCompiledError.of(kind)
 
     def offset(self, kind: Type, number: int) -> int:
-        """Raises `NotCompiledError` if the offset differs between messages."""
         if not isinstance(kind, value_types.RecordType):
             raise NotCompiledError.of(kind)
         return sum(map(self.size, self._values.fields(kind)[:number]))
 
     def element(self, kind: Type) -> tuple[Type, int]:
-        """Return the type of the elements, and their distance in bytes: for strings, in the table.
-
-        Raises `NotCompiledError`.
-        """
+        """Return the type of the elements, and their distance in bytes: for strings, in the table."""
         if isinstance(kind, value_types.StringType):
             return value_types.UINT8, 1
         if not isinstance(kind, value_types.VectorType):
@@ -114,7 +109,7 @@ class MemoryLayout:
         )
 
     def copied(self, kind: Type) -> Type:
-        """Raises `NotCompiledError` for messages whose copy is not free."""
+        """Return the type. Raises `NotCompiledError` if a copy of its values is not free."""
         if isinstance(kind, value_types.RecordType):
             for field in self._values.fields(kind):
                 self.copied(field)

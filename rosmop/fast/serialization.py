@@ -1,4 +1,7 @@
-"""Serialize a compiled set: one process compiles it, and another runs it. Reading accepts only valid sets."""
+"""Serialize a compiled set: one process compiles it, and another runs it.
+
+Equal sets give equal bytes. Reading accepts only valid sets, and otherwise raises `msgspec.ValidationError`.
+"""
 
 from typing import Any, get_type_hints
 
@@ -22,8 +25,6 @@ _MADE_OF = {kind: _parts(kind) for logic in LOGICS.values() for kind in logic.pr
 
 
 class _Used(msgspec.Struct):
-    """Collects the message definitions that a set uses."""
-
     messages: dict[str, MessageDefinition]
     services: dict[str, ServiceDefinition]
 
@@ -55,7 +56,6 @@ _DECODER = msgspec.msgpack.Decoder(Compiled, dec_hook=_made)
 
 
 def encoded(compiled: Compiled) -> bytes:
-    """Equal sets give equal bytes."""
     definitions = compiled.messages.definitions
     reached = {name for one in compiled.specifications for name in one.reached}
     reached |= {one.type for one in compiled.publications}
@@ -75,16 +75,13 @@ def encoded(compiled: Compiled) -> bytes:
 
 
 def decoded(data: bytes) -> Compiled:
-    """Raises `msgspec.ValidationError`."""
     return _DECODER.decode(data)
 
 
 def encoded_part(part: SetPart) -> bytes:
-    """Equal parts give equal bytes."""
     return msgspec.msgpack.encode((msgspec.Raw(encoded(part.compiled)), part.module))
 
 
 def decoded_part(data: bytes) -> SetPart:
-    """Raises `msgspec.ValidationError`."""
     compiled, module = _PARTS.decode(data)
     return SetPart(_DECODER.decode(compiled), module)

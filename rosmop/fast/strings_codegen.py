@@ -1,10 +1,10 @@
 """Generate code for strings and arrays of numbers: constants, those of the message, and variables of the set.
 
-While a batch is processed, the bytes of a variable may be in a message, in a constant, or in the former memory of
-another variable, so assignments copy nothing, and a topic that keeps an array is not compiled if it changes an
-element of one. At the end of a batch all are copied (`settling`), to one of two buffers in turn, because lines of
-output may still read the strings of the last batch. A value longer than `most_kept` is marked `BEYOND`; messages that
-bring or read it are left to the interpreter.
+While a batch is processed, the bytes of a variable may be in a message, in a constant, or in the former
+memory of another variable, so assignments copy nothing, and a topic that keeps an array must not change an
+element. At the end of a batch all are copied (`settling`), to one of two buffers in turn, because lines of
+output may still read the strings of the last batch. A value longer than `most_kept` is marked `BEYOND`;
+messages that bring or read it are left to the interpreter.
 """
 
 from rosmop.fast.abi import Cells, kept_size, most_kept

@@ -88,7 +88,7 @@ def function_type(parameters: Sequence[int], result: int) -> bytes:
 
 
 def function(made: Sequence[tuple[int, int]], code: bytes) -> bytes:
-    """Locals are pairs of number and type; `code` has no final `END`."""
+    """Encode a function. `made` has the number and type of its locals; `code` has no final `END`."""
     whole = row([unsigned(count) + bytes((machine,)) for count, machine in made]) + code + END
     return unsigned(len(whole)) + whole
 

@@ -40,11 +40,11 @@ Call = Callable[..., int | None]
 
 
 class WasmError(Exception):
-    """An instance or function cannot be created."""
+    """An instance or function that cannot be created."""
 
 
 class WasmTrap(Exception):  # noqa: N818  its name in WebAssembly
-    """A call was stopped, with the reason ("out of fuel"). Its writes to memory stay."""
+    """A call was stopped, with the reason ("out of fuel"). Its writes to memory remain."""
 
     def __init__(self, reason: str) -> None:
         super().__init__(reason)
@@ -94,7 +94,7 @@ class WasmInstance:
 
     @property
     def memory(self) -> memoryview:
-        """Read the property again after the memory has grown. Raises `WasmError` if the instance is closed."""
+        """Return the memory. Read the property again after it has grown."""
         asked = self._asked()
         size = load().wasmtime_memory_data_size(*asked)
         if size != len(self._view):
@@ -104,7 +104,6 @@ class WasmInstance:
         return self._view
 
     def reserve(self, size: int) -> None:
-        """Let the memory grow to `size` bytes or more. Raises `WasmError` beyond the limit."""
         missing = size - len(self.memory)
         _check(
             load().wasmtime_memory_grow(
@@ -113,11 +112,10 @@ class WasmInstance:
         )
 
     def call(self, name: str | int, *arguments: int, fuel: int) -> int | None:
-        """Call an exported function of integers by its name or number; a 32-bit parameter gets the low bits of its
-        argument.
+        """Call an exported function of integers. A 32-bit parameter gets the low bits of its argument.
 
-        Raises `WasmTrap`, `WasmError` if the function does not exist or the instance is closed, and `struct.error`
-        for a wrong number of arguments, or for one beyond 64 bits.
+        Raises `WasmTrap`, `WasmError` if the function does not exist or the instance is closed, and
+        `struct.error` for a wrong number of arguments, or for an argument beyond 64 bits.
         """
         function = self.function(name)
         self.refuel(fuel)
@@ -138,11 +136,9 @@ class WasmInstance:
         return self._natives[name]
 
     def refuel(self, fuel: int) -> None:
-        """Raises `WasmError` if the instance is closed."""
         _check(load().wasmtime_context_set_fuel(self._asked()[0], fuel))
 
     def close(self) -> None:
-        """The memory is freed with its last view."""
         self._functions, self._view, self._store = {}, memoryview(b""), None
 
     def _asked(self) -> tuple[int, Any]:
@@ -204,7 +200,7 @@ _C: dict[str, tuple[Any, ...]] = {  # the result and the parameters of each func
 
 
 def translated(code: bytes, limit: int) -> bytes:
-    """Translate a module into machine code for a `WasmInstance` with this limit; deterministic.
+    """Translate a module into machine code for a `WasmInstance` with this limit. The result is deterministic.
 
     Raises `WasmError` if the code is not a module.
     """

@@ -182,7 +182,6 @@ class ModuleState:
         return self._source
 
     def hasten(self) -> None:
-        """Compute the next deadline again, because there is an earlier one."""
         self.leave()
         self._due(anew=True)
 
