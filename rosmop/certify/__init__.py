@@ -1,1 +1,4 @@
-"""Check compiled automata against the definitions of their logics, without any code of `rosmop/logics`."""
+"""Check compiled automata against the definitions of their logics.
+
+The definitions share no code with the compilers in `rosmop/logics`.
+"""

@@ -1,8 +1,8 @@
 """Check that an automaton gives, after every trace, the verdict of its formula's definition.
 
-The check visits every reachable pair of a remaining obligation of the definition and a state of the automaton, with
-every event. There are finitely many, so a result for all pairs holds after every trace. Time bounds, grammars, and
-properties that exceed the work limit are not certified.
+Every reachable pair of a remaining obligation of the definition and a state of the automaton is visited with
+every event. There are finitely many, so a result for all pairs holds after every trace. Time bounds,
+grammars, and properties that exceed the work limit are not certified.
 """
 
 import itertools
@@ -71,7 +71,7 @@ def certify(logic: str, formula: str, events: Sequence[str], tables: AutomatonTa
 
 
 def _look_at_form(logic: str, events: Sequence[str], tables: AutomatonTables) -> None:
-    """Reject tables that are not an automaton. A negative state would index from the end in Python."""
+    """Reject tables that are not an automaton: Python would count a negative state from the end."""
     limits = [limit for limit in tables.timeouts if limit is not None]
     if len(tables.verdicts) != len(tables.table) or (
         tables.timeouts and len(tables.timeouts) != len(tables.table)
@@ -239,7 +239,6 @@ def _check_endless(
 
 
 def _check_machine(formula: str, events: Sequence[str], tables: AutomatonTables) -> int:
-    """The time limits of a state machine, and their next states, must be as written."""
     machine = StateMachineFollower(formula, events)
 
     def silently(before: str, state: int) -> str | None:

@@ -1,4 +1,4 @@
-"""Compute the expected effect of a walk on messages, as in `run/execution.py`, over certified automata."""
+"""Compute the effect that a walk must have on messages: that of `run/execution.py`, over certified automata."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -52,7 +52,7 @@ class ExpectedResult:
 
 
 class LeftToEngineError(Exception):
-    """Raised if the walk leaves the message to the engine."""
+    """The walk leaves the message to the engine."""
 
 
 @dataclass(frozen=True)
@@ -210,7 +210,6 @@ def _initial(property_: CompiledProperty) -> int:
 
 
 def begun_in(one: PropertyStep, state: int) -> Any:
-    """If the property has a clock, the clock begins at `BEGAN`."""
     return state if isinstance(one.compiled, FiniteProperty) else (state, BEGAN, BEGAN)
 
 

@@ -22,7 +22,7 @@ class UnsupportedFormulaError(Exception):
 
 
 class WorkLimitError(Exception):
-    """The check exceeds its limit."""
+    """A check takes more work than its limit."""
 
 
 _NANOSECONDS = {"ns": 0, "us": 3, "ms": 6, "s": 9}
@@ -109,7 +109,6 @@ Grammar = tuple[Mapping[str, str], Sequence[Mapping[str, str]]]
 
 
 def formula(text: str, events: Sequence[str], grammar: Grammar) -> Node:
-    """Parse a formula of temporal logic. Raises `UnsupportedFormulaError`."""
     unary, levels = grammar
     signs = {"(", ")", "[", "]", ",", *unary, *(sign for level in levels for sign in level)}
     words = WordReader(text, [sign for sign in signs if not sign.isidentifier()])
@@ -158,7 +157,6 @@ def _unbounded(words: WordReader, grammar: Grammar) -> None:
 
 
 def expression(text: str, events: Sequence[str]) -> Node:
-    """Parse an extended regular expression. Raises `UnsupportedFormulaError`."""
     words = WordReader(text, "|&~*+^()")
     node = _union(words, events, 0)
     words.end()

@@ -1,10 +1,10 @@
-"""Formulas about the future, over endless traces. A state is the remaining obligation: *clauses*, of which one must
-come true.
+"""Formulas about the future, over endless traces.
 
-A clause is a set of temporal parts of the formula, all of which must come true. A clause that requires more than
-another one is left out, so there are finitely many states. The remainder after an event follows from the definition:
-`x U y` is `y`, or else `x` now and `x U y` at the next event. A clause can come true if its paths reach a cycle on
-which no `until` is postponed at every step.
+A state is the remaining obligation: *clauses*, of which one must come true. A clause is a set of temporal
+parts of the formula, all of which must come true. A clause that requires more than another clause is left
+out, so there are finitely many states. The remainder after an event follows from the definition: `x U y` is
+`y`, or else `x` now and `x U y` at the next event. A clause can come true if its paths reach a cycle on which
+no `until` is postponed at every step.
 """
 
 from collections.abc import Sequence

@@ -1,8 +1,8 @@
 """Replace the operators about the past in a formula about the future.
 
-The value of each operator about the past is guessed with every event: a letter is an event and one bit for each of
-them. On every endless trace, exactly one sequence of guesses satisfies the rules of their definitions. So a formula
-can come true with guesses exactly if it could without them.
+Their values are guessed with every event: a letter is an event and one bit for each operator. On every
+endless trace, exactly one sequence of guesses satisfies their definitions. So a formula can come true with
+guesses exactly if it could without them.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -18,13 +18,13 @@ _DEFINED: Mapping[str, tuple[Callable[[Node, Node, Node], Node], bool]] = {
     "since": (lambda x, y, before: ("or", y, ("and", x, before)), False),
     "dual since": (lambda x, y, before: ("and", y, ("or", x, before)), True),
 }
-"""For each operator: its value from the operands and its value at the previous event, and before the first event."""
+"""For each operator: its value, from its operands and its previous value, and the value before the first event."""
 _BEFORE: Mapping[str, bool] = {"previously": False, "dual previously": True}
 """For each operator: its value at the first event. Later it has the operand's value at the previous event."""
 
 
 class PastGuesses:
-    """The letters of each event, as numbers below `count`, and the formula over sets of letters (`one of`)."""
+    """The letters of each event, as numbers below `count`, and the formula over sets of them (`one of`)."""
 
     def __init__(self, formula: Node, events: Sequence[str]) -> None:
         self._guessed: dict[Node, int] = {}

@@ -1,7 +1,4 @@
-"""State machines, as written.
-
-`state [ event -> state, default state, timeout 2s -> state ]`, and `alias name = states`.
-"""
+"""State machines, as written: `state [ event -> state, default state, timeout 2s -> state ]`."""
 
 from collections.abc import Sequence
 

@@ -20,7 +20,6 @@ _FALSE: Node = ("false",)
 
 
 def meaning(formula: str, events: Sequence[str]) -> Node:
-    """Raises `UnsupportedFormulaError`."""
     words = WordReader(formula, (":", "(", ")"))
     opens, closes = _scope(words, events)
     words.expect(":")

@@ -1,4 +1,4 @@
-"""Certify the compiled properties of specifications. Only this module connects the logics to the certifier."""
+"""Certify the compiled properties of specifications."""
 
 from collections.abc import Iterable
 
@@ -23,7 +23,6 @@ def certificate_of(compiled: CompiledProperty) -> Certificate:
 def certificates_of(
     specifications: Iterable[SpecificationCode],
 ) -> tuple[dict[str, list[str]], list[Diagnostic]]:
-    """Return a line for each property, by specification, and an error for each wrong automaton."""
     lines: dict[str, list[str]] = {}
     wrong: list[Diagnostic] = []
     for specification in specifications:

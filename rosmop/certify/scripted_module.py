@@ -1,9 +1,8 @@
 """Replace the functions of events and handlers in a finished module with stubs that return scripted results.
 
-Everything else stays byte for byte the same. This file shares no encoder or decoder with the writer of modules
-(`fast/wasm.py`), so an error there is not repeated here, only facts about the module (`WasmModule`). If these have a
-wrong address, the module traps or the comparison in `steps.py` fails, unless the writer uses the same wrong address
-everywhere.
+Everything else stays byte for byte the same. This file shares no encoder or decoder with `fast/wasm.py`, so
+that it cannot repeat an error there. If an address in `WasmModule` is wrong, the module traps or the
+comparison in `steps.py` fails, unless the writer uses the same wrong address everywhere.
 """
 
 import struct
@@ -26,7 +25,6 @@ _COPY_MEMORY = b"\xfc\x0a\x00\x00"
 
 
 def scripted(module: WasmModule) -> bytes:
-    """Return the module with stubs, and for each walk a function `try…` that tries a range of states."""
     sections = sections_of(module.code)
     types, chosen = list(_types(sections[1])), list(_chosen(sections[3]))
     exports = _exports(sections[7])
@@ -64,10 +62,9 @@ def _stub(module: WasmModule, number: int, kind: bytes) -> bytes:
 
 
 def _sweep(module: WasmModule, walk: int) -> bytes:
-    """Return `try(first, behind, cell, out, end, now)`.
+    """Return `try(first, behind, cell, out, end, now)`, which runs the walk with each of these states in `cell`.
 
-    This function runs the walk on the frames up to `end` with each of these states in `cell`, with all other state
-    restored.
+    It restores all other state before each run on the frames up to `end`.
     """
     state, last, cell, out, end, now, answer = range(7)
     told, template = module.frames + TELL, module.frames + TELL + 16
@@ -141,7 +138,6 @@ def sections_of(code: bytes) -> dict[int, bytes]:
 
 
 def _types(section: bytes) -> Iterator[bytes]:
-    """Each function has at most 127 arguments."""
     count, at = _read_leb(section, 0)
     for _ in range(count):
         begin = at

@@ -1,18 +1,18 @@
 """Run the steps of a compiled module in every state, and compare them with the certified automata.
 
-A *walk* of a module (`fast/batch_codegen.py`) calls the functions of events, looks up states in tables, and runs
-handlers. The check runs the same bytes, but with stubs that return scripted results (`scripted_module.py`), and
+A *walk* of a module (`fast/batch_codegen.py`) calls the functions of events, looks up states in tables, and
+runs handlers. The check runs the same bytes with stubs for these functions (`scripted_module.py`), and
 compares the effect with `expected_steps.py`:
 
 - each event alone, in every state of every property; with a clock before, at and after its bound;
 - each handler with no result, a drop, `__RESET;`, both, and a message that is left to the engine;
 - each event that may drop, with a drop; two events on one message in every state, with a drop by the second, up to
-  `MOST` steps; and several messages in one read, all with the same results;
+`MOST` steps; and several messages in one read, all with the same results;
 - a monitor that is switched off, and a drop and a verdict that are left to the engine.
 
 Not checked: the functions themselves (see `prove`), the list of effects after a changed message, the stored
-explanations, and the translation to machine code. Addresses are taken from the code generator (`WasmModule`,
-`Cells`), and the steps of clocked properties from `ClockedRun`.
+explanations, and the translation to machine code. Addresses are taken from the code generator, and the steps
+of clocked properties from `ClockedRun`.
 """
 
 import struct
@@ -54,7 +54,6 @@ class StepDiffersError(Exception):
 
 
 def check_steps(compiled: Compiled, module: WasmModule) -> int:
-    """Return the number of steps. Raises `StepDiffersError` for the first wrong step."""
     if not module.feeds:
         return 0
     pairs = MOST
@@ -142,7 +141,6 @@ def _handling(one: PropertyStep) -> tuple[int, int] | None:
 
 
 def _answers(one: PropertyStep, bits: int) -> dict[int, int]:
-    """Handlers that may not drop get no drop."""
     bits |= HAPPENED | CHANGED
     return {
         each.function: bits if each.drops else bits & ~DROPPED

@@ -1,4 +1,4 @@
-"""Decode a module into functions, with only the instructions that the writer of modules uses."""
+"""Decode a module into functions. Only the instructions that `rosmop/fast` writes are known."""
 
 import struct
 from collections.abc import Mapping
@@ -7,12 +7,12 @@ from types import MappingProxyType
 
 
 class UnknownInstructionError(Exception):
-    """The module has an unknown instruction or element."""
+    """An instruction or element of a module that is not known here."""
 
 
 @dataclass(frozen=True, slots=True)
 class WasmInstruction:
-    """`operands` are constants. A block has a `body`; `if` also has the branch `otherwise`."""
+    """An instruction with its constant `operands`. A block has a `body`; `if` also has the branch `otherwise`."""
 
     name: str
     operands: tuple[int | float, ...] = ()
@@ -22,7 +22,7 @@ class WasmInstruction:
 
 @dataclass(frozen=True, slots=True)
 class Code:
-    """A decoded function; types are "i32", "f64", …."""
+    """A decoded function. `made` are its local variables; types are "i32", "f64", …."""
 
     parameters: tuple[str, ...]
     result: str
@@ -48,7 +48,6 @@ _TRUNCATED = """i32.trunc_sat_f32_s i32.trunc_sat_f32_u i32.trunc_sat_f64_s i32.
 
 
 def _plain() -> dict[int, str]:
-    """Return the opcodes (WebAssembly 1.0, section 5.4)."""
     found = {
         0x00: "unreachable",
         0x0F: "return",
@@ -151,7 +150,7 @@ class Reader:
 def functions_of(module: bytes) -> list[Code]:
     """Return the functions of a module without imports.
 
-    Raises `UnknownInstructionError`, `KeyError` for an unknown type, and `IndexError` where the module ends too
+    Raises `UnknownInstructionError`, `KeyError` for an unknown type, and `IndexError` if the module ends too
     early.
     """
     reader = Reader(module)

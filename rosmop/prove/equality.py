@@ -1,16 +1,15 @@
 """Ask z3 whether the compiled code of an event can differ from its intermediate form (`form/nodes.py`).
 
-Both are compared for every message of up to `AREA` bytes and every state. They are equal if the function leaves the
-message to Python, which then processes it from the start, or if all of these hold:
+Both are compared for every message of up to `AREA` bytes and every state. They are equal if the function
+leaves the message to Python, which then processes it from the start, or if all of these hold:
 
-- the form does not fault,
-- both agree on whether the event happened, dropped or replaced the message, and changed it,
-- the bytes of the message, the variables and the rest of the budget are the same,
-- the lines of output are the same, in order.
+- the form does not fault;
+- both agree on whether the event happened, and dropped, replaced or changed the message;
+- the message, the variables, the rest of the budget and the lines of output are the same.
 
-Whether two strings in variables or names of senders are equal is left open, and an event that reads their bytes is
-not proved. If the function leaves the message, each variable that it wrote must be among those that are restored, and
-each byte in the log (`module_terms.py`).
+Whether two strings in variables or names of senders are equal is left open, and an event that reads their
+bytes is not proved. If the function leaves the message, each variable that it wrote must be restored, and
+each byte must be in the log (`module_terms.py`).
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -75,8 +74,8 @@ class _MayDifferError(Exception):
 class ProofFinding:
     """The result for an event on a topic, or part of a service.
 
-    `answer` is `EQUAL`, the reason why equality is not known, or the difference; `differs` is a defect in the writer
-    of modules.
+    `answer` is `EQUAL`, the reason why equality is not known, or the difference. If it `differs`,
+    `rosmop/fast` has a defect.
     """
 
     topic: str
@@ -88,7 +87,6 @@ class ProofFinding:
 def findings_of(
     compiled: Compiled, clock: Callable[[], float], patience: float = PATIENCE
 ) -> Iterator[ProofFinding]:
-    """Yield the result for each event except timers. `patience` is the time limit for each, in seconds."""
     found = list(groups(compiled.specifications))
     values = ValueCodec(compiled.messages)
     module = written(compiled.functions, [group.component for group in found], values)
@@ -231,7 +229,6 @@ class Validation:
     def _first(
         self, known: Sequence[Term], wrong: Mapping[str, Term], begun: float, *, found: type[Exception]
     ) -> str | None:
-        """Return why the two are not known to be equal, or None. Raises `found` for a difference."""
         possible = {
             text: simple for text, one in wrong.items() if not z3.is_false(simple := z3.simplify(one))
         }
@@ -247,9 +244,6 @@ class Validation:
         return "not decided in time" if undecided else None
 
     def _decided(self, question: Sequence[Term], begun: float) -> tuple[Any, Any]:
-        """Return whether the conditions are satisfiable, and a model; formulas without costly operations are tried
-        first.
-        """
         for abstraction in (Abstraction(floats=True), Abstraction()):
             answer, guess = self._asked(abstraction.of(question), begun)
             if answer == z3.unsat:
@@ -259,9 +253,6 @@ class Validation:
         return self._asked(question, begun)
 
     def _asked(self, conditions: Sequence[Term], begun: float, *, part: float = 1) -> tuple[Any, Any]:
-        """Return whether the conditions are satisfiable, and a model, within this part of the time that is left since
-        `begun`.
-        """
         rest = int(1000 * part * (begun + self._patience - self._clock()))
         if rest <= 0:
             return z3.unknown, None

@@ -1,12 +1,11 @@
 """Translate the intermediate form of an event (`form/nodes.py`) to terms of z3, as `run/interpreter.py` runs it.
 
 - Positions and counts have 64 bits here, but are unbounded in the interpreter. A function without loops adds a few
-  products of a count below 2**32 and a size, which never exceed 64 bits. Times also have 64 bits, and the sum of two
-  times fits.
-- For 32-bit floats, the interpreter rounds the double result of `+ - * /`. That equals the result of the operation on
-  floats: a double has more than twice as many digits, so rounding twice gives the same result as rounding once.
+products of a count below 2**32 and a size, which never exceed 64 bits; nor does the sum of two times.
+- For 32-bit floats, the interpreter rounds the double result of `+ - * /`. That equals the result on floats, because
+a double has more than twice as many digits.
 - The interpreter also measures the values of a specification once for each megabyte that it allocates; this is left
-  out.
+out.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -63,8 +62,6 @@ _MESSAGE, _DROPPED, _REPLACED, _CHANGED, _SAID = "message", "dropped", "replaced
 
 @dataclass(frozen=True)
 class _View:
-    """A string, vector or message in the bytes."""
-
     message: Term
     start: Term
     count: Term
@@ -82,7 +79,7 @@ _LOOPS: Mapping[type[nodes.FormNode], str] = MappingProxyType(
 
 
 class UnknownError(Exception):
-    """The form has a node that is not translated."""
+    """The form has a node that cannot be translated."""
 
 
 def is_signed(kind: Type) -> bool:
@@ -111,7 +108,7 @@ def _word(value: Term, kind: Type) -> Term:
 
 
 class FormTerms:
-    """Translates one event on a topic. `lines` has the module's lines of output, by number."""
+    """Translates one event on a topic. `lines` are the module's lines of output. Raises `NotProvedError`."""
 
     def __init__(
         self,
@@ -145,7 +142,6 @@ class FormTerms:
         self._shared: Sequence[str] = self._function.shared
 
     def result(self) -> FormResult:
-        """Raises `NotProvedError` for a loop that is not translated."""
         begin, no = self._beginning, z3.BoolVal(False)
         budget = begin.budgets[self._function.context]
         slots: dict[Any, Any] = {_MESSAGE: begin.message, _DROPPED: no, _REPLACED: no, _CHANGED: no}
@@ -289,7 +285,6 @@ class FormTerms:
         state.slots[_REPLACED] = z3.BoolVal(True)
 
     def _put_safe(self, safe: nodes.SafeMessage, state: State) -> None:
-        """Keep `seq` and `stamp` of the header."""
         message, changed = state.slots[_MESSAGE], state.slots[_CHANGED]
         place = SAFE_HEAD if safe.stamped else 0
         while place < len(
@@ -474,7 +469,6 @@ class FormTerms:
         return z3.Concat(z3.Extract(31, 0, rest), z3.Extract(31, 0, seconds))
 
     def _parts(self, value: Term) -> tuple[Term, Term]:
-        """Return `divmod(value, 10**9)`. The remainder has the sign of the divisor."""
         billion = integer(times.BILLION, 64)
         rest = z3.SRem(value, billion)
         rest = z3.If(rest < 0, rest + billion, rest)
@@ -532,7 +526,6 @@ class FormTerms:
         return value if own in state.slots else self._kept(value, node.type, state)
 
     def _kept(self, value: Any, kind: Type, state: State) -> Any:
-        """Leave the message to Python if a string or array is longer than the module keeps."""
         if isinstance(value, _View) and kept_size(kind):
             value = TextTerm(AT + z3.Extract(31, 0, value.start), value.count)
         if isinstance(value, TextTerm):
@@ -631,8 +624,10 @@ class FormTerms:
         return self._of_parts(node.type, seconds, rest, state)
 
     def _of_parts(self, kind: Type, seconds: Term, rest: Term, state: State) -> Term:
-        """Seconds beyond 2**33 are out of range for all allowed nanoseconds; below, the sum in 72 bits shows an
-        overflow in 64 bits.
+        """Return the time of seconds and nanoseconds.
+
+        Below 2**33 seconds, the product fits in 64 bits, and the sum in 72 bits shows an overflow. More
+        seconds are out of range for all allowed nanoseconds, and are not proved.
         """
         far = either(seconds >= 1 << 33, seconds <= -(1 << 33), rest >= 1 << 62, rest <= -(1 << 62))
         known = state.where(far)
@@ -916,7 +911,7 @@ _QUESTIONS: Mapping[str, Callable[[Term], Term]] = MappingProxyType(
         "h_isfinite": lambda value: z3.fpLT(z3.fpAbs(value), floating(inf, _bits(value))),
     }
 )
-"""As comparisons with infinity: without a meaning of numbers, z3 knows of nothing else that it is the same."""
+"""Comparisons with infinity, as in the module: if z3 knows nothing about floats, only equal terms are equal."""
 _OF_MOMENTS: Mapping[str, Callable[[FormTerms, Term], Term]] = MappingProxyType(
     {
         "m_is_zero": lambda _, value: value == 0,

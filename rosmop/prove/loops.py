@@ -1,17 +1,17 @@
 """Loops of the form and of the module, as one induction over their iterations.
 
-Both sides run through their loops in the same order, so the loops are paired by number. A loop is *cut* at its head:
-each slot that an iteration changes gets a new constant there, on the module's side that of the form's variable with
-the same name. Then one iteration, and the statements after the loop, are translated once. `loop_conditions` yields
-the conditions that must not hold; together they are the induction:
+Both sides run through their loops in the same order, so the loops are paired by number. A loop is *cut* at
+its head: each slot that an iteration changes gets a new constant there. On the module's side, it is the
+constant of the form's variable with the same name. Then one iteration, and the statements after the loop, are
+translated once. `loop_conditions` yields the conditions that must not hold; together they are the induction:
 
 - both sides reach the loop, or neither does, and paired slots are equal then;
-- if one side begins another iteration, so does the other one, and paired slots are equal again;
+- if one side begins another iteration, so does the other, and paired slots are equal again;
 - each iteration takes something from the budget, so the loop of the form ends.
 
-Names are only a guess of equal slots: a wrong pair leaves a condition that may hold, and a slot without a pair has
-any value. So a proof is for each number of iterations, but the answer to a condition may be a state that does not
-occur; `equality.py` then searches for a difference in `unrolled` loops.
+Names are only a guess of equal slots: a wrong pair leaves a condition that may hold. So a proof holds for any
+number of iterations, but a counterexample may be a state that does not occur; `equality.py` then searches for
+a difference in `unrolled` loops.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -59,7 +59,7 @@ class Cut:
 class Loops:
     """The loops of one side. With `unrolled`, each has at most that many iterations.
 
-    `again` has the conditions under which a state is not followed any further.
+    `again` is the condition that an iteration begins that is not followed any further.
     """
 
     unrolled: int = 0
@@ -78,7 +78,7 @@ class Loops:
         head: Head,
         logs: Sequence[list[Any]],
     ) -> None:
-        """Make `state` that after the loop, and remove entries of `logs` by a translation that is repeated.
+        """Advance `state` to the end of the loop. A repeated translation removes its earlier entries from `logs`.
 
         `body` returns the states that begin another iteration, and those that leave the loop.
         """
@@ -132,7 +132,8 @@ def loop_conditions(
 ) -> Iterator[tuple[str, Term]]:
     """Yield the conditions that must not hold. Raises `NotProvedError`.
 
-    `ended`: the form faulted, or uses something unknown. `left`: the module left the message to Python.
+    `ended` holds if the form faulted or uses something unknown, `left` if the module left the message to
+    Python.
     """
     if len(form) != len(module):
         raise NotProvedError("its code has another number of loops")
@@ -165,7 +166,7 @@ def loop_conditions(
 
 
 def assumed(form: Sequence[Cut]) -> Sequence[Term]:
-    """Return that the budget at the head of each loop is at most that before the loop."""
+    """Return the assumption that the budget at the head of each loop is at most the budget before the loop."""
     return [
         both(
             is_budget(cut.head[BUDGET_SLOT]),
@@ -209,7 +210,6 @@ def _same(one: Any, other: Any) -> bool:
 
 
 def _joined(states: Sequence[State]) -> State:
-    """The states exclude each other."""
     alive = [state for state in states if not z3.is_false(state.alive)]
     if not alive:
         return State(z3.BoolVal(False), {})

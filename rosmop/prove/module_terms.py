@@ -3,14 +3,14 @@
 Memory has these parts; access to any other address counts as a difference:
 
 - cells, 8 bytes each at constant addresses: variables, budgets, times, and the end of the log (`UNDO`);
-- the message, from the address that the function gets: all reads and writes are within its size;
+- the message, from the address that the function gets, within its size;
 - lines of output, in order;
-- the log, which restores a message that is left. Each write to the message is preceded by an entry with address, size
-  and old bytes. Entries are never overwritten.
+- the log, which restores a message that is left: an entry with address, size and old bytes precedes each write to the
+message, and is never overwritten.
 
-An element of an array in a variable or of a constant array is a byte of `MEMORY`; code that reads other bytes there
-is not proved, except that two strings are equal or not by the result of one function. A message that is left
-(`ELSEWHERE`) and a trap are treated alike: the effects are undone.
+Elements of arrays in variables or constants are bytes of `MEMORY`; code that reads other bytes there is not
+proved. Strings are only compared, by a function that is not translated (`MISMATCH`). A trap is treated like a
+message that is left (`ELSEWHERE`): the effects are undone.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -67,7 +67,7 @@ class Pointer:
 
 @dataclass(frozen=True)
 class _Note:
-    """The last entry of the log, and its address."""
+    """The last entry of the log: position, size and old bytes of the write that it announces."""
 
     alive: Term
     position: Term
@@ -86,9 +86,7 @@ class ReadableBytes:
 
 @dataclass(frozen=True)
 class LoopGuess:
-    """A guess of equal values at the head of a loop, from the loops of the form and the names of variables on both
-    sides.
-    """
+    """Names of variables on both sides, and the form's loops, to guess equal values at the head of a loop."""
 
     cuts: Sequence[Cut]
     variables: Mapping[int, Any]
@@ -98,7 +96,9 @@ class LoopGuess:
 
 @dataclass(frozen=True)
 class ModuleResult:
-    """`bits` are the return value, unless the function has `trapped`. `outside`: it reads beyond the message."""
+    """The result of a function: its return value `bits`, unless it `trapped`. `outside` means a read beyond the
+    message.
+    """
 
     trapped: Term
     outside: Term
@@ -112,11 +112,10 @@ class ModuleResult:
 
 
 class ModuleExecution:
-    """Executes the function of one event on these cells. Booleans in cells are also numbers.
+    """Executes the function of one event on these cells. Raises `DiffersError` and `NotProvedError`.
 
-    `strings` are the addresses of strings, and of the cells that refer to arrays. `routines` are functions of z3 for
-    the results of functions that are not translated, by their numbers. `spans` are the bytes that code may read
-    there.
+    `strings` are the addresses of strings, and of the cells that refer to arrays; code may read `spans`
+    there. `routines` has a function of z3 for each function that is not translated, by its number.
     """
 
     def __init__(  # noqa: PLR0917  a function, its message and its cells
@@ -160,7 +159,6 @@ class ModuleExecution:
         self._number = number
 
     def done(self) -> ModuleResult:
-        """Raises `DiffersError` and `NotProvedError`."""
         state = self._state
         bits = _bits(self._call(self._number, [Pointer("message", integer(0, 32)), self._size], state))
         cells = {
@@ -174,7 +172,6 @@ class ModuleExecution:
         )  # fmt: skip
 
     def _call(self, number: int, arguments: Sequence[Any], state: State) -> Any:
-        """The given `state` becomes the state after the call."""
         code = self._functions[number]
         self._frames += 1
         outer = self._frame, self._returned, self._function, self._labels
@@ -259,7 +256,6 @@ class ModuleExecution:
         self._loops.run(state, body, self._frame, self._at_head, logs)
 
     def _at_head(self, number: int, key: Any, value: Any) -> Any:
-        """Return the constant of the form's variable of the same name, or a new one."""
         if key in (_MESSAGE, _LINES, _NOTE, ("cell", SAID), ("cell", UNDO)):
             raise NotProvedError("not loop-free: a loop changes the message or prints")
         cut = self._guess.cuts[number] if number < len(self._guess.cuts) else None
@@ -395,7 +391,7 @@ class ModuleExecution:
         return next((one for one in self._spans for part in _summands(address) if part.eq(one.begin)), None)
 
     def _in_span(self, address: Term, offset: int, size: int, span: ReadableBytes, state: State) -> Term:
-        """A place before the begin is a very large offset."""
+        """Return the address, which must be in the span. An address before its begin is a very large offset."""
         end = z3.ZeroExt(32, address - span.begin) + integer(offset + size, 64)
         self._outside.append(both(state.alive, either(opposite(span.known), z3.UGT(end, span.size))))
         return address + integer(offset, 32) if offset else address
@@ -454,7 +450,6 @@ def _summands(term: Term) -> Iterator[Term]:
 
 
 def _same_sort(one: Term, other: Term) -> bool:
-    """Truths are also numbers."""
     sorts = [z3.BitVecSort(32) if z3.is_bool(value) else value.sort() for value in (one, other)]
     return bool(sorts[0] == sorts[1])
 
@@ -524,7 +519,6 @@ def _calculated(family: str, name: str, operands: Sequence[float], stack: list[A
 
 
 def _cut(value: Term, bits: int, *, signed: bool) -> Term:
-    """`trunc_sat`: round toward zero, saturate, 0 for NaN."""
     least, most = (-(1 << bits - 1), (1 << bits - 1) - 1) if signed else (0, (1 << bits) - 1)
     whole = (z3.fpToSBV if signed else z3.fpToUBV)(z3.RTZ(), value, z3.BitVecSort(bits))
     # A value between a limit and the next whole number can only be cut to the limit.

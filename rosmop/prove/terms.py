@@ -1,7 +1,7 @@
 """Terms of z3 for both sides, their initial state, and states that merge branches.
 
-A message is an array of bytes, addressed in 32 bits, with a `size` that no frame exceeds. Bit vectors have 64 or 32
-bits; narrower numbers are extended by their sign or by zeros. There is only one NaN, and its bits cannot be read.
+A message is an array of bytes with addresses of 32 bits. Bit vectors have 64 or 32 bits; narrower numbers are
+extended by their sign or by zeros. There is only one NaN, and its bits cannot be read.
 """
 
 import struct
@@ -12,7 +12,7 @@ from typing import Any
 import z3
 
 Term = Any
-"""z3 has no Python types."""
+"""A term of z3, which has no Python types."""
 
 DOUBLE, SINGLE = z3.Float64(), z3.Float32()
 NEAREST = z3.RNE()
@@ -21,7 +21,7 @@ FRAME = z3.BitVec("position", 32)
 MEMORY = z3.Array("memory", z3.BitVecSort(32), z3.BitVecSort(8))
 
 MISMATCH = z3.Function("mismatch", *[z3.BitVecSort(32)] * 4)
-"""The place of the first difference of two strings (addresses and length), or the length; not translated."""
+"""The index of the first difference of two strings (addresses and length), or the length. It is not translated."""
 SECONDS = z3.Function("seconds", z3.BitVecSort(64), DOUBLE)
 
 
@@ -34,18 +34,18 @@ class TextTerm:
 
 
 class NotProvedError(Exception):
-    """Nothing is known about an event; the text gives the reason."""
+    """An event about which nothing is known; the text gives the reason."""
 
 
 class _Mixed:
-    """A slot has different kinds of values in two branches, and must not be read."""
+    """Marks a slot that has different kinds of values in two branches, and must not be read."""
 
 
 MIXED = _Mixed()
 
 
 class DiffersError(Exception):
-    """The module behaves differently from the form."""
+    """A difference between the module and the form."""
 
 
 def integer(value: int, bits: int) -> Term:
@@ -79,7 +79,7 @@ def opposite(condition: Term) -> Term:
 
 
 def choice(test: Term, yes: Term, no: Term) -> Term:
-    """`test ? yes : no` for terms, or for structures of terms; a part that only one has is taken from it."""
+    """`test ? yes : no` for terms or structures of terms. A part that only one of them has is taken from it."""
     if z3.is_true(test) or no is None or yes is no:
         return yes
     if z3.is_false(test) or yes is None:
@@ -119,7 +119,7 @@ def with_number(message: Term, position: Term, value: Term) -> Term:
 
 
 def with_sign(value: Term, sign: Term) -> Term:
-    """Return `copysign` of two terms; the sign of a NaN is not known."""
+    """Return `copysign` of two terms, for a `sign` other than NaN."""
     return z3.If(z3.fpIsNegative(sign), z3.fpNeg(z3.fpAbs(value)), z3.fpAbs(value))
 
 
@@ -143,7 +143,6 @@ class State:
 
 
 def merged(test: Term, yes: State, no: State) -> dict[Any, Any]:
-    """A branch that has ended has no values."""
     if z3.is_false(no.alive):
         return yes.slots
     if z3.is_false(yes.alive):
@@ -153,10 +152,10 @@ def merged(test: Term, yes: State, no: State) -> dict[Any, Any]:
 
 @dataclass(frozen=True)
 class StartTerms:
-    """The initial state of an event: message and size, time, variables by name, budgets and times of output.
+    """The initial state of an event.
 
-    Budgets are by context, times of output by context and site, `senders` by context and part. `constants` are the
-    addresses of constant strings.
+    Budgets are by context, throttles (times of output) by context and site, senders by context and part.
+    `constants` are the addresses of constant strings.
     """
 
     message: Term
@@ -197,7 +196,7 @@ class FormResult:
     said: Term
     noted: Sequence[LineTerm]
     loops: Any
-    """`loops.Loops`, which imports this module."""
+    """A `loops.Loops`, whose module imports this module."""
 
 
 _SMALL = 1 << 10
@@ -212,18 +211,18 @@ _FLOATING = frozenset((z3.Z3_FLOATING_POINT_SORT, z3.Z3_ROUNDING_MODE_SORT))
 
 
 class Abstraction:
-    """Replaces the results of costly operations by variables, with the same variable for equal operands.
+    """Replaces the results of costly operations by variables, the same variable for equal operands.
 
-    With `floats`, floating-point numbers become values without a meaning, which are only equal or not. If a formula
-    over these variables cannot hold, the original formula cannot hold.
+    With `floats`, floating-point numbers are values that are only equal or not. If a formula over these
+    variables cannot hold, the original formula cannot hold.
     """
 
     def __init__(self, *, floats: bool = False) -> None:
         self._floats = floats
         self._known: dict[int, tuple[Term, Term]] = {}
-        """By its number, each term with its replacement; a number is used again after its term is gone."""
+        """Each term with its replacement, by its number. Keeping the term keeps z3 from reusing its number."""
         self._laws: list[Term] = []
-        """The simplifier orders the operands of sums and products in no fixed way."""
+        """Sums and products commute here, because the simplifier orders their operands in no fixed way."""
 
     def of(self, terms: Sequence[Term]) -> list[Term]:
         begin = [z3.simplify(term) for term in terms]
