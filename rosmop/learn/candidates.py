@@ -1,7 +1,7 @@
 """Propose conditions on a topic's messages and on their order, each with a bound that the recordings support.
 
-All bounds of the file together are expected to be exceeded once in `QUIET_HOURS` (`extremes`). Conditions without
-content are left out, such as a rate that allows any change, or a standstill as long as the recording.
+All bounds of the file together are expected to be exceeded once in `QUIET_HOURS` (`extremes`). Conditions
+without content are left out, such as a rate that allows any change.
 """
 
 import math
@@ -17,9 +17,7 @@ from rosmop.learn.topics import TopicContent, TopicRhythm
 
 QUIET_HOURS = 10.0
 MOST = {"range": 10, "constant": 12, "values": 6, "rate": 6, "unchanged": 6, "moves": 2, "order": 2}
-"""The most conditions for one topic and kind, those that the most messages exercised. Other kinds have one for each
-field.
-"""
+"""The most conditions of a kind for one topic. Other kinds have at most one for each field."""
 
 _FEWEST = 20  # the minimum number of messages for a statement about all messages
 _FEWEST_SET = 10
@@ -241,7 +239,6 @@ class _Proposer:
     def _moves(
         self, topic: str, content: TopicContent, path: str, values: ValueSeries, support: CandidateSupport
     ) -> Iterator[Candidate]:
-        """Propose the automaton of a field's values if some value never followed another and changes are frequent."""
         moves = content.moves.get(path, {})
         ordered = values.ordered
         count = len(ordered)

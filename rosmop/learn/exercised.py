@@ -36,14 +36,13 @@ class CoverageItem:
 
 
 def items_of(texts: Mapping[str, str]) -> list[CoverageItem]:
-    """Return items in the order of the text. Raises `SpecificationError`."""
     return _items(_marked(texts))
 
 
 def covered(texts: Mapping[str, str], definitions: Definitions, recording: RecordingSource) -> list[int]:
     """Return the counts in the order of `items_of`. Raises `SpecificationError`.
 
-    The number for a state is how often an event entered it or stayed in it.
+    A state counts the events that entered it or stayed in it.
     """
     compiled_from(texts, definitions)  # reports errors for the unchanged text
     marked = _marked(texts)
@@ -81,8 +80,6 @@ def _items(marked: "_Marked") -> list[CoverageItem]:
 
 
 class _Marked:
-    """Files with a counter before each item; `items` has the names of the counters as keys."""
-
     def __init__(self, files: Sequence[tree.SpecificationFile]) -> None:
         self.items: dict[str, CoverageItem] = {}
         self._declared: list[tree.Declaration] = []

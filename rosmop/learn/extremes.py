@@ -1,13 +1,13 @@
 """Set a bound beyond the observed values, by extreme value theory on the extremes of independent windows.
 
-Gumbel's distribution, which suits exponential tails, is fitted to the largest value of each window by L-moments
-(Hosking 1990). The bound is the level that is passed once in a given number of windows. No shape parameter is fitted,
-because some twenty windows are too few: if the quantity has a limit, the margin is wider than needed, which causes no
-false alarm.
+Gumbel's distribution, which suits exponential tails, is fitted to the largest value of each window by
+L-moments (Hosking 1990). The bound is the level that is passed once in a given number of windows. No shape
+parameter is fitted, because some twenty windows are too few: if the quantity has a limit, the margin is wider
+than needed, which causes no false alarm.
 
-If a robot often stays near and sometimes goes far, the upper quarter of windows has a longer tail: the exponential
-through its mean excess (Weissman 1978) is the bound if it is higher. An extreme that several windows reach exactly is
-a stop, such as a joint's limit, and is then the bound.
+If a robot sometimes goes far, the upper quarter of windows has a longer tail: the exponential through its
+mean excess (Weissman 1978) is the bound if it is higher. An extreme that several windows reach exactly is a
+stop, such as a joint's limit, and is then the bound.
 """
 
 import math
@@ -24,8 +24,8 @@ _EULER = 0.5772156649015329
 def upper(highs: Iterable[float], windows: float, *, stops: bool = False) -> float | None:
     """Return the level that the maximum of a window exceeds once in `windows` windows, or None with too little data.
 
-    `stops`: the quantity may have a stop. Calculated quantities have none, because rounded differences can be equal
-    by chance.
+    With `stops`, the quantity may have a stop. Calculated quantities have none, because rounded differences
+    can be equal by chance.
     """
     values = sorted(highs)
     count = len(values)

@@ -1,8 +1,8 @@
 """Read the values of a message's fields by path, as far as they are useful for learning.
 
-Numbers, strings and times are scalars, arrays of numbers are tuples, and arrays of strings are lists. Only the length
-of an array of messages is read. Bytes (images, points, maps) are left out, because single bytes mean nothing, and the
-`seq` of headers, because every publisher increments it automatically.
+Numbers, strings and times are scalars, arrays of numbers are tuples, arrays of strings are lists, and arrays
+of messages have only their length. Single bytes (of images, points, maps) mean nothing, and every publisher
+increments the `seq` of headers, so both are left out.
 """
 
 import struct
@@ -13,7 +13,7 @@ from roswire.message_layout import ArrayPart, FixedField, FixedPart, MessageLayo
 from roswire.message_text import PRIMITIVES
 
 MOST_ELEMENTS = 20_000
-"""A monitor that reads a longer array would be too slow, so only its length is read."""
+"""The longest array whose elements are read: a monitor that reads a longer array would be too slow."""
 
 _LENGTH = struct.Struct("<I")
 _BYTES = frozenset({"uint8", "int8", "char", "byte", "bool"})
@@ -24,7 +24,7 @@ _Part = Callable[[bytes, int, dict[str, Value]], int]
 
 
 class MessageError(Exception):
-    """The bytes are not a message of this type."""
+    """The bytes of a message do not fit its type."""
 
 
 class Fields:
@@ -36,7 +36,6 @@ class Fields:
         """The primitive types of the fields that are read, `[]` for arrays; `length` if only the length is read."""
 
     def read(self, data: bytes) -> dict[str, Value]:
-        """Raises `MessageError`."""
         values: dict[str, Value] = {}
         position = 0
         try:

@@ -43,7 +43,7 @@ _WINDOWS = 24  # the minimum number for all recordings together
 
 @dataclass(frozen=True)
 class LearningResult:
-    """`alarms` are the alarms on the held-out recordings."""
+    """The learnt specifications as text, their candidates, and the candidates that were left out."""
 
     text: str
     candidates: tuple[Candidate, ...]
@@ -59,7 +59,7 @@ class LearningResult:
 def learn(
     recordings: Sequence[RecordingFacts], definitions: Definitions, held_out: float, run: Run
 ) -> LearningResult:
-    """Hold out the fraction `held_out`; `run` executes the passes. Raises `LearningError`."""
+    """Learn from all but the fraction `held_out`, which tests the result. `run` executes the passes."""
     return _Learner(recordings, definitions, held_out, run).learnt()
 
 
@@ -167,7 +167,6 @@ class _Learner:
         return part.number, part.began, part.ended, place * self._each, self._each, chosen
 
     def _pass(self, steps: Sequence[AnyStep], nothing: Facts) -> tuple[Any, Any]:
-        """Return the facts of the training recordings, and of all. Raises `LearningError` if all recordings failed."""
         trained: Any = nothing  # of the kind of the pass
         held_out: Any = nothing
         waiting = [step for step in steps if step.recording not in self._failed]

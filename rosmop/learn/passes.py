@@ -52,7 +52,7 @@ class ContentStep(LearningStep, frozen=True):
 
 
 class AlarmStep(LearningStep, frozen=True):
-    """Runs the learnt specifications. `says`, by monitor: a candidate's number, and how its warning begins."""
+    """Runs the learnt specifications. `says` has a candidate's number and how its warning begins, by monitor."""
 
     text: str
     says: dict[str, list[tuple[int, str]]]
@@ -94,7 +94,6 @@ AnyStep = TimeStep | ContentStep | AlarmStep
 
 
 def facts_of(step: AnyStep, source: RecordingSource, definitions: Definitions) -> Facts:
-    """Raises `LearningError`."""
     if isinstance(step, TimeStep):
         return _times(step, source)
     if isinstance(step, ContentStep):

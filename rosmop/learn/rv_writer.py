@@ -142,7 +142,6 @@ def _once(pieces: Iterable[str]) -> list[str]:
 
 
 def _filled(row: Candidate, texts: Iterable[str], names: Mapping[str, str]) -> list[str]:
-    """Statements about an array element run only if the element exists."""
     value = _short(row, names)
     name = value
     if row.element is not None:

@@ -100,17 +100,16 @@ class Series(msgspec.Struct):
     rates: HighestValues = msgspec.field(default_factory=HighestValues)
     stays: HighestValues = msgspec.field(default_factory=HighestValues)
     last: float | None = None
-    """The last value in a recording; its end resets it, like its time and the time since which it is the same."""
+    """The last value in a recording, its time, and the time since which it is the same. The end resets all three."""
     time: float = 0.0
     since: float = 0.0
 
     def end(self) -> None:
-        """The values of the next recording are independent of those of this one."""
+        """Forget the last value, because the next recording is independent of this one."""
         self.last, self.time, self.since = None, 0.0, 0.0
         self.values.end()
 
     def merged(self, other: "Series") -> "Series":
-        """Both series must have ended."""
         return Series(
             self.period, self.count + other.count, self.changed + other.changed, self.nan or other.nan,
             self.infinite or other.infinite, self.highs.merged(other.highs), self.lows.merged(other.lows),
@@ -118,7 +117,7 @@ class Series(msgspec.Struct):
         )  # fmt: skip
 
     def add(self, value: float | int, seconds: float, window: int) -> None:
-        """Only whole numbers may be an enumeration."""
+        """Add a value. Only whole numbers may be an enumeration."""
         self.count += 1
         if not self.values.many and not isinstance(value, float):
             self.values.add(value, window)

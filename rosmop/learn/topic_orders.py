@@ -1,7 +1,7 @@
 """Find which topics follow each other: alternations, answers and preconditions, with their times.
 
-Three things are measured for each pair: the time from a message of the second topic back to the last message of the
-first (`back`); the time from the first unanswered message to its answer (`forth`); and whether the topics take turns.
+Each pair has the time from a message of the second topic back to the last message of the first (`back`), the
+time from the first unanswered message to its answer (`forth`), and whether the topics take turns.
 """
 
 import math

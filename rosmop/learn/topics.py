@@ -43,7 +43,6 @@ class TopicRhythm(msgspec.Struct):
         self.last = None
 
     def merged(self, other: "TopicRhythm") -> "TopicRhythm":
-        """Both rhythms must have ended and be of different parts."""
         return TopicRhythm(
             self.count + other.count, self.recordings | other.recordings, self.gaps.merged(other.gaps),
             {**self.some, **other.some},
@@ -107,7 +106,7 @@ def _merged_moves(
 
 
 class TopicContentReader:
-    """Reads the messages of a topic in one recording. `period` and `interval` are those of its rhythm."""
+    """Reads the messages of a topic in one recording; the topic's rhythm has this `period` and `interval`."""
 
     def __init__(self, fields: Fields, period: float, interval: float) -> None:
         self.content = TopicContent()
@@ -133,7 +132,6 @@ class TopicContentReader:
         return content
 
     def add(self, data: bytes, time: int, window: int) -> None:
-        """Raises `MessageError`."""
         seconds = time / 10**9
         for path, value in self._fields.read(data).items():
             kind = self._types[path]
