@@ -1,6 +1,6 @@
-"""Define the interface of executors, and the loop that submits jobs and retries those whose worker died.
+"""Define the interface of executors, and the loop that retries jobs whose worker died.
 
-`work` of `rosmop.batch.jobs` depends only on the job and the recording, so the result is the same everywhere.
+The result is the same everywhere, because `work` depends only on the job and the recording.
 """
 
 from collections import deque
@@ -60,7 +60,7 @@ def execute(
 ) -> Iterator[tuple[int, bytes | WorkerDeath]]:
     """Yield the number and the result of each job, in the order in which they end.
 
-    A job whose worker dies is tried `ATTEMPTS` times in all. Jobs are read as they are needed.
+    A job whose worker dies is tried `ATTEMPTS` times in total. Jobs are read as they are needed.
     """
     supply = iter(jobs)
     again: deque[tuple[int, bytes]] = deque()

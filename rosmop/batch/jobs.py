@@ -1,7 +1,7 @@
 """Jobs on one recording, and `work`, the pure function that executes them.
 
-A job has all that its result depends on, except the messages. The size of a result does not depend on the recording's
-length.
+A job has all that its result depends on, except the messages. The size of the result does not depend on the
+recording's length.
 """
 
 import os
@@ -85,8 +85,6 @@ class _TooLong(BaseException):
 
 
 class _Envelope(msgspec.Struct, frozen=True):
-    """A job, and the version of the program that made it."""
-
     version: str
     job: Job
 
@@ -96,13 +94,12 @@ def packed(job: Job) -> bytes:
 
 
 def unpacked(result: bytes) -> Result | Failure:
-    """Raises `ValueError`."""
     decoded: Result | Failure = msgspec.msgpack.decode(result, type=Result | Failure)
     return decoded
 
 
 def work(job: bytes) -> bytes:
-    """Every error becomes a `Failure`, so one recording never ends the work on others."""
+    """Execute a job. Every error becomes a `Failure`, so one recording never ends the work on others."""
     result: Result | Failure
     try:
         envelope = msgspec.msgpack.decode(job, type=_Envelope)
@@ -178,7 +175,8 @@ def definitions_by_type(texts: dict[str, str]) -> Definitions:
 def local_file(recording: RecordingName) -> Iterator[Path]:
     """Open a block with the path of a recording, which is fetched if it is remote.
 
-    Raises `RecordingError`, also if a local file changed after the command listed it, or during the block.
+    Raises `RecordingError`, even if a local file only changed after the command listed it, or during the
+    block.
     """
     with ExitStack() as opened:
         if recording.uri.startswith(SCHEME):

@@ -1,8 +1,8 @@
-"""Keep the results of finished jobs, so that an interrupted command can continue, or only temporarily.
+"""Keep the results of finished jobs in a journal, so that an interrupted command can continue, or temporarily.
 
-The key of a result is the hash of its job, which contains the specifications, the options, the version, and the
-recording's name, size and time of change. Each line has a checksum: a job with a damaged result runs again, and a
-line that was cut off by a crash is removed.
+The key of a result is the hash of its job, which has the specifications, the options, the version, and the
+recording's name, size and time of change. Each line has a checksum: a job with a damaged result runs again,
+and a line that a crash cut off is removed.
 """
 
 import base64

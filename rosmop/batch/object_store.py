@@ -14,7 +14,6 @@ _PIECE = 1 << 20
 
 
 def listed(prefix: str) -> Iterator[tuple[str, int, str]]:
-    """Yield URI, size and hash of each object, in the order of their names. Raises `RecordingError`."""
     bucket, key = _parts(prefix)
     with _errors(prefix):
         pages = _client().get_paginator("list_objects_v2").paginate(Bucket=bucket, Prefix=key)
@@ -25,7 +24,7 @@ def listed(prefix: str) -> Iterator[tuple[str, int, str]]:
 
 @contextmanager
 def fetched(uri: str, version: str) -> Iterator[Path]:
-    """Copy an object into a temporary file for the block. Raises `RecordingError`, also if it changed.
+    """Copy an object into a temporary file for the block. Raises `RecordingError` if it changed or cannot be read.
 
     The file has no name, so it ends with the process, even if that is killed.
     """

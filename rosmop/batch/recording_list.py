@@ -15,8 +15,7 @@ ENDINGS = (".bag", ".mcap")
 class RecordingName(msgspec.Struct, frozen=True):
     """A path or an S3 URI, with the size in bytes, and the time of change or the hash, which identify the contents.
 
-    Bytes of a path outside UTF-8 are escaped in `uri`. `path` is absolute, because workers have other current
-    folders.
+    `uri` escapes bytes outside UTF-8. `path` is absolute, because workers have other current folders.
     """
 
     uri: str

@@ -26,8 +26,8 @@ _LONGEST = 4096  # characters of the text of an effect
 class Specifications(msgspec.Struct, frozen=True):
     """Specifications by file name, and message and service definitions by file name (`package/Type.msg`).
 
-    `chosen` is the only monitor to run, with those that share its variables; None for all. `topics` and `given`
-    replace values of the texts, by monitor and name.
+    With `chosen`, only this monitor runs, with those that share its variables. `topics` and `given` replace
+    values of the texts, by monitor and name.
     """
 
     texts: dict[str, str]
@@ -37,12 +37,11 @@ class Specifications(msgspec.Struct, frozen=True):
     given: dict[str, dict[str, bool | int | float | str]] = msgspec.field(default_factory=dict)
 
     def known(self, recorded: Definitions) -> Definitions:
-        """Return all definitions: of the recording, of ROS, and the given ones; later ones replace earlier ones."""
+        """Return the definitions of the recording, of ROS, and the given ones; later ones replace earlier ones."""
         own = standard_definitions().extended(Definitions.from_files(self.definitions))
         return recorded.extended(own)
 
     def monitors(self, recorded: Definitions, *, margins: bool = False) -> MonitorSet:
-        """Raises `SpecificationError`."""
         compiled = compiled_from(self.texts, self.known(recorded), margins=margins, topics=self.topics)
         fast = fast_path_of(compiled) if find_spec("wasmtime") is not None else None
         monitors = MonitorSet.of(compiled, fast=fast)
@@ -56,8 +55,8 @@ class Specifications(msgspec.Struct, frozen=True):
 class ReplayJob(msgspec.Struct, frozen=True, tag=True):
     """Runs specifications on the topics that match a pattern, between two times in nanoseconds.
 
-    `most`: the number of places that are kept for each monitor, topic and kind. `strict`: a topic of another type
-    than the specifications expect is an error, otherwise its messages are dropped.
+    The first `most` occurrences are kept for each monitor, topic and kind. A topic of another type is an
+    error if the job is `strict`; otherwise its messages are dropped.
     """
 
     recording: RecordingName
@@ -110,7 +109,7 @@ class ClosestMargin(msgspec.Struct, frozen=True):
 
 
 class Replayed(msgspec.Struct, frozen=True, tag=True):
-    """The effects on one recording: all of them counted, the first ones listed. `notes` are reasons of drops."""
+    """The effects on one recording: all are counted, and the first are listed. `notes` are reasons of drops."""
 
     messages: int
     passed: int
@@ -131,7 +130,6 @@ class Found(NamedTuple):
 
 
 def replayed(job: ReplayJob, path: Path) -> Replayed:
-    """Raises `RecordingError` and `SpecificationError`."""
     with closing(open_recording(path)) as reader:
         monitors = job.specifications.monitors(definitions_of(reader), margins=job.margins)
         notes = refusals(monitors, reader, job.topics)

@@ -16,7 +16,7 @@ from rosmop.batch.ray_cluster import RayCluster
 
 @dataclass(frozen=True)
 class JobRunner:
-    """An executor, and the journal of the command if it has one. `done` gets the number of each job that ended."""
+    """An executor, and perhaps a journal. `done` gets the number of each job that ended."""
 
     executor: Executor
     journal: ResumeJournal | None
@@ -49,7 +49,6 @@ class JobRunner:
     def in_order(
         self, jobs: Sequence[Job], done: Callable[[int], None] = lambda _number: None
     ) -> Iterator[Result | Failure]:
-        """Yield results in the order of the jobs. Early results wait in a temporary file."""
         following = 0
         places: dict[int, tuple[int, int]] = {}
         with TemporaryStore() as early:
@@ -66,7 +65,6 @@ class JobRunner:
 
 @contextmanager
 def executor_for(recordings: int, workers: int | None, cluster: str | None) -> Iterator[Executor]:
-    """Raises `ClusterError`."""
     executor: Executor
     count = min(workers or len(os.sched_getaffinity(0)), recordings)
     if cluster is not None:

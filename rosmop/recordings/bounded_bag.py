@@ -1,11 +1,11 @@
-"""Read a ROS 1 bag in time linear in its size, even if the bag is malicious, and in memory independent of its length.
+"""Read a ROS 1 bag in time linear in its size, even if it is malicious, and in memory independent of its length.
 
-`rosbags` trusts the headers of a bag, and keeps the index of all messages. This reader keeps the index of chunks
-whose times overlap (as the flight recorder writes them), and adds limits:
+`rosbags` trusts the headers of a bag, and holds the index of all messages. This reader holds the index only
+of chunks whose times overlap (the flight recorder writes such chunks), and adds limits:
 
 1. It reads at most `LARGEST_CHUNK` bytes at once, and unpacks a chunk to at most that size.
 2. It unpacks and reads at most `PER_BYTE` bytes for each byte of the bag, plus one chunk. Otherwise, index entries
-   could name one message many times, or unpack many chunks in turn.
+could name one message many times, or unpack many chunks in turn.
 3. The index has at most as many entries as fit in the bag, so chunks cannot share an index.
 """
 
@@ -49,7 +49,7 @@ class _Content(NamedTuple):
 
 
 class BoundedReader(Reader):
-    """Raises `ReaderError` and `ValueError` beyond a limit."""
+    """A bag, read within the limits above. Beyond them it raises `ReaderError` or `ValueError`."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(regular_files.BoundedPath(path))
@@ -67,7 +67,7 @@ class BoundedReader(Reader):
         return sum(sum(info.connection_counts.values()) for info in self.chunk_infos)
 
     def read_index_data(self, pos: int, indexes: dict[int, list[IndexData]]) -> None:
-        """`in_order` reads the index of a chunk when its time has come."""
+        """Do nothing: `in_order` reads the index of a chunk when its time has come."""
 
     def in_order(self) -> Iterator[tuple[Connection, int, bytes]]:
         """Yield connection, time (ns) and bytes of messages, by time, then by position in the file."""

@@ -1,7 +1,7 @@
 """Read an MCAP file with ROS 1 messages, with the limits of `bounded_bag`.
 
-The package `mcap` would unpack a chunk to any size, and keep all chunks whose times overlap. Here waiting messages of
-such chunks have at most `LARGEST_CHUNK` bytes in all.
+The package `mcap` would unpack a chunk to any size, and hold all overlapping chunks. Here, waiting messages
+of such chunks have at most `LARGEST_CHUNK` bytes in total.
 """
 
 import heapq
@@ -54,7 +54,6 @@ class BoundedMcap:
         self._file.close()
 
     def in_order(self) -> Iterator[tuple[Connection, int, bytes]]:
-        """Yield connection, time (ns) and bytes of messages, by time, then by position in the file."""
         connections = {connection.id: connection for connection in self.connections}
         waiting: list[tuple[int, int, int, int, bytes]] = []
         held = 0

@@ -1,4 +1,4 @@
-"""Open recordings: bags and MCAP files, distinguished by their first bytes."""
+"""Open recordings: bags and MCAP files, distinguished by their first bytes. Errors are a `RecordingError`."""
 
 import struct
 from collections.abc import Iterator, Sequence
@@ -27,17 +27,15 @@ _DAMAGE = (
 
 
 class RecordingError(Exception):
-    """A recording cannot be used; the text names it and the reason."""
+    """A recording cannot be used. The text names the recording and the reason."""
 
 
 def ros_type(name: str) -> str:
-    """The reader writes `package/msg/Type`."""
     package, _, kind = name.partition("/")
     return f"{package}/{kind.rpartition('/')[2]}"
 
 
 def open_recording(path: Path) -> Reader:
-    """Raises `RecordingError`."""
     is_mcap = False
     try:
         if path.is_file():
@@ -59,7 +57,7 @@ def open_recording(path: Path) -> Reader:
 
 
 def messages_of(reader: Reader) -> Iterator[tuple[Connection, int, bytes]]:
-    """Yield the messages with times in nanoseconds. Raises `RecordingError` for a damaged file."""
+    """Yield messages, with times in nanoseconds."""
     try:
         yield from reader.in_order()
     except _DAMAGE as error:
@@ -71,7 +69,6 @@ def _text_of(error: Exception) -> str:
 
 
 def definitions_of(reader: Reader) -> Definitions:
-    """Leave out definitions that cannot be parsed."""
     found: dict[str, MessageDefinition] = {}
     sent = dict.fromkeys((ros_type(row.msgtype), row.msgdef.data) for row in reader.connections)
     for name, text in sent:
@@ -90,8 +87,7 @@ def fits(topic: str, patterns: Sequence[str]) -> bool:
 class RecordedFile:
     """The messages of a recording on topics that match a pattern, read again for each pass.
 
-    `name` is for messages to the user. Raises `RecordingError` for a recording that cannot be read, has no messages,
-    or has two types on one topic.
+    The recording must have messages, and one type on each topic. `name` is for messages to the user.
     """
 
     def __init__(self, path: Path, patterns: Sequence[str], name: str | None = None) -> None:
@@ -113,7 +109,6 @@ class RecordedFile:
                     raise RecordingError(f"{path}: {connection.topic} carries both {other} and {kind}")
 
     def messages(self) -> Iterator[tuple[str, int, bytes]]:
-        """Yield the messages with times in nanoseconds. Raises `RecordingError`."""
         with closing(open_recording(self._path)) as reader:
             for connection, time_ns, data in messages_of(reader):
                 if connection.topic in self.topics:

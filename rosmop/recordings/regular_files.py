@@ -41,7 +41,6 @@ def open_regular(path: Path) -> BufferedReader:
 
 class _BoundedFile(BufferedReader):
     def read(self, size: int | None = -1, /) -> bytes:
-        """Raises `ValueError` beyond `LARGEST_CHUNK` bytes."""
         if size is None or not 0 <= size <= LARGEST_CHUNK:
             raise ValueError(f"it has a record of more than {LARGEST_CHUNK} bytes.")
         return super().read(size)
@@ -54,5 +53,4 @@ class BoundedPath(PosixPath):
     """The path of a regular file that is read in bounded pieces."""
 
     def open(self, *_mode: object) -> BinaryIO:  # type: ignore[override] # readers of recordings ask for bytes
-        """Raises `OSError`."""
         return _BoundedFile(open_regular(Path(self)).detach())

@@ -1,6 +1,6 @@
 """Run monitors on a recording, and write a bag with the messages that subscribers would have received.
 
-Messages of a topic with a different definition than the specifications expect are dropped.
+Messages are dropped if their topic's definition differs from that of the specifications.
 """
 
 from collections.abc import Iterator, Sequence
@@ -22,9 +22,9 @@ _OWN = "/rosrv"  # caller id of messages that monitors publish; monitors do not 
 
 @dataclass(frozen=True)
 class ReplayStep:
-    """The outcome of a message, or without a topic, of a tick or deadline.
+    """The outcome of a message, or of a tick or deadline if there is no topic.
 
-    A message without an index was published by the monitor `publisher`, and went through the monitors behind it.
+    A message without an index was published by the monitor `publisher`, and judged by the monitors behind it.
     """
 
     outcome: Outcome
@@ -38,10 +38,10 @@ _Header = tuple[str, str, str, str, str | None, int | None]
 
 
 class OutputBag:
-    """A new bag. Raises `RecordingError`.
+    """A bag that is being written.
 
-    Tools order messages of the same time by their connections. So a message before or after one of a monitor gets a
-    later time than the earlier of the two, if need be by a nanosecond.
+    Tools order messages of the same time by their connections. To keep their order, a message before or after
+    one of a monitor is at least a nanosecond later than its predecessor.
     """
 
     def __init__(self, path: Path, definitions: Definitions) -> None:
@@ -99,7 +99,7 @@ def replay(
     topics: Sequence[str] = ("*",),
     span: tuple[int, int] = (0, 1 << 63),
 ) -> Iterator[ReplayStep]:
-    """Run monitors on a bag, in its order and by its clock.
+    """Run monitors on a recording in its order, with its times as their clock.
 
     `topics` are patterns; `span` is the first and last time in nanoseconds since the epoch.
     """
@@ -156,8 +156,6 @@ class _Caller:
 
 
 class _ExplainOnce:
-    """Explains, in each second, the first verdict of each category and binding of a property."""
-
     def __init__(self) -> None:
         self.now = 0
         self._second = 0

@@ -1,1 +1,1 @@
-"""The command `rosmop`, shared with `rosrv monitor`: only this part of the language reads and writes files."""
+"""The command `rosmop`, which `rosrv monitor` shares."""

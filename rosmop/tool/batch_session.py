@@ -1,6 +1,6 @@
 """Execute the jobs of `run`, `learn`, `coverage` and `replay` on recordings.
 
-The exit status is 3 if one of several recordings failed; if the only one failed, that is a usage error.
+The exit status is 3 if one of several recordings failed. If the only recording failed, that is a usage error.
 """
 
 import json
@@ -57,7 +57,6 @@ class BatchSession:
     kept: TemporaryStore
 
     def results(self, what: str, jobs: Sequence[Job]) -> Iterator[tuple[int, Result | Failure]]:
-        """Yield results in the order in which they end."""
         with self._progress(what, jobs) as done:
             yield from self.runner.run(jobs, done)
 

@@ -28,7 +28,6 @@ def check(
     dot: Path | None,
     svg: Path | None,
 ) -> int:
-    """Return 0 without errors, 1 with errors. A usage error ends with 2."""
     if prove and find_spec("z3") is None:
         raise program.usage_error("--prove needs the package z3-solver: pip install z3-solver")
     try:

@@ -35,8 +35,6 @@ from rosmop.tool.renamed_options import RenamedCommand
 
 
 def commands_of(program: CommandContext) -> dict[str, Callable[..., None]]:
-    """Return the commands; the docstring of each is its help after the summary."""
-
     def check(
         files: Files,
         *,

@@ -25,7 +25,7 @@ class CommandContext:
     write: Callable[[Path, bytes | mmap], object]
 
     def read(self, path: Path) -> bytes:
-        """Raises `OSError`, also for a file that is not regular, or too long."""
+        """Read a file. Raises `OSError`, even for a file that is too long or not regular."""
         with open_regular(path) as file:
             data = file.read(MAX_FILE + 1)
         if len(data) > MAX_FILE:
@@ -33,7 +33,7 @@ class CommandContext:
         return data
 
     def read_text(self, path: Path) -> str:
-        """Make line ends LF, and invalid UTF-8 bytes surrogates. Raises `OSError`."""
+        """Read a text, with LF as line ends and surrogates for bytes outside UTF-8. Raises `OSError`."""
         with io.TextIOWrapper(io.BytesIO(self.read(path)), "utf-8", "surrogateescape") as text:
             return text.read()
 
@@ -41,13 +41,12 @@ class CommandContext:
         typer.echo(f"{self.name}: {printable(text)}", err=True)
 
     def usage_error(self, text: str) -> typer.Exit:
-        """The caller raises the result (exit status 2)."""
+        """Print the message. The caller raises the result (exit status 2)."""
         self.warn(text)
         return typer.Exit(2)
 
     @contextmanager
     def reports(self) -> Iterator[None]:
-        """Turn a `RecordingError` in the block into a usage error."""
         try:
             yield
         except RecordingError as error:

@@ -72,7 +72,6 @@ def _surveys(session: BatchSession, topics: list[str]) -> tuple[list[tuple[int, 
 
 
 def _definitions(program: CommandContext, surveys: Sequence[Survey]) -> Definitions:
-    """Reject recordings with different definitions of one type."""
     recorded = Definitions({})
     for survey in surveys:
         own = definitions_by_type(survey.definitions)

@@ -20,10 +20,10 @@ from rich.progress import (
 def progress(
     what: str, total: Callable[[], int], *, shares_screen: bool = False, always: bool = False
 ) -> Iterator[Callable[[int], None]]:
-    """Show progress in a block; the result takes the finished amount of `total()`.
+    """Show progress during a block, which passes the finished part of `total()` to the function that it gets.
 
-    `shares_screen`: the work writes to standard output, so there is no bar if that is a terminal. `always`: without a
-    bar, print a line for each percent.
+    If the work `shares_screen`, there is no bar when standard output is a terminal. Without a bar, `always`
+    prints a line for each percent.
     """
     console = Console(stderr=True)
     is_bar = console.is_terminal and not (shares_screen and sys.stdout.isatty())

@@ -10,7 +10,6 @@ FORMER_OPTIONS: Mapping[str, str] = {"--out": "--output", "--expires": "--for", 
 
 
 def renamed(command: Any, args: list[str]) -> list[str]:
-    """Replace former names that the command does not know, with a remark."""
     known = {option for parameter in command.params for option in parameter.opts}
     given: list[str] = []
     for position, word in enumerate(args):

@@ -109,8 +109,6 @@ class ReplayReport:
 
 
 class _Line(NamedTuple):
-    """A recording in the table: its effects by kind, with the times of the first and the last one, or its error."""
-
     recording: str
     messages: int
     counts: tuple[int, ...]

@@ -77,7 +77,6 @@ def run_spans(
     *,
     margins: bool,
 ) -> None:
-    """Raises `RecordingError` and `SpecificationError`."""
     for name, path, span in spans:
         recording = RecordingName(name, path.stat().st_size, "")
         job = ReplayJob(recording, specifications, topics, span, MOST_IN_ROWS, margins, strict=True)

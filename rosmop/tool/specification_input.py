@@ -24,7 +24,7 @@ _RECORDINGS = (b"#ROSBAG ", b"\x89MCAP")
 def load(
     program: CommandContext, files: list[Path], folders: list[Path], recorded: Definitions | None = None
 ) -> Compiled:
-    """`recorded` applies to types that no file defines. Raises `SpecificationError`."""
+    """Compile the files. `recorded` applies to types that no file defines. Raises `SpecificationError`."""
     definitions = read_definitions(program, files, folders)
     if recorded is not None:
         definitions = recorded.extended(definitions)
@@ -34,8 +34,7 @@ def load(
 def read_specifications(program: CommandContext, files: Sequence[Path]) -> dict[str, str]:
     """Return texts by name, in the order of file names.
 
-    Bytes outside UTF-8 are escaped in names. In texts they become surrogates, which the parser rejects with their
-    position.
+    In texts, bytes outside UTF-8 become surrogates, which the parser rejects with their position.
     """
     texts: dict[str, str] = {}
     for file in sorted(files, key=lambda path: (path.name, str(path))):
@@ -53,7 +52,6 @@ def read_specifications(program: CommandContext, files: Sequence[Path]) -> dict[
 
 
 def topics_of(specifications: Specifications) -> dict[str, str]:
-    """Return types by topic, of the chosen specification or of all. Raises `SpecificationError`."""
     chosen, topics = specifications.chosen, specifications.topics
     return {
         event.trigger.topic: event.trigger.type
@@ -66,8 +64,7 @@ def topics_of(specifications: Specifications) -> dict[str, str]:
 
 
 def read_definitions(program: CommandContext, files: Sequence[Path], folders: Sequence[Path]) -> Definitions:
-    """Return the definitions of ROS, of `msg/` beside the specifications, and of the folders; later ones replace
-    earlier ones.
+    """Return the definitions of ROS, of `msg/` beside the specifications, and of the folders, in this precedence.
 
     Raises `SpecificationError` for a definition that cannot be read.
     """
@@ -85,9 +82,9 @@ def read_definitions(program: CommandContext, files: Sequence[Path], folders: Se
 def read_for_recordings(
     program: CommandContext, files: Sequence[Path], folders: Sequence[Path]
 ) -> Specifications:
-    """Return specifications that workers compile, without the definitions of ROS.
+    """Return specifications for workers to compile, without the definitions of ROS.
 
-    Raises `SpecificationError` for a text that cannot be parsed and a definition that cannot be read.
+    Raises `SpecificationError` for an invalid text or definition.
     """
     read_definitions(program, files, folders)
     definitions: dict[str, str] = {}

@@ -16,7 +16,6 @@ def table_of(*heads: str | Column) -> Table:
 
 
 def add_row(table: Table, *cells: str) -> None:
-    """Escape control characters of untrusted strings, of which nothing is read as markup."""
     table.add_row(*(Text(printable(cell)) for cell in cells))
 
 

@@ -21,7 +21,7 @@ def counted(number: int, noun: str) -> str:
 
 
 def refused(findings: Iterable[object]) -> typer.Exit:
-    """The caller raises the result (exit status 1)."""
+    """Print the findings. The caller raises the result (exit status 1)."""
     for finding in findings:
         typer.echo(printable(str(finding)), err=True)
     return typer.Exit(1)
