@@ -86,12 +86,12 @@ def load(
 
 
 def action(body: str, *, before: str = "") -> str:
-    """The action is on `/t`, `std_msgs/Int32` bound to `x`; `before` are declarations."""
+    """Return a specification with an action on `/t`, where `x` is the data of a `std_msgs/Int32`."""
     return f"s() {{ {before} event e(int x) /t std_msgs/Int32 '{{data:x}}' {{ {body} }} }}"
 
 
 def act(body: str, *, before: str = "", data: int = 0, most: int = BUDGET) -> Outcome:
-    """`most` is the number of instructions that a message may take."""
+    """Run an action, with at most this number of instructions."""
     text = action(body, before=before)
     told = message("std_msgs/Int32", data=data)
     monitors = load(text)

@@ -1,4 +1,4 @@
-"""The same monitors run by the interpreter only, as a reference for modules."""
+"""Run the same monitors by the interpreter only, as a reference for modules."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -15,7 +15,7 @@ def sent(functions: Mapping[str, nodes.Function]) -> dict[str, nodes.Function]:
 
 
 def beside(monitors: MonitorSet) -> MonitorSet:
-    """From the form as it is sent, with its own state and without a module; not started."""
+    """Return the monitors from the form as it is sent, with their own state and without a module; not started."""
     compiled = replace(monitors.compiled, functions=sent(monitors.compiled.functions))
     return MonitorSet(compiled, monitors.on_fault, monitors.patience)
 

@@ -81,7 +81,7 @@ class Traffic:
 
 
 class Specifications:
-    """With `numbers`, they only have parts that a module handles: numbers and conditions."""
+    """Random specifications. With `numbers`, they only have numbers and conditions, which a module handles."""
 
     def __init__(self, seed: int, *, numbers: bool = False) -> None:
         self._random = Random(seed)  # noqa: S311  draws examples, not keys

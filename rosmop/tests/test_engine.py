@@ -56,7 +56,6 @@ def test_a_message_without_events_keeps_its_buffer() -> None:
 def test_a_name_of_its_own_does_not_use_the_variable_of_another_specification(
     parameter: str, when: str, body: str
 ) -> None:
-    """The two can be switched, tried, moved and removed separately, unless a name really means the other's variable."""
     event = f"event e(int {parameter}) /t std_msgs/Int32 '{{data:{parameter}}}' {when} {{ {body} }}"
     other = "other() { int shared = 0; event e() /u std_msgs/Empty '{}' { shared++; } }"
     for text, uses in (("", set()), ("event f() /u std_msgs/Empty '{}' when (shared > 1) { }", {"other"})):
@@ -137,7 +136,6 @@ def test_a_leap_of_the_clock_skips_ticks() -> None:
 
 
 def test_late_ticks_are_skipped_and_deadlines_wait() -> None:
-    """Otherwise late ticks would pile up; the caller sets the limit."""
     text = """a() { int n; event e() /t std_msgs/Bool '{}' { } event tick() every 1ms { n++; ROS_INFO("%d", n); } }
     b() { event x() /t std_msgs/Bool '{}' { }
         tfsm: s [ x -> s, timeout 1ms -> late ] late [ ] @timeout { ROS_WARN("late"); } }"""

@@ -117,8 +117,7 @@ def test_expressions_at_the_limits(expression: str) -> None:
 def test_each_program_does_the_same_in_the_module_and_the_interpreter(case: Case) -> None:
     """Messages are also cut after each byte, and have false lengths.
 
-    The module handles messages of programs marked `module`, and none of those marked `engine`. For each difference
-    between module and interpreter that was found or suspected, one row is added.
+    The module handles messages of programs marked `module`, and none of those marked `engine`.
     """
     both, random = BothWays(case.text), Random(case.beside)  # noqa: S311  draws examples, not keys
     ((topic, kind),) = both.monitors.topics.items()
@@ -255,7 +254,6 @@ def test_fuel_lasts_for_many_calls_and_is_renewed(
 
 
 def test_only_the_beginning_of_a_long_message_is_copied() -> None:
-    """The limit does not apply to a message that is completely in the module's memory."""
     picture = bytes(range(256)) * (BEGINNING // 128)
     both = BothWays(event("if (count == 3) { return; } count = count + 1; n++;"))
     both.check([plain(1, rest=picture), plain(2), plain(3, rest=picture), plain(4, rest=picture), plain(5)])
@@ -458,7 +456,6 @@ def test_a_deadline_set_by_the_module_is_known_at_once() -> None:
 
 
 def test_a_disabled_monitor_is_not_in_the_lane() -> None:
-    """If no other monitor needs the topic, it has no lane; otherwise the lane has only the others."""
     both = BothWays(event("n = count;"), event("n++;").replace("s()", "t()"))
     for one in (both.monitors, both.interpreter):
         one.switch({"s": False}, 5)

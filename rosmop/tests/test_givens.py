@@ -78,7 +78,7 @@ def test_the_module_and_the_interpreter_agree_for_all_values() -> None:
 
 
 def test_a_topic_renames_events_safe_messages_and_publications() -> None:
-    """A state belongs to the text and to its topics, so another topic starts again; unknown names are ignored."""
+    """A state belongs to the text and to its topics, so another topic starts again."""
     given: tuple[dict[str, str], ...] = (
         {},
         {"command": "/base/cmd"},

@@ -110,7 +110,6 @@ def test_expensive_operations_are_charged(body: str) -> None:
 
 
 def test_short_operations_are_not_charged() -> None:
-    """Comparing names and other short strings is free, because monitors do it all the time."""
     body = 'if (s == "turret" || s == t || s < t || v == w) s = t;'
     text = (
         "s() { std::string s, t; std::vector<int> v, w; event e() /t std_msgs/Empty '{}' { " + body + " } }"
@@ -257,7 +256,6 @@ def test_few_elements_before_a_field_cost_nothing_and_many_their_number() -> Non
 
 
 def test_an_array_of_too_many_strings_is_a_fault() -> None:
-    """Strings and messages in an array are read one by one, so a million is the limit."""
     monitors = load("a() { event e(std::string[] x) /t sensor_msgs/JointState '{name:x}' { auto y = x; } }")
     outcome = monitors.process("/t", b"\0" * 16 + (1_500_000).to_bytes(4, "little") + bytes(6_000_012), 0)
     assert "an array of 1500000 elements; at most 1000000" in outcome.faults[0].text

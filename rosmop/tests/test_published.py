@@ -55,7 +55,6 @@ def test_a_circle_ends_with_the_order() -> None:
 
 
 def test_a_monitor_that_holds_drops_what_others_publish() -> None:
-    """It cannot judge the message."""
     monitors = load(MUX, y=COUNT)
     monitors.monitor("count").hold("its state is lost")
     outcome = monitors.process("/joy", FAST, 1)
@@ -74,7 +73,6 @@ def test_a_disabled_monitor_judges_nothing(name: str) -> None:
     [(CAP, MUX, True), (MUX, CAP, False), (COUNT, MUX, True), (MUX.replace("mux", "m"), MUX, False)],
 )
 def test_a_pair_in_the_wrong_order_is_a_warning(first: str, second: str, warned: bool) -> None:
-    """Only the order of the files decides which monitors see a published message."""
     warnings = [str(one) for one in load(first, y=second).warnings if "does not see them" in one.text]
     assert bool(warnings) is warned
     assert not warned or warnings[0].startswith("y.rv:2:5: warning: mux publishes /cmd_vel, but ")

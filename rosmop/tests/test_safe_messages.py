@@ -1,5 +1,3 @@
-"""A monitor that cannot judge sends its safe message and passes no other."""
-
 from itertools import product
 from typing import Any
 
@@ -286,7 +284,6 @@ def test_the_module_sends_the_safe_message() -> None:
 
 
 def test_a_string_of_the_message_is_kept_before_it_is_replaced() -> None:
-    """If events keep a part of the message that the safe one would overwrite, the engine takes the stopped messages."""
     both = BothWays(f"""s() {{ std::vector<uint8_t> kept; {ON_PLAIN}
         event e(int c, std::vector<uint8_t> r) /plain own/Plain '{{count:c, rest:r}}' {{
             kept = r; if (c > 6) {{ STOP; }} }} }}""")  # fmt: skip

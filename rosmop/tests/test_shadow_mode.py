@@ -229,7 +229,6 @@ def shadow(*texts: str, shadowed: Collection[str]) -> MonitorSet:
 
 
 def test_requests_and_responses() -> None:
-    """Only the other specifications decide about the definition of a service."""
     text = """s() { event asked(bool on) service /mode std_srvs/SetBool request '{data:on}' { if (on) { return; } } }"""
     monitors = shadow(text, shadowed=["s"])
     assert monitors.process_service("/mode", "request", b"\x01", 1).result == "passed"
@@ -287,7 +286,6 @@ def test_an_incomplete_state_is_reset_when_it_is_enforced() -> None:
 
 
 def test_a_topic_of_shadow_mode_only_has_a_type_there_only() -> None:
-    """A publisher with another definition is not refused because of such a topic."""
     monitors = shadow("s() { event e() /chatter std_msgs/String '{}' { } }", shadowed=["s"])
     assert monitors.wants("/chatter")
     assert (monitors.type_of("/chatter"), monitors.type_of("/chatter", shadowed=True)) == (

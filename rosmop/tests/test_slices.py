@@ -253,7 +253,6 @@ def test_a_long_binding_is_a_fault() -> None:
 
 
 def test_finished_slices_are_collected_and_do_not_begin_again() -> None:
-    """An answered goal uses no memory, but its id cannot be reused."""
     counted = ANSWERED.replace("again = again + 1;", "if (again < 1) again = again + 1;")
     monitors = MonitorSet.of(compiled_from({"x.rv": counted}, definitions()), slices=3)
     monitors.start(0)

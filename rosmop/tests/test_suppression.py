@@ -1,4 +1,4 @@
-"""For formulas, a dropped message has not happened: their trace is the one that subscribers saw."""
+"""For formulas, a dropped message has not happened: their trace is that of subscribers."""
 
 from collections.abc import Iterator, Sequence
 from itertools import product

@@ -46,7 +46,7 @@ def expression(random: Random, depth: int, events: Sequence[str]) -> str:
 
 
 def pattern(random: Random, _depth: int, events: Sequence[str]) -> str:
-    """Without a time bound; no event both opens and closes the scope."""
+    """Return a pattern without a time bound, in which no event both opens and closes the scope."""
     a, b, c, d = (random.choice(events) for _ in range(4))
     scopes = ["globally", f"after {a}", f"until {b}"] + [f"after {a} until {b}"] * (a != b)
     bodies = [f"no {c}", f"some {c}", *(f"{c} {verb} {d}" for verb in ("causes", "requires", "forbids"))]
@@ -147,7 +147,7 @@ def same_verdicts(one: AutomatonTables, other: AutomatonTables) -> bool:
 
 
 def broken(random: Random, tables: AutomatonTables) -> AutomatonTables:
-    """One compiler fault: a wrong transition, two merged states, or a wrong verdict."""
+    """Return tables with one compiler fault: a wrong transition, two merged states, or a wrong verdict."""
     table, verdicts = [list(row) for row in tables.table], list(tables.verdicts)
     state, other = random.randrange(len(table)), random.randrange(len(table))
     timeouts = list(tables.timeouts)
@@ -167,7 +167,6 @@ def broken(random: Random, tables: AutomatonTables) -> AutomatonTables:
 
 @pytest.mark.parametrize("logic", LOGICS)
 def test_an_invalid_automaton_is_refused(logic: str) -> None:
-    """Python would count a negative state from the end; the relay's module would read outside its table."""
     compiled = next(iter(properties(logic, 5, 5)))
     made = tables_of(compiled)
     states = len(made.table)

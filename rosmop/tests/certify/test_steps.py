@@ -69,10 +69,7 @@ def test_a_large_table_is_run_in_all_of_its_states() -> None:
 
 
 def test_mutants_of_walks_and_tables_are_rejected() -> None:
-    """Hundreds of faults are found in cells, indexes, written states, verdicts, drops, order and restarts.
-
-    The remaining mutants only change explanations, budgets or cells that are overwritten, or cannot occur here.
-    """
+    """The remaining mutants only change explanations, budgets or cells that are overwritten, or cannot occur here."""
     of = compiled(GUARD)
     whole, came = module(of), Counter[str]()
     every = 6 // examples(6)

@@ -1,7 +1,6 @@
 """Random expressions and assignments have the results of a C++ compiler for the same text.
 
-A compiler option makes integers wrap. The examples avoid other undefined results of C++: shifts by more than the width,
-conversions out of range, and division by zero.
+The examples avoid undefined results of C++, except integers that wrap (a compiler option).
 """
 
 import os
@@ -156,7 +155,6 @@ def float_program(random: Random) -> str:
 
 
 def compiler_of_cpp() -> str:
-    """Without it the test is skipped, or fails in CI."""
     path = shutil.which("g++")
     if path is None and os.environ.get("CI", "").lower() in ("1", "true", "yes"):
         pytest.fail("needs `g++` (Debian: sudo apt install g++), which this CI machine lacks", pytrace=False)

@@ -26,7 +26,6 @@ JOINTS = message(
 
 
 def test_a_float_constant_of_a_message_is_a_float() -> None:
-    """The constant is rounded to 32 bits like the field that holds it, so that the two are equal."""
     own = definitions().extended(Definitions.from_files({"own/C.msg": "float32 LIMIT=0.1\nfloat32 x\n"}))
     text = event(
         "own/C", "float x", "x:x", 'ROS_INFO("%d %d", x == own::C::LIMIT, (double) own::C::LIMIT == 0.1);'

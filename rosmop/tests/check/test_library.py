@@ -1,4 +1,4 @@
-"""`rosmop/tests/programs.txt` compares them in the module with the interpreter."""
+"""The functions of the library. `rosmop/tests/programs.txt` compares them in the module with the interpreter."""
 
 import math
 import struct

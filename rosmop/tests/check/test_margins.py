@@ -54,7 +54,7 @@ def test_the_nearest_on_both_sides_since_it_was_asked_last(walking: bool) -> Non
 
 
 def test_answers_are_those_of_the_text_as_it_is() -> None:
-    """Covers large integers that a double cannot distinguish, unsigned ones and NaN: compared as in C++."""
+    """Large integers that a double cannot distinguish, unsigned integers and NaN are compared as in C++."""
     text = """big() { event e(%s x) /t std_msgs/%s '{data:x}' { if (x %s %s) { return; } } }"""
     for kind, message, code, operator, side, values in (
         ("uint64_t", "UInt64", "<Q", ">", "18446744073709551614u", (2**64 - 1, 2**64 - 2, 0)),

@@ -36,7 +36,7 @@ def test_an_action_prints_what_cpp_prints(case: Case) -> None:
 
 
 def unfolded(case: Case) -> str:
-    """`x` is 0; added to the numbers, it keeps values from being computed before a message."""
+    """Add `x`, which is 0, to the numbers, so that no value is computed before a message."""
     if '"' in case.source:
         return case.text
     return case.frame.replace("…", re.sub(r"(?<![\w.])(\d+(\.\d+)?)(?![\w.])", r"(\1 + x)", case.source))

@@ -66,7 +66,7 @@ def test_events_that_are_not_named_are_one_class() -> None:
 
 
 def test_components_against_reachability() -> None:
-    """Two nodes are in one component if and only if each leads to the other; successors' components come first."""
+    """Two nodes are in one component if and only if each leads to the other."""
     random = seeded(19)
     for _ in range(300):
         size = random.randint(1, 8)
@@ -84,6 +84,5 @@ def test_components_against_reachability() -> None:
 
 
 def test_many_states_with_many_ways_out_are_refused() -> None:
-    """Memory is limited by the number of transitions, because minimising stores each of them."""
     with pytest.raises(TooManyStatesError, match="more than 500000 transitions"):
         explore(0, 1000, lambda state, _letter: min(state + 1, 9_000), lambda _state: ())

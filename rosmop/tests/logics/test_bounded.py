@@ -137,7 +137,7 @@ def is_about_the_future(tree: Tree) -> bool:
 
 
 def rtamt_text(tree: Tree) -> str:
-    """A signal of the other monitor is 1 at its event, else -1."""
+    """Return the formula for the other monitor, where a signal is 1 at its event, else -1."""
     operator, *rest = tree
     if operator == "event":
         return f"({rest[0]} >= 0)"
@@ -149,7 +149,7 @@ def rtamt_text(tree: Tree) -> str:
 
 
 def rtamt_knows(tree: Tree) -> bool:
-    """Some operators differ: in the other monitor, `xor` and `iff` are distances, and the time before holds."""
+    """Whether the operators agree: in the other monitor, `xor` and `iff` are distances, and the time before holds."""
     if tree[0] == "event":
         return True
     endless = tree[0] in PAST and tree[-1][1] is None

@@ -23,7 +23,7 @@ PRINTER = Printer(
 )  # fmt: skip
 
 Lasso = tuple[tuple[str, ...], int]
-"""A trace that goes on for ever: its positions, and where the last one leads back to."""
+"""An endless trace: its positions, and the position to which the last one leads back."""
 
 
 def lassos(events: tuple[str, ...], stem: int, loop: int) -> list[Lasso]:

@@ -128,7 +128,7 @@ def reelay_text(tree: Tree) -> str:  # noqa: PLR0911  # one per operator
 
 
 def expressible(tree: Tree) -> bool:
-    """The other monitor reads `[0:0]` as no bounds."""
+    """Whether the other monitor has the formula: it reads `[0:0]` as no bounds."""
     if isinstance(tree[-1], tuple) and tree[-1] == (0, 0):
         return False
     if tree[0] in ("true", "false", "xor", "iff") or (tree[0] == "previously" and len(tree) > 2):

@@ -79,7 +79,6 @@ class Meaning:
         return any(j > i and near(t, u) for i, t in firsts for j, u in seconds), set()
 
     def verdict(self, trace: Timed, now: int, events: tuple[str, ...], ahead: int) -> tuple[str, ...]:
-        """Validation: no violation or duty is possible. Violation: a duty cannot be met."""
         gaps = (0,) if self.within is None else (0, self.within + 1)
         _, due_now = self.unmet(trace, now)
         can_meet = can_miss = False
@@ -165,7 +164,6 @@ def with_answers(trace: list[tuple[int, str]], remedies: list[int], answer: str)
 def check_remedies(
     plain: CompiledProperty, trace: list[tuple[int, str]], remedies: list[int], answer: str
 ) -> None:
-    """Each remedy must come when the deadline would otherwise have violated the pattern."""
     for place, time in enumerate(remedies):
         before = [one for one in with_answers(trace, remedies[:place], answer) if one[0] <= time]
         assert play(plain.start(0), "abc", before, time + 1)[-1] == (time, ("violation",)), (trace, remedies)

@@ -31,7 +31,7 @@ def show(tree: Tree) -> str:
 
 
 def before(trace: Sequence[str], place: int) -> int:
-    """The abstract past skips returned calls; -1 if it has no previous event."""
+    """Return the previous event in the abstract past, which skips returned calls, or -1."""
     depth, at = 0, place - 1
     if at >= 0 and trace[at] == "end":
         while at >= 0:

@@ -63,7 +63,6 @@ def test_endless_rewriting_is_a_fault_and_changes_nothing() -> None:
 
 
 def test_comparing_long_rules_is_charged() -> None:
-    """A rule as long as the string is allowed alone; comparisons that would take seconds at each event are a fault."""
     long, half = "a " * 20_000, "a " * 10_000
     for formula, fault in (
         (f"{long} b -> #fail .", False),

@@ -193,7 +193,6 @@ def test_without_time_nothing_is_proved() -> None:
     ],
 )
 def test_wrong_modules_are_found(name: str, every: int, times: int) -> None:
-    """A sample of the mutants of `tests/proofs/test_events.py`: each is decided, and most differ."""
     told = Counter(answer for _, answer in faulty(FAULTY[name], every=every))
     assert {*told} == {EQUAL, "not equal"}
     assert told["not equal"] > times * told[EQUAL]

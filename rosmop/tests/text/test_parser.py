@@ -174,7 +174,6 @@ def test_properties() -> None:
 
 @pytest.mark.parametrize("name", ["auto", "new", "break", "try", "default", "NULL"])
 def test_a_category_may_be_a_word_of_cpp(name: str) -> None:
-    """States have separate names, so a C++ keyword may be a state."""
     found = parsed(
         f"s() {{ event e() /t std_msgs/Empty '{{}}' {{ }} fsm: {name} [ e -> {name} ] @{name} {{ }} }}"
     )
