@@ -12,7 +12,7 @@ import msgspec
 from rosmop.learn.series import HighestValues, merged_rows
 
 MOST_TOPICS = 24
-"""Topics with more messages are preferred."""
+"""The topics with the fewest messages are compared, because a command says more than a regular beat."""
 
 _SURE = 1e-6  # the probability that any of all pairs looks like an order by chance
 _FEWEST = 20  # the minimum number of messages for an order

@@ -96,9 +96,7 @@ class LoopGuess:
 
 @dataclass(frozen=True)
 class ModuleResult:
-    """The result of a function: its return value `bits`, unless it `trapped`. `outside` means a read beyond the
-    message.
-    """
+    """The return value `bits` of a function, unless it `trapped`. `outside` means a read beyond the message."""
 
     trapped: Term
     outside: Term

@@ -70,7 +70,7 @@ def told(property_: CompiledProperty, trace: Timed) -> tuple[str, ...]:
 
 
 def projected(property_: CompiledProperty, trace: Timed) -> list[bool]:
-    """Return whether each message passes, if a run judges it that has seen only the earlier messages that passed."""
+    """Return whether each message passes, judged by a run that has seen only the earlier messages that passed."""
     seen: Timed = []
     found = []
     for event in trace:

@@ -264,9 +264,10 @@ LOGICS: dict[str, Callable[[Random], Drawn]] = {
 def differing(
     logic: str, count: int, seed: int, *, each: int = _EACH, short: int | None = None
 ) -> Iterator[tuple[int, str]]:
-    """How many traces were judged of each property, and what differed; `count` are random traces, at least.
+    """Yield, for each property, how many traces were judged and the first difference, or an empty text.
 
-    `each` are the random traces of a property, and `short` its short ones: all, unless said.
+    Properties are drawn until `count` random traces are judged: `each` of a property, with `short` of its short
+    traces (all by default).
     """
     random = seeded(seed)
     left = count

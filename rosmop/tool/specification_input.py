@@ -64,9 +64,9 @@ def topics_of(specifications: Specifications) -> dict[str, str]:
 
 
 def read_definitions(program: CommandContext, files: Sequence[Path], folders: Sequence[Path]) -> Definitions:
-    """Return the definitions of ROS, of `msg/` beside the specifications, and of the folders, in this precedence.
+    """Return the definitions of ROS, of `msg/` beside the specifications, and of the folders.
 
-    Raises `SpecificationError` for a definition that cannot be read.
+    Later definitions replace earlier ones. Raises `SpecificationError` for a definition that cannot be read.
     """
     definitions = standard_definitions()
     for folder in definition_folders(program, files, folders):

@@ -58,7 +58,7 @@ _PLAIN_FUNCTIONS = 2  # of g0 to g4, in programs that also have other functions
 
 
 class Programs:
-    """Random programs: of numbers, of numbers and vectors, or of all types. Each has statements of numbers only."""
+    """Random programs of numbers, of numbers and vectors, or of all types. Some statements have only numbers."""
 
     def __init__(self, seed: int, kind: Kind, *, orders: bool = True) -> None:
         self._random = Random(seed)  # noqa: S311  draws examples, not keys

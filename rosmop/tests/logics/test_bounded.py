@@ -149,7 +149,7 @@ def rtamt_text(tree: Tree) -> str:
 
 
 def rtamt_knows(tree: Tree) -> bool:
-    """Whether the operators agree: in the other monitor, `xor` and `iff` are distances, and the time before holds."""
+    """Whether rtamt means the same: it takes `xor` and `iff` as distances, and `previously` as true at the start."""
     if tree[0] == "event":
         return True
     endless = tree[0] in PAST and tree[-1][1] is None
