@@ -175,8 +175,7 @@ def definitions_by_type(texts: dict[str, str]) -> Definitions:
 def local_file(recording: RecordingName) -> Iterator[Path]:
     """Open a block with the path of a recording, which is fetched if it is remote.
 
-    Raises `RecordingError`, even if a local file only changed after the command listed it, or during the
-    block.
+    Raises `RecordingError`, also after the block if a local file has changed since the command listed it.
     """
     with ExitStack() as opened:
         if recording.uri.startswith(SCHEME):

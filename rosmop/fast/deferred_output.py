@@ -43,10 +43,9 @@ class OutputLine(msgspec.Struct, tag=True, array_like=True, dict=True):
 
     @property
     def cost(self) -> int:
-        """Return the cost in instructions without strings.
+        """Return the cost in instructions, without the bytes of strings (one for each `BYTES_PER_INSTRUCTION`).
 
-        With one instruction for each `BYTES_PER_INSTRUCTION` bytes of its strings, it is at least the cost that the
-        form charges.
+        Together they are at least the cost that the form charges.
         """
         return OUTPUT_COST + 3 * (self.longest // BYTES_PER_INSTRUCTION + 1)  # formatting, joining, output
 

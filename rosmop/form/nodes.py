@@ -30,7 +30,7 @@ class FormNode(msgspec.Struct, frozen=True, tag=True, tag_field="node", array_li
 
 
 class Literal(FormNode, frozen=True):
-    """A constant. An array of numbers is given by its bytes in a message.
+    """A constant. The value of an array of numbers is its bytes as in a message.
 
     The type is void for None and for the name of a part of a time.
     """
@@ -564,7 +564,7 @@ class Pending(FormNode, frozen=True):
 class WriteBack(FormNode, frozen=True):
     """Write all assigned fields to the message or, if that faults, none. The variable `name` is for spliced bytes.
 
-    If the message was dropped or replaced, leave it unchanged; the event has happened.
+    A message that was dropped or replaced stays unchanged, although the event has happened.
     """
 
     site: int

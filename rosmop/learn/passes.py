@@ -39,7 +39,7 @@ class LearningStep(msgspec.Struct, frozen=True, tag=True):
 
 
 class TimeStep(LearningStep, frozen=True):
-    """Reads only times, and keeps at most `gaps` of each topic for the median."""
+    """Reads only times. The median of a topic's gaps is taken from at most `gaps` of them."""
 
     gaps: int
 

@@ -190,7 +190,7 @@ class MonitorInstance:
     def sending(self, *, passes: bool) -> list[SafeSender]:
         """Return the senders that send now: all while no message can be judged, else those of `starting` topics.
 
-        With `passes`, faults pass messages, even faults of the start.
+        With `passes` (`on_fault`), messages pass a monitor that failed to start.
         """
         if not self.safes or not self.enabled:
             return []
