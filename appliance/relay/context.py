@@ -1,4 +1,4 @@
-"""The objects that all parts of one relay share."""
+"""The objects that the parts of one relay share."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from appliance.relay.transport.memory import RelayMemory
 
 @dataclass(frozen=True, slots=True)
 class RelayContext:
-    """The loop, limits, reporter, hosts' memory, scratch area and monitors of one relay."""
+    """The shared objects of one relay."""
 
     loop: EventLoop
     limits: RelayLimits
@@ -23,7 +23,7 @@ class RelayContext:
     scratch: Scratch
     interceptor: Interceptor
     payer: Callable[[str], str]
-    """A function that returns the payer for the processor time of a host."""
+    """Returns the payer for the processor time of a host."""
 
     @classmethod
     def of(

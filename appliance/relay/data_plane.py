@@ -1,7 +1,7 @@
 """The data plane of a relay: carries out control's messages, and connects peers with topics and services.
 
-The data plane makes no decisions: a peer is served if the `GrantTable` has a grant for its address, its `callerid`,
-and the topic or service in its header. Withdrawing a grant cuts its connection.
+It makes no decisions: a peer is served while the `GrantTable` has a grant for its address, its `callerid`, and the
+topic or service in its header.
 """
 
 import socket
@@ -95,7 +95,7 @@ class DataPlane:
         self._sink = sink
 
     def take(self, message: messages.Message, descriptors: tuple[int, ...]) -> bool:
-        """Return True if the message must wait for specifications; later ones then wait behind it."""
+        """Carry out a message; return True if it must wait for specifications, with all later ones."""
         if self.interceptor.preparing:
             return True
         self._carry_out(message, descriptors)
@@ -270,7 +270,9 @@ class DataPlane:
                 subscriber.limit(flow)
 
     def _allowance(self, grant: messages.GrantInstalled) -> RateAllowance | None:
-        """Return an allowance that publishers' motions cannot use up for a guard's stop."""
+        """Return the allowance of a grant; None for own topics, so that motions cannot use up the allowance of a
+        guard's stop.
+        """
         node = self._table.node(grant.key)
         if node is not None and node.monitors:
             return None
@@ -314,9 +316,9 @@ class DataPlane:
             self._link.go_on()
 
     def _ask_for_latched(self, topics: frozenset[str] | None) -> None:
-        """Ask for messages that monitors held back, on these topics only (None: all).
+        """Request the messages that monitors held back, on these topics only (None: all).
 
-        Monitors of other topics would judge the same message twice.
+        On other topics, monitors would judge the same message twice.
         """
         for relayed in list(self.topics.values()):
             concerned = topics is None or relayed.topic in topics
@@ -363,7 +365,7 @@ class DataPlane:
         self._cut_members(relayed, reason)
 
     def _cut_members(self, relayed: RelayedTopic, reason: str) -> None:
-        """Close the connections one quantum at a time: there may be thousands."""
+        """Cut the subscribers, which may be thousands, one quantum at a time."""
         for member in relayed.members:
             member.cut(reason)
             if self._loop.over():
@@ -543,7 +545,7 @@ class DataPlane:
             self._by_grant.pop(peer.grant, None)
 
     def _refuse(self, asked: PeerGrant, sock: socket.socket, reason: str) -> None:
-        """Refuse the peer, whose connection counts for its host until it is closed."""
+        """Refuse the peer; its connection counts for its host until it is closed."""
         kind, key, name, host, caller_id = asked
         self._reporter.refused(key, (kind, name), host, caller_id, reason)
 

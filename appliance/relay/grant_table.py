@@ -1,8 +1,7 @@
 """The state that control wants: incarnations, publications, services, and the grants for them.
 
-Between `StateBegan` and `StateEnded`, all earlier facts stay valid, so a restart of control interrupts no connection.
-`StateEnded` withdraws the facts that were not stated again. If control dies before `StateEnded`, the next `StateBegan`
-starts over and withdraws nothing. Withdrawing an incarnation withdraws its publications, services and grants.
+Between `StateBegan` and `StateEnded`, earlier facts stay valid, so a restart of control interrupts no connection.
+`StateEnded` withdraws the facts that were not stated again. If control dies before it, nothing is withdrawn.
 """
 
 from collections import Counter
@@ -13,7 +12,7 @@ from appliance.quotas.pool import QuotaClass
 from appliance.relay.loop import ANYBODY, UNKNOWN
 
 PeerGrant = tuple[str, str, str, str, str]
-"""The grant of a peer: `topic` or `service`, key of the incarnation, name of the topic or service, host, caller id."""
+"""A peer's grant: `topic` or `service`, the incarnation's key, the name of the topic or service, host, caller id."""
 _Fact = tuple[str, ...]
 
 
@@ -29,7 +28,7 @@ class ServiceEndpoint:
 
 
 class GrantTable:
-    """Control's statements, in a table that can be restated."""
+    """The facts that control has stated."""
 
     def __init__(self) -> None:
         self._facts: dict[_Fact, messages.Message] = {}

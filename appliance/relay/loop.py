@@ -1,19 +1,19 @@
 """The relay's event loop: epoll and timers, single-threaded; long work runs in a thread `beside` it.
 
-asyncio costs a callback, a transport and a future for each read. Raw epoll halves the delay of a relayed message. The
-pump waits (`transport/pump.pyx`), and serves armed connections that are ready alone without Python.
+asyncio costs a callback, a transport and a future for each read; raw epoll halves the delay of a relayed message. The
+pump waits (`transport/pump.pyx`), and serves an armed connection that is ready alone without Python.
 
 Each descriptor has a *payer* for its processor time. The descriptors of a payer beyond the first `_DIRECT` are in a
-second epoll, so a payer with many ready descriptors cannot hide those of other payers. Payers are served by deficit
-round robin in its continuous form: the payer that has used the least processor time goes first. Idle time earns a
-credit of at most one quantum, and a new payer starts behind the others. Before a *costly* payer, which used much more
-than a quantum in its last turn, the other ready payers share one quantum.
+second epoll, so they cannot hide those of other payers. Payers are served by deficit round robin in its continuous
+form: the payer that has used the least processor time goes first. Idle time earns a credit of at most one quantum,
+and a new payer starts behind the others. Before a *costly* payer, which used much more than a quantum in its last
+turn, the other ready payers share one quantum.
 
 - A handler is never called for a descriptor that was unwatched earlier in the same turn. `discard` closes a socket
   only at the end of the turn, so its number cannot refer to another socket in that turn.
-- A turn calls the relay's own handlers first. Once payers have used `QUANTUM` in a turn, the turn serves no further
-  payer, except one costly payer. A payer that has used `QUANTUM` starts no further handler; the same holds for the
-  timers together. A handler with much to do stops when the quantum is `over`, and passes the rest to `later`.
+- A turn calls the relay's own handlers first. Once payers have used `QUANTUM` in a turn, it serves only one costly
+  payer more. A payer, or all timers together, starts no handler after `QUANTUM`. A handler with much to do stops when
+  the quantum is `over`, and passes the rest to `later`.
 - A handler that raises an exception has a defect: the process ends, and the supervisor starts another.
 """
 
@@ -112,14 +112,14 @@ class _Watched(NamedTuple):
 
 
 class WorkBeside(Protocol):
-    """Work that is done beside the loop."""
+    """Work in a thread beside the loop."""
 
     def discard(self) -> None:
-        """Wait for the end of the work, and discard its result."""
+        """Wait for the end of the work, and drop its result."""
 
 
 class _WorkThread:
-    """Work in a thread of its own, and the descriptor with which it wakes the loop."""
+    """Work in its own thread, and the descriptor with which it wakes the loop."""
 
     def __init__(self, loop: "EventLoop", work: Callable[[], T], done: Callable[[T], None]) -> None:
         sys.setswitchinterval(_SWITCH_SECONDS)
@@ -234,7 +234,9 @@ class EventLoop:
         return _WorkThread(self, work, done)
 
     def used(self) -> int:
-        """The running handler's processor time (ns), or the time since the first call if its start is unknown."""
+        """Return the running handler's processor time (ns), or the time since the first call if its start is
+        unknown.
+        """
         now = self._processor_time()
         if self._since == _UNKNOWN:
             self._since = now
@@ -246,7 +248,7 @@ class EventLoop:
     def charge(self, payer: str, used: int) -> None:
         """Charge a payer in addition to the payer of the running handler.
 
-        While no other descriptor is ready, the use takes time from no other host, so it leaves no debt.
+        If no other descriptor is ready, no other host loses time, so the use leaves no debt.
         """
         found = self._payer(payer)
         found.spent += used
@@ -363,7 +365,7 @@ class EventLoop:
         self._floor = max(self._floor, min(map(_spent, in_order)))
 
     def _serve(self, payer: _Payer) -> None:
-        """A payer's events and its postponed callbacks take turns in going first."""
+        """Call a payer's events and its postponed callbacks; each kind goes first in every second turn."""
         began = self._since
         if not payer.later:
             self._call_ready(payer, began)

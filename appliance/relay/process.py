@@ -38,7 +38,7 @@ def main(lifeline_fd: int, index: int, limits: RelayLimits | None = None) -> Non
 
 
 class RelayProcess:
-    """The `DataPlane` with the lifeline and the current control."""
+    """The data plane, with its lifeline and the link to the current control."""
 
     def __init__(self, lifeline: socket.socket, index: int, limits: RelayLimits) -> None:
         self._index = index
@@ -111,12 +111,12 @@ class RelayProcess:
 
 
 def descriptors_for(connections: int) -> int:
-    """Each connection of a peer may need a second connection."""
+    """Return the descriptors to reserve: each connection of a peer may need a second connection."""
     return 2 * connections + _DESCRIPTORS_BESIDE
 
 
 def fitted(limits: RelayLimits, descriptors: int) -> RelayLimits:
-    """Allow no more connections than descriptors, so that surplus peers are refused."""
+    """Return limits with no more connections than descriptors permit, so that surplus peers are refused."""
     possible = max(1, (descriptors - _DESCRIPTORS_BESIDE) // 2)
     if possible >= limits.connections:
         return limits

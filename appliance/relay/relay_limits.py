@@ -1,4 +1,4 @@
-"""The limits of the data plane. The defaults exceed a large robot (100 nodes, 1,000 topics)."""
+"""The limits of the data plane. The defaults exceed the needs of a large robot (100 nodes, 1,000 topics)."""
 
 from dataclasses import dataclass
 

@@ -1,9 +1,8 @@
 """Reports to control: connections, refusals, lost publishers, traffic. A new control gets the counts so far.
 
-- `TrafficReported` is sent at most once per `report_every`.
-- Equal refusals within that time become one message with a count, and at most `refusals` different ones are sent. So a
-  flood of unknown hosts can neither grow the relay nor fill the link.
-- At most `_KEPT` limits and `_KEPT` ended connections are kept without a link; further ones are only counted.
+- Equal refusals within `report_every` become one message with a count, and at most `refusals` different ones are
+  sent, so a flood of unknown hosts can neither grow the relay nor fill the link.
+- Without a link, at most `_KEPT` limits and `_KEPT` ended connections are kept; further ones are only counted.
 """
 
 from collections.abc import Callable, Mapping
@@ -31,7 +30,7 @@ _KEPT = 1000
 
 
 class Reporter:
-    """Reports to control, if there is one."""
+    """Sends reports over the link to control; without a link, keeps or counts them."""
 
     def __init__(self, limits: RelayLimits) -> None:
         self._limits = limits
@@ -104,7 +103,10 @@ class Reporter:
         row[1] += size
 
     def tick(self, traffic: Callable[[], list[TopicTraffic]], memory: Mapping[str, int]) -> None:
-        """`traffic` returns and resets the traffic counts; `memory` has the bytes held now in each pool."""
+        """Send the counts since the last tick.
+
+        `traffic` returns and resets the traffic counts; `memory` has the bytes held now in each pool.
+        """
         if self._link is None:
             self._silent += 1
             return

@@ -1,6 +1,6 @@
-"""Tap topics: send control a few messages, parsed, as subscribers get them; an operator requests this.
+"""Tap topics for operators: send control a few messages, as subscribers get them.
 
-The relay parses the messages, because it handles untrusted bytes anyway; control gets bounded data.
+The relay parses them, because it handles untrusted bytes anyway.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Check a peer's header for flaws, and compare it with the grant table.
 
-roscpp never tries again after an error header. Therefore a peer without a grant waits for `RelayLimits.grant_seconds`,
-and until a restatement ends.
+roscpp never retries after an error header, so a peer without a grant waits for `RelayLimits.grant_seconds`, and until
+a restatement ends.
 """
 
 from collections.abc import Mapping
@@ -15,7 +15,7 @@ from roswire.names import canonical_tool_id
 _REQUIRED = {"topic": ("md5sum", "callerid"), "service": ("md5sum", "callerid")}
 
 NOTHING = ("", "")
-"""The kind and name for a missing header, or for a header that names neither a topic nor a service."""
+"""The kind and name for a header that names neither a topic nor a service."""
 
 
 def asked_for(fields: Mapping[str, str]) -> tuple[str, str]:
@@ -63,8 +63,8 @@ def missing(table: GrantTable, key: str, host: str, fields: Mapping[str, str]) -
 def bound_name(table: GrantTable, key: str, host: str, fields: Mapping[str, str]) -> str | None:
     """Return the name under which a client calls a service; None if it may not.
 
-    A probe calls nothing, so a tool may look up a service under one name and probe under another (roswtf probes as
-    `/rosservice`). The service then sees the name of the lookup.
+    roswtf looks up a service under one name and probes it under another (`/rosservice`). A probe calls nothing, so it
+    gets the name of the lookup.
     """
     caller_id, service = fields["callerid"], fields["service"]
     if table.may_call(key, service, host, caller_id):

@@ -1,7 +1,7 @@
-"""The requests of service clients that need an operator's approval: control decides each of them.
+"""Hold the requests of service clients that need an operator's approval until control has decided.
 
-- A request reaches the monitors and the service only after control has approved it.
-- Control gets at most `MOST_OF_HOST` of a host at once, because it answers other hosts in the same thread.
+- A request reaches the monitors and the service only after its approval.
+- Control gets at most `MOST_OF_HOST` requests of a host at once, because one thread answers all hosts.
 - If control ends first, all open requests are refused.
 """
 
@@ -16,11 +16,11 @@ MOST_OF_HOST = 2
 _SHOWN = 4096
 
 Answered = Callable[[str], None]
-"""Gets the reason for refusing a request, or an empty text if it is approved."""
+"""Called with the reason for a refusal, or with an empty text if the request is approved."""
 
 
 class CallApprovals:
-    """The open questions, at most one for each client."""
+    """The requests that wait for control, at most one for each client."""
 
     def __init__(self, loop: EventLoop, send: Callable[[Message], None]) -> None:
         self._loop = loop
@@ -32,7 +32,7 @@ class CallApprovals:
         self._number = 0
 
     def ask(self, caller: tuple[str, str, str], type_: str, body: bytes, answered: Answered) -> int:
-        """Return the request's number. `caller` is the service, the host and the name of the client.
+        """Return the request's number. `caller` is the service, and the host and name of the client.
 
         `answered` is called once, in a later turn of the loop, unless the request is forgotten.
         """

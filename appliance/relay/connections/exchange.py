@@ -1,9 +1,8 @@
 """The requests and replies of one service connection after the headers, without sockets.
 
 - The service has at most one request at a time. A reply without a request is an error.
-- A client that does not read its replies gets no further request through, and the relay stops reading a client whose
-  request waits.
-- A request that needs an approval is held; it reaches monitors and the service only by `settle`.
+- While a client has an open request or does not read its replies, the relay reads nothing from it.
+- A request that needs an approval is held; only `settle` passes it to monitors and the service.
 """
 
 from collections import deque

@@ -1,7 +1,7 @@
 """Write the connection headers for peers, services and publishers.
 
-Headers are not trusted. The sender's name is replaced by the registered one. Fields that ROS does not define are
-dropped, because no rule decides on them.
+Received headers are not trusted: the sender gets its registered name, and fields that ROS does not define are
+dropped.
 """
 
 from collections.abc import Mapping
@@ -18,7 +18,7 @@ _TRUE = frozenset({"1", "true"})
 
 _OF_PEER = ("callerid", "topic", "service", *_OF_CLIENT, *_SWITCHES)
 _LONGEST = 1024
-"""The most characters of a header field; the relay keeps names, types and md5sums while the peer is connected."""
+"""The most characters of a header field, because the relay keeps some fields as long as the peer is connected."""
 
 
 def kept(fields: Mapping[str, str]) -> dict[str, str]:

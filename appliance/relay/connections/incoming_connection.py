@@ -1,7 +1,7 @@
 """Accepted connections until their headers are known, and refused connections.
 
-A refused peer gets a TCPROS header with `error=<reason>`. The relay shuts the connection for writing before closing
-it: closing a socket with unread data resets the connection, and the reason would be lost.
+A refused peer gets a TCPROS header with `error=<reason>`. Closing a socket with unread data resets the connection and
+loses the reason, so the relay first only shuts it for writing.
 """
 
 import socket
@@ -17,7 +17,7 @@ from roswire.tcpros import HeaderParser, encode_header
 
 
 class IncomingConnection:
-    """An accepted connection whose header is not complete, which costs one socket and the bytes received.
+    """An accepted connection whose header is not complete.
 
     `introduced(self)` or `failed(self, reason)` ends this stage; `rest` has the bytes after the header.
     """

@@ -1,8 +1,7 @@
-"""The header with which the relay introduces itself to a publisher: any type first, then the likely ones.
+"""Choose the header with which the relay introduces itself to a publisher: any type first, then the likely ones.
 
-rospy and roscpp accept `type=*`, `md5sum=*`; rosgo, roslibrust up to 0.9 and many nodes written by hand accept only
-their own type and md5sum, and some demand a `message_definition`. They refuse with an error header, or just close the
-connection.
+rospy and roscpp accept `type=*`, `md5sum=*`. rosgo, roslibrust up to 0.9 and many nodes written by hand accept only
+their own type and md5sum, some demand a `message_definition`, and some refuse by just closing the connection.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -27,7 +26,7 @@ class Introductions:
         self.fields: Mapping[str, str] = {"type": _ANY, "md5sum": _ANY}
 
     def refused(self) -> bool:
-        """Choose the next fields; return False if all are refused, after which the first ones are next again."""
+        """Choose the next fields; return False if all are refused. The next attempt then begins with the first ones."""
         self._refused.add(_key(self.fields))
         named = (claim for claim in self._claims() if _named(claim, "md5sum"))
         for claim in (*islice(named, _MOST), {}):

@@ -1,7 +1,7 @@
 """The relay's listening sockets, one for each incarnation, and the limits on connections.
 
-- The limits include peers that are not served yet. All unknown hosts share one quota (`RELAY_CONNECTIONS`). If all
-  connections are in use, a peer within its quota is accepted if `make_room` ends another connection.
+- All unknown hosts share one quota (`RELAY_CONNECTIONS`). If all connections are in use, a peer within its quota is
+  accepted if `make_room` ends another connection.
 - A flood of connections is accepted one quantum at a time, and charged to its hosts. When the process has no
   descriptor left, listening pauses.
 """

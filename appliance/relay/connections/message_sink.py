@@ -1,19 +1,21 @@
-"""Define what gets a copy of the messages that publishers send, such as memory that the supervisor holds."""
+"""The interface of consumers that get a copy of publishers' messages, such as memory that the supervisor holds."""
 
 from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
 
 class MessageStream(Protocol):
-    """The messages of one connection to a publisher. `keeps`: it needs the frames as the publisher sent them."""
+    """The messages of one connection to a publisher. If it `keeps` them, it needs the frames as the publisher sent
+    them.
+    """
 
     @property
     def keeps(self) -> bool: ...
 
     def write(self, frames: memoryview, messages: int, first: int, judged: int = 0) -> None:
-        """Take frames, of which `first` is the first one's number.
+        """Take frames; `first` is the number of the first one.
 
-        `judged` is the time by which monitors judged them; 0: now.
+        `judged` is the time for which monitors judged them; 0 means now.
         """
 
     def close(self) -> None:
@@ -24,8 +26,8 @@ class MessageSink(Protocol):
     """Gets the messages of all publishers."""
 
     def open(self, topic: str, host: str, header: Mapping[str, str]) -> MessageStream | None:
-        """Return None if the sink does not take the publisher's messages."""
+        """Return a stream for a publisher's connection, or None if the sink does not take its messages."""
 
 
 OpenSink = Callable[[Mapping[str, Any], int, Callable[[], int]], MessageSink]
-"""A function that makes a sink of its terms and a memory's descriptor, with the monitors' clock."""
+"""Makes a sink from its terms, a descriptor of its memory and the monitors' clock."""

@@ -1,8 +1,7 @@
 """The service calls of monitors, which the appliance's own node makes.
 
-The relay connects to the service's port as any client does. So the call passes through all checks, and its request and
-response are events of the service. Each call that does not get a successful response is reported once, as a fault of
-its monitor.
+The relay connects to the service's port as any client does, so all checks apply, and request and response are events
+of the service. A failed call is reported once, as a fault of its monitor.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ if TYPE_CHECKING:
 
 OwnAnswer = OwnServiceAnswered | MonitorCallAnswered | ApprovalAnswered
 MOST, MOST_OF_MONITOR = 64, 4
-"""The maximum number of calls under way in a relay, and of one monitor, so that none takes the calls of the others."""
+"""The most calls under way in a relay, and of one monitor, so that no monitor takes the calls of the others."""
 
 
 @dataclass(eq=False, slots=True)

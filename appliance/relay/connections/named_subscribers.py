@@ -1,9 +1,8 @@
 """Extra connections that show a publisher the names of its subscribers; only action topics need them.
 
 An action client waits until *its server* subscribes to its goals and cancellations, and recognizes the server by the
-`callerid` of the status messages (actionlib, `wait_for_server`). At most sixteen names of a host get an extra
-connection, the action's server first. The relay opens it after it has begun to serve the subscriber, so the subscriber
-gets everything that the publisher sends from then on.
+`callerid` of the status messages (actionlib, `wait_for_server`). An extra connection opens after the relay has begun
+to serve the subscriber, so the subscriber misses nothing that the publisher sends from then on.
 """
 
 from collections.abc import Callable, Collection, Mapping

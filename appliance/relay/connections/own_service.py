@@ -1,8 +1,8 @@
 """The services that the appliance itself offers (`std_srvs/Trigger`); control answers them through the relay.
 
-Control gets at most one call of a service from a host at a time, and at most one a second, so a single host cannot
-keep control busy. Further calls of that host get the same answer if it `repeats`. An answer about the holder of a
-group may be outdated by then, so they wait for the end of the second. If control ends first, the answer reports this.
+Control gets at most one call of a service from a host at a time, and one a second, so no host keeps control busy.
+Further calls of that host get the same answer if it `repeats`. Otherwise, such as about a group's holder, it may be
+outdated, so they wait for the end of the second.
 """
 
 from collections.abc import Callable
@@ -25,10 +25,7 @@ _SECOND = 1.0
 
 @dataclass(slots=True)
 class _Call:
-    """A host's last call of a service: the clients that wait, and when the second of its answer ends (0: not answered).
-
-    `reply` is the answer if it repeats.
-    """
+    """A host's last call of a service; `until` is the end of its second, or 0 before the answer."""
 
     asked: OwnServiceCalled
     waiting: list["OwnServer"] = field(default_factory=list)
@@ -37,7 +34,7 @@ class _Call:
 
 
 class OwnService:
-    """The clients and calls of the service that the appliance offers; `send` passes a message to a running control."""
+    """The calls of the appliance's own services; `send` passes a message to control if it is running."""
 
     def __init__(self, loop: EventLoop, send: Callable[[Message], None]) -> None:
         self._loop = loop

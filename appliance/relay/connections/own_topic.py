@@ -8,7 +8,7 @@ from roswire.tcpros import encode_frame
 
 
 class OwnTopicPublisher(Upstream):
-    """The upstream of one such topic; `header()` is None if no specification publishes it."""
+    """The upstream of one such topic; `header()` returns None while no specification or feature publishes it."""
 
     def __init__(self, topic: RelayedTopic, header: Callable[[], dict[str, str] | None]) -> None:
         self._topic = topic

@@ -1,8 +1,8 @@
 """Connections that are not served yet: the memory for their headers, and the order in which they are ended.
 
 - The first `_FREE` bytes of a header are not counted, so a flood of long headers does not keep out normal ones.
-- When a connection must end, connections of hosts without a grant come first, in order of their wait. A connection of
-  a host with a grant is ended only after it has waited `_PATIENCE` seconds.
+- Connections of hosts without a grant are ended first, the longest wait first. A connection of another host is ended
+  only after `_PATIENCE` seconds.
 """
 
 from collections.abc import Callable

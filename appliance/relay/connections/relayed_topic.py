@@ -2,14 +2,14 @@
 
 Subscribers stay connected when the upstream is lost, until control withdraws the publication: rospy never reconnects
 to an address that closed its connection, and roscpp waits up to 20 s. They are cut only if the publisher returns with
-another type, md5sum, definition or latching flag, because they must read the new header.
+another header (`_identity`), which they must read.
 
-A guard's stop comes over the connection of the appliance's own publication, so it can overtake motions that wait in a
-publisher's connection, in the queue or in the kernel. Therefore each publisher's subscribers also get it behind these
-motions, and until the publisher's next message, a later subscriber gets the stop and nothing before it (`supersede`).
+A guard's stop comes over another connection, so it can overtake motions that wait in this publisher's connection, in
+the queue or in the kernel. Therefore subscribers also get the stop behind these motions, and a later subscriber gets
+it instead of them (`supersede`).
 
-If the publisher's host has no memory left, a latched message is not kept. A later subscriber makes the relay reconnect
-to the publisher, once memory is free again. The other subscribers then get the message twice.
+If the publisher's host has no memory left, a latched message is not kept. Once memory is free, a later subscriber
+makes the relay reconnect to the publisher; the other subscribers then get the message twice.
 
 While *all* subscribers are behind, the relay stops reading the publisher for at most `queue_grace`, so a subscriber
 that the scheduler paused for some milliseconds loses nothing.
@@ -35,7 +35,7 @@ _SEEN_OF_A_HOST = 16  # subscribers of a host that a publisher may see by name, 
 
 
 class Upstream:
-    """The connection to the publisher; here, its methods do nothing."""
+    """The connection to the publisher, as its topic uses it. The methods of this base class do nothing."""
 
     def connect(self) -> None:
         """Connect, because the topic is wanted."""
@@ -67,7 +67,9 @@ class Upstream:
         """Apply the specifications that are in force now."""
 
     def silence(self, *, silent: bool) -> None:
-        """Take no message, and close the connection at once; or connect again if it is wanted."""
+        """If `silent`, close the connection at once and take no message; otherwise connect again if the topic is
+        wanted.
+        """
 
     def check_stall(self) -> None:
         """Cut a publisher that holds memory for a message and sends nothing of it."""
@@ -81,7 +83,7 @@ def _no_call() -> ModuleCall | None:
 
 
 Through = Callable[[Batch], Batch | None]
-"""A function that passes frames through monitors, and returns the passed ones or None."""
+"""Passes frames through monitors, and returns the frames that may pass, or None."""
 
 
 class TopicState(Enum):
@@ -95,7 +97,7 @@ class TopicState(Enum):
 
 @dataclass(frozen=True, slots=True)
 class _Monitoring:
-    """How messages pass monitors (`through` is None: past them), and whether monitors need the topic."""
+    """How a topic's messages pass monitors (`through` is None: past them), and whether monitors need the topic."""
 
     through: Through | None = None
     call: Callable[[], ModuleCall | None] = _no_call
@@ -105,8 +107,8 @@ class _Monitoring:
 class RelayedTopic:
     """A topic of an incarnation at `host`, with its subscribers; `share` counts the memory of its kept messages.
 
-    The upstream stays open while a subscriber, a monitor or a tap needs it, and during a reload or a restart a short
-    time longer.
+    The upstream stays open while a subscriber, a monitor or a tap needs it, and a little longer during a reload or
+    restart.
     """
 
     def __init__(
@@ -371,9 +373,9 @@ class RelayedTopic:
         self._pass_on(batch, divided=False)
 
     def supersede(self, data: bytes | None) -> None:
-        """Send a guard's stop behind all messages of this publisher, and repeat none of these.
+        """Send a guard's stop behind all messages of this publisher, and repeat none of them to later subscribers.
 
-        Without a stop, only repeat none of them: a monitor has published another command.
+        If `data` is None, send nothing: a monitor has published another command.
         """
         self._startup_replay.forget()
         if data is None or self._header is None:

@@ -1,8 +1,8 @@
 """The messages that wait for one slow subscriber: bounded, the oldest dropped first, never a torn frame.
 
-- Bytes leave in the order they came; a frame whose first byte was sent is sent whole.
-- The rest of that frame counts as memory of the host. The buffer behind it is less than `LITTLE` times its size.
-- After `trim`, at most `queue_messages` frames and `queue_bytes` wait besides the one being sent.
+- Bytes leave in order; a frame whose first byte was sent is sent whole.
+- The rest of that frame counts as memory of the host; its buffer is less than `LITTLE` times as large.
+- After `trim`, at most `queue_messages` frames and `queue_bytes` wait besides that frame.
 """
 
 from collections import deque

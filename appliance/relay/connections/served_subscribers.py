@@ -16,19 +16,19 @@ class TopicSubscriber(Protocol):
     caller_id: str
 
     missed: bool
-    """Whether the subscriber did not get the last message: its rate limit was used up, or the topic is withheld."""
+    """Whether the subscriber missed the last message, because of its rate limit or a withheld topic."""
 
     behind_since: float | None
     """When the queue first became so long that the subscriber is behind; None once it has caught up."""
 
     def greet(self, header: Mapping[str, str]) -> bool:
-        """Answer with the publisher's header; return False for a different type."""
+        """Send the publisher's header; return False if the subscriber has a different type."""
 
     def deliver(self, batch: Batch) -> int:
         """Send or queue the batch; return how many messages are dropped."""
 
     def accepted(self, batch: Batch, sent: int) -> int:
-        """Like `deliver`, after the pump has sent `sent` bytes (negative: an error)."""
+        """Like `deliver`, after the pump has sent `sent` bytes (negative: the number of an error)."""
 
     @property
     def descriptor(self) -> int:
@@ -36,7 +36,7 @@ class TopicSubscriber(Protocol):
 
     @property
     def exhausted(self) -> bool:
-        """Whether no more data should be kept for the subscriber's host."""
+        """Whether the memory of the subscriber's host is used up."""
 
     @property
     def full(self) -> bool: ...
@@ -53,8 +53,8 @@ class TopicSubscriber(Protocol):
 class ServedSubscribers:
     """The subscribers, in the order in which they came.
 
-    Once the quantum of a publisher is used up (`over`), the remaining subscribers get the batch in the publisher's
-    next turn, before more data is read.
+    When the publisher's quantum is used up (`over`), the other subscribers get the batch in its next turn, before
+    more data is read.
     """
 
     def __init__(self, over: Callable[[], bool]) -> None:

@@ -1,8 +1,7 @@
 """The connection from a service client, and the matching connection to the service.
 
 A service that never answers delays only this client. If the service cannot be reached, or dies before its header, the
-client gets an error header, as rospy and roscpp expect. If the service dies later, the client's connection ends, as in
-plain ROS.
+client gets an error header, as rospy and roscpp expect; later, its connection ends, as in plain ROS.
 """
 
 import errno
@@ -320,7 +319,7 @@ class ServiceClient:
 
 
 def _why(error: Exception) -> str:
-    """Omit the address of the service's node: the client must not learn it."""
+    """Return the error's name, without the address of the service's node, which the client must not learn."""
     return errno.errorcode.get(
         (error.errno if isinstance(error, OSError) else None) or 0, "it has no usable address"
     )

@@ -3,10 +3,10 @@
 A monitored topic connects to its publisher before the first real subscriber does. A publisher that waits for a
 subscriber and then sends one message would send it to the monitor alone.
 
-- Streams are not kept. If a publisher still sends `SPEECH` seconds after its first message, all kept messages are
-  dropped: a command must not be executed late.
+- Streams are not kept: if a publisher still sends `SPEECH` seconds after its first message, all kept messages are
+  dropped. A command must not be executed late.
 - The kept messages have no gap up to the latest one.
-- A subscriber that reconnects under the same name does not get the kept messages again.
+- A subscriber that reconnects under the same name does not get them again.
 """
 
 from appliance.relay.transport.frames import Batch

@@ -1,7 +1,7 @@
 """A subscriber's connection: the publisher's header, then frames.
 
 - No send blocks. Bytes that the socket does not accept wait in the subscriber's `SendQueue`.
-- A subscriber that sends anything after its header is cut: its connection is for the one topic of its grant.
+- A subscriber that sends anything after its header is cut: a connection is for one topic.
 """
 
 import errno
@@ -90,7 +90,9 @@ class Subscriber:
         return True
 
     def deliver(self, batch: Batch) -> int:
-        """Drop a large batch while the host's memory is exhausted, because its unsent rest could not be kept."""
+        """Send or queue the batch; while the host's memory is exhausted, drop a large one, whose unsent rest could
+        not be kept.
+        """
         if self._flow is not None:
             passing = self._limited(self._flow, batch)
             if passing is None:

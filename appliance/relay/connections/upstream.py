@@ -5,8 +5,7 @@
       +---linger------+------ refused, failed, lost: wait (doubling), then ask again --------+
 
 A publisher that turns the relay's header away is asked again at once with another header (`introductions`). The wait
-doubles even if a publisher sends its header and then breaks the protocol, and starts again only after a connection has
-flowed for more than `retry_longest` seconds.
+starts over once a connection has flowed for more than `retry_longest` seconds.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -31,7 +30,7 @@ _REASON = 1000  # most characters of a reported error; a publisher chooses the t
 
 
 class UpstreamState(Enum):
-    """The event that a connection to a publisher waits for. WAITING: for the next try, after a failure."""
+    """The event for which a connection to a publisher waits; in WAITING, the time of the next try after a failure."""
 
     IDLE = auto()
     ASKED = auto()
@@ -54,7 +53,7 @@ class _Attempt:
 class PublisherConnection(Upstream):
     """The upstream of one relayed topic; `objection(header)` returns why a publisher is refused.
 
-    `unsettled()`: subscribers may return after a reload or a restart.
+    `unsettled()` returns whether subscribers may still return after a reload or a restart.
     """
 
     def __init__(
@@ -164,9 +163,9 @@ class PublisherConnection(Upstream):
             self.ask()
 
     def recheck(self) -> None:
-        """Disconnect a publisher that the specifications now reject, or try a rejected one again.
+        """Disconnect a publisher that the specifications now reject, or retry a rejected one.
 
-        A quiet publisher keeps no earlier module of the monitors in memory.
+        Even a quiet publisher must release the monitors' previous module, so its connection is disarmed.
         """
         if self._reader is not None:
             self._reader.disarm()

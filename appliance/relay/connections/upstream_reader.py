@@ -2,7 +2,7 @@
 
     WATCHED --quantum used up, or frames undelivered--> LEFT --queued--> QUEUED --next turn--> WATCHED
 
-In WATCHED, the pump passes simple frames on automatically. In LEFT and QUEUED, nothing is read.
+In WATCHED, the pump passes simple frames on. In LEFT and QUEUED, nothing is read.
 """
 
 import os
@@ -21,7 +21,7 @@ from appliance.relay.transport.pump import JUDGED, RECEIVED, UNARMED, Left
 from roswire.errors import LimitExceededError, PeerError
 
 Lost = Callable[[str, Violation], None]
-"""Called with the reason for closing a connection to a publisher, and the kind of violation."""
+"""Called with the reason why the connection to a publisher is lost, and the kind of violation."""
 
 
 class _State(Enum):
@@ -32,7 +32,7 @@ class _State(Enum):
 
 
 class UpstreamReader:
-    """The open connection to a publisher. `lost` is called once."""
+    """The open connection to a publisher. `lost` is called at most once."""
 
     def __init__(
         self,

@@ -11,8 +11,8 @@ _MOST_TURNS = 64
 class BatchProgress:
     """The progress of a batch, received at `time` (nanoseconds).
 
-    `pieces` is the output so far. Messages from position `run` on are not in it yet; unchanged ones stay in their
-    buffer.
+    `pieces` is the output so far. Messages from position `run` on are not yet in it, so unchanged ones can stay in
+    their buffer.
     """
 
     __slots__ = (

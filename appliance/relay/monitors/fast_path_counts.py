@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 _Count = tuple[int, int, int]
-"""The number of occurrences, and the times of the first and the last one (nanoseconds)."""
+"""How often something occurred, and the times of the first and the last occurrence (nanoseconds)."""
 
 _NONE: _Count = (0, 0, 0)
 
@@ -26,7 +26,7 @@ class FastPathCounts:
         self.begun = False
         """Whether the observer will collect these counts."""
         self.changed: dict[int, int] = {}
-        """The number of changed messages by writers, added up by walks (`BatchOptions`)."""
+        """How many messages each set of writers changed, added up by the module (`BatchOptions`)."""
         self._call: ModuleCall | None = None
         self._clear()
 
@@ -47,7 +47,7 @@ class FastPathCounts:
     def take(self) -> tuple[list[_Count], dict[tuple[str, ...], int], list[_Count]]:
         """Return and reset three counts: drops by event, changed messages by the events that changed them, verdicts.
 
-        While the pump may go on counting, the counts stay `begun`.
+        While the pump may still count, the counts stay `begun`.
         """
         if self._call is not None:
             self._call.settle()

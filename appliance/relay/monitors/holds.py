@@ -10,9 +10,9 @@ if TYPE_CHECKING:
 
 
 def hold_begun(monitors: "MonitorSet", message: SpecificationsStated, switches: Mapping[str, bool]) -> None:
-    """Let monitors that began in their initial state hold their topics, if they moved or have no code.
+    """Let monitors that began in their initial state hold their topics, if they moved or cannot be built.
 
-    A disabled monitor guarded nothing, so it need not hold its topics.
+    A disabled monitor guarded nothing, so it does not hold its topics.
     """
     for monitor in monitors.monitors:
         if monitor.name not in monitors.began:

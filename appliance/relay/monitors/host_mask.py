@@ -14,7 +14,7 @@ class HostMask:
         self._known: dict[tuple[str, str], bool] = {}
 
     def hides(self, host: str) -> bool:
-        """A host without an IP address is in every network."""
+        """Return whether to hide the topic from this host; a host without an IP address counts as in every network."""
         return any(self._contains(network, host) for network in self._networks())
 
     def _contains(self, network: str, host: str) -> bool:

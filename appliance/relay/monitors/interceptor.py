@@ -1,10 +1,9 @@
 """The monitors of one relay: the specifications in force, and their effects on messages, requests and replies.
 
 - A fault of a monitor, or a defect of this program, drops only the current message, and is reported.
-- Refused specifications change nothing. A relay whose first specifications are refused blocks all messages.
+- Refused specifications change nothing, but a relay whose first ones are refused blocks all messages.
 - Specifications are replaced between two messages. A published message goes only through later monitors.
 - The clock of monitors never goes back or jumps. All messages of a batch have the same time.
-- A message that takes more than `budget` seconds of processor time is cut off, which is a fault.
 """
 
 from __future__ import annotations
@@ -61,8 +60,9 @@ class Interceptor:
     """The monitors of one relay. A topic without an enabled event bypasses them.
 
     `changed(topics)` is called when monitors may want other topics; `topics` are those whose messages may now be
-    judged differently (None: all). `holder(host)` is charged for the slices that a host's messages create, and
-    `payer(host)` for their processor time.
+    judged differently (None: all). `holder(host)` is charged for the slices that a host's messages create,
+    `payer(host)` for their processor time. A message that takes more than `budget` seconds of processor time is cut
+    off, which is a fault.
     """
 
     def __init__(
@@ -92,7 +92,7 @@ class Interceptor:
         self._time_budgets: dict[ObservationPoint, TimeBudget] = {}
         """The time budgets of points; `tick` removes those that have recovered."""
         self._prepared: dict[tuple[ObservationPoint, str], BatchOptions] = {}
-        """The prepared options for requests and replies, for a second, or until the next `preparation`."""
+        """The prepared options for requests and replies; they last a second, or until `preparation` changes."""
         self._timer: LoopTimer | None = None
         self._due: int | None = None
         self._loader = Loader(loop, self.loaded, self.holder_of)
@@ -293,7 +293,7 @@ class Interceptor:
         return self._objection(service, objection, monitors.service_type_of(service) is None)
 
     def _objection(self, resource: str, objection: str, only_tried: bool) -> str:
-        """Monitors in shadow mode just miss messages that they cannot read."""
+        """Return the objection, unless only monitors in shadow mode have it: they just miss what they cannot read."""
         self.shadow.understand(resource, objection)
         return "" if only_tried else objection
 
@@ -331,7 +331,7 @@ class Interceptor:
     # --- messages ---
 
     def time_budget(self, point: ObservationPoint) -> TimeBudget:
-        """Hosts with a common payer share one budget."""
+        """Return the budget of a point; hosts with a common payer share one."""
         if self._payer(point.host) != point.host:
             return self._shared_pace
         if point not in self._time_budgets:
@@ -380,9 +380,9 @@ class Interceptor:
         return ServiceVerdict(body)
 
     def tick(self) -> None:
-        """Send the counts of this second.
+        """Send the counts of this second; the next event of each kind is reported in full.
 
-        Prepared options stay valid after a second without an event: the next one of each kind is reported in full.
+        If there was no event, the options already ask for this, and stay valid.
         """
         self.observer.tick(self.now())
         self.shadow.tick()

@@ -1,4 +1,4 @@
-"""The points where monitors act: a publication or service, with a sender, and one of the sender's messages."""
+"""Identify what a monitor acts on: a publication or service with a sender, and one of the sender's messages."""
 
 import struct
 from collections import OrderedDict
@@ -30,13 +30,15 @@ NOWHERE = ObservationPoint("", "")
 
 
 class PointHolder(Protocol):
-    """An object that exists as long as its point is in use."""
+    """An object that keeps its point's names known as long as it exists."""
 
     point: ObservationPoint
 
 
 class Senders:
-    """Numbers of observation points for the senders of earlier messages; the last `_SENDERS` are known."""
+    """Numbers observation points, so that the senders of earlier messages can be named; the last `_SENDERS` are
+    known.
+    """
 
     def __init__(self) -> None:
         self._points: OrderedDict[int, ObservationPoint] = OrderedDict()
@@ -68,9 +70,9 @@ class Senders:
 
 
 class ObservedMessage:
-    """One message of a publication: its position in the batch, and the received start of its header if it has one.
+    """A message of a publication: its position in the batch, and the first bytes of its header, if it has one.
 
-    Without a progress (None), `position` is the number of the message in its publication.
+    If `progress` is None, `position` is the message's number in its publication.
     """
 
     __slots__ = ("_head", "_position", "_progress")

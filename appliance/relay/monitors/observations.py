@@ -1,10 +1,10 @@
 """Report monitors' actions to control: the first event of each kind in a second in full, the others as counts.
 
-- Counts are complete for each monitor, kind and distinction (the category of a verdict, the text of a log line without
-  its numbers), but at most `_DISTINCT` distinctions are separate.
-- The event with a count has the last text, if the texts differ at most in numbers.
+- Counts are complete for each monitor, kind and distinction (the category of a verdict, the text of a log line
+  without its numbers), but at most `_DISTINCT` distinctions are separate.
+- A count has the last text, if the texts differ at most in numbers.
 - Counters are sent after the events that they count.
-- Without a link to the control process, at most `_KEPT` events wait; only the number of further events is reported.
+- Without a link to control, at most `_KEPT` events wait; only the number of further events is reported.
 """
 
 from collections import deque
@@ -104,9 +104,9 @@ class Observations:
         size: int = 0,
         observed: ObservedMessage | None = None,
     ) -> None:
-        """Note an event at `point`, concerning the `observed` message.
+        """Report an event about the `observed` message, or count it if its kind was already reported in this second.
 
-        `shared` is the detail for the count of further events, which has no text with `only_number`.
+        `shared` is the detail of the count; with `only_number`, the count has no text.
         """
         text = text[:LONGEST_TEXT]
         repeated = self._repeated(kind, monitor, point, distinction)

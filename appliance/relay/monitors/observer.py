@@ -1,7 +1,6 @@
 """Count the actions of monitors, and turn outcomes into reports to control (`observations`).
 
-A change by several monitors is one record under the last of them, and names them all. It counts once for each of these
-monitors, and once for the topic.
+A change by several monitors is one record under the last of them, but counts for each of them.
 """
 
 from __future__ import annotations
@@ -43,7 +42,7 @@ class _Counters:
 
 
 class Observer:
-    """Counts all actions of monitors. For monitors in shadow mode, `prefix` is before the kind."""
+    """Counts and reports actions of monitors. The kinds of reports begin with `prefix`, which marks shadow mode."""
 
     def __init__(
         self,
@@ -82,7 +81,7 @@ class Observer:
         return self._observations.was_reported("verdict", verdict.monitor, point, named(verdict))
 
     def asks(self, verdict: Verdict, source: int) -> bool:
-        """At most `_EXPLAINED` verdicts a second are reported in full and need an explanation."""
+        """Return whether to explain a verdict: at most `_EXPLAINED` a second, of those reported in full."""
         point = self.senders.point(source) or NOWHERE
         kind = f"{self._prefix}verdict"
         if (
@@ -100,7 +99,7 @@ class Observer:
     def report(
         self, outcome: Outcome, point: ObservationPoint, observed: ObservedMessage | None = None
     ) -> None:
-        """Publish the messages of an outcome first: a stop waits for no report."""
+        """Publish an outcome's messages before reporting anything: a stop must not wait for a report."""
         self._send(outcome)
         self._report(outcome, point, observed)
 

@@ -2,8 +2,8 @@
 
 - Their actions reach no message, subscriber or monitor in force; they are only reported.
 - They take at most `SHARE` of the processor's time, and the loop continues between slices.
-- At most `_MOST_BYTES` of messages wait for them. If messages are missed, the monitors count as incomplete. A monitor
-  that exceeds its instructions, or has a defect, also counts as incomplete, and rests until the second is over.
+- If too many messages wait, some are missed, and the monitors count as incomplete. So does a monitor that exceeds its
+  instructions or has a defect; it rests until the second is over.
 - Ticks and deadlines are processed after the messages that arrived before them.
 """
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from rosmop.run.engine import MonitorSet, ShadowCopy
 
 SHARE = 0.2
-"""The seconds of processor time in a second."""
+"""Seconds of processor time in a second."""
 
 _SLICE = 0.002  # seconds of processor time
 _LAST_SLICE = 0.02  # seconds, before other monitors take over their state

@@ -1,11 +1,11 @@
 """Keep the state of a relay's monitors in memory that outlives the process, and read the state of earlier processes.
 
-- The state after a batch is written before any message of the batch is passed on, and before a monitor's message is
-  published. Therefore no subscriber sees an effect of a state that can be lost.
+- A state is written before a message that depends on it is passed on or published, so no subscriber sees an effect of
+  a state that can be lost.
 - A state is reused only if it was written since the machine started, or before an orderly end of the appliance, and
   the machine's clock was not set since. Otherwise, it is `lost`, with the reason.
 - The times in a state are ages: after a takeover, the clock of monitors continues where the other appliance stopped
-  it, so a difference between the clocks of the machines neither shortens nor extends any bound.
+  it, so different clocks of the machines change no bound.
 """
 
 from collections.abc import Iterator, Sequence
@@ -25,10 +25,10 @@ if TYPE_CHECKING:
 _UNREADABLE = "its saved state cannot be read"
 _NO_ROOM = "the states of all monitors together exceed the limit"
 LARGEST_COPY = 1 << 20
-"""The bytes of the largest state that is copied to the other appliance while it changes."""
+"""The largest state, in bytes, that is copied to the other appliance while it changes."""
 
 LEAVING = "the other appliance takes over"
-"""Why a relay drops all messages whose appliance hands over."""
+"""Why a relay drops all messages while its appliance hands over."""
 
 _NO_MEMORY = "the previous relay process exited, and the state of monitors is not kept"
 _STEP = 1_000_000_000  # nanoseconds; a larger difference means that the clock was set
@@ -81,7 +81,9 @@ class _Entry:
 
 
 class StateKeeper:
-    """The state of one relay in `own`; if `own` is empty at the start, that of the `earlier` memories."""
+    """Keeps the state of one relay in `own`, and recovers it from there or, if `own` is empty, from `earlier`
+    memories.
+    """
 
     def __init__(self, given: StateGiven, own: Memory, earlier: Sequence[Memory] = ()) -> None:
         self._given = given
@@ -166,7 +168,7 @@ class StateKeeper:
         self._lay_out()
 
     def keep(self, channel: str) -> bool:
-        """Return False if states are now at other places (see `cells_place`)."""
+        """Write the state of the channel's monitors; return False if states have moved (see `cells_place`)."""
         entry = self._by_channel.get(channel)
         return entry is None or self._keep(entry)
 
@@ -240,7 +242,7 @@ class StateKeeper:
 
 
 def state_left(message: StateWanted, keeper: StateKeeper | None) -> StateLeft:
-    """Answer `StateWanted`. A state that is too large is not copied."""
+    """Return the answer to `StateWanted`; the copy of a state that is too large is empty."""
     if not message.copy:
         return StateLeft(message.number, b"" if keeper is None else keeper.content())
     content = keeper.changed_content(full=message.full) if keeper is not None else b""
@@ -250,9 +252,9 @@ def state_left(message: StateWanted, keeper: StateKeeper | None) -> StateLeft:
 
 
 def continued(message: SpecificationsStated, keeper: StateKeeper | None, now: int) -> int:
-    """Return the time to add to the clock of monitors before their first start.
+    """Return the nanoseconds to add to the clock of monitors before their first start.
 
-    The clock continues where the other appliance stopped it, or the relay that this one replaces.
+    The clock continues where the other appliance, or the relay that this one replaces, stopped it.
     """
     shift = 0
     if message.left:

@@ -2,10 +2,10 @@
 
 The file contains a magic number, a byte with the valid half (1 or 2; 0: none), and two halves. A half contains a
 `head` (the writer's data), a table, and *sections*. A section contains two places for the `base` state of a group of
-monitors, two for its `cells`, and one byte that marks the valid places. A writer writes what is invalid, and then the
-byte. Stores of one thread become visible in order, so a process killed at any point leaves the state either before or
-after a write. A power cut can lose this order, so the reader uses the head to check whether the machine has restarted
-since.
+monitors, two for its `cells`, and one byte that marks the valid places. A writer changes only invalid places, and
+then the byte. Stores of one thread become visible in order, so a process killed at any point leaves the state before
+or after a write. A power cut can lose this order, so the reader uses the head to check whether the machine has
+restarted.
 """
 
 import mmap
@@ -28,7 +28,7 @@ _FLAGS = 16  # bytes before the places of a section: the section's byte, and fro
 _LEAST_ROOM, _MOST_SPARE = 256, 8192
 
 Memory = Any
-"""A memory that slicing reads and writes: a view of a mapped file."""
+"""A view of a mapped file, or other memory that is read and written by slices."""
 
 
 class StoredState(NamedTuple):
@@ -93,7 +93,7 @@ class StateMemory:
         return self._sections[section].has_cells
 
     def cells_place(self, section: int) -> CellsPlace:
-        """The place is valid until the next `lay_out`."""
+        """Return the places where the pump writes a section's cells; they are valid until the next `lay_out`."""
         return self._sections[section].cells_place
 
 
@@ -152,7 +152,7 @@ def mapped(descriptor: int, *, writable: bool) -> memoryview:
 
 
 def read(memory: Memory) -> StoredState | None:
-    """Return None if nothing is valid. Raises `ValueError` if the memory is malformed."""
+    """Return the valid state, or None if there is none. Raises `ValueError` if the memory is malformed."""
     if len(memory) < _START or bytes(memory[:_ROOT]) != MAGIC or memory[_ROOT] == 0:
         return None
     half = (len(memory) - _START) // 2

@@ -1,8 +1,7 @@
 """The processor time that the next message of a publication, or of a service's client, may take.
 
-After a message is cut off, messages get a tenth of the budget for a time, because their sender may send more such
-messages. Hosts that the policy does not name share one budget, because each of many addresses could send such a
-message.
+After a message is cut off, messages get a tenth of the budget for some seconds, because more may follow. Hosts that
+the policy does not name share one budget, because each of many addresses could send such a message.
 """
 
 from rosmop.run.outcomes import FUEL_PER_SECOND
@@ -25,7 +24,7 @@ class TimeBudget:
         return _REDUCED if now < self._until else 1.0
 
     def fuel(self, now: int, budget: float) -> int:
-        """Return a number of instructions; `budget` is in seconds."""
+        """Return the most instructions for one message; `budget` is in seconds."""
         return int(FUEL_PER_SECOND * budget * self.part(now))
 
     def cut(self, now: int) -> None:

@@ -1,7 +1,7 @@
 """The path of one publication's messages through the monitors.
 
-The fast path takes many messages of a batch together if none needs a report. A message that comes alone loses most
-time to cold caches, so the options of batches stay prepared until something changes (`Interceptor.preparation`).
+The fast path takes many messages of a batch together if none needs a report. A single message loses most time to cold
+caches, so the options stay prepared until something changes (`Interceptor.preparation`).
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class TopicPipeline:
         interceptor.senders.hold(self._source, self)
 
     def through(self, batch: Batch) -> Batch | None:
-        """Keep the monitors' state before returning the frames to pass on."""
+        """Return the frames to pass on, after the monitors' state has been kept."""
         judged = self._judged(batch)
         self._interceptor.keep(self.point[1])
         return judged

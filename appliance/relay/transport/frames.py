@@ -1,10 +1,10 @@
 """Find whole TCPROS frames in received bytes; every relayed message passes through this module.
 
 A frame is a 4-byte little-endian length, followed by that many bytes. All whole frames of a read become one `Batch`,
-without copying them. Data sent to subscribers always ends with a whole frame.
+without copying them.
 
-- Small frames are received into a scratch area that all receivers share. If monitors run, this area is in the memory
-  of the monitors' WebAssembly module.
+- Small frames are received into a scratch area that all receivers share. If monitors run, it is in the memory of
+  their WebAssembly module.
 - A frame larger than `LARGE` gets its own area. An area of up to 8 MiB is reused for the next large frame, unless a
   queue has kept it or memory is short. A larger area is anonymous memory, so a declared length that is never sent
   costs only address space.
@@ -47,8 +47,8 @@ _unpack_length = _LENGTH.unpack_from
 class Batch:
     """Consecutive whole frames in a buffer that is reused unless they are kept.
 
-    `last` is the offset of the last frame (None: not known yet). `stride` is the size of each frame if all are known
-    to be equally long, else 0. `first` is the number of the first frame in its publication. `judged` is the time when
+    `last` is the offset of the last frame (None: not known yet), `stride` the size of each frame if all are known to
+    be equally long, else 0, and `first` the number of the first frame in its publication. `judged` is the time when
     monitors got the frames (0: never), and `answer` the result of their module if the pump has called it. `left` is
     the number of messages at the end that monitors had no time for.
     """
@@ -327,7 +327,7 @@ class FrameReceiver:
 
 
 def equal_frames(buffer: memoryview, end: int) -> tuple[int, int]:
-    """Return the size and number of many equally long frames, else (0, 0).
+    """Return the size and number of the frames if many of equal length follow each other, else (0, 0).
 
     Comparing all lengths at once is cheaper than going from frame to frame.
     """

@@ -13,9 +13,9 @@ from appliance.relay.loop import READ, WRITE, EventLoop, LoopTimer
 class LoopLink:
     """One end of a lifeline or link. `ended(reason)` is called once, when the link fails.
 
-    A message of another link, or a backlog beyond its limit, ends the link as if the other end had died. A restatement
-    of thousands of messages is carried out one quantum at a time. If `received` returns True, that message and later
-    ones wait for `go_on`, and nothing more is read until then.
+    A message of another link, or a backlog beyond its limit, ends the link as if the other end had died. A
+    restatement is carried out one quantum at a time. If `received` returns True, that message and later ones wait for
+    `go_on`, and nothing more is read until then.
     """
 
     def __init__(
@@ -89,7 +89,7 @@ class LoopLink:
             self._watch()
 
     def _take_in(self) -> None:
-        """Carry out arrived messages before reporting the end."""
+        """Receive messages; if the link has ended, carry out all that arrived before reporting it."""
         try:
             self._arrived += self._channel.receive()
         except (ChannelClosedError, ValueError) as error:

@@ -2,10 +2,10 @@
 
 A frame is charged to the host that sends it, a queue to the slow host. Invariants, besides those of `Pool`:
 
-1. A host gets no more memory once it holds as much as is free. So each of *n* greedy hosts gets 1/(*n* + 1) of the
+1. A host gets no more memory once it holds as much as is free, so each of *n* greedy hosts gets 1/(*n* + 1) of the
    pool, and the same amount stays free for the next host.
-2. Memory beyond a host's quota is freed when the relay next handles data of that host, or at the next check (once a
-   second). A latched message is dropped when a host that holds less memory needs to latch one.
+2. Memory beyond a host's quota is freed when the relay next handles its data, or within a second. A latched message
+   is dropped when a host that holds less memory needs to latch one.
 """
 
 from collections.abc import Callable

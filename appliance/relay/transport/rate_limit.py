@@ -1,14 +1,14 @@
 """Apply the policy's rate limits, in messages and bytes per second. No I/O; callers pass the time.
 
-A message passes while neither unit is used up, even if the message is larger than the rest; later messages pay for the
-excess. So large messages pass, and the average holds.
+A message passes while neither unit is used up; if it is larger than the rest, later messages pay for the excess. This
+admits large messages and keeps the average.
 
 1. Each holder of a shared limit gets an equal part, in its own store. When a store is full, its overflow goes to the
    others in equal parts (max-min fairness); when all are full, it goes to a common store.
-2. A holder takes from its own store first, then from the common store. So a holder within its equal part loses nothing
-   because of others, and the others can use what it leaves.
-3. A store is below zero only after its holder sent a message that was too large. If that holder leaves, its debt stays
-   in the common store, and the limit is kept until the debt is paid, so reconnecting does not help.
+2. A holder takes from its own store first, then from the common store, so a holder within its part loses nothing
+   because of others, and others can use what it leaves.
+3. Only a message that was too large makes a store negative. If its holder leaves, the debt stays in the common store
+   until it is paid, so reconnecting does not help.
 """
 
 from collections.abc import Callable, Iterator
@@ -112,7 +112,7 @@ class SharedRateLimit:
         self._holders = 0
 
     def set(self, limit: FlowLimit, now: float) -> None:
-        """The unused amount of the old limit carries over."""
+        """Change the limit; the unused amount carries over."""
         if limit != self._limit:
             self._fill(now)
             self._limit = limit
@@ -120,7 +120,7 @@ class SharedRateLimit:
             self._bytes.set(limit.bytes)
 
     def of(self, name: str) -> "RateAllowance":
-        """The name counts as a holder while the allowance is referenced."""
+        """Return the allowance of a name, which counts as a holder while the allowance is referenced."""
         share = self._shares.get(name)
         if share is None:
             share = self._shares[name] = RateAllowance(self, name)
@@ -144,7 +144,7 @@ class SharedRateLimit:
         return bool(self._shares)
 
     def paid(self, now: float) -> bool:
-        """Whether everything used has been refilled, so that a new limit would not differ."""
+        """Return whether everything used has been refilled, so that a new limit would not differ."""
         self._fill(now)
         return self._messages.full and self._bytes.full
 

@@ -1,4 +1,4 @@
-"""The options of the relay's sockets, and a buffered socket that never blocks."""
+"""Set the options of the relay's sockets, and buffer writes without blocking."""
 
 import contextlib
 import errno
@@ -56,8 +56,8 @@ def begin_connect(host: str, port: int) -> socket.socket:
 class BufferedSocket:
     """A connected (or connecting) socket with a write buffer, for everything except the fast path.
 
-    `received(data)` gets b"" once at the end of the connection. `drained()` is called whenever the kernel has accepted
-    the last waiting byte, and `broken(reason)` once. After `close` or `take`, no callback is called.
+    `received(data)` gets b"" once at the end of the connection, `drained()` is called whenever the last waiting byte
+    has left, and `broken(reason)` once. After `close` or `take`, no callback is called.
     """
 
     def __init__(
@@ -109,7 +109,7 @@ class BufferedSocket:
             self._watch()
 
     def finish(self) -> None:
-        """Shut the socket for writing; the peer sees the end after the waiting bytes."""
+        """Shut the socket for writing; no bytes may wait, except in the kernel."""
         with contextlib.suppress(OSError):
             self._socket.shutdown(socket.SHUT_WR)
 
