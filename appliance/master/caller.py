@@ -1,4 +1,4 @@
-"""Define the caller of RVMaster or of a proxy endpoint, and the answer to it."""
+"""The caller of RVMaster or of a proxy endpoint, and the answer to it."""
 
 from dataclasses import dataclass
 from typing import NamedTuple

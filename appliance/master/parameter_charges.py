@@ -3,8 +3,8 @@
 A *place* is a key where the owner changes. Parameters that no host has set belong to the appliance (loopback).
 
 1. The sum of the weights of all places is the weight of the tree.
-2. A place and the nearest place above it have different owners, so there are few places even for many parameters.
-3. Every place except the root is a key of the tree. The journal stores the place; it is removed with its key.
+2. A place and the nearest place above it have different owners, so even many parameters have few places.
+3. Every place except the root is a key of the tree, and is removed from the journal with its key.
 """
 
 from collections import Counter

@@ -24,11 +24,11 @@ from roswire.xmlrpc import Value
 class ParameterMirror:
     """A copy of the ROS master's parameter tree, changed only after the ROS master has accepted the change.
 
-    `weight` is the approximate size of the whole tree in an answer to `getParam("/")`. Size and depth are limited,
-    because otherwise the ROS master could not send its tree: it would fail for all nodes.
+    `weight` is the approximate size of the whole tree in an answer to `getParam("/")`. It and the depth are limited,
+    because otherwise the ROS master could send its tree to no node.
 
-    `note(key, value)` is called for each change of one parameter (None: it was deleted); `unnoted` is set by a change
-    of the whole tree, until its owner has stored the tree.
+    `note(key, value)` is called for each change of one parameter (None: it was deleted); a change of the whole tree
+    sets `unnoted`, until its owner has stored the tree.
     """
 
     def __init__(
@@ -69,9 +69,9 @@ class ParameterMirror:
     def reserve(self, key: str, weight: int, host: Address) -> "Reservation":
         """Reserve room for a value that a host is about to set. Raises `LimitReachedError`.
 
-        A value that is not larger than the present value always has room, charged to this host within its quota, or
-        otherwise to the previous owner. So a host can always correct a parameter, and two hosts together cannot exceed
-        their quotas.
+        A value that is not larger than the present one always has room, charged to this host within its quota,
+        otherwise to the previous owner. So a host can always correct a parameter, and two hosts together cannot
+        exceed their quotas.
         """
         pool = self.charges.pool
         parts, before = self._place_of(key)

@@ -1,7 +1,7 @@
 """Publish reports of monitors on `/rosout`, if configured.
 
-Only the first report of each kind in a second has its text, as the relay sends it. At most `_A_SECOND` reports are
-published per second, with the number of omitted reports. As with a node's own logger, DEBUG is omitted.
+At most `_A_SECOND` reports are published per second, with the number of omitted ones. Like a node's own logger, this
+omits DEBUG.
 """
 
 from collections.abc import Callable

@@ -1,7 +1,7 @@
 """Define a row of a table of calls, and an attempt to make such a call.
 
-A call is decided by canonical values: names are resolved as in the ROS master, also the caller's, because some client
-libraries send `//name`.
+A call is decided by canonical values: names are resolved as in the ROS master, including the caller's, because some
+client libraries send `//name`.
 """
 
 import enum
@@ -27,7 +27,7 @@ T = TypeVar("T")
 class CallParameter(Generic[T]):
     """A parameter of a call, with the conversion to its canonical value.
 
-    The audit record of a command includes the `recorded` parameters, which are resolved names. In a call with a kind,
+    The `recorded` parameters are resolved names. The record of a command includes them, and in a call with a kind,
     the first of them is the resource.
     """
 
@@ -304,7 +304,7 @@ class Attempt:
 
     @property
     def about(self) -> dict[str, str]:
-        """Return the recorded parameters of a command, because its request has only the call's name."""
+        """Return the recorded parameters of a command; its request has only the call's name."""
         if self.call.category is not Category.COMMAND:
             return {}
         return {

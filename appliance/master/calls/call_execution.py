@@ -1,11 +1,11 @@
 """Carry out a call, from its parameters to its answer: canonicalise → decide → record → perform.
 
-1. A registering call waits for earlier registering calls of the same name, and a write of a parameter for earlier
-   writes of overlapping keys. No other call waits for a turn. Otherwise, two hosts could register a free name at the
-   same time, or another write could change the tree that a decision depends on.
-2. A call that had to wait is decided again in its turn. If a call did not wait, no other code ran after its decision.
-3. If a new policy comes into force while a call is carried out, the caller's rights are decided again afterwards. The
-   revocation by the new policy could not see the result of the call yet.
+1. A registering call waits for earlier ones of the same name, so two hosts cannot register a free name at the same
+   time. A write of a parameter waits for earlier writes of overlapping keys, which could change the tree that the
+   decision depends on. Other calls take no turn.
+2. A call that had to wait is decided again in its turn. If it did not wait, no other code ran after its decision.
+3. If a new policy comes into force while a call is carried out, the caller's rights are decided again afterwards,
+   because the revocation did not see the result of the call.
 4. An error becomes a record and a well-formed answer, never an exception.
 """
 
@@ -61,7 +61,7 @@ class KeyTurns:
         return len(self._turns)
 
     def alone(self, keys: Collection[str]) -> "KeyTurn":
-        """Wait for earlier calls with equal or overlapping keys."""
+        """Return a turn, which waits for earlier calls with equal or overlapping keys."""
         return KeyTurn(self._turns, _ended(keys))
 
     def of_name(self, name: str) -> "KeyTurn":
@@ -118,7 +118,7 @@ def _meet(mine: tuple[str, ...], others: tuple[str, ...]) -> bool:
 
 
 class ServedRequest(NamedTuple):
-    """A request, the table of calls of its listener, and its bulk."""
+    """A request, and the table of calls of its listener; `bulk` holds its turn for large values."""
 
     table: Table
     caller: Caller
@@ -187,8 +187,8 @@ class Execution:
     async def answer_run(self, visit: ServedRequest, run: Sequence[Attempt], weight: int) -> list[Value]:
         """Decide reads and writes of parameters one by one, and carry them out as if in order.
 
-        No call of the run reads a parameter that an earlier call writes, so all reads are carried out first. Their
-        answers have about `weight` bytes.
+        No read depends on an earlier write of the run, so all reads are carried out first. Their answers have about
+        `weight` bytes.
         """
         if weight >= self.large:
             await visit.bulk.take()
@@ -212,7 +212,7 @@ class Execution:
     async def _turn(self, attempts: Sequence[Attempt]) -> AsyncIterator[bool]:
         """Wait until no other call writes these parameters; yield whether other code may have run.
 
-        A subscription also takes a turn, so its node gets the value in the answer, and then every later write.
+        A subscription also takes a turn, so its node misses no write after the value in the answer.
         """
         keys = [attempt.resource for attempt in attempts if attempt.call.kind is Kind.PARAMETER]
         host, values = attempts[0].caller.peer.host, [attempt.value for attempt in attempts]

@@ -39,7 +39,7 @@ class Introspection:
         return [*sorted(MASTER_CALLS), "system.multicall"]
 
     async def method_help(self, _caller: Caller, name: str) -> str:
-        """`system.methodHelp(method_name)`: the first line of the call's documentation."""
+        """`system.methodHelp(method_name)`: the call's documentation."""
         call = MASTER_CALLS.get(name)
         return (call.method.perform.__doc__ or "").replace("`", "") if call is not None else ""
 

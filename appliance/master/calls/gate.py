@@ -30,7 +30,7 @@ class NameConflict:
 
 @dataclass(frozen=True, slots=True)
 class HostLimits:
-    """The limits of one host, and of all hosts together, in the registry."""
+    """The most registrations of one host, and of all hosts together."""
 
     registrations: int = NAMES.bounds.host
     registrations_in_all: int = NAMES.bounds.whole
@@ -104,7 +104,7 @@ class CallGate:
     def is_own_subscriber(self, caller: Caller, topic: str) -> bool:
         """Return whether an own node calls a proxy endpoint for a topic to which it is subscribed.
 
-        Unlike RVMaster, proxy endpoints have no separate listener for the appliance's own nodes.
+        Proxy endpoints have no separate listener for own nodes.
         """
         holder = self._registry.holder(caller.caller_id) if caller.peer.here else None
         return holder is not None and holder.own and (Kind.SUBSCRIPTION, topic) in holder.registrations
@@ -125,7 +125,7 @@ class CallGate:
         return None
 
     def _too_many_names(self, host: Address) -> Decision | None:
-        """Hosts that the policy names as a network count as one."""
+        """Deny a host with too many registrations; hosts that the policy names as one network count as one."""
         registrations = self._registry.registrations
         left = max(0, self._limits.registrations_in_all - registrations)
         if registrations < _TIMES_THE_REST * left:
@@ -173,7 +173,7 @@ def _unreachable(caller: Caller, api: ApiUri) -> Decision | None:
 
 
 def contested(contest: NameConflict, probe: Probe | None) -> Decision:
-    """Deny the call if the probe is missing or outdated."""
+    """Return the decision on a contested name: denied unless a probe of this holder found that it is gone."""
     holder = contest.holder
     if probe is not None and probe.holder is holder:
         if probe.presence is Presence.GONE:

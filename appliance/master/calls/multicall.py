@@ -1,7 +1,7 @@
 """Answer `system.multicall`. The parts are carried out in order, and a failed part does not affect other parts.
 
-Adjacent reads and writes of parameters form a *run*, which waits once for the disk and for the ROS master. A read of a
-parameter that the run writes begins a new run. Other hosts have their turn after each run and each other part.
+Adjacent reads and writes of parameters form a *run*, which waits once for the disk and for the ROS master. A read of
+a parameter that the run writes begins a new run. Other hosts have their turn between runs and other parts.
 """
 
 import asyncio

@@ -1,8 +1,7 @@
 """Answer the node API on a proxy endpoint. Other nodes and tools call the endpoint as if it were the node.
 
 Only `getPid`, `shutdown`, and `requestTopic` for unrelayed topics are forwarded to the node. If the node does not
-answer `getPid`, the connection is reset: `rosnode` then skips the node, but would stop at an error. Calls that only a
-master makes are denied like unknown calls.
+answer `getPid`, the connection is reset: `rosnode` skips such a node, but stops at an error.
 """
 
 import os
@@ -71,7 +70,7 @@ class NodeCalls:
         return [1, f"ready on {target.host}:{port}", ["TCPROS", str(target.host), port]]
 
     async def get_pid(self, caller: Caller) -> Answer:
-        """`getPid(caller_id)` → the node's own, from the node."""
+        """`getPid(caller_id)` → the node's process id, from the node."""
         target = _target(caller)
         if target.of_monitors:
             return [1, "", os.getpid()]
@@ -103,7 +102,7 @@ class NodeCalls:
         return [1, "", _target(caller).name]
 
     async def get_uri(self, caller: Caller) -> Answer:
-        """`getUri(caller_id)` → the outer URI."""
+        """`getUri(caller_id)` → the URI of the proxy endpoint."""
         return [1, "", _target(caller).outer_uri(self.addresses.address_for(caller.peer))]
 
     async def get_master_uri(self, caller: Caller) -> Answer:

@@ -1,8 +1,7 @@
 """Carry out the parameter calls. The mirror answers most reads, because a starting node makes hundreds.
 
-`searchParam` must not reveal whether a parameter exists that the host may not read. So a global key is decided before
-the search, and a search upwards skips keys that the host may not read. If nothing is found, the answer depends only on
-the policy.
+`searchParam` must not reveal the existence of unreadable parameters: a global key is decided before the search, and a
+search upwards skips unreadable keys. If nothing is found, the answer depends only on the policy.
 """
 
 import asyncio
@@ -219,8 +218,8 @@ def _wanted(write: ParameterWrite) -> Wanted:
 def _is_set(answer: Answer, write: ParameterWrite) -> bool:
     """Return whether the ROS master has stored the value.
 
-    It stores the value before it computes the updates for subscribers, so their error (a name such as `a/b` in a
-    dictionary) comes although the value is stored. It rejects only a root that is not a namespace.
+    It stores a value before it computes the updates for subscribers, so it may store the value and still answer with
+    an error (for a name such as `a/b` in a dictionary). It rejects only a root that is not a namespace.
     """
     return answer[0] == 1 or write.key != "/" or isinstance(write.value, dict)
 

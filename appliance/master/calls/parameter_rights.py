@@ -25,7 +25,7 @@ class ParameterRights:
     def hidden(self, caller: Caller, call: str, key: str, answer: Answer) -> str | None:
         """Return a denial text if the caller may not read the answer's value.
 
-        The decision used an earlier state of the parameters.
+        The decision on the call used an earlier state of the parameters.
         """
         if answer[0] != 1 or not isinstance(answer[2], dict) or caller.own:
             return None
@@ -33,7 +33,7 @@ class ParameterRights:
         return None if decision.allowed else self.recorded(caller, call, key, decision)
 
     def may_read_value(self, incarnation: Incarnation, key: str, value: Value) -> bool:
-        """Whether a subscriber may read the new value (an empty namespace if it was deleted). Record a denial."""
+        """Return whether a subscriber may read a new value (an empty namespace if it was deleted); record a denial."""
         if incarnation.own:
             return True
         decision = self._to_read(incarnation.host, incarnation.name, key, value)

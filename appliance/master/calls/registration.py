@@ -1,7 +1,6 @@
 """Carry out the calls that register and unregister topics, services, and subscriptions to parameters.
 
-Before the answer, the change is in the registry and in the store: a ROS 1 node never registers twice, and control and
-the ROS master may die at the same time.
+Each change is stored before it is answered, because a ROS 1 node never registers twice.
 """
 
 from dataclasses import dataclass
@@ -128,7 +127,7 @@ class RegistrationCalls:
 
 
 def given_up(registry: Registry, denied: Attempt) -> None:
-    """Forget a withdrawn registration that its node unregisters, although this call is denied."""
+    """Forget a registration that the policy withdrew, because its node unregisters it, even if that call is denied."""
     kind, caller = denied.call.kind, denied.caller
     asked = next(argument for argument in denied.arguments if isinstance(argument, ApiUri))
     for incarnation in registry.all():

@@ -1,7 +1,6 @@
 """Parse the beginning of a request's body, for the record of a denial. No I/O.
 
-The beginning is untrusted and a few KiB long. A complete known call is recorded with the same fields as a decision on
-it.
+The beginning is untrusted and a few KiB long. A complete known call is recorded like a decided one.
 """
 
 import re

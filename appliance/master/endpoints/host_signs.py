@@ -1,4 +1,4 @@
-"""The signs of life of hosts."""
+"""Find signs of life of a robot's hosts."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from appliance.policy.model import Address
 
 @dataclass(frozen=True, slots=True)
 class HostSigns:
-    """`moved(host, names)` returns the time of the host's last message on these topics, or 0."""
+    """`live(host)`: the host has a live node; `moved(host, names)`: when it last published on these topics, or 0."""
 
     live: Callable[[Address], bool]
     moved: Callable[[Address, frozenset[str]], float]

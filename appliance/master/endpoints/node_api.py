@@ -1,8 +1,8 @@
 """Call nodes at their peer address.
 
-After a node was killed, another node may get its port. So an order to shut down an earlier incarnation is not sent to
-the address of a live node, and a call that finds out whether a node is there, or ends it, opens a new connection.
-Several live nodes may share an address, because some programs serve several names with one API.
+After a node was killed, another node may get its port. So a shutdown of an earlier incarnation is not sent to the
+address of a live node, and a call that probes or ends a node opens a new connection. Several live nodes may share an
+address, because some programs serve several names with one API.
 
 The size limit for answers is small, because thousands of nodes may answer at once, and each may be compromised.
 """
@@ -49,7 +49,9 @@ class NodeApiClient:
         return await client.call(method, *params)
 
     def _kept(self, incarnation: Incarnation) -> XmlRpcClient:
-        """Keep up to `_MOST_KEPT` connections, because a starting node gets a dozen calls in a second."""
+        """Return a client with a kept connection (at most `_MOST_KEPT`): a starting node gets a dozen calls in a
+        second.
+        """
         uri = incarnation.call_uri
         client = self._used.get(uri) or self._unused.pop(uri, None)
         if client is None:

@@ -1,8 +1,7 @@
 """Manage the ports and listening sockets of each incarnation, and the advertised address.
 
-The port that was unused for the longest time is taken first, because a subscriber may still call the port of a dead
-node. A host may have `_TIMES_THE_REST` times as many ports as are left; a network that the policy names counts as one
-host.
+The port that was unused for the longest time is taken first, because a subscriber may still call a dead node's port.
+A host may have `_TIMES_THE_REST` times as many ports as are left; a network that the policy names counts as one host.
 """
 
 import asyncio
@@ -186,8 +185,9 @@ _ANSWER_SECONDS = 3.0
 class AdvertisedAddresses:
     """Chooses the appliance's address that each host gets in URIs.
 
-    A (network, address) pair of `advertised` has priority. Otherwise, a host gets the address at which it reached the
-    appliance. `fixed` is the address of the active one of two appliances, for all hosts outside the network `tunnels`.
+    A (network, address) pair of `advertised` has priority; otherwise, a host gets the address at which it reached the
+    appliance. `fixed` is the address of the active one of two appliances, for all hosts outside the network
+    `tunnels`.
     """
 
     def __init__(

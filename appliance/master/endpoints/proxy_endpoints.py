@@ -1,7 +1,7 @@
 """Serve the two endpoints of every incarnation. Neither endpoint reveals the node's real URI.
 
-The *inner* (master-side) endpoint is for the ROS master: one loopback listener serves all incarnations, and the path
-of a URI is the key of an incarnation. The *outer* (peer-side) endpoint has its own port.
+The *inner* (master-side) endpoint is for the ROS master: one loopback listener serves all incarnations, whose keys
+are the paths of its URIs. The *outer* (peer-side) endpoint has its own port.
 
 The ROS master's calls are acknowledged and ignored: it joins the names in a value to keys that the policy did not
 decide. `Subscribers` calls the nodes instead.

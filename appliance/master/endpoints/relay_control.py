@@ -32,8 +32,8 @@ from roswire.xmlrpc import Value
 class RelayOutbox(Link):
     """The link to relay `index`, with the facts that control has stated: it sends only differences.
 
-    Messages with `soon` are batched for some milliseconds, in which a starting node registers about ten topics.
-    Batching is safe, because peers connect only with a grant, and grants and revocations are sent at once.
+    Messages with `soon` are batched for some milliseconds, in which a starting node registers about ten topics. This
+    is safe, because peers connect only with a grant, and grants and revocations are sent at once.
     """
 
     def __init__(self, index: int, heard: Callable[[Any], None], lost: Callable[[str], None]) -> None:
@@ -141,8 +141,7 @@ class RelayControl:
     async def carried_out(self, topics: Iterable[str] | None = None) -> None:
         """Wait until the relays, or those that carry these topics, have carried out their orders.
 
-        The supervisor kills a relay after `ANSWER_SECONDS` without an answer, and the next one begins with these
-        orders.
+        The supervisor kills a relay that does not answer, and the next one begins with these orders.
         """
         posts = self._posts if topics is None else {self._post(TOPIC, topic) for topic in topics}
         while any(post.unstated for post in posts):

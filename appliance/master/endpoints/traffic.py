@@ -194,7 +194,7 @@ class RelayTraffic:
         return subscriber
 
     def refused(self, message: messages.ConnectionRefused) -> None:
-        """An own node that connects too late is not recorded as an attack."""
+        """Record a refused connection, but not as an attack if an own node connected too late."""
         own = self._is_own(message.host, message.caller_id, message.resource)
         self._trail.happened(
             "connection refused",

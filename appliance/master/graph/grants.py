@@ -1,7 +1,7 @@
 """Keep the grants of the relays: the topics and services that each client may use. No I/O.
 
-Grants are stored, because a ROS node never asks twice. A host above its limit loses its oldest grants that have no
-connection. Above the limit of all hosts, the host with the most grants loses them.
+Grants are stored, because a ROS node never asks twice. Above its limit, a host loses its oldest grants without a
+connection; above the common limit, the host with the most grants does.
 """
 
 from collections.abc import Callable, Collection, Iterable

@@ -135,7 +135,7 @@ class RosGraph:
             self._give_up(node, topic)
 
     def _give_up(self, subscriber: Incarnation, topic: str) -> None:
-        """Remove grants for all publishers of a topic, also lost ones.
+        """Remove the subscriber's grants for all publishers of a topic, even lost ones.
 
         Grants are for a name and a host, so another subscriber with the same two keeps them.
         """

@@ -1,11 +1,9 @@
 """Compute the updates for subscribers when a parameter is set or deleted, like rosmaster's `compute_param_updates`.
 
-Only the canonical key that the policy allowed the caller to change counts, and keys below it, whatever names a value
-contains:
+They depend on the canonical key that the policy allowed the caller to change, never on names in a value:
 
 1. Subscribers to the changed key, or to a key above it, get the changed key and its value.
-2. Subscribers to a key below the changed key get their part of the new value, or `{}`.
-3. If the value is not a namespace, there are no updates for keys below the changed key.
+2. Subscribers to a key below it get their part of the new value, or `{}`, unless the value is not a namespace.
 """
 
 from collections.abc import Iterable, Iterator

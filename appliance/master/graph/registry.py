@@ -1,7 +1,7 @@
 """Keep the registry: nodes, and their registrations. No I/O, no clock.
 
-1. At most one incarnation of a name (one life of a node, with an API URI on one host) is *live*. Only it holds the
-   name. An earlier one is *replaced*, and never comes back.
+1. At most one incarnation of a name (one life of a node, with an API URI on one host) is *live*, and only it holds
+   the name. An earlier one is *replaced*, and never comes back.
 2. A live incarnation that no longer answers becomes a *shadow*. Its registrations are kept, but have no effect until
    the node returns or the shadow expires. A shadow does not hold its name.
 3. Registrations are numbered, so that a rebuilt ROS master gets them in their original order.
@@ -48,7 +48,7 @@ _OF_TOPICS = (Kind.PUBLICATION, Kind.SUBSCRIPTION)
 
 
 class Life(enum.StrEnum):
-    """The state of an incarnation."""
+    """The state of an incarnation; the registry no longer has a forgotten one."""
 
     LIVE = "live"
     SHADOW = "shadow"
@@ -210,7 +210,7 @@ class Registry:
         return self._types.get(topic, ANY_TYPE)
 
     def types(self) -> Iterable[tuple[str, str]]:
-        """Include topics without a node, like the ROS master."""
+        """Return the types of topics, including topics without a node, like the ROS master."""
         return self._types.items()
 
     @property
@@ -245,7 +245,7 @@ class Registry:
         return idle or min(gone, key=lambda incarnation: incarnation.changed, default=None)
 
     def evictable_for(self, host: Address) -> Incarnation | None:
-        """Return one of this host, or an evictable one of another."""
+        """Return an evictable or lost incarnation of this host, or else an evictable one of another host."""
         return self._evictable_of(host) or next(
             (incarnation for incarnation in self._by_key.values() if incarnation.evictable), None
         )

@@ -1,8 +1,8 @@
 """Find or make the incarnation of a registering call, by its name, host and API URI.
 
-multimaster_fkie registers the nodes of other machines, which cannot be called at their caller's address. But a node on
-a machine with several addresses may also name another one. So a new node whose URI names another host must have its
-port open, as every node has before it registers.
+multimaster_fkie registers the nodes of other machines, which cannot be called at their caller's address. A node on a
+machine with several addresses may also name another host. So the port of such a new node must be open at the caller's
+address, as every node's port is before it registers.
 """
 
 from collections.abc import Callable

@@ -1,11 +1,10 @@
 """State the registrations to the hidden ROS master, after the answers to nodes.
 
 1. No answer to a node depends on a forwarded change. All reads of the graph are answered from the registry.
-2. `_stated` has the registrations that the ROS master has, or will have after the one request under way.
-3. `_differing` has the keys that differ from it, in the order in which they changed. So the number of keys has the
-   bounds of the registry, and no call of a node waits.
-4. A request that fails is not repeated. It shuts the door, and the next round of the reconcile loop reads what the ROS
-   master has (`adopt`). The same holds after the death of control: its registry is stored.
+2. `_stated` has the registrations that the ROS master has, or will have after the one request under way. `_differing`
+   has the keys that differ from it, in the order of their changes.
+3. A request that fails is not repeated. It shuts the door, and the next round of the reconcile loop reads what the
+   ROS master has (`adopt`), as after the death of control.
 """
 
 import asyncio

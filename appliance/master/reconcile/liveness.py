@@ -1,9 +1,9 @@
 """Check nodes every few seconds, and at once after a failure.
 
 A node is *lost* if its API refuses connections several times in a row, if another process answers at its address, or
-after `silent` seconds without an answer. It then keeps its registrations as a shadow until its API answers again: a
-ROS 1 node never registers twice. A firewall that shuts out the appliance for a moment makes all nodes of a host look
-lost, so a lost node is checked more often at first.
+after `silent` seconds without an answer. It then keeps its registrations as a shadow until its API answers again,
+because a ROS 1 node never registers twice. If a firewall shuts out the appliance for a moment, all nodes of a host
+look lost, so a lost node is checked more often at first.
 """
 
 import asyncio
@@ -127,8 +127,8 @@ class Watchlist:
 class Liveness:
     """Checks nodes. Hosts take turns, so that hanging nodes of one host do not delay checks of others.
 
-    A node that refuses `refusals` connections in a row is lost, unless the robot's firewalls may shut out this
-    appliance (`shut_out`, on one of two appliances).
+    A node that refuses `refusals` connections in a row is lost, unless the robot's firewalls may shut out this one of
+    two appliances (`shut_out`).
     """
 
     registry: Registry
@@ -271,7 +271,7 @@ class Liveness:
         return False, ""
 
     async def _call(self, incarnation: Incarnation) -> None:
-        """Call a node. Raises `CallFailedError`, and `RefusedError` also if another process has the node's port.
+        """Call a node. Raises `CallFailedError`: as `RefusedError` if another process answers at the node's port.
 
         After each registration, the first process that answers becomes the expected one.
         """

@@ -1,10 +1,9 @@
 """Reconcile the *wanted* state (the registry, the parameter mirror) with the *seen* state of the ROS master.
 
 - A new ROS master gets everything again, in the original order. Calls wait at the door (`rosmaster.py`) until then.
-- A registration that is seen but not wanted is ended. It is never added to the registry, because the registry is
-  stored before the ROS master gets a change.
-- After a rebuild, and after a relay starts, every subscriber gets each of its lists of publishers once. After a
-  restart of control, every node gets the values of the parameters that it subscribed to.
+- A registration that is seen but not wanted is ended: the registry is stored before the ROS master gets a change.
+- After a rebuild, every subscriber gets its lists of publishers once. After a restart of control, every node gets the
+  values of the parameters that it subscribed to.
 """
 
 import asyncio
@@ -133,7 +132,7 @@ class Reconciler:
         }
 
     def _entry(self, key: EntryKey, api: str, service: str) -> MasterEntry:
-        """The ROS master does not tell the type; the wanted type is assumed."""
+        """Return an entry as the ROS master has it; it does not report the type, so the wanted one is assumed."""
         wanted = self.entries.wanted(key)
         return MasterEntry(
             api, service if key[0] is Kind.SERVICE else wanted.detail if wanted is not None else ""

@@ -1,10 +1,9 @@
 """Send subscribers their lists of publishers again, after a relay started or a topic moved to another relay.
 
-rospy reconnects only for a list that arrives *after* rospy noticed the broken connection. roscpp reconnects to a port
+rospy reconnects only for a list that arrives *after* it noticed the broken connection. roscpp reconnects to a port
 that stayed open, but after a restart of the appliance it gives up and ignores an unchanged list. So a subscriber that
-is still absent after the first reminders gets a list without the publisher, and then a list with the publisher again.
-This also helps a subscriber without a grant: the policy withdrew and restored the topic, and the subscriber or control
-missed this.
+is still absent after the first reminders gets a list without the publisher, and then one with it. This also helps a
+subscriber whose grant was withdrawn and restored without its knowledge.
 """
 
 import asyncio
@@ -79,8 +78,8 @@ class Reminders:
 class RelayMoves:
     """The interface to the relays for specifications.
 
-    A topic moves when a specification connects it with a topic or service of another relay. No relay carries the topic
-    until its connections are made again.
+    A topic moves when a specification connects it with a topic or service of another relay. Until its connections are
+    made again, no relay carries it.
     """
 
     def __init__(self, relay: RelayControl, subscribers: Subscribers, reminders: Reminders) -> None:

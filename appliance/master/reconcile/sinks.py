@@ -1,8 +1,7 @@
 """Make the store, the nodes, the ROS master and the relays agree with the registry, at the end of each turn.
 
 1. A call is answered after its changes are flushed: they are stored, and the relay has them before a peer can use
-   them. Exception: a relay that cannot take a change gets it soon (`relay_control.py`), and the orders of operators
-   wait.
+   them. If a relay cannot take a change, operators' orders wait for it (`relay_control.py`).
 2. Whatever else changes the registry, `soon` flushes it before the event loop waits again.
 """
 
@@ -103,8 +102,8 @@ _SHELVED = "revoked "  # the prefix of the stored kind of a withdrawn registrati
 def save(changed: Sequence[Change], grants: Grants, store: StateStore) -> None:
     """Store the present state of what has changed.
 
-    After a crash, the store has all changes of a turn or none, except that a turn with thousands of changes is
-    divided: no other change, nor the standby, waits for one large write.
+    After a crash, the store has all changes of a turn or none. Only a turn with thousands of changes is divided, so
+    that no other change waits for one large write.
     """
     for begin in range(0, len(changed), _TOGETHER):
         with store.database.together():

@@ -1,7 +1,7 @@
 """Keep the nodes informed of the lists of publishers and of the values of parameters that they subscribed to.
 
-Values of parameters are sent with each call that sets them, because a node may count the changes. The calls of the ROS
-master's notification threads are ignored, because they can be outdated, wrong, or partial.
+Values are sent with each call that sets them, because a node may count the changes. The notifications of the ROS
+master are ignored, because they can be outdated, wrong, or partial.
 """
 
 import sys
@@ -24,7 +24,7 @@ _Stated = dict[tuple[Kind, str], tuple[str, ...]]
 
 @dataclass(frozen=True, slots=True)
 class Subscribers:
-    """The sink of nodes."""
+    """Sends nodes the lists and values that they subscribed to."""
 
     registry: Registry
     grants: Grants
@@ -124,10 +124,10 @@ class Subscribers:
     def absent(
         self, subscribers: Iterable[Incarnation]
     ) -> Iterator[tuple[Incarnation, str, list[Incarnation]]]:
-        """Yield topics with the publishers that a subscriber is not connected to.
+        """Yield subscribers and topics, with the publishers to which the subscriber is not connected.
 
         Grants do not matter: if one was withdrawn unnoticed, the subscriber asks again only after it drops the
-        publisher. So the result depends only on data that survive a restart.
+        publisher.
         """
         used = self.grants.used()
         for subscriber in subscribers:
@@ -152,7 +152,7 @@ class Subscribers:
         self.parameter_set(key, {}, None)
 
     def parameter_set(self, key: str, value: Value, caller_id: str | None) -> None:
-        """Send a value to the subscribers; its setter does not get exactly this key."""
+        """Send a value to the subscribers; its setter gets no update of exactly this key."""
         if not self.registry.tells_parameters:
             return
         calls: dict[str, NodeCall] = {}
