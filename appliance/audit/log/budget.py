@@ -1,9 +1,8 @@
-"""Limit the bytes of audit records that each host causes over time, and more strictly on a nearly full disk. No
-I/O.
+"""Limit the bytes of audit records that each host causes over time, and more strictly on a nearly full disk. No I/O.
 
-The debt of a host shrinks by `RATE`, and only the calls of a host above its quota wait. The last part of the
-disk's reserve is kept for the robot and for hosts that the policy names, because after a restart no host has a
-registration. Unknown hosts are not charged: their denials are folded.
+A host's debt shrinks by `RATE`, and only the calls of a host above its quota wait. The last part of the disk's
+reserve is kept for the robot and for hosts that the policy names. Unknown hosts are not charged: their denials are
+folded.
 """
 
 import dataclasses
@@ -35,8 +34,7 @@ def weight(record: AuditRecord) -> int:
 class Budget:
     """The debts of hosts, for one thread; only `folded`, `summarised` and `room` may be called from several.
 
-    `reserve` has the bounds for the reserve of the disk, whose last part is left to hosts for which `kept_for` is
-    true.
+    `reserve` has the bounds for the disk's reserve, whose last part is left to hosts for which `kept_for` is true.
     """
 
     def __init__(
@@ -78,7 +76,7 @@ class Budget:
             self._changes.append((record.host, weight(record)))
 
     def room(self, left: int | None) -> None:
-        """`left` is None while more than the reserve is free."""
+        """Set how many bytes of the disk's reserve are left; None while more than the reserve is free."""
         self._left = left
 
     def shut_out(self, host: str) -> str:

@@ -55,7 +55,7 @@ class StoredColumns(NamedTuple):
 
 
 def to_columns(record: AuditRecord, sequence: int) -> StoredColumns:
-    """Never fails, whatever the record contains."""
+    """Return the columns of a record. This never fails, whatever the record contains."""
     try:
         columns = _columns(record, sequence)
         if isinstance(record.detail, dict) and len(columns.detail) <= LARGEST_DETAIL and _storable(columns):
@@ -184,7 +184,7 @@ def _text(value: object) -> str:
 
 
 def packed(columns: tuple[object, ...]) -> bytes:
-    """Return an array, so the encoding is injective."""
+    """Return the columns as an array, so that no two rows have the same encoding."""
     return _packer.encode(columns)
 
 

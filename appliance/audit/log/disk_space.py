@@ -22,7 +22,7 @@ class DiskSpace:
         self.left: int | None = None
 
     def look(self, now: float) -> bool | None:
-        """Return True if space just became scarce, False if scarcity just ended. Raises `OSError`."""
+        """Return True if space just became scarce, False if it just ceased to be, else None. Raises `OSError`."""
         self.due = now + _LOOK_SECONDS
         disk = os.statvfs(self._folder)
         free, before = disk.f_bavail * disk.f_frsize, self.left

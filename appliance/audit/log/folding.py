@@ -1,10 +1,9 @@
 """Fold repetitions, so that a flood cannot push evidence out of the log or fill the disk. No I/O, no clock.
 
 1. The first record of a kind is written in full; each repetition counts in one summary.
-2. Memory is limited: in the pool of denials (`AUDIT_KINDS`), all unknown hosts together have a small quota, so
-   they cannot displace hosts that the policy names. Above a quota, all further denials count as one kind. When
-   the pool of reads (`AUDIT_READ_KINDS`) is full, decisions are written in full, because policies are learned
-   from them.
+2. Memory is limited. In the pool of denials (`AUDIT_KINDS`), all unknown hosts together have a small quota; above a
+   quota, further denials count as one kind. When the pool of reads (`AUDIT_READ_KINDS`) is full, decisions are
+   written in full, because policies are learned from them.
 3. An allow ends the denial kinds of the same host, caller and request, and a denial ends the allow kinds. Their
    summaries are written first, then the new record in full.
 4. Counts are stored on disk, so the key of a kind has only storable texts (`storable`).

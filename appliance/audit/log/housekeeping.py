@@ -118,7 +118,7 @@ class Housekeeping:
     # --- between two batches of records -----------------------------------------------------------------------
 
     def after_batch(self, *, written: bool) -> None:
-        """Limit also the lag of the full-text index: every search reads the unindexed records."""
+        """Seal if it is due, and limit the lag of the full-text index: every search reads the unindexed records."""
         if written and self._seal_is_due():
             self.attempt(self.seal)
         if written and self._waiting:

@@ -30,7 +30,7 @@ class IdSource:
 
     @property
     def ahead(self) -> float:
-        """Return by how many seconds the clock was set back behind the last id."""
+        """Return by how many seconds the last id is ahead of the clock, which was set back."""
         return max(0.0, (self._last - self._clock()) / 1e9)
 
     def raise_floor(self, after: str) -> None:

@@ -1,7 +1,7 @@
 """Find the processes that hold SQLite's write locks on the log, in the kernel's list of locks.
 
-Any reader can lock an SQLite database, but a correct reader never takes these locks. The files are not opened,
-because closing a file releases all of this process's locks on it.
+A correct reader never takes these locks. The files are not opened, because closing a file releases all of this
+process's locks on it.
 """
 
 from pathlib import Path
@@ -12,7 +12,9 @@ _OF_THE_DATABASE = range(0x40000000, 0x40000002)  # bytes of the database: pendi
 
 
 def holders(log: Path) -> list[int]:
-    """Return process ids; -1 is a lock without a process (an open file description lock)."""
+    """Return the ids of the processes with such a lock; -1 is a lock without a process (an open file
+    description lock).
+    """
     bytes_of = {}
     for path, needed in ((log.with_name(f"{log.name}-shm"), _OF_WRITING), (log, _OF_THE_DATABASE)):
         try:

@@ -2,8 +2,7 @@
 
 1. `record` never blocks and never raises.
 2. Records keep their order.
-3. No record is dropped silently: if the log cannot be written, records beyond `queue_limit` are counted, and the
-   count is recorded later.
+3. If the log cannot be written, records beyond `queue_limit` are counted, and the count is recorded later.
 """
 
 import asyncio
@@ -78,8 +77,9 @@ class _LossCounter:
 class AuditLog:
     """The log at `path`, open for writing; `drive` makes the driver that calls its turns, in one thread.
 
-    `durability`: `strict` writes at once (group commit), `batched` after 20 ms; both fsync. The owner answers
-    requests to `signer` and `removals` with a method. `held_by` gets the ids of processes that lock the log.
+    `durability`: `strict` writes at once (group commit), `batched` after 20 ms; both fsync. The owner passes the
+    answers of `signer` to `signed` or `refused`, those of `removals` to `removal_approved` or `removal_refused`.
+    `held_by` gets the ids of processes that lock the log.
     """
 
     def __init__(
@@ -145,7 +145,7 @@ class AuditLog:
     # --- for the owner, from any thread ---------------------------------------------------------------------
 
     def record(self, record: AuditRecord) -> str:
-        """Return the id of the record, or of the record that it repeats; "" if a collective kind counts it.
+        """Return the id of the record, or of the record that it repeats; "" if it is only counted with other kinds.
 
         The caller must not change `detail` afterwards.
         """
@@ -169,7 +169,7 @@ class AuditLog:
         return await waiter
 
     async def wait_signed(self) -> str | None:
-        """Return None after the signature of a checkpoint, or why it is refused."""
+        """Return None once a checkpoint that seals all records so far is signed, or why it is not."""
         waiter: Waiter = asyncio.get_running_loop().create_future()
         self._put(partial(self.housekeeping.seal_now, waiter))
         self._driver.hurry()
@@ -190,7 +190,7 @@ class AuditLog:
         return Lag(waiting, now() - self._caught_up if waiting else 0.0)
 
     def signed(self, number: int, signature: bytes, public_key: bytes) -> None:
-        """Store the signature only if it is valid and made with the pinned key."""
+        """Store a signature of the signer, if it is valid and made with the pinned key."""
         keep = partial(self.housekeeping.keep_signature, number, signature, public_key)
         self._put(partial(self.housekeeping.attempt, keep))
 
@@ -198,12 +198,12 @@ class AuditLog:
         self._put(partial(self.housekeeping.refused, number, reason))
 
     def removal_approved(self, number: int, text: bytes, signature: bytes, public_key: bytes) -> None:
-        """Remove the records only if the signer's signature of that removal is valid."""
+        """Remove records, if the signer's signature of exactly that removal is valid."""
         remove = partial(self.housekeeping.removal_approved, number, text, signature, public_key)
         self._put(partial(self.housekeeping.attempt, remove))
 
     def removal_refused(self, number: int, reason: str, *, early: bool = False) -> None:
-        """Request the removal again later; `early`: the records are too young for the signer."""
+        """Request a removal again later; `early`: the records are too young for the signer."""
         self._put(partial(self.housekeeping.remover.refused, number, reason, early=early))
 
     def request_signatures(self) -> None:

@@ -1,6 +1,6 @@
 """Create the log's database file, and open it for writing or reading.
 
-A new log is linked to its name when complete, so an empty or cut file is an error, and left unchanged.
+A new log gets its name when it is complete, so an empty or cut file is an error, and left unchanged.
 """
 
 import os
@@ -55,7 +55,7 @@ class LogUnreadableError(Exception):
 
 
 def create(path: Path, begun: int) -> None:
-    """`begun` is nanoseconds since the epoch. The group of the folder may read the log."""
+    """Create a log that the group of the folder may read; `begun` is nanoseconds since the epoch."""
     making = name_to_make(path)
     descriptor = os.open(making, os.O_CREAT | os.O_EXCL | os.O_RDWR, 0o600)
     os.fchmod(descriptor, 0o640)
@@ -81,7 +81,7 @@ def create(path: Path, begun: int) -> None:
 
 
 def open_for_writing(path: Path) -> sqlite3.Connection:
-    """Raises `LogUnreadableError` and `sqlite3.Error`."""
+    """Return a connection that commits durably. Raises `LogUnreadableError` and `sqlite3.Error`."""
     connection = sqlite3.connect(
         _uri(path, "rw"),
         uri=True,
@@ -104,7 +104,7 @@ def _prepare_writing(connection: sqlite3.Connection) -> None:
 
 
 def open_for_reading(path: Path) -> sqlite3.Connection:
-    """Raises `LogUnreadableError` and `sqlite3.Error`."""
+    """Return a connection that only reads. Raises `LogUnreadableError` and `sqlite3.Error`."""
     if not path.parent.is_dir():
         raise LogUnreadableError(f"{path.parent}: no such directory; is the state directory right (--state)?")
     try:
@@ -126,7 +126,7 @@ def open_for_reading(path: Path) -> sqlite3.Connection:
 
 @contextmanager
 def reading(path: Path, advice: str = "; run 'rosrv audit verify'") -> Iterator[sqlite3.Connection]:
-    """Raises `LogUnreadableError`, also for SQLite's errors in the block."""
+    """Yield a connection that only reads. Raises `LogUnreadableError`, even for SQLite's errors in the block."""
     try:
         with closing(open_for_reading(path)) as connection:
             yield connection

@@ -130,7 +130,7 @@ class ChainWriter:
         return sequence, digest, last_id
 
     def seal(self, time: int) -> tuple[Checkpoint, bytes]:
-        """Return the checkpoint and its text."""
+        """Store a checkpoint of the chain so far; return it and its text."""
         checkpoint = Checkpoint(
             self.log_id,
             self.checkpoint_number + 1,
@@ -151,7 +151,7 @@ class ChainWriter:
         return checkpoint, text
 
     def unsigned(self, limit: int) -> list[tuple[int, bytes]]:
-        """Return numbers and texts, oldest first."""
+        """Return the numbers and texts of unsigned checkpoints, oldest first."""
         query = "SELECT number, text FROM checkpoint WHERE signature IS NULL ORDER BY number LIMIT ?"
         return self._connection.execute(query, (limit,)).fetchall()
 
@@ -202,10 +202,10 @@ class ChainWriter:
     def removable(
         self, step: int, *, signed: bool, between: tuple[int, int] | None = None
     ) -> RemovedRange | None:
-        """Return the range of about `step` oldest records that ends at a (signed) checkpoint.
+        """Return the range of about `step` oldest records that ends at a (signed) checkpoint, but not the last one.
 
-        `between` is an age limit and the present time. Checkpoints with a later time, made while the clock was
-        ahead, are removed with the following ones. The last checkpoint always stays.
+        `between` is an age limit and the present time. Checkpoints with a later time, made while the clock was ahead,
+        are removed with the following ones.
         """
         first = self._first_sequence()
         condition = "AND signature IS NOT NULL" if signed else ""

@@ -30,9 +30,9 @@ class RuleReference(msgspec.Struct, frozen=True):
 class AuditRecord(msgspec.Struct, frozen=True, kw_only=True):
     """An event with its author, or a decision with its rule.
 
-    `time` is in nanoseconds since the epoch; `duration_us` is the time from the request's arrival to the
-    decision. Two fields are not stored. `unknown`: no rule of the policy names `host`. `folds`: repetitions are
-    only counted, because this is an allowed read, or the host is over its quota.
+    `time` is in nanoseconds since the epoch; `duration_us` is the time from the request's arrival to the decision.
+    Two fields are not stored: `unknown` (no rule of the policy names `host`), and `folds` (repetitions are only
+    counted).
     """
 
     id: str

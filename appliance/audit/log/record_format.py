@@ -34,7 +34,7 @@ class LogEntry(NamedTuple):
 
 
 def rfc3339(time: int) -> str:
-    """Format nanoseconds since the epoch, or `@…ns` if out of range."""
+    """Return nanoseconds since the epoch as RFC 3339, or as `@…ns` if they are out of range."""
     seconds, fraction = divmod(time, _SECOND)
     try:
         moment = datetime.fromtimestamp(seconds, UTC)
@@ -44,7 +44,7 @@ def rfc3339(time: int) -> str:
 
 
 def without_contents(entry: LogEntry) -> LogEntry:
-    """Remove the contents of messages, for roles that may not read them."""
+    """Return the entry without the contents of messages, for roles that may not read them."""
     detail = entry.record.detail
     if "monitor" not in detail:
         return entry
@@ -64,7 +64,7 @@ def without_contents(entry: LogEntry) -> LogEntry:
 
 
 def without_binding(text: str, detail: Mapping[str, Any]) -> str:
-    """Remove the values of parameters, which come from messages."""
+    """Return the text without the values of parameters, which come from messages."""
     found = _BOUND.search(text)
     if found is None:
         return text
@@ -87,7 +87,7 @@ def as_object(entry: LogEntry) -> dict[str, Any]:
 
 
 def entry_of(fields: Any) -> LogEntry:
-    """Raises `ValueError`, `KeyError` and `TypeError`."""
+    """Return the entry of a JSON object. Raises `ValueError`, `KeyError` and `TypeError`."""
     if not isinstance(fields, dict):
         raise TypeError("not an object")
     own = {name: value for name, value in fields.items() if name not in _NOT_THE_RECORDS}

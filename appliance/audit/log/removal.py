@@ -95,7 +95,9 @@ class Remover:
         return True
 
     def refused(self, number: int, reason: str, *, early: bool = False) -> None:
-        """`early`: by the signer's clock, the records are not old enough yet, which is normal."""
+        """Request this removal again later. `early`: by the signer's clock, the records are too young, which is
+        normal.
+        """
         wanted = self._wanted
         if wanted is not None and wanted.gone.last_checkpoint == number:
             self._wanted = None

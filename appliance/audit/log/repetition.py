@@ -1,8 +1,8 @@
 """Define the kinds of folded records: the key that repetitions share, and the summary of a kind.
 
-Texts from peers cannot create an unlimited number of kinds. The peer chooses numbers, names and quotations in an
-error, so only its plain words are part of a key. The key of an unknown host's kind has no resource and no caller.
-Above the quota there is one kind per host, and one for all unknown hosts.
+Texts from peers cannot create an unlimited number of kinds: only the plain words of an error are part of a key, not
+the numbers, names and quotations that the peer chooses, and the key of an unknown host's kind has no resource and no
+caller.
 """
 
 from typing import Any

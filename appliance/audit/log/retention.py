@@ -1,8 +1,8 @@
 """Choose which old records to remove, and which of these to write again. No I/O.
 
-An age limit removes all older records. A size limit keeps denials and alarms longer: they are written again at
-the end of the log, with their id and time, at most half of a step. Hosts take turns, so a flood from one host
-cannot displace the records of another.
+A size limit keeps denials and alarms longer than other records: they are written again at the end of the log, with
+their id and time, at most half of a step. Hosts take turns, so a flood from one host cannot displace the records of
+another.
 """
 
 from collections import OrderedDict
@@ -39,7 +39,7 @@ class Retention:
         return f"the log was larger than {self.size} bytes" if too_large else None
 
     def oldest_kept(self, now: int) -> int:
-        """Return nanoseconds since the epoch; 0 without a limit."""
+        """Return the time up to which records are too old (nanoseconds since the epoch); 0 without a limit."""
         return 0 if self.days is None else now - int(self.days * _DAY)
 
 
@@ -70,7 +70,10 @@ def as_kept(columns: StoredColumns, digest: bytes) -> AuditRecord:
 
 
 def worth_keeping(evidence: Sequence[AuditRecord], removed: int) -> list[AuditRecord]:
-    """All unknown hosts together take one turn. The alarms of a host are first, then denials, then summaries."""
+    """Return at most half as many records as are removed. Hosts take turns; unknown hosts together have one.
+
+    A host's alarms are chosen first, then its denials, then summaries.
+    """
     waiting: OrderedDict[str, list[AuditRecord]] = OrderedDict()
     for record in sorted(evidence, key=_rank):
         # Version 0.1.0 wrote `stranger`.

@@ -1,8 +1,7 @@
 """Request signatures of checkpoints, and store the valid ones.
 
-The key of the first valid signature is pinned in `<log>.pub` (PEM); the program never replaces it. A signer
-refuses all checkpoints before the last that it signed, so each request says whether it is the oldest, and a new
-signer gets the oldest first.
+The key of the first valid signature is pinned in `<log>.pub` (PEM); the program never replaces it. A signer refuses
+all checkpoints before the last that it signed, so a new signer gets the oldest first.
 """
 
 from collections.abc import Callable
@@ -25,7 +24,7 @@ class CheckpointSigner(Protocol):
     """Requests signatures of checkpoints; the log calls it on its own thread."""
 
     def __call__(self, number: int, text: bytes, *, oldest: bool) -> None:
-        """`oldest`: all earlier checkpoints are signed."""
+        """Request a signature. `oldest`: all earlier checkpoints are signed."""
 
 
 class KeyUnreadableError(Exception):
@@ -97,7 +96,7 @@ class Signatures:
         self._signer(number, text, oldest=oldest)
 
     def keep(self, writer: ChainWriter, number: int, signature: bytes, public_key: bytes) -> str | None:
-        """Pin the first key; return the reason if the signature is invalid."""
+        """Store a signature, and pin the first key; return the reason if the signature is invalid."""
         self._asked.discard(number)
         text = writer.checkpoint_text(number)
         if text is None:
@@ -127,7 +126,7 @@ class Signatures:
 
 
 def write_public_key(path: Path, public_key: bytes) -> None:
-    """Raises `OSError`."""
+    """Write the key as PEM. Raises `OSError`."""
     key = Ed25519PublicKey.from_public_bytes(public_key)
     text = key.public_bytes(Encoding.PEM, PublicFormat.SubjectPublicKeyInfo)
     write_whole(path, text, 0o644)

@@ -36,7 +36,7 @@ class ChainProof(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def evidence(path: Path, wanted: Filter, page: int = 1000) -> Iterator[tuple[LogEntry, ChainProof]]:
-    """One page is in memory at a time. Raises `LogUnreadableError` and `FilterError`."""
+    """Yield the records found with their proofs, oldest first. Raises `LogUnreadableError` and `FilterError`."""
     cursor: str | None = "0"
     waiting: LogEntry | None = None
     while cursor is not None:
@@ -59,7 +59,7 @@ def stored_line(columns: StoredColumns, chain: ChainProof) -> bytes:
 
 
 def _placed(path: Path, entries: list[LogEntry], *, whole: bool) -> Iterator[tuple[LogEntry, ChainProof]]:
-    """Omit the last record, unless these are the `whole` rest of the export."""
+    """Yield entries with their proofs, without the last one unless these are the `whole` rest of the export."""
     following = [entry.sequence for entry in entries[1:]] + ([0] if whole else [])
     with reading(path) as connection:
         connection.execute("BEGIN")

@@ -1,8 +1,8 @@
 """Verify the checkpoints of a log, using the log's chain, the key, and the signer's memory.
 
-A checkpoint is valid if it follows the previous one and has the chain's hash, and proven if the expected key
-signed it. A signature that the signer remembers may be missing only for the last `ASKED_AT_ONCE` checkpoints,
-whose answers may be pending; an older one was removed.
+A checkpoint is valid if it follows the previous one and has the chain's hash, and proven if the expected key signed
+it. If the signer remembers a signature that the log lacks, it was removed, except among the last `ASKED_AT_ONCE`,
+which may be under way.
 """
 
 import sqlite3
@@ -61,7 +61,7 @@ class StoredCheckpoint(NamedTuple):
 
 
 def last_removal(connection: sqlite3.Connection) -> RemovedRange | None:
-    """Raises the errors of `msgspec` for a damaged record."""
+    """Return the last removal on record, or None. Raises the errors of `msgspec` for a damaged record."""
     query = "SELECT detail FROM record WHERE event = 'records removed' ORDER BY sequence DESC LIMIT 1"
     row = connection.execute(query).fetchone()
     return None if row is None else msgspec.json.decode(row[0], type=RemovedRange)
@@ -84,7 +84,7 @@ class CheckpointVerifier:
         self._on_their_way: list[int] = []
 
     def read(self, connection: sqlite3.Connection) -> None:
-        """Raises `sqlite3.DatabaseError` after the readable rows."""
+        """Read all checkpoints. Raises `sqlite3.DatabaseError` after the readable ones."""
         query = "SELECT number, sequence, text, signature, public_key FROM checkpoint ORDER BY number"
         for row in connection.execute(query):
             if not all(map(isinstance, row, _TYPES)):
@@ -92,7 +92,7 @@ class CheckpointVerifier:
             self.rows.append(StoredCheckpoint(*row))
 
     def check(self, before: tuple[int, str], chain: dict[int, bytes], last: int) -> Iterator[LogFinding]:
-        """`before` is the last checkpoint that retention removed: number and hash, or zeros."""
+        """Yield the faults; `before` is the last checkpoint that retention removed: number and hash, or zeros."""
         number, previous = before
         self.last_number = number
         for row in self.rows:

@@ -1,8 +1,7 @@
 """Export signed checkpoints to another machine, and compare the log with these copies.
 
-Root on the appliance can rewrite the whole history with valid signatures; only copies on another machine reveal
-this. It is a finding if a copy has an invalid signature, if all copies are from other logs (this log replaced
-another one), or if all seal removed records (they prove nothing about the rest).
+Root on the appliance can rewrite the whole history with valid signatures; only copies on another machine reveal this.
+Copies that prove nothing, because they are from other logs or seal only removed records, are a finding.
 """
 
 import json
@@ -60,7 +59,7 @@ class SignedCheckpoint(msgspec.Struct, frozen=True, omit_defaults=True):
 
     @classmethod
     def of(cls, text: bytes, signature: bytes, key: bytes) -> "SignedCheckpoint":
-        """Raises `ValueError`."""
+        """Return a checkpoint as it is exported. Raises `ValueError` for a malformed text."""
         return cls(**parse_checkpoint(text)._asdict(), signature=signature.hex(), key=key.hex())
 
     @property
@@ -95,19 +94,21 @@ class SignedCheckpoint(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 def select_signed(connection: sqlite3.Connection, where: str, *values: int) -> list[SignedCheckpoint]:
-    """`where` is a condition in SQL. Raises `ValueError` for a damaged checkpoint."""
+    """Return the signed checkpoints for which the SQL condition `where` holds. Raises `ValueError` for a
+    damaged one.
+    """
     query = "SELECT text, signature, public_key FROM checkpoint WHERE signature IS NOT NULL AND public_key IS NOT NULL"
     found = connection.execute(f"{query} AND {where}", values)
     return [SignedCheckpoint.of(*row) for row in found]
 
 
 def signed_checkpoints(log: Path, after: int = 0, limit: int = 1000) -> list[SignedCheckpoint]:
-    """Raises `LogUnreadableError`."""
+    """Return the signed checkpoints after the number `after`, in order. Raises `LogUnreadableError`."""
     return _read(log, "number > ? ORDER BY number LIMIT ?", after, limit)
 
 
 def newest_checkpoint(log: Path) -> SignedCheckpoint | None:
-    """Raises `LogUnreadableError`."""
+    """Return the last signed checkpoint, or None. Raises `LogUnreadableError`."""
     return next(iter(_read(log, "true ORDER BY number DESC LIMIT 1")), None)
 
 
@@ -120,7 +121,8 @@ def _read(log: Path, where: str, *values: int) -> list[SignedCheckpoint]:
 
 
 def read_copies(file: Path) -> list[SignedCheckpoint]:
-    """Accepts NDJSON (`rosrv audit checkpoints`), or the output of a syslog receiver; other lines are skipped.
+    """Return the checkpoints in NDJSON (`rosrv audit checkpoints`) or in a syslog receiver's output; skip other
+    lines.
 
     Raises `CopiesUnreadableError` if there is no checkpoint.
     """

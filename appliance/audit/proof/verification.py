@@ -1,8 +1,8 @@
 """Verify that a log is complete and unchanged, or report which records are missing or changed, and how.
 
-If a record does not follow from the previous one, the verifier tries the next records in other positions, to
-distinguish a change, a removal, an insertion and a reordering. The log alone cannot show whether records after
-the last signed checkpoint were cut off or rewritten.
+If a record does not follow from the previous one, the verifier tries the next records in other positions, to tell a
+change from a removal, an insertion and a reordering. The log alone cannot show whether records after the last signed
+checkpoint were cut off or rewritten.
 """
 
 import re
@@ -55,10 +55,10 @@ def verify(
     copies: Sequence[SignedCheckpoint] | None = None,
     progress: Callable[[int], None] = lambda _sequence: None,
 ) -> Verification:
-    """Raises `LogUnreadableError` and `KeyUnreadableError`.
+    """Verify the log at `path`. Raises `LogUnreadableError` and `KeyUnreadableError`.
 
-    `public_key` (raw) must have signed the checkpoints, by default the key beside the log. `signer` is the
-    directory with the signer's memory. `copies` are from another machine.
+    `public_key` (raw) must have signed the checkpoints, by default the key beside the log. `signer` is the directory
+    with the signer's memory, and `copies` are from another machine.
     """
     with reading(path, advice="") as connection:
         connection.text_factory = lambda text: text.decode("utf-8", "surrogateescape")
@@ -276,7 +276,7 @@ class _Verifier:
         return map(_row, rows)
 
     def _explain(self, row: _Row, previous: bytes) -> bytes:
-        """Return the hash to continue from.
+        """Report why the row does not follow from the previous one, and return the hash to continue from.
 
         After `_MOST_FINDINGS`, no search is made, so that a forged log cannot take hours.
         """

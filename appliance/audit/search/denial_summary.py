@@ -1,9 +1,8 @@
 """Summarise the denials of a log by host: number, first and last time, most frequent reasons, callers.
 
-1. Memory and time are bounded: hosts, reasons and callers beyond the limits are counted together as `OTHERS`.
-   Decisions about calls have their own limit, so the noise of a port scan does not hide them.
-2. No reason has contents of messages. Reasons that differ only in numbers are counted together, under the newest
-   text.
+1. Memory and time are bounded: beyond the limits, hosts, reasons and callers count as `OTHERS`. Decisions about calls
+   have their own limit, so the noise of a port scan does not hide them.
+2. No reason has contents of messages. Reasons that differ only in numbers are counted together.
 3. Rights that a new policy or a block revoked are not counted, because the host attempted nothing.
 """
 
@@ -99,7 +98,7 @@ class _HostCounts:
 
 
 def summary_of_log(path: Path, wanted: Filter, limit: int) -> DenialSummary:
-    """Raises `LogUnreadableError` and `FilterError`."""
+    """Return the summary of a log, with at most `limit` hosts. Raises `LogUnreadableError` and `FilterError`."""
     return summarised(_newest_first(path, msgspec.structs.replace(wanted, decision=("deny",))), limit)
 
 

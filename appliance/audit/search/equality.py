@@ -4,9 +4,7 @@
 2. A record that stands for several (`12 more in the same second`) equals the record that it continues, and counts
    that many times. If it does not repeat the reason, it equals each record with its other fields.
 3. Equal records are one row if they are consecutive. At most `_BETWEEN` rows of other monitors may separate a
-   monitor's records, because one message causes several. Any other record ends all rows, so the order of
-   decisions and changes is as recorded.
-4. Each record is in exactly one row, so the rows' counts add up.
+   monitor's records, because one message causes several. Any other record ends all rows, so order is kept.
 """
 
 import hashlib
@@ -61,7 +59,7 @@ def equal_key(record: AuditRecord) -> EqualKey:
 
 
 def plain_reason(record: AuditRecord) -> str:
-    """Remove the words about repetitions."""
+    """Return the reason without its words about repetitions."""
     if "monitor" not in record.detail:
         return record.reason
     found = _MORE.match(record.reason)
@@ -72,7 +70,7 @@ def plain_reason(record: AuditRecord) -> str:
 
 
 def time_span(record: AuditRecord) -> tuple[int, int]:
-    """A record is made some time after its events."""
+    """Return the times of the first and last event, if the record has them: it is made some time after its events."""
     first, last = record.detail.get("first_time"), record.detail.get("last_time")
     return (first, last) if type(first) is int and type(last) is int else (record.time, record.time)
 

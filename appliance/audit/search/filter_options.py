@@ -57,7 +57,7 @@ def filter_given(
         typer.Option("--who", help="Author: the name of a token, operator, or disk; a glob"),
     ] = None,
 ) -> Filter:
-    """Raises `TimestampError`."""
+    """Return the filter that the options define. Raises `TimestampError`."""
     wanted = {"deny": deny, "allow": allow, "would deny": would_deny}
     begin, end = times_given(since, until)
     return Filter(
@@ -77,7 +77,7 @@ def filter_given(
 
 
 def times_given(since: str | None, until: str | None) -> tuple[int | None, int | None]:
-    """Raises `TimestampError`."""
+    """Return both times in nanoseconds since the epoch. Raises `TimestampError`."""
     now = clock.wall_ns()
     begin = None if since is None else parse_timestamp(since, now)
     end = None if until is None else parse_timestamp(until, now)

@@ -59,7 +59,7 @@ class Condition(NamedTuple):
 
 
 def conditions(wanted: Filter) -> list[Condition]:
-    """Leave out the filter's text. Raises `FilterError`."""
+    """Return the conditions of a filter, except that on its text. Raises `FilterError`."""
     found: list[Condition] = []
     if wanted.decision:
         marks = ", ".join("?" * len(wanted.decision))
@@ -97,7 +97,7 @@ def conditions(wanted: Filter) -> list[Condition]:
 
 
 def _within(networks: tuple[str, ...]) -> Condition:
-    """Only hosts' addresses have an index."""
+    """Return the condition that a host is in one of the networks; an index has only single addresses."""
     if all(network.endswith(("/32", "/128")) for network in networks):
         addresses = tuple(network.rpartition("/")[0] for network in networks)
         marks = ", ".join("?" * len(addresses))
@@ -113,7 +113,7 @@ def _match(column: str, value: str) -> Condition:
 
 
 def checked_pattern(name: str, value: str) -> str:
-    """Raise `FilterError` unless the pattern is short, simple and valid Unicode."""
+    """Return the pattern. Raises `FilterError` unless it is short, simple and valid Unicode."""
     if len(value) > _LONGEST_PATTERN:
         raise FilterError(f"{name}: longer than {_LONGEST_PATTERN} characters")
     if value.count("*") > _MOST_STARS:
@@ -131,7 +131,7 @@ def text_condition(text: str) -> Condition:
 
 
 def text_match(text: str) -> str | None:
-    """Return None if the text is too short for the index, which only finds candidates."""
+    """Return a query of the index, which only finds candidates, or None if the text is too short for it."""
     if len(text) < _TRIGRAM or "\0" in text:
         return None
     trigrams = {text[start : start + _TRIGRAM] for start in range(len(text) - _TRIGRAM + 1)}

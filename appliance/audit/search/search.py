@@ -50,7 +50,7 @@ class RecordInContext(NamedTuple):
 def search(
     path: Path, wanted: Filter, cursor: str | None = None, limit: int = 100, *, newest_first: bool = True
 ) -> SearchPage:
-    """Raises `LogUnreadableError` and `FilterError`."""
+    """Return a page of the records found. Raises `LogUnreadableError` and `FilterError`."""
     if not 1 <= limit <= LARGEST_PAGE:
         raise FilterError(f"limit: not within 1 and {LARGEST_PAGE}")
     walk = _Walk(_sequence(cursor), newest_first)
@@ -58,7 +58,7 @@ def search(
 
 
 def show(path: Path, record_id: str, neighbours: int = 5) -> RecordInContext | None:
-    """`record_id` may also be a sequence."""
+    """Return the record with this id or sequence, or None."""
 
     def find(connection: sqlite3.Connection) -> RecordInContext | None:
         column = "id" if len(record_id) == ID_LENGTH else "sequence"
@@ -107,7 +107,7 @@ class Follower:
     """Each `poll` returns the records since the previous one, oldest first."""
 
     def __init__(self, path: Path, wanted: Filter, after: int | None = None) -> None:
-        """Begin at the end of the log without `after`. Raises `FilterError`."""
+        """Begin after this sequence, by default at the end of the log. Raises `FilterError`."""
         conditions(wanted)  # an invalid filter is refused now, not at the first record
         if wanted.text:
             text_condition(wanted.text)
@@ -202,7 +202,7 @@ def _networks_of(text: str) -> tuple[ipaddress.IPv4Network | ipaddress.IPv6Netwo
 
 
 def _most_selective(connection: sqlite3.Connection, found: list[Condition]) -> str | None:
-    """Return None if each index has `_SELECTIVE` candidates or more, as a scan is then quick."""
+    """Return the index with the fewest candidates, or None if all have `_SELECTIVE` or more: a scan is then quick."""
     best, fewest = None, _SELECTIVE
     for condition in found:
         if condition.answered_by is not None:
