@@ -44,7 +44,7 @@ def check_resource(category: Category, name: str) -> str:
 
 
 def find_hosts(text: str, policy: Policy) -> tuple[Address, ...]:
-    """Return the addresses that a text names; of a group's network, the first host. Raises `BadWordError`."""
+    """Return the addresses that a text names; for a group's network, its first host. Raises `BadWordError`."""
     try:
         return (canonical_address(ipaddress.ip_address(text)),)
     except ValueError:
@@ -58,7 +58,7 @@ def find_hosts(text: str, policy: Policy) -> tuple[Address, ...]:
 
 
 def find_host(text: str, policy: Policy) -> Address:
-    """Return the address that a text names; of `robot`, the first one. Raises `BadWordError`, also for several."""
+    """Return the address that a text names; for `robot`, the first one. Raises `BadWordError`, even for several."""
     found = find_hosts(text, policy)
     if len(found) > 1 and text != ROBOT:
         some = ", ".join(map(str, found[:_MOST_NAMED]))

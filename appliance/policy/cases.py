@@ -42,7 +42,7 @@ class CaseResult:
 
     @property
     def passed(self) -> bool:
-        """A request that passes only because of audit-only mode counts as denied."""
+        """Whether the case passed; a request that passes only because of audit-only mode counts as denied."""
         verdict = self.decision.verdict
         return self.expected == ("deny" if verdict == "would deny" else verdict)
 

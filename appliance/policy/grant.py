@@ -1,7 +1,7 @@
 """Find the smallest change of a policy's text that grants a denied request. No I/O.
 
-A new line for an exact key lists the host and all hosts of the deciding rule, so the rights of other hosts do not
-change. The key for the anonymous name of a stock tool is a pattern, because its numbers change with each run.
+A new line for an exact key lists the host and all hosts of the deciding rule, so other hosts keep their rights. The
+key for the anonymous name of a stock tool is a pattern, because its numbers change with each run.
 """
 
 import difflib

@@ -134,7 +134,7 @@ class HostGroups:
         return network
 
     def _robot_instead(self) -> str:
-        """Loopback is the appliance itself, not the robot."""
+        """Return the hint to write `robot`: loopback is the appliance itself."""
         if not self.robot:
             return "(unless isolation is none): write robot if you mean the nodes of its machine"
         robot = ", ".join(str(member).removesuffix("/32").removesuffix("/128") for member in self.robot)

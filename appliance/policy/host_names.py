@@ -1,9 +1,9 @@
 """Names of hosts: `robot`, the groups of the policy, and enrolled hosts. Only this module resolves them. Pure.
 
-A name means every network of its group, at any depth, and the address of the enrolled host of this name. `host:NAME`
-means the enrolled host only, `door:NAME` the door. The label of an address is the name of the smallest network that
-contains it: of an enrolled host before `robot`, and of `robot` before the group with the fewest networks. A network of
-all addresses gives no label.
+A name means every network of its group, at any depth, and the enrolled host of this name. `host:NAME` means only the
+enrolled host, `door:NAME` the door. The label of an address is the name of the smallest network that contains it: of
+an enrolled host before `robot`, and of `robot` before the group with the fewest networks. A network of all addresses
+gives no label.
 """
 
 import ipaddress
@@ -19,7 +19,7 @@ from appliance.policy.policy_findings import Findings, quoted
 from appliance.policy.sections import GROUPS
 
 HostInWords = Callable[[str], str]
-"""A function that returns a host as text for people: `tablet (10.0.0.7)`, or the address alone."""
+"""Returns a host as text for people: `tablet (10.0.0.7)`, or the address alone."""
 
 _MOST_NAMED = 20
 _EVERY = tuple(map(ipaddress.ip_network, ("0.0.0.0/0", "::/0")))

@@ -1,8 +1,7 @@
 """Store networks and groups as numbers, and find the numbers for an address with a prefix table.
 
 A host has the numbers (*atoms*) of all networks that contain its address, and of all groups that contain these
-networks. A rule includes a host if they share an atom, so memory and time do not grow with the number of rules times
-the size of groups.
+networks. A rule includes a host if they share an atom, so cost does not grow with the size of groups.
 """
 
 import ipaddress

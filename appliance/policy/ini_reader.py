@@ -1,7 +1,6 @@
 """Read INI text, with the line and column of every word, which configparser does not report.
 
-The text has sections `[Name]`, entries `key = value`, and comments from `#` or `;` to the end of the line. It has no
-continuation lines, no interpolation and no quotes.
+There are no continuation lines, no interpolation and no quotes; comments go from `#` or `;` to the end of the line.
 """
 
 import re
@@ -43,7 +42,7 @@ class SectionText:
 
 
 def read(text: str, findings: Findings) -> list[SectionText]:
-    """Skip unreadable lines, and report them in `findings`."""
+    """Return the sections; skip unreadable lines, and report them in `findings`."""
     if len(text) > MAXIMUM_CHARACTERS:
         findings.error(1, 1, f"the file has {len(text)} characters; the limit is {MAXIMUM_CHARACTERS}")
         return []

@@ -22,8 +22,8 @@ def approvals_of(rows: Iterable[Iterable[str]]) -> frozenset[Approval]:
 class PolicyContext:
     """The surroundings of a policy: the addresses of `host:NAME` and `robot`, and the test cases.
 
-    `cases_error`, why the test cases could not be read, rejects the policy. `blocks`, `holders` and `approved` do not
-    affect checks and test cases.
+    If the test cases could not be read, `cases_error` says why, and rejects the policy. `blocks`, `holders` and
+    `approved` do not affect checks and test cases.
     """
 
     hosts: Mapping[str, Address] = field(default_factory=dict)

@@ -1,10 +1,9 @@
 """The left side of a rule (a resolved ROS name, or a pattern), and the tree that finds the key for a name.
 
-The forms of keys, and their order, are in docs/reference/policy-file.md. Two keys tie if they are equally specific and
-match the same name; a policy with a tie is rejected.
+The forms of keys, and their order, are in docs/reference/policy-file.md. Two keys tie if they are equally specific
+and match the same name; a policy with a tie is rejected.
 
-A look-up takes one step per level of the name, whatever the number of keys with stars only at their end. The compiler
-limits the number of other keys.
+A look-up takes one step per level of the name, whatever the number of keys with stars only at their end.
 """
 
 from collections.abc import Iterator
@@ -40,12 +39,12 @@ class Key:
 
     @property
     def specificity(self) -> tuple[bool, int, bool]:
-        """The matching key with the greatest specificity decides."""
+        """The rank among matching keys, of which the greatest decides."""
         return (self.exact, len(self.literal), not self.subtree)
 
     @property
     def inner_star(self) -> bool:
-        """Only keys with a star before the end can tie (`/*/state`, `/arm*/**`)."""
+        """Whether a star is before the end, as in `/*/state` or `/arm*/**`; only such keys can tie."""
         return any(star for _, star in (self.steps if self.subtree else self.steps[:-1]))
 
     def matches(self, name: str) -> bool:
@@ -78,7 +77,7 @@ def levels(name: str) -> list[str]:
 
 
 def parse_key(text: str, *, parameter: bool = False) -> Key:
-    """Names of parameters have a wider grammar than those of topics. Raises `BadKeyError`."""
+    """Return the key of a name or pattern; parameters' names have a wider grammar. Raises `BadKeyError`."""
     if not text.startswith("/"):
         raise BadKeyError(f"names here are resolved and begin with a slash: /{text.lstrip('~')}")
     if "//" in text:
@@ -120,7 +119,7 @@ Value = TypeVar("Value")
 
 @dataclass(slots=True)
 class _Node(Generic[Value]):
-    """`value` belongs to a key that ends here, `subtree` to one that ends here with `/**`."""
+    """`value` belongs to a key that ends here, `subtree` to a key that goes on with `/**`."""
 
     names: dict[str, "_Node[Value]"] = field(default_factory=dict)
     # The literal beginnings of levels with a star: one table for each length, longest first.
@@ -175,7 +174,7 @@ class KeyTree(Generic[Value]):
         return pattern[1] if pattern is not None else None
 
     def below(self, name: str) -> list[Value]:
-        """These keys decide only some of the names below `name`."""
+        """Return the values of keys that decide only some of the names below `name`."""
         inherited, ends = self._walk(name)
         prefix = "/" if name == "/" else name + "/"
         found = [pair for end in ends for child in end.children() for pair in _everything(child)]
@@ -186,7 +185,7 @@ class KeyTree(Generic[Value]):
         return [value for _, value in found]
 
     def inherited(self, name: str) -> Value | None:
-        """The key decides names below `name` that no more specific key matches."""
+        """Return the value for names below `name` that no more specific key matches."""
         inherited, _ = self._walk(name)
         return inherited[1] if inherited is not None else None
 
@@ -229,7 +228,7 @@ def _everything(node: _Node[Value]) -> Iterator[tuple[Key, Value]]:
 
 
 def _find(path: list[_Node[Value]], parts: list[str]) -> tuple[Key, Value] | None:
-    """The first levels of the name lead through `path` without a star.
+    """Return the best pattern for a name whose first levels lead through `path` without a star.
 
     Literal beginnings grow along the path, so the end of the path is tried first. In each node, stars are tried
     before `subtree`, because a longer literal beginning beats a shorter one, and /x/* beats /x/**.
@@ -249,8 +248,7 @@ def _find(path: list[_Node[Value]], parts: list[str]) -> tuple[Key, Value] | Non
 def _find_behind_star(node: _Node[Value], parts: list[str], depth: int) -> tuple[Key, Value] | None:
     """Return the best pattern behind a star.
 
-    All patterns here have the same literal beginning. So at most one pattern with `/**` matches, and at most one
-    without.
+    All patterns here have the same literal beginning, so at most one with `/**` matches, and at most one without.
     """
     waiting = [(node, depth)]
     subtree: tuple[Key, Value] | None = None

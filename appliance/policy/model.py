@@ -10,7 +10,7 @@ Address = ipaddress.IPv4Address | ipaddress.IPv6Address
 
 
 class _Stored:
-    """A property that is computed once; the standard library would compute it at each use."""
+    """An address whose hash, text and `is_loopback` are computed once, instead of at each use."""
 
     is_loopback = False
 
@@ -112,7 +112,7 @@ class Decision:
     `rule` is None if no rule matches. `told` is the reason without names and addresses of other hosts; None if
     `reason` contains none. In audit-only mode, `would_deny` is true if the rules deny the request, and `allowed` is
     true. `needs` names the further right that decided, if any. `asks` is the request that needs an operator's
-    approval, also while it has one.
+    approval, even while it has one.
     """
 
     allowed: bool
@@ -125,7 +125,7 @@ class Decision:
 
     @property
     def rank(self) -> int:
-        """Order: nothing is granted, with an approval, only in audit-only mode, all."""
+        """0 if nothing is granted, 1 with an approval, 2 only in audit-only mode, 3 otherwise."""
         return 2 if self.would_deny else 1 if self.asks is not None else 3 if self.allowed else 0
 
     @property

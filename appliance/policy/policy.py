@@ -1,8 +1,8 @@
 """A compiled policy, and the one pure function that decides: `Policy.decide(request)`.
 
-1. A request that no rule grants is denied. Exception: if an extension section is missing, its requests are allowed. An
-   operator's block denies every request of its host, whatever the rules say, also in audit-only mode.
-2. Otherwise one rule decides a request: the rule with the most specific matching key of its section, or `default`.
+1. An operator's block denies every request of its host, whatever the rules say, even in audit-only mode.
+2. A request that no rule grants is denied, unless its section is an extension and missing. One rule decides: the rule
+   with the most specific matching key of its section, or `default`.
 3. `Decision.reason` is a sentence shorter than 300 characters.
 4. Memory does not grow with requests: answers are kept for at most `_KEPT_DECISIONS` short resource names, and hosts.
 """
@@ -31,7 +31,7 @@ _KEPT_NAME = 256
 _LONGEST_REASON = 299
 
 Approval = tuple[Address, Category, str]
-"""The right of a host to publish a topic or write a parameter."""
+"""A right that an operator has approved: the host, the category, and the name of the topic, service or parameter."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +91,7 @@ class Policy:
     """A compiled policy, which only `compile_policy` makes.
 
     `named` has the atoms of all hosts that a rule names. `blocks` has the end of a sentence for each blocked host,
-    such as `blocked by ann`. A group without an entry in `holders` is free. Without `holders` (for checks of a text),
+    such as `blocked by ann`. A group without an entry in `holders` is free; without `holders` (for checks of a text),
     each host with a claim counts as the holder. Without `approved`, no request that needs an approval passes.
     """
 
@@ -141,8 +141,8 @@ class Policy:
     def decide_parameter(self, request: Request, *, namespace: bool = False) -> Decision:
         """Decide access to a parameter; a rule for a name below that denies the host denies the call.
 
-        `namespace`: the parameter contains other parameters. Then the rule for contained parameters without their own
-        key must also grant the host, because an exact key `/arm` does not match `/arm/speed`.
+        `namespace`: the parameter contains other parameters. Then the rule for those without their own key must also
+        grant the host, because an exact key `/arm` does not match `/arm/speed`.
         """
         decision = self.decide(request)
         if not decision.allowed or decision.would_deny or request.category not in self.present:
@@ -182,7 +182,7 @@ class Policy:
         return self.limits.find(topic) if self.limits.rules else None
 
     def limit(self, part: LimitScope, topic: str, host: Address | None = None) -> Rate:
-        """Without `host`, return the limit of all publishers together. No limit is `NO_LIMIT` itself."""
+        """Return the limit for a host, or without `host` for all publishers together. No limit is `NO_LIMIT` itself."""
         rule = self.limit_rule(topic)
         if rule is None:
             return NO_LIMIT
@@ -208,7 +208,7 @@ class Policy:
         return HostStanding(atoms, known, free and network is not None, named_as, str(named_as), text)
 
     def knows(self, address: Address) -> bool:
-        """Whether a rule includes this address, and the host is not blocked.
+        """Return whether a rule includes this address, and the host is not blocked.
 
         In audit-only mode without a rule that names a host, every host is known, because a robot is being learned.
         """
@@ -250,11 +250,11 @@ class Policy:
         return self.standing(address).alike
 
     def counted_as(self, address: Address) -> str:
-        """Return one empty string for all unknown hosts."""
+        """Return the same text for hosts that count as one; all unknown hosts have the empty one."""
         return self.alike(address) if self.knows(address) else ""
 
     def names(self, address: Address) -> bool:
-        """`*` and blocked hosts do not count as named."""
+        """Return whether a rule names the host; `*` does not name hosts, and a blocked host does not count."""
         return self.standing(address).named
 
     def audit_only(self, category: Category) -> bool:
@@ -292,7 +292,7 @@ class Policy:
     def _commanding(self, request: Request, decision: Decision, group: AuthorityGroup) -> Decision:
         """Deny a host without a claim to the group, and calls of a host that does not hold it.
 
-        The publication of a host with a claim stays registered, because a ROS 1 node never registers again. The relay
+        A publication of a host with a claim stays registered, because a ROS 1 node never registers again; the relay
         carries its messages only while the host holds the group.
         """
         if not decision.allowed and decision.asks is None:
@@ -333,7 +333,10 @@ class Policy:
         return _by_rule(what, found, table.audit_only)
 
     def _asking(self, request: Request, rule: CompiledRule, audit_only: bool) -> Decision:
-        """A service call passes, because the relay holds each of its requests."""
+        """Return the decision on a request that needs an approval.
+
+        A service call passes, because the relay holds each of its requests.
+        """
         if self._is_approved(request):
             reason = f"{self._what(request, 'may')} by {rule.place}, while an approval lasts"
             return Decision(True, rule.rule, reason, asks=request)

@@ -1,7 +1,7 @@
 """Read `[Limits]`: the number of messages and bytes that may pass in a second (docs/reference/policy-file.md).
 
-Only the most specific key counts. If several of its clauses match a host, the strictest one counts. A limit never
-allows or denies a request.
+If several clauses of the most specific key match a host, the strictest counts. A limit never allows or denies a
+request.
 """
 
 import re

@@ -35,7 +35,7 @@ class Right(NamedTuple):
     alone: bool = False
 
     def __str__(self) -> str:
-        """`write /arm/**` for a namespace (`read /**` for all), `write /arm` for one parameter, `node /it`."""
+        """Return `write /arm/**` for a namespace (`read /**` for all), `write /arm` for one parameter, `node /it`."""
         name = self.request.resource
         return f"{self.request.category} {name.rstrip('/') + '/**' if self.namespace else name}"
 
@@ -91,7 +91,7 @@ def needs_node(request: Request) -> bool:
 
 
 def decide(policy: Policy, rights: Iterable[Right]) -> Decision:
-    """Return the first decision of the lowest rank, so a denial before a missing approval.
+    """Return the first of the lowest-ranked decisions, so a denial before a missing approval.
 
     Each right that asks needs its own approval.
     """

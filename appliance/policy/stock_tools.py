@@ -1,4 +1,4 @@
-"""List the rights that the stock tools of ROS need before they do what the user asked for. No I/O.
+"""List the rights that the stock tools of ROS need before they carry out a command. No I/O.
 
 A denied tool reports only its first denied call. The calls are those that the tools of Debian 12 made with all their
 verbs that only read.
@@ -18,7 +18,7 @@ _LOG_LEVEL = ("get_loggers", "set_logger_level")
 
 
 def key_of(name: str) -> str:
-    """The key of `/rostopic_4711_1700000000000` is `/rostopic_*`."""
+    """Return the key for a tool's name: `/rostopic_*` for `/rostopic_4711_1700000000000`."""
     return "/".join(_ANONYMOUS.sub("_*", level) for level in name.split("/"))
 
 
