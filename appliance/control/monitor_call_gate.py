@@ -1,7 +1,6 @@
 """Decide the service calls of monitors by the policy, as those of a client at the appliance's own address.
 
-Relays connect to themselves, so this is the address that they listen on. The decision, the grant and its revocation
-are about the host that the relay sees.
+Relays connect to themselves, so this is the address that they listen on, which the serving relay sees.
 """
 
 import ipaddress

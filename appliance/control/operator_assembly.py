@@ -34,7 +34,7 @@ class Operators:
 
 
 def make_operators(base: Foundation, parts: Parts) -> Operators:
-    """The specifications must already be loaded."""
+    """Make the parts; the specifications must already be loaded."""
     settings, trail, ends = base.settings, base.trail, parts.endpoints
     ends_of_tokens = StoredDeadlines(base.store)
     rest = Current[RestLink]()

@@ -1,8 +1,8 @@
 """Run the control process: start its parts, serve until the supervisor stops the process, end the parts.
 
-The order of the start: receive the listening sockets of an earlier control; open the log and the store, and bring the
-policy into force; restore the registry; serve the listeners; register all nodes with the ROS master, in the first
-reconcile round; send `Ready`.
+The start receives the listening sockets of an earlier control, opens the log and the store, brings the policy into
+force, restores the registry, serves the listeners, registers all nodes with the ROS master in the first reconcile
+round, and then sends `Ready`.
 """
 
 import asyncio

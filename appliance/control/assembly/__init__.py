@@ -1,1 +1,1 @@
-"""Make the parts of control, in order, and keep what they have in common."""
+"""Make the parts of control, in order."""

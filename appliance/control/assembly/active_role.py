@@ -54,7 +54,7 @@ class ActiveRole:
         return make_host_authority(signer, store, trail, table)
 
     def hand_tunnels_to(self, tunnels: Tunnels) -> None:
-        """Give a link that is already open to the tunnels."""
+        """Give the tunnels a link that is already open."""
 
     def in_doubt(self) -> bool:
         return False
@@ -63,11 +63,11 @@ class ActiveRole:
         """Call `ended` when computers of the robot stop refusing connections."""
 
     def close(self) -> None:
-        """End the role: a change that is not answered yet gets no answer."""
+        """End the role; a change that is not answered yet gets no answer."""
 
 
 class StartGate:
-    """The decision when control may serve."""
+    """Decides when control may serve."""
 
     links: Mapping[str, tuple[Callable[[Channel], None], Any]] = {}
 

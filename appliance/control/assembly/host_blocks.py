@@ -2,7 +2,7 @@
 
 1. A block is stored before it takes effect, and survives restarts of control and of the appliance.
 2. A block ends by the age clock (`base/age_clock.py`): changes of the system clock neither end nor extend it.
-3. `reasons` is never changed, only replaced. So a policy keeps the blocks with which it was put into force.
+3. `reasons` is never changed, only replaced, so a policy keeps the blocks with which it was put into force.
 """
 
 from collections.abc import Callable, Mapping

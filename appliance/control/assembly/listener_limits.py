@@ -1,7 +1,7 @@
 """Limit the listeners of control, and find the quota class of a host (`appliance/quotas`).
 
-An unknown host (an address that no rule of the policy names, or that an operator blocks) is refused. If a section of
-the policy is audit-only, only a blocked host is. The beginning of the body is read first, to record the name of the
+An unknown host (an address that no rule of the policy names, or that an operator blocks) is refused; if a section of
+the policy is audit-only, only a blocked host is. The beginning of its body is read first, to record the name of the
 call. While the ROS master is not hidden, every host is refused.
 """
 
@@ -77,7 +77,7 @@ class ListenerLimits:
         guarded: bool = True,
         keep: bool = True,
     ) -> HttpServer:
-        """`guarded` is false for a listener that only the appliance's own processes can reach."""
+        """Return a server; `guarded` is false for a listener that only the appliance's own processes can reach."""
         return HttpServer(
             sock,
             handler,
@@ -156,8 +156,8 @@ def class_of(
 ) -> str:
     """Return the class that is charged for a host's processor time, and that shares turns.
 
-    A host can have many addresses, so all hosts that only `*` names share one class, or a second one if they have a
-    registration.
+    A host can have many addresses, so the hosts that only `*` names share one class, and those with a registration
+    another.
     """
     standing = policy().standing(host)
     if host.is_loopback or standing.named:
@@ -170,9 +170,8 @@ def connection_class_of(
 ) -> QuotaClass:
     """Return a host's quota class for connections.
 
-    The connections of hosts that only `*` names must not use up the quotas of hosts that the policy names. With a
-    registration, they count as named, otherwise as unknown. Any of them can register a node, so they do not get the
-    part for registered hosts.
+    Hosts that only `*` names must not use up the quotas of named hosts: with a registration, which each of them can
+    make, they count as named, otherwise as unknown.
     """
     if host.is_loopback or policy().standing(host).named:
         return quota_class(host)
@@ -199,14 +198,14 @@ class HostQuotaClass:
         self._registrations = registrations
 
     def __call__(self, host: Address) -> QuotaClass:
-        """In audit-only mode, also an unknown host can have registrations."""
+        """Return the quota class of a host; in audit-only mode, even an unknown host can have registrations."""
         # The policy need not name loopback, from which the appliance's own nodes call.
         if not (host.is_loopback or self._policy().standing(host).known):
             return QuotaClass.UNKNOWN
         return QuotaClass.REGISTERED if self._registrations(host) else QuotaClass.NAMED
 
     def of_text(self, host: str) -> QuotaClass:
-        """A text that is not an address counts as named."""
+        """Return the quota class of a host in text form; a text that is not an address counts as named."""
         try:
             return self(address_of(host)) if self._policy else QuotaClass.NAMED
         except ValueError:

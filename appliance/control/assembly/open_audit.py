@@ -22,7 +22,9 @@ def open_audit(
     kept_for: Callable[[str], bool],
     receipts: ReceiptFloor,
 ) -> AuditLog:
-    """`kept_for(host)`: whether the last of the disk is kept for a host. `held_by` gets processes that lock the log."""
+    """Open the log. `kept_for(host)`: the last of the disk is kept for the host. `held_by` gets processes that lock
+    the log.
+    """
     audit = settings.audit
     reserve = AUDIT_RESERVE.bounds.sized(
         int(audit.reserve_bytes), int(audit.reserve_bytes) // _HOSTS_IN_RESERVE

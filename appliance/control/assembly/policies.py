@@ -1,6 +1,6 @@
 """Manage the policy in force: load it, store revisions, roll back, and limit the time of an unconfirmed change.
 
-A new policy passes the gate (`policy_gate.py`) before it takes effect, also at a start. A change is answered once it
+Each policy passes the gate (`policy_gate.py`) before it takes effect, even at a start. A change is answered once it
 is on disk and the relays have carried it out: revoked traffic no longer passes.
 """
 
@@ -110,7 +110,7 @@ class Policies(Revisions[RevisionRow]):
         self._labelled: Policy | None = None  # whose labels are kept
         self._labels: list[tuple[Network, str]] = []
         self.file_refused = store.settings().get(_REFUSED, "")
-        """Why the file was refused at the last start or reload, in a line; empty: it was not."""
+        """Why the file was refused at the last start or reload, in a line; empty if it was accepted."""
 
     @property
     def current(self) -> Policy:
@@ -133,9 +133,9 @@ class Policies(Revisions[RevisionRow]):
     def start(self, *, restarted: bool) -> None:
         """Bring a policy into force at the start of control. Raises `PolicyRefusedError`.
 
-        After a crash of control (`restarted`), this is the policy that was in force. At the start of the appliance, it
-        is the file, if a reload would take it: otherwise the last revision stays in force, with an alarm. An
-        operator's own revision that was in force when the appliance stopped comes first.
+        After a crash of control (`restarted`), the previous policy stays in force. At the start of the appliance, an
+        operator's revision that was in force at its stop comes first, and then the file. If the file is refused, the
+        last revision stays in force, with an alarm.
         """
         kept_first = self._find_last(restarted=restarted)
         kept = kept_policy(self.in_force) if self.revision else None
@@ -178,8 +178,8 @@ class Policies(Revisions[RevisionRow]):
     async def load(self, request: admin.PolicyLoad, who: str) -> Loaded:
         """Bring a given text into force. Raises `PolicyRefusedError` and `RevisionChangedError`.
 
-        Loading the same text again makes no new revision. Messages cite its rules as `revision N:line`, because the
-        lines of the file may differ.
+        The same text makes no new revision. Messages cite its rules as `revision N:line`, because the file's lines
+        may differ.
         """
         return await self.load_with(request, who, None)
 
@@ -300,7 +300,7 @@ class Policies(Revisions[RevisionRow]):
         )
 
     def _note_refused(self, reason: str) -> None:
-        """Keep the reason, also for a control that follows after a crash."""
+        """Store the reason, so that it survives a crash of control."""
         if reason != self.file_refused:
             self.file_refused = reason
             self.store.save_setting(_REFUSED, reason)

@@ -40,7 +40,7 @@ class KeptPolicy(NamedTuple):
 
 
 class StartingPolicy(NamedTuple):
-    """The policy that a start brings into force; `refused` is the error of a file that does not."""
+    """The policy that a start brings into force; `refused` is the error of the file, if the file is not used."""
 
     policy: Policy
     signature: str
@@ -50,7 +50,9 @@ class StartingPolicy(NamedTuple):
 def policy_at_start(
     kept: KeptPolicy | None, file: Path, known: PolicyContext, *, kept_first: bool
 ) -> StartingPolicy:
-    """Return `kept` if it comes first, or if the file does not pass. Raises `PolicyRefusedError`."""
+    """Return `kept` if it comes first or the file does not pass, else the file's policy. Raises
+    `PolicyRefusedError`.
+    """
     if kept is not None and kept_first:
         try:
             return StartingPolicy(judged(kept.text, kept.signature, kept.file, known), kept.signature)

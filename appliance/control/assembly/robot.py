@@ -14,7 +14,7 @@ _ROUTES = Path("/proc/net/route")
 
 
 def robot_addresses(settings: Settings, robot: str | None = None) -> list[Address]:
-    """Return loopback with `isolation: none`, otherwise the gateway of the default route."""
+    """Return loopback with `isolation: none`, otherwise `robot` or the gateway of the default route."""
     if settings.isolation == "none":
         return [ipaddress.ip_address("127.0.0.1"), ipaddress.ip_address("::1")]
     if robot is not None:

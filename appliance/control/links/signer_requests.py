@@ -1,7 +1,7 @@
 """Send requests to the signer: sign checkpoints of the audit log, approve removals from the log, make certificates.
 
-Missing signatures are requested again whenever a signer process starts. Until then a new signer gets none: it would
-sign the present checkpoint, and then refuse the earlier ones for ever.
+Missing signatures are requested again whenever a signer process starts. Before that, a new signer gets no request:
+after the present checkpoint, it would refuse the earlier ones.
 """
 
 import asyncio
@@ -21,7 +21,7 @@ _ANY = 1 << 63
 class ReceiptFloor:
     """The last record that retention by age may remove: any record, or if `holding`, only what another machine has.
 
-    While only the reserve of the log's disk is free, it may remove any record. One thread writes, another reads.
+    While only the reserve of the log's disk is free, it may remove any. One thread writes, another reads.
     """
 
     def __init__(self, state: Path, reserve: int, *, holding: bool) -> None:

@@ -41,8 +41,8 @@ class Surroundings:
 class ControlLifeline:
     """Control's end of the lifeline.
 
-    `links` has a function for each process that the start of control may wait for, and the messages that control
-    accepts from it. Other messages are queued until `hear` is called.
+    `links` has a function for each process that the start of control may wait for, and the messages accepted from it.
+    Other messages are queued until `hear` is called.
     """
 
     def __init__(
@@ -117,7 +117,7 @@ class ControlLifeline:
         self.say(messages.SocketDropped(name))
 
     async def route_to(self, host: str) -> str | None:
-        """Return the machine's address at which `host` reaches the appliance (None: the address that `host` used)."""
+        """Return the machine's address at which `host` reaches the appliance, or None if `host` already used it."""
         if host not in self._routes:
             await self._free_questions.acquire()
             if host in self._routes:  # another call has sent the query in the meantime

@@ -23,7 +23,7 @@ class RequestHandler(Protocol):
     """The part of control that carries out requests."""
 
     async def carry_out(self, request: admin.AdminRequest[A], *, who: str) -> admin.AdminAnswer[A]:
-        """Carry out a request of `who`."""
+        """Carry out a request of the client `who`."""
 
 
 class AdminServer:
@@ -34,7 +34,7 @@ class AdminServer:
         self._decoder = msgspec.json.Decoder(AnyRequest)
 
     async def start(self, sock: socket.socket) -> asyncio.Server:
-        """The caller must keep a reference to the returned server."""
+        """Return the running server; the caller must keep a reference to it."""
         return await asyncio.start_unix_server(self._serve, sock=sock, limit=_LINE_LIMIT)
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -68,7 +68,7 @@ class AdminServer:
 
 
 def _given_up(writer: asyncio.StreamWriter) -> bool:
-    """Whether the client closed its sending side, which withdraws its request."""
+    """Return whether the client closed its sending side, which withdraws its request."""
     if writer.is_closing():
         return True
     found = select.poll()

@@ -1,7 +1,7 @@
 """Check whether the times of audit records are credible, for status, metrics and the log. Nothing is blocked.
 
-It reports a clock that no time service synchronises, that is before the last record of the log or before the date of
-this program's files, or that advanced by more than the elapsed time.
+It reports a clock that no time service synchronises, that is behind the last record or the date of this program's
+files, or that advanced by more than the elapsed time.
 """
 
 import asyncio
@@ -53,7 +53,7 @@ class ClockCheck:
             await asyncio.sleep(_LOOK_SECONDS)
 
     def look(self) -> None:
-        """Record a step back only once, until the clock has caught up with the last record."""
+        """Record steps of the clock; a step back only once, until the clock has caught up with the last record."""
         before, self._seen = self._seen, self._started()
         ahead = self._seen - before
         if ahead > _STEP_SECONDS:

@@ -26,7 +26,10 @@ _DECISIONS = tuple(
 def measures_of(
     parts: Parts, meter: Meter, status: Status, hosts: list[Host], queued_deliveries: int
 ) -> Measures:
-    """All but `MOST_RESOURCES` topics and services (histograms: `MOST_DELAYED`) are summed in `OTHERS`."""
+    """Return the measurements; all but `MOST_RESOURCES` topics and services are summed in `OTHERS`.
+
+    For histograms, the limit is `MOST_DELAYED`.
+    """
     lives = Counter(incarnation.life for incarnation in parts.core.registry.all() if not incarnation.own)
     kinds = Counter(
         registration.kind.value for node, registration in parts.core.registry.in_order() if not node.own

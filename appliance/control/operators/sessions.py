@@ -1,4 +1,4 @@
-"""Define people's sessions beside tokens: what the feature that signs people in offers to the rest of control.
+"""Define people's sessions, which a feature that signs people in offers to the rest of control.
 
 A session is a token that a person's browser made for itself, so roles, quotas, signed orders and records treat both
 alike.
@@ -32,4 +32,4 @@ class Sessions(Protocol):
         """Return the usable sessions, in the form of tokens."""
 
     def of(self, session_id: str) -> Session | None:
-        """Return None if the session has ended."""
+        """Return the session, or None if it has ended."""

@@ -1,7 +1,7 @@
 """Make, rotate, list and revoke the access tokens of REST.
 
-The api gets data to recognise tokens, but never their secrets. A compromised api can report wrong uses of tokens. A
-session (`sessions.py`) never replaces the token with its id.
+The api gets data to recognise tokens, but never their secrets; if compromised, it can report wrong uses. A session
+(`sessions.py`) never replaces the token with its id.
 """
 
 import contextlib
@@ -61,7 +61,7 @@ class TokenOrders:
         return answers.Tokens([self._shown(row) for row in self._rows.values()], self._uses_since)
 
     def usable(self) -> list[TokenKept]:
-        """The api checks `expires`."""
+        """Return the usable tokens, as the api gets them; the api also checks `expires`."""
         tokens = {row.id: row for row in self._rows.values() if row.usable(self._ends)}
         return [kept_by_api(row) for row in ({row.id: row for row in self._session_rows()} | tokens).values()]
 

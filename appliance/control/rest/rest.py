@@ -2,13 +2,13 @@
 
 A flooded or compromised api cannot block RVMaster:
 
-1. At most `_MOST_WAITING` requests wait; further requests are answered `busy` at once. Between two requests, the event
+1. At most `_MOST_WAITING` requests wait; further ones are answered `busy` at once. Between two requests, the event
    loop serves nodes.
 2. Requests that wait for another process (`WaitingRequest`, at most `_MOST_SLOW`) do not delay other requests.
-3. The link to the api ends if the api sends an invalid message or does not read its answers.
+3. The link ends if the api sends an invalid message or does not read its answers.
 4. REST requests cannot make access tokens, and RVMaster's decisions do not depend on the api.
-5. Every request needs a token whose role allows it. Every change also needs the client's own HTTP request, with a
-   proof if the settings require it (`rest_proof.py`). Control denies and records all other requests.
+5. A request needs a token whose role allows it, and a change also the client's own HTTP request, with a proof if the
+   settings require it (`rest_proof.py`). Control denies and records all other requests.
 """
 
 import asyncio
@@ -55,8 +55,8 @@ NO_DOORS = (503, "this appliance opens no doors now")
 class RestLink:
     """The link to the api.
 
-    `served(pin)` gets the pin by which hosts recognise the api. `connected` passes a WebSocket on, and returns a
-    status and why it is refused.
+    `served(pin)` gets the pin by which hosts recognise the api. `connected` passes a WebSocket on; it returns a
+    status and the reason of a refusal.
     """
 
     def __init__(

@@ -2,13 +2,12 @@
 
 Browsers and scripts connect to the api process, so it may be compromised.
 
-1. Every request must contain its token, or the token's reading key. A compromised api can use only the tokens that it
-   has received since it was compromised.
+1. A request must contain its token, or the token's reading key. A compromised api can use only the tokens that it has
+   received since then.
 2. A change must equal the order that control derives from the client's HTTP request (`channel/rest_meaning.py`).
 3. A change by a reading key needs a proof: a signature of the HTTP request by the token's signing key, with a
    challenge that is valid once. A compromised api can drop such an order, but cannot change, repeat or forge it.
-4. A bare token authorises requests of anyone who has seen it. With the setting `api_require_proof`, a bare token does
-   not authorise changes.
+4. A bare token authorises requests of anyone who has seen it, but no changes if `api_require_proof` is set.
 """
 
 import asyncio
@@ -127,7 +126,7 @@ class RequestAuthenticator:
         return row.name
 
     async def _holder(self, shown: str) -> TokenRow:
-        """Accept a token or a reading key. Raises `UnprovenError`."""
+        """Return the row of a valid token or reading key. Raises `UnprovenError`."""
         parsed = parse_token(shown)
         token_id = parsed[0] if parsed is not None else reading_id(shown)
         row = self._tokens.usable_row(token_id) if token_id is not None else None
