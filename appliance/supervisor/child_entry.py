@@ -107,7 +107,10 @@ def _leave_network_if_allowed() -> None:
 
 
 def _enter_sandbox(plan: LaunchPlan) -> None:
-    """A role without network must be limited, or it could make a socket."""
+    """Limit system calls, files and ports, and report what the kernel lacks.
+
+    Without a filter, a role without network does not start, because it could make a socket.
+    """
     lacks = []
     abi = 0
     try:

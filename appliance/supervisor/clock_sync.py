@@ -1,6 +1,6 @@
 """Query the kernel whether a time service keeps the clock synchronised (adjtimex(2)).
 
-The sandboxes of other processes than the supervisor deny this system call.
+Only the supervisor can: all sandboxes deny this system call.
 """
 
 import ctypes
@@ -27,7 +27,7 @@ _libc = ctypes.CDLL(None)
 
 
 def clock_is_synchronised() -> bool | None:
-    """Return None if the kernel denies the call, as in some containers."""
+    """Return whether the clock is synchronised; None if the kernel denies the call, as in some containers."""
     timex = Timex()
     if _libc.adjtimex(ctypes.pointer(timex)) < 0:
         return None

@@ -29,7 +29,7 @@ class InheritedListeners:
         return iter(list(self._sockets.items()))
 
     def keep(self, name: str, descriptor: int) -> None:
-        """Raise `ListenerRejectedError` after closing `descriptor`. The name's earlier socket is closed."""
+        """Keep a socket in place of the earlier one of its name. Raises `ListenerRejectedError`, and then closes it."""
         try:
             self._check(name, descriptor)
         except ListenerRejectedError:

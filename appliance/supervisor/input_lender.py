@@ -29,9 +29,7 @@ class Borrower:
         self._is_owed = False  # the answer to an earlier request
 
     def open(self, path: Path) -> int | None:
-        """Return None for any other path. Raises `OSError`, which is `TimeoutError` while the supervisor does not
-        answer.
-        """
+        """Return a descriptor of an input, None for any other path. Raises `OSError`, such as `TimeoutError`."""
         with self._asking:
             if self._is_owed:
                 for late in self._answer(path, 0)[1]:
@@ -86,7 +84,7 @@ def _serve(link: socket.socket, inputs: tuple[Path, ...]) -> None:
 
 
 def open_input(path: Path, inputs: Collection[Path]) -> int | None:
-    """Return None unless the path is an input, a file beside it, or a file below it. Raises `OSError`."""
+    """Return a descriptor if the path is an input, or a file beside or below one, else None. Raises `OSError`."""
     for given in inputs:
         if any(path == given.with_name(given.name + suffix) for suffix in _BESIDE):
             return open_as_owner(path)

@@ -4,8 +4,8 @@ All calls block, the probe for seconds, so a running supervisor makes them in a 
 
 1. No process starts before the firewall is in force.
 2. A hidden port counts as open if another local user can reach it, or if it cannot be probed.
-3. Missing rules are installed again and logged.
-4. After `remove`, no rule is installed again: it waits for a running call, and later calls fail.
+3. Missing rules are installed again and logged, but none after `remove`: it waits for a running call, and later calls
+   fail.
 """
 
 import contextlib
@@ -82,7 +82,7 @@ class NoIsolation:
         yield
 
     def build(self) -> None:
-        """Raises `StartError` after removing everything that was built."""
+        """Build the isolation. Raises `StartError`, after removing everything that was built."""
 
     def remove(self) -> None: ...
 
@@ -110,7 +110,7 @@ class NoIsolation:
         return None
 
     def endpoint(self) -> PublicAddress:
-        """Raises `NetworkError` if the address is unknown."""
+        """Return the address at which other networks reach the appliance. Raises `NetworkError` if it is unknown."""
         raise NetworkError(f"isolation {self.kind} has no tunnels: use isolation netns or container")
 
     def report(self) -> FirewallState:
@@ -268,7 +268,7 @@ class ContainerIsolation(NoIsolation):
                 self._namespace.run(lambda: clear_leftovers(address))
 
     def endpoint(self) -> PublicAddress:
-        """Return the only address; among several, it is unknown which one outside hosts reach."""
+        """Return the only address; among several, it is unknown which one hosts outside reach."""
         found = only_address(self._namespace, without=("lo", USER_SPACE_INTERFACE))
         if is_contained() and not lives_on_the_machines_network():
             reason = f"{found.reason}, in a container: outside the machine the address may differ"
@@ -474,7 +474,7 @@ def isolation_for(
 
 
 def _require_own_network() -> None:
-    """The firewall would affect the whole machine of a container with the machine's network."""
+    """Refuse a container that shares the machine's network: the firewall would affect the whole machine."""
     shared = lives_on_the_machines_network()
     if is_contained() and (shared or bridges()):
         raise StartError(

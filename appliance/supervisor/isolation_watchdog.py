@@ -85,7 +85,7 @@ class IsolationWatchdog:
         return messages.TunnelsEnclosed(esp)
 
     async def open_own_network(self, network: str, ports: list[int]) -> str:
-        """Return the reason of a failure."""
+        """Open the network, and return the reason of a failure, or an empty text."""
         try:
             async with self._one_at_a_time:
                 await in_thread(lambda: self.isolation.open_own_network(network, ports))

@@ -1,6 +1,6 @@
 """Answer operators while control is stopped, and while it starts again without the right to serve.
 
-Every request gets the same answer, unparsed. Pauses shorter than `_PATIENCE_SECONDS` need none: control answers.
+Every request gets the same answer, unparsed. For less than `_PATIENCE_SECONDS`, requests wait for control.
 """
 
 import asyncio
@@ -17,7 +17,7 @@ _LONGEST_REQUEST = 16 << 20  # bytes, as in `control/admin_socket.py`
 
 
 async def answer_for_control(listener: Callable[[], socket.socket], reason: str) -> None:
-    """`listener()` copies the admin socket."""
+    """Answer all requests with `reason`; `listener()` copies the admin socket."""
     await asyncio.sleep(_PATIENCE_SECONDS)
     async with await asyncio.start_unix_server(
         partial(_answer, reason), sock=listener(), limit=_LONGEST_REQUEST

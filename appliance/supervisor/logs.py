@@ -45,7 +45,7 @@ def configure_logs(process: str) -> None:
 
 
 def write_line(text: str, stream: TextIO) -> None:
-    """Raises `OSError`."""
+    """Write a line, in JSON if there is no terminal. Raises `OSError`."""
     if stream.isatty() or sys.stderr.isatty():
         stream.write(f"{text}\n")
         stream.flush()

@@ -1,8 +1,8 @@
 """Provide the files in which relays keep the state of their monitors (`relay/monitors/state_memory.py`).
 
-The kernel keeps the files when all processes die. Files of earlier runs are removed only when each relay of a
-later run has written its own, so an appliance that is killed during its start loses no state. After a reboot, the
-state is used only if an orderly end wrote it to disk.
+The kernel keeps the files when all processes die. Files of earlier runs are removed only when each relay of a later
+run has written its own, so an appliance that is killed during its start loses no state. After a reboot, a state is
+used only if an orderly end wrote it to disk.
 """
 
 import os

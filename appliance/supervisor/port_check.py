@@ -18,7 +18,7 @@ def free_port() -> int:
 
 
 def first_free(ports: range) -> int:
-    """Skip also ports with an old connection. Raises `OSError`."""
+    """Return the first free port that has no old connection either. Raises `OSError`."""
     for port in ports:
         with socket.socket() as sock:
             try:
@@ -45,7 +45,7 @@ def spare_ports(count: int, taken: Sequence[range], within: range) -> range:
 
 
 def require_free(host: str, port: int) -> None:
-    """Raise `StartError`; its text names the process on the port, if known."""
+    """Raise `StartError` if the port cannot be used; its text names the process on the port, if known."""
     if port == 0:
         return
     try:

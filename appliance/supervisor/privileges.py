@@ -1,8 +1,8 @@
 """Drop privileges of a child before its own code runs.
 
 1. The child dies with the supervisor (`PR_SET_PDEATHSIG`), even if the supervisor died before the call.
-2. The child has only the role's capabilities; they are ambient, so its own children inherit them. It cannot gain
-   further privileges (`no_new_privs`).
+2. The child has only the role's capabilities, which its own children inherit, and cannot gain others
+   (`no_new_privs`).
 3. Only the child's user can read the files that the child makes (`umask 077`).
 
 Without root, only 1, 3 and `no_new_privs` apply.
@@ -34,7 +34,9 @@ _SCHED_SETATTR = {"x86_64": 314, "aarch64": 274}
 
 
 def die_with_parent(parent: int) -> None:
-    """Call this after the change of user, which clears the setting."""
+    """Let the kernel kill this process if its parent dies. The change of user clears the setting, so call this after
+    it.
+    """
     prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:
         os._exit(1)
@@ -73,9 +75,10 @@ def raise_priority(by: int) -> int:
 
 
 def add_niceness(by: int) -> None:
-    """With autogroups, niceness has an effect only inside a session, so a session with a process of higher
-    priority also gets it: call this in a session of this process alone. A session of lower priority keeps its
-    share, or a busy machine would lock operators out.
+    """Lower the priority of this process, which must be alone in its session.
+
+    With autogroups, niceness orders only the processes of a session, so a session with a process of higher priority
+    also gets that priority. A session of lower priority keeps its share, or a busy machine would lock operators out.
     """
     with contextlib.suppress(PermissionError):
         os.nice(by)
@@ -99,7 +102,7 @@ def shorten_slice(nanoseconds: int) -> None:
 
 
 def leave_network() -> None:
-    """Raises `OSError`."""
+    """Enter a new network namespace. Raises `OSError`."""
     libc_call("unshare(CLONE_NEWNET)", _CLONE_NEWNET)
 
 
@@ -176,7 +179,7 @@ def _reduce_capabilities(kept: int) -> None:
 
 
 def prctl(option: int, first: int, second: int = 0) -> None:
-    """Raises `OSError`."""
+    """Call prctl(2). Raises `OSError`."""
     libc_call(f"prctl({option})", ctypes.c_int(option), *map(ctypes.c_ulong, (first, second, 0, 0)))
 
 

@@ -76,7 +76,11 @@ class ProcessCallbacks:
 
 
 def is_hanging(silent: float, *, starting: bool, still: float) -> bool:
-    """During a start, `silent` seconds count from the start, and a start that progresses (`still`) may take long."""
+    """Return whether a process that has been silent for some seconds hangs.
+
+    During a start, they count from its beginning. A start may take long while it progresses: `still` are the seconds
+    without progress.
+    """
     if starting:
         return silent > LONGEST_START_SECONDS or (silent > FIRST_ANSWER_SECONDS and still > ANSWER_SECONDS)
     return silent > ANSWER_SECONDS
@@ -153,7 +157,7 @@ class ProcessHandle:
         ]
 
     def send(self, message: Message, descriptors: tuple[int, ...] = ()) -> None:
-        """Ignore a dead process, because its death is reported separately."""
+        """Send a message. A dead process is ignored, because its death is reported separately."""
         if self._channel is None:
             return
         try:
@@ -243,7 +247,7 @@ def _environment(home: str) -> dict[str, str]:
 
 
 def program_environment(home: str, extra: dict[str, str]) -> dict[str, str]:
-    """Inherit only language and time zone."""
+    """Return the environment of a program; only language and time zone are inherited."""
     environment = _environment(home)
     del environment["PYTHONPATH"], environment["PYDANTIC_DISABLE_PLUGINS"]
     return {**environment, **extra}

@@ -17,5 +17,5 @@ def main(lifeline_fd: int, index: int, config: Path) -> None:
 
 
 def limits_of(config: Path) -> RelayLimits:
-    """Raises `OSError`, `msgspec.ValidationError`."""
+    """Return the limits in the configuration. Raises `OSError`, `msgspec.ValidationError`."""
     return msgspec.json.decode(config.read_bytes(), type=_Section).relay

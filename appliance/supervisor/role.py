@@ -65,17 +65,17 @@ class ExternalProgram:
 class Role:
     """One row of the table of processes.
 
-    `most` processes may run (None: one for each relay). `after` is the role that must be ready first; with
-    `stands_by`, a role also runs while this appliance is passive. `listens`: the supervisor keeps the listening
-    sockets. `on_demand`: control requests the start, and exit status 0 is not followed by a restart. `asks`: the
-    supervisor checks a program without a lifeline over HTTP. `dispensable`: the other roles continue when this
-    role cannot serve. `outlives_control` roles are stopped last.
+    `most` processes may run (None: one for each relay), after the role `after` is ready; with `stands_by`, even while
+    this appliance is passive. `listens`: the supervisor keeps the listening sockets. `on_demand`: control requests
+    the start, and exit status 0 is not followed by a restart. `asks`: the supervisor checks a program without a
+    lifeline over HTTP. `dispensable`: the other roles continue when this role cannot serve. `outlives_control` roles
+    are stopped last.
 
     The group of the user `readable_by` may read files of `part`; a role that reads them has this user as `group`.
     `secret` is a file that the role's user may not read: the last argument of `entry` is its descriptor or None.
-    `inputs` are files of the operator, which the supervisor opens. `ended_early` is the `oom_score_adj`. A higher
-    `nice` yields the processor, so that no console delays a stop. `slice_ns` is the length of its turns (0: the
-    kernel's). `receiver` is the only other machine that the firewall lets the user reach.
+    `inputs` are files of the operator, which the supervisor opens. `ended_early` is the `oom_score_adj`, and
+    `slice_ns` the length of turns (0: the kernel's). `receiver` is the only other machine that the firewall lets the
+    user reach.
     """
 
     name: str

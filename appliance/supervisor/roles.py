@@ -25,7 +25,7 @@ ROS_PROGRAMS = {ROSMASTER: "python3-rosmaster", ROSOUT: "rosout"}
 
 
 def _of_ros(facts: Facts, part: str, master: str) -> dict[str, str]:
-    """ROS_IP makes rosmaster listen on loopback only."""
+    """Return the environment of a ROS program. ROS_IP makes rosmaster listen on loopback only."""
     return {
         "ROS_IP": "127.0.0.1",
         "ROS_MASTER_URI": master,
@@ -37,7 +37,7 @@ def _of_ros(facts: Facts, part: str, master: str) -> dict[str, str]:
 
 
 def _messages_at(ports: range | None) -> tuple[str, ...]:
-    """roscpp uses the first free port of the range: connections of an earlier run may occupy one for a minute."""
+    """Return the option for the first free port, because an earlier run's connections may occupy one for a minute."""
     return () if ports is None else (f"__tcpros_server_port:={first_free(ports)}",)
 
 
@@ -123,7 +123,7 @@ def roles_of(
     api: bool = True,
     paired: bool = False,
 ) -> tuple[Role, ...]:
-    """Raises `StartError` if a ROS program is missing."""
+    """Return the rows to start. Raises `StartError` if a ROS program is missing."""
     require_programs(ROS_PROGRAMS)
     wanted = {"api": api}
     return tuple(
@@ -134,7 +134,7 @@ def roles_of(
 
 
 def require_programs(packages: Mapping[Path, str]) -> None:
-    """Raise `StartError`, with the package to install."""
+    """Raise `StartError` if a program is missing, with the package to install."""
     for program, package in packages.items():
         if shutil.which(program) is None:
             raise StartError(f"{program} is missing: install it with `apt install {package}`")

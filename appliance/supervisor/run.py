@@ -51,8 +51,10 @@ def run_appliance(
     pairing: Pairing | None = None,
     waits: Callable[[], None] = lambda: None,
 ) -> None:
-    """Raises `StartError`. `ready` is called once, with the settings after all ports are chosen, and `waits` once
-    when an appliance with `pairing` could serve.
+    """Run the appliance until it is stopped. Raises `StartError`.
+
+    `ready` is called once, with the settings after all ports are chosen; `waits` once, if an appliance with `pairing`
+    stands by.
     """
     if settings.isolation == "none":
         log.warning(
@@ -188,7 +190,7 @@ def _listener(settings: Settings) -> socket.socket | None:
         return None
     host, port = settings.api_address
     if settings.isolation == "netns":
-        host = "::" if ":" in host else "0.0.0.0"  # noqa: S104  see above
+        host = "::" if ":" in host else "0.0.0.0"  # noqa: S104  the namespace has none of the addresses of the host
     require_free(host, port)
     family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
     listener = socket.socket(family, socket.SOCK_STREAM)

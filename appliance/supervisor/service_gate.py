@@ -18,8 +18,8 @@ class RoleChanges:
 class ServiceGate:
     """The gate of a single appliance, which may always serve, in epoch 0.
 
-    `accepts` has the messages of roles by which the gate decides; operators get `paused` or `ended` as the
-    answer.
+    `accepts` has the messages of roles by which the gate decides. While control is stopped, operators get `paused` or
+    `ended_text` as the answer.
     """
 
     accepts: Mapping[str, tuple[type, ...]] = {}

@@ -23,14 +23,14 @@ class ServiceManager:
 
     @classmethod
     def of(cls, environment: MutableMapping[str, str]) -> "ServiceManager":
-        """Remove the socket and the watchdog from the environment, which children inherit."""
+        """Return the manager of this environment, from which it removes its variables: children inherit them."""
         said = {
             name: environment.pop(name, None) for name in ("NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID")
         }
         return cls(said["NOTIFY_SOCKET"], _seconds(said))
 
     def starting(self, status: str) -> None:
-        """Request more time."""
+        """Report a status, and request more time."""
         self._say(f"{_MORE}STATUS={status}")
 
     def ready(self, status: str) -> None:

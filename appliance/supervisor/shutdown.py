@@ -18,7 +18,7 @@ log = structlog.get_logger()
 
 
 async def end_all(slots: Sequence[ProcessSlot], process_died: asyncio.Event) -> None:
-    """No process may start during the shutdown. `process_died` is set after each death, when its slot is free."""
+    """End all processes; no process may start. `process_died` is set after each death, when its slot is free."""
     for slot in slots:
         if slot.due is not None:
             slot.due.cancel()

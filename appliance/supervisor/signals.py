@@ -1,7 +1,7 @@
 """Block ending signals while the isolation is built or removed, so that nothing is left on the machine.
 
-Signals during the build are delivered when the supervisor's loop runs, and signals during the removal are
-ignored. Other threads must also block them (`block`); otherwise the kernel would deliver the signals to them.
+Signals during the build are delivered when the supervisor's loop runs, and signals during the removal are ignored.
+Other threads must also block them (`block`), or the kernel would deliver the signals to them.
 """
 
 import signal

@@ -34,7 +34,7 @@ _SHOWN = 3
 
 
 def foreign(path: Path) -> str | None:
-    """An empty or missing directory may become an appliance's state. Raises `OSError`."""
+    """Return why the directory is not an appliance's state; None if it is, or is empty or missing. Raises `OSError`."""
     if not path.is_dir():
         return None
     found = sorted(entry.name for entry in path.iterdir() if entry.name != _OF_THE_DISK)
@@ -46,7 +46,7 @@ def foreign(path: Path) -> str | None:
 
 
 def _has_lock(path: Path) -> bool:
-    """In a shared folder, any user may create a lock file; only that of the folder's owner counts."""
+    """Return whether its owner has created a lock file: in a shared folder, any user may create one."""
     try:
         lock = (path / _LOCK).lstat()
     except FileNotFoundError:
@@ -58,7 +58,7 @@ class StateDirectory:
     """The directory, whose lock is held until `close`."""
 
     def __init__(self, path: Path) -> None:
-        """Raises `StartError`."""
+        """Lock the directory. Raises `StartError`."""
         self.path = path.absolute()
         self._written: list[str] = []  # for the children, beside the configuration
         try:
@@ -79,7 +79,7 @@ class StateDirectory:
         return self.path / "run" / "config.json"
 
     def prepare(self, roles: Collection[Role]) -> None:
-        """Remove also the unfinished files of killed writers. Raises `StartError`."""
+        """Give the roles their parts, and remove the unfinished files of killed writers. Raises `StartError`."""
         try:
             self._give_parts(roles)
         except PermissionError as error:

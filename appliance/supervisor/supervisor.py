@@ -1,15 +1,14 @@
 """Start, watch and restart the processes of the appliance.
 
-1. The supervisor parses no data from a node or a browser. A child that sends a message outside `_FROM_ANY` and
-   `_FROM_CONTROL` is killed.
+1. The supervisor parses no data from a node or a browser. A child that sends a message that it may not send is
+   killed.
 2. A dead process is restarted within a second; a dispensable process that cannot serve, within a minute. A process
    that does not answer for five seconds is killed.
-3. Once nodes may connect, only a request of the control process ends the appliance, and no death of a process.
-4. If one end of a link is new, both ends get a new link. A new control first gets every kept socket, then its
-   links, then the list of processes.
+3. Once nodes may connect, only a request of control ends the appliance, never the death of a process.
+4. If one end of a link is new, both ends get a new link. A new control first gets every kept socket, then its links,
+   then the list of processes.
 5. When the gate suspends the service, all processes that serve the robot are stopped (SIGSTOP). They go on if it
-   resumes the service in the same epoch; otherwise they are killed, so no state in memory is older than the next
-   epoch.
+   resumes in the same epoch; otherwise they are killed, so no state in memory is older than the next epoch.
 6. Stopping the appliance takes less than five seconds, even if children hang.
 """
 
@@ -314,7 +313,7 @@ class Supervisor:
                 self.control_said(process, message, descriptors)
 
     def _sandboxed(self, process: ProcessHandle, sandbox: messages.Walled) -> None:
-        """Accept the limits of a process only as its first message."""
+        """Note the limits of a process, which only its first message may report."""
         if process.sandbox is not None:
             self._violated(process, "reported its sandbox twice")
             return
@@ -326,7 +325,7 @@ class Supervisor:
         self._tell_processes()
 
     def _cannot_serve(self, process: ProcessHandle, reason: str, output: Sequence[str]) -> None:
-        """End the appliance only if it is still starting: the next start of the process may succeed."""
+        """Kill the process, whose next start may succeed; end the appliance only if it is still starting."""
         slot = next(slot for slot in self.slots if slot.process is process)
         process.reason = reason
         process.output = tuple(_printable(line)[:_LONGEST_LINE] for line in output[-OUTPUT_LINES:])
@@ -438,7 +437,7 @@ class Supervisor:
                 slot.process.kill()
 
     def _suspend(self) -> bool:
-        """Return False if a process is only starting.
+        """Stop the processes that serve the robot; return False if any of them is only starting.
 
         A control that stood by does not count, so a lapse soon after the activation does not end the appliance.
         """

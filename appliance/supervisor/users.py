@@ -1,7 +1,6 @@
 """Choose the users of the children.
 
-As root, each role has its own user: that with its name, or a reserved numeric id, so that a container without
-these users also works.
+As root, each role has its own user: that with its name, or else a reserved numeric id, as in a container.
 """
 
 import os
@@ -37,7 +36,7 @@ class Account:
 
 
 def account_of(user: str, group: str | None = None) -> Account:
-    """`group` names the user whose group replaces the role's own. Raises `KeyError`."""
+    """Return the account of a user; `group` names the user whose group replaces its own. Raises `KeyError`."""
     if group is not None:
         return replace(account_of(user), gid=account_of(group).gid)
     numeric = NUMERIC_IDS[user]

@@ -32,7 +32,7 @@ def executables_of(program: Path) -> tuple[str, ...]:
 
 
 def folders_of(*files: Path | None) -> tuple[str, ...]:
-    """Return folders, because editors often replace a file when they save it."""
+    """Return the folders of files, because editors often replace a file when they save it."""
     given = [file for file in files if file is not None]
     found = [str(place.parent) for file in given for place in (file.absolute(), file.resolve())]
     return tuple(dict.fromkeys(found))

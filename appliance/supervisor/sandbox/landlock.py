@@ -45,7 +45,7 @@ def lacking(abi: int) -> list[str]:
 
 
 def restrict(sandbox: SandboxPlan) -> int:
-    """Return the ABI, 0 for none. Raises `LandlockError`."""
+    """Limit this process; return the ABI of Landlock, 0 for none. Raises `LandlockError`."""
     abi = version()
     if abi == 0:
         return 0

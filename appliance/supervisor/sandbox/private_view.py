@@ -1,10 +1,9 @@
 """Show a process the program where its user may not reach it, such as a checkout in a home of mode 0700.
 
 1. The view is a mount namespace of the process: no other process sees a difference, and no file is changed.
-2. An empty, read-only folder with only the program and the state covers each closed folder, so the process can
-   reach less of a home than with permission to pass through it.
-3. The program is mounted read-only. Where umask 077 at the clone closed its files, its owner is mapped to the
-   process's user.
+2. Each closed folder is covered by an empty, read-only folder with only the program and the state, so the process
+   reaches less of a home than if it could pass through.
+3. The program is mounted read-only. If umask 077 closed its files, its owner is mapped to the process's user.
 """
 
 import contextlib
@@ -48,7 +47,7 @@ class ViewError(Exception):
 
 @dataclass(frozen=True)
 class PrivateView:
-    """`owned` are the folders of the program with files that only their owner may read."""
+    """A view; `owned` are the folders of the program with files that only their owner may read."""
 
     covered: tuple[str, ...]
     program: tuple[str, ...]
@@ -63,7 +62,7 @@ def program_folders() -> tuple[Path, ...]:
 
 
 def view_of(program: Sequence[Path], state: Path) -> PrivateView | None:
-    """Return None if other users reach everything, or the processes are not root."""
+    """Return the view that the processes need; None if other users reach everything, or the processes are not root."""
     if os.geteuid() != 0:
         return None
     owned = [folder for folder in program if not _is_open(folder)]
@@ -93,7 +92,7 @@ def require_view(view: PrivateView | None, *, may_mount: bool) -> PrivateView | 
 
 
 def enter(view: PrivateView, account: Account) -> None:
-    """Call this in a process with one thread, before the change of user. Raises `ViewError`."""
+    """Mount the view in this process, which has one thread, before the change of user. Raises `ViewError`."""
     try:
         _enter(view, account)
     except OSError as error:
@@ -126,7 +125,9 @@ def _closed_above(path: Path) -> Path | None:
 
 
 def _is_open(folder: Path) -> bool:
-    """Check every file: a pull may have another umask."""
+    """Return whether other users may read the folder; of the program, every file counts, as a pull may use another
+    umask.
+    """
     if folder.name not in _PARTS:
         return _permits(folder, _ENTER | _READ)
     return all(
@@ -166,7 +167,7 @@ def _set_attributes(tree: int, attributes: int, namespace: int, folder: str) -> 
 
 @contextlib.contextmanager
 def _user_namespace(owner: os.stat_result, account: Account) -> Iterator[int]:
-    """Only mounts use the namespace."""
+    """Yield a user namespace that maps the owner to the account; only mounts use it."""
     here, there = socket.socketpair()
     child = os.fork()
     if child == 0:

@@ -1,11 +1,10 @@
 """Filter the system calls of a process with libseccomp, which knows their numbers on every architecture.
 
-A call outside the allowlist, or a call that hides its arguments (`clone3`), fails with ENOSYS, so that libraries
-try an older call instead. Only calls of another architecture (32 bits) kill a process: a killed relay stops its
-topics.
+A call outside the allowlist, or a call that hides its arguments (`clone3`), fails with ENOSYS, so that libraries try
+an older call. Only calls of another architecture (32 bits) kill a process: a killed relay stops its topics.
 
-Memory is never writable and executable at once, but a written page may become executable (`mprotect`), because
-compiled code needs this.
+Memory is never writable and executable at once, but `mprotect` may make a written page executable, as compiled code
+needs.
 """
 
 import ctypes
@@ -96,11 +95,11 @@ class _Filter:
         self._otherwise = otherwise
 
     def set(self, attribute: int, value: int) -> None:
-        """The same calls are denied without an attribute that libseccomp or the kernel lacks."""
+        """Set an attribute, if libseccomp and the kernel have it; the same calls are denied without it."""
         self._library.seccomp_attr_set(self._context, ctypes.c_int(attribute), ctypes.c_uint32(value))
 
     def add(self, action: int, names: Iterable[str], *comparisons: Comparison) -> None:
-        """Skip calls that this architecture lacks."""
+        """Add a rule for each of these calls that the architecture has."""
         if action == self._otherwise:
             return
         compared = (_Comparison * len(comparisons))(*(_Comparison(*comparison) for comparison in comparisons))
