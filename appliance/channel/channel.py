@@ -1,11 +1,10 @@
 """Send and receive typed messages and file descriptors over a Unix stream socket, without blocking.
 
 A frame is a 4-byte big-endian length, followed by a MessagePack document. Descriptors are sent with the first byte of
-their frame. The kernel never merges two sends with descriptors, so received descriptors are assigned to frames in
-order.
+their frame. The kernel never merges two sends with descriptors, so they are assigned to frames in order.
 
-The kernel may refuse a write for a while though the socket is writable: too many descriptors are on their way, or it
-has no memory. Then nothing is lost, and the channel is `delayed`: its owner calls `flush()` after `AGAIN_SECONDS`.
+The kernel may refuse a write though the socket is writable: too many descriptors are on their way, or it has no
+memory. Then the channel is `delayed`: nothing is lost, and its owner calls `flush()` after `AGAIN_SECONDS`.
 """
 
 import contextlib
@@ -74,7 +73,7 @@ class Channel:
 
     @property
     def crowded(self) -> bool:
-        """Whether a sender that can wait should, because half of the backlog is in use."""
+        """Whether a sender that can wait should wait, because half of the backlog is in use."""
         return self._backlog > self._limit // 2
 
     def send(self, message: Message, descriptors: tuple[int, ...] = (), *, soon: bool = False) -> None:
@@ -135,10 +134,10 @@ class Channel:
         return self._outgoing[0]
 
     def receive(self) -> list[tuple[Any, tuple[int, ...]]]:
-        """Return all complete messages. The caller owns the descriptors.
+        """Return all complete messages. The caller owns their descriptors.
 
-        Raises `ChannelClosedError`. Raises `ValueError`, and leaves the link unusable, if a message does not belong to
-        this link, is too long, or lacks its descriptors.
+        Raises `ChannelClosedError`. Raises `ValueError`, and leaves the link unusable, if a message does not belong
+        to this link, is too long, or lacks its descriptors.
         """
         closed = False
         for _turn in range(_MAX_READS):

@@ -53,7 +53,7 @@ class Child:
             return False
 
     def fail(self, reason: str, output: list[str]) -> None:
-        """`output` is the output of the program that this process ran."""
+        """Report that this process cannot serve; `output` is of the program that it ran."""
         self._answer(Failed(reason, output))
 
     def close(self) -> None:

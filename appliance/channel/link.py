@@ -55,7 +55,7 @@ class Link:
         channel.attach(asyncio.get_running_loop(), received, ended, ended)
 
     def send(self, message: Message, descriptors: tuple[int, ...] = (), *, soon: bool = False) -> bool:
-        """Return False if the link is not connected. Raises `ChannelFullError`."""
+        """Send a message; return False if the link is not connected. Raises `ChannelFullError`."""
         if self.channel is None:
             return False
         self.channel.send(message, descriptors, soon=soon)

@@ -1,7 +1,7 @@
 """Convert HTTP requests to orders, and orders to HTTP requests, by the table of operations.
 
-Control derives the api's order again from the client's request and carries it out only if both are equal. So a
-compromised api cannot use a proof for another order. The api may only fill in the fields in `Operation.filled`.
+Control derives the api's order again from the client's request and carries it out only if both are equal, so a
+compromised api cannot use a proof for another order. It may only fill in the fields in `Operation.filled`.
 """
 
 import json

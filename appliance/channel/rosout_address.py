@@ -1,7 +1,7 @@
 """The address of the appliance's own node (rosout), for control and the firewall.
 
-The node serves its API on every address. Control calls it at a loopback address to which only control may connect, and
-the firewall blocks all other access.
+The node serves its API on every address. Control calls it at this loopback address, to which only control may
+connect.
 """
 
 ADDRESS = "127.87.79.1"

@@ -6,7 +6,7 @@ from appliance.channel.answers.status import ProcessInfo, Status
 
 
 def probe_failed(status: Status) -> bool:
-    """Whether the probe failed; False before the first probe."""
+    """Return whether the probe failed; False before the first probe."""
     return status.probe not in ("", "passed")
 
 

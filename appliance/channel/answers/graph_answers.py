@@ -100,7 +100,7 @@ class TopicMessages(msgspec.Struct, frozen=True):
 
 
 class Registration(msgspec.Struct, frozen=True):
-    """Something live that a call gave a host, as `appliance.policy.Live` has it."""
+    """A live right that a call gave a host (`LiveRight` in `appliance/policy/live_rights.py`)."""
 
     host: str
     caller_id: str

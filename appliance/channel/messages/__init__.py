@@ -1,8 +1,7 @@
 """Every message that crosses a process boundary of the appliance, by link.
 
-A link accepts only the messages of its union. Strings from unknown hosts (names, header values) are carried as values,
-and never interpreted on the way. `messages` does not have those of `messages.api`, which imports all requests of
-operators.
+A link accepts only the messages of its union. Strings from unknown hosts (names, header values) are values, never
+interpreted on the way. `messages.api` is not imported here, because it needs all requests of operators.
 """
 
 # ruff: noqa: F403  so that a new message need not be listed

@@ -42,7 +42,7 @@ class RequestWithdrawn(Message):
 
 
 class RequestAnswered(Message):
-    """Carries the same document as the admin socket."""
+    """The answer to a request, as on the admin socket."""
 
     number: int
     answer: bytes

@@ -65,8 +65,8 @@ class Contents(msgspec.Struct, frozen=True):
 class ContentsWanted(Message):
     """Control asks for the contents of specifications (name to text) with these message definitions.
 
-    A `dry_run` gets less processor time than an order, and builds the module too. `at_start`: files with errors, also
-    the `broken` ones of before, do not keep the others from being compiled.
+    A `dry_run` gets less processor time than an order, and builds the module too. `at_start`: files with errors, such
+    as those in `broken`, do not keep the others from being compiled.
     """
 
     number: int

@@ -11,7 +11,7 @@ from appliance.channel.messages.tunnels import TunnelsEnclosed, TunnelsWanted
 
 
 class Ping(Message):
-    """A child that does not answer within 5 s is killed and restarted."""
+    """A question that a child must answer within 5 s; otherwise it is killed and restarted."""
 
     number: int
 
@@ -144,7 +144,7 @@ class RouteWanted(Message):
 
 
 class RouteFound(Message):
-    """`address` is None if the peer used the correct address."""
+    """The answer to `RouteWanted`; `address` is None if the host used the right one."""
 
     host: str
     address: str | None

@@ -225,7 +225,7 @@ class LatchRefused(Message):
 
 
 NO_GRANT = "no grant for"
-"""The reason of each `ConnectionRefused` for lack of a grant, and of no other, begins with this."""
+"""The beginning of the reason of each `ConnectionRefused` for lack of a grant, and of no other."""
 
 
 class ConnectionOpened(Message):
@@ -265,8 +265,8 @@ DELAY_BOUNDS = (0.00005, 0.0001, 0.00025, 0.0005, 0.001, 0.0025, 0.005, 0.01, 0.
 class TopicTraffic(msgspec.Struct, frozen=True, array_like=True):
     """Traffic since the last report.
 
-    `delays` counts messages by the time from their receipt to the write to the subscribers' sockets: for each of
-    `DELAY_BOUNDS` and for longer delays. `md5sum` is empty while unknown, and for services.
+    `delays` counts messages by the time from their receipt to the write to the subscribers' sockets: up to each of
+    `DELAY_BOUNDS`, and beyond. `md5sum` is empty while unknown, and for services.
     """
 
     key: str
@@ -317,18 +317,18 @@ class TrafficReported(Message):
 class SpecificationsStated(Message):
     """The specifications in force, sent before any topic is placed, and at every change.
 
-    `part` is empty if this relay runs none of them. `restarted`: this relay replaces a dead one, so its monitors with
-    the modifier `hold` block their topics; so do those in `moved`, which come from another relay and start here.
+    `part` is empty if this relay runs none of them. If `restarted`, this relay replaces a dead one, so its monitors
+    with the modifier `hold` block their topics, as do those in `moved`, which come from another relay.
 
-    The answer repeats `statement`, because the same revision may be sent again. `ahead`: the relay carries out later
-    messages only after these specifications are in force or rejected, so no topic is placed before its monitors.
+    The answer repeats `statement`, because the same revision may be sent again. With `ahead`, the relay carries out
+    later messages only after these specifications are in force or rejected, so no topic is placed before its
+    monitors.
 
-    After a takeover, `left` has the states that the relays of the other appliance left (`StateLeft`), and `left_at`
-    the time of its monitors by then (0: that in the states). `lost` is the reason why other states are lost. In both
-    cases the relay ignores its own memory.
+    After a takeover, `left` has the states that the other appliance's relays left (`StateLeft`), `left_at` the time
+    of its monitors by then (0: that in the states), and `lost` why other states are lost. The relay then ignores its
+    own memory.
 
-    `unbuilt` has the monitors that do nothing because their files have errors. Unless they are declared `begin`, they
-    hold their topics.
+    `unbuilt` has the monitors whose files have errors. They hold their topics unless they are declared `begin`.
     """
 
     revision: int
@@ -521,10 +521,9 @@ class MonitorEvent(msgspec.Struct, frozen=True, array_like=True):
     missed": a message that it did not get). `time` is in nanoseconds since the epoch. `count` is 0 for a complete
     event.
 
-    `before` and `after` are the first bytes of the message; `size` is its whole length. For a change, `monitor` is the
-    last one; `changed_by` in the detail names the events of all monitors that changed the message. `host` and
-    `caller_id` identify the sender of the message. They are empty for timed events; in a count, `caller_id` is empty
-    for several senders of one host.
+    `before` and `after` are the first bytes of the message; `size` is its whole length. For a change, `monitor` is
+    the last one; `changed_by` in the detail names the events of all. `host` and `caller_id` identify the message's
+    sender; they are empty for timed events, and `caller_id` for a count of several senders.
     """
 
     kind: str
