@@ -39,7 +39,7 @@ class OpenService:
 
 
 def parse_services(texts: Sequence[str]) -> tuple[OpenService, ...]:
-    """Raises `ValueError` with the invalid one."""
+    """Return the services in the texts. Raises `ValueError` with the invalid one."""
     return tuple(_service(part.strip()) for text in texts for part in text.split(","))
 
 
@@ -51,7 +51,7 @@ def parse_ports(text: str) -> PortRange:
 
 
 def parse_address(text: str) -> str:
-    """Reject networks and names."""
+    """Return the IP address of an appliance; a network or a name is a `ValueError`."""
     try:
         address = ipaddress.ip_address(text)
     except ValueError:
@@ -74,7 +74,9 @@ def local_port_range() -> PortRange:
 def protection(
     appliances: Sequence[str], ports: PortRange, services: Sequence[OpenService], *, tunnelled: bool = False
 ) -> str:
-    """`tunnelled`: the appliances' addresses are accepted only through IPsec, where they cannot be forged."""
+    """Return the nftables file. `tunnelled`: the appliances' addresses are accepted only through IPsec, where they
+    cannot be forged.
+    """
     if not appliances:
         raise ValueError("give the address of at least one appliance")
     rules, leaving = ['iifname "lo" accept'], []

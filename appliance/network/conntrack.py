@@ -19,7 +19,7 @@ _FAMILIES = (socket.AF_INET, socket.AF_INET6)
 
 
 def forget(namespace: Namespace, ports: Iterable[int]) -> int:
-    """Delete only entries of the namespace's own addresses; return their number. Raises `NetworkError`."""
+    """Delete the entries of the namespace's own addresses; return their number. Raises `NetworkError`."""
     own = {address.partition("/")[0] for address in interfaces.addresses(namespace)}
     try:
         return namespace.run(

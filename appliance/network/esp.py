@@ -19,7 +19,7 @@ _STATE = ("src", "192.0.2.1", "dst", "192.0.2.2", "proto", "esp", "spi")
 
 
 def choose_esp(namespace: Namespace) -> Esp:
-    """Raises `NetworkError` with the remedy."""
+    """Return where ESP can run. Raises `NetworkError` with the remedy."""
     refusal = _try_kernel(namespace)
     if refusal is None:
         return "kernel"
@@ -32,7 +32,7 @@ def choose_esp(namespace: Namespace) -> Esp:
 
 
 def lend_tun(uid: int, gid: int, tun: Path | None = None) -> None:
-    """Add an entry to the device's access control list if needed. Raises `NetworkError`."""
+    """Let a user open the TUN device, by its access control list if needed. Raises `NetworkError`."""
     device, shown = tun or TUN, ""
     try:
         about = device.stat()
@@ -64,7 +64,7 @@ def _entries_of(device: Path, mode: int) -> list[tuple[int, int, int]]:
 
 
 def _with_user(entries: list[tuple[int, int, int]], uid: int) -> bytes:
-    """The mask permits the rights of all entries."""
+    """Return the list with a user added; its mask permits the rights of all entries."""
     kept = [row for row in entries if row[0] != _MASK and row[::2] != (_USER, uid)]
     mask = _READ_WRITE
     for tag, rights, _id in kept:

@@ -32,7 +32,7 @@ class ProcessActivity:
         self._since = clock.now()
 
     def stalled_seconds(self) -> float:
-        """Call this every second."""
+        """Return the seconds without progress; call this every second."""
         now = clock.now()
         try:
             fields = self._stat.read_text(encoding="utf-8", errors="replace").rpartition(")")[2].split()
@@ -53,7 +53,9 @@ def run_program(program: Start, text: str, what: str) -> tuple[int, str, str]:
 
 
 def communicate(process: "subprocess.Popen[str]", text: str, what: str) -> tuple[str, str]:
-    """Raises `TimeoutError` after a hanging process is killed; logs long waits for `what`."""
+    """Send the input, and return both outputs; log long waits for `what`. Raises `TimeoutError` after killing a
+    hanging process.
+    """
     began, progress, said = clock.now(), ProcessActivity(process.pid), _SAY_SECONDS
     # Send the input here: a second call of `Popen.communicate` would not continue it.
     with ThreadPoolExecutor(1, "communicate") as pool:

@@ -23,7 +23,7 @@ T = TypeVar("T")
 
 
 def create_veth(near: Namespace, near_name: str, far: Namespace, far_name: str) -> None:
-    """Set both ends up."""
+    """Create a pair of interfaces, and set both up."""
     for name in (near_name, far_name):
         if not 0 < len(name) <= IFNAMSIZ:
             raise ValueError(f"interface name {name!r} must have 1 to {IFNAMSIZ} characters")
@@ -104,7 +104,7 @@ def delete_address(namespace: Namespace, name: str, address: str) -> None:
 
 
 def add_route(namespace: Namespace, destination: str, via: str) -> None:
-    """`destination` is a network, or "default"."""
+    """Add a route; `destination` is a network, or "default"."""
     family = _family(via)
     everywhere = "::/0" if family == socket.AF_INET6 else "0.0.0.0/0"
     where = everywhere if destination == "default" else destination
@@ -204,7 +204,7 @@ def default_route(namespace: Namespace, version: int) -> DefaultRoute | None:
 
 
 def networks(namespace: Namespace) -> list[str]:
-    """Leave out default routes."""
+    """Return the networks of routes and addresses, without default routes."""
 
     def read(route: Any) -> list[str]:
         routes = [
@@ -218,7 +218,7 @@ def networks(namespace: Namespace) -> list[str]:
 
 
 def source_address_for(namespace: Namespace, peer: str) -> str:
-    """Raises `NetworkError` without a route."""
+    """Return the source address of packets to `peer`. Raises `NetworkError` without a route."""
     family = _family(peer)
 
     def look_up(route: Any) -> str:

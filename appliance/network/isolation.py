@@ -82,8 +82,10 @@ class LinkAddresses:
 
 
 class _IpForwarding:
-    """The kernel copies the global setting to every interface, so each is also recorded. A host that forwards
-    ignores IPv6 router advertisements unless `accept_ra` is 2.
+    """Reads, enables and restores IP forwarding.
+
+    The kernel copies the global setting to every interface, so each is also recorded. A host that forwards ignores
+    IPv6 router advertisements unless `accept_ra` is 2.
     """
 
     def __init__(self, host: Namespace) -> None:
@@ -138,7 +140,7 @@ class Isolation:
         self._lock: int | None = None
 
     def up(self) -> None:
-        """Remove leftovers of a crash first.
+        """Build the isolation, after removing leftovers of a crash.
 
         Raises `PrivilegeError`, or `NetworkError`; the host is then left unchanged.
         """
@@ -172,7 +174,7 @@ class Isolation:
         return interfaces.source_address_for(self._host, peer)
 
     def endpoint(self) -> PublicAddress:
-        """Raises `NetworkError` if the address is unknown."""
+        """Return the address by which other networks reach this machine. Raises `NetworkError` if it is unknown."""
         return outward_address(self._host, without=("lo", self.settings.link))
 
     def obstacles(self) -> tuple[str, ...]:
@@ -189,7 +191,7 @@ class Isolation:
         return (*self._backend.foreign_translations(), *iptables.foreign_translations(self._host))
 
     def forward_tunnels(self) -> None:
-        """Raises `NetworkError` if the host uses UDP 500 or 4500."""
+        """Forward IKE and ESP to the appliance. Raises `NetworkError` if the host uses UDP 500 or 4500."""
         if self._udp == _TUNNELS:
             return
         used = self._host.run(udp_ports_in_use) & {port.first for port in _TUNNELS}
@@ -399,7 +401,7 @@ def _true_sources(family: Family, end: LinkAddresses, inward: Interface) -> tupl
 
 
 def _loopback(family: Family, inward: Interface) -> PacketRule:
-    """::1 cannot leave a host, so it stays refused."""
+    """Return the rule for the host's own loopback; ::1 cannot leave a host, so it stays refused."""
     if family == 4:
         local = partial(PacketRule, chain=Chain.KEPT_SOURCE, source="127.0.0.0/8", leaves_on=inward)
         return local("from the host's own loopback", PacketVerdict.MASQUERADE)

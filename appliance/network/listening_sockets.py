@@ -47,6 +47,6 @@ def _rows(*names: str) -> Iterator[_Row]:
 
 
 def _address(text: str) -> str:
-    """/proc/net/tcp has words of 32 bits in the machine's byte order."""
+    """Return an address of /proc/net/tcp, which has words of 32 bits in the machine's byte order."""
     words = [text[index : index + 8] for index in range(0, len(text), 8)]
     return str(ipaddress.ip_address(b"".join(int(word, 16).to_bytes(4, sys.byteorder) for word in words)))

@@ -99,7 +99,7 @@ class Namespace:
         return hash(self.path)
 
     def exists(self) -> bool:
-        """A bare file from a crash does not count."""
+        """Return whether the namespace exists; a bare file from a crash does not count."""
         try:
             here, above = self.path.stat(), self.path.parent.stat()
         except OSError:
@@ -107,7 +107,7 @@ class Namespace:
         return here.st_dev != above.st_dev
 
     def create(self) -> "Namespace":
-        """The namespace has only `lo`, which is down. Raises `PrivilegeError`, `NetworkError`."""
+        """Create the namespace, with only `lo`, which is down. Raises `PrivilegeError`, `NetworkError`."""
         require_privileges(f"creating the network namespace {self.name}")
         with _directory_lock():
             if self.exists():
@@ -156,11 +156,13 @@ class Namespace:
         return _in_thread(inside)
 
     def popen(self, args: Sequence[str | os.PathLike[str]], **options: Any) -> "subprocess.Popen[Any]":
-        """`options` are those of `subprocess.Popen`."""
+        """Start a program in the namespace; `options` are those of `subprocess.Popen`."""
         return self.run(lambda: subprocess.Popen(args, **options))
 
     def sysctl(self, key: str, value: str | None = None) -> str:
-        """`key` has slashes instead of dots if it has an interface name with a dot."""
+        """Return a setting, after writing `value` if given; in `key`, slashes replace dots if an interface name has a
+        dot.
+        """
         path = Path("/proc/sys", *key.split("/" if "/" in key else "."))
 
         def access() -> str:
@@ -180,7 +182,7 @@ class Namespace:
             return True
 
     def processes(self) -> list[int]:
-        """Leave out this process."""
+        """Return the other processes in the namespace."""
         if not self.exists():
             return []
         mark = self.path.stat()
@@ -194,7 +196,7 @@ class Namespace:
         return sorted(found)
 
     def open(self) -> int:
-        """The caller closes the descriptor."""
+        """Return a descriptor of the namespace, which the caller closes."""
         try:
             return os.open(self.path, os.O_RDONLY | os.O_CLOEXEC)
         except OSError as error:
@@ -231,7 +233,7 @@ class _OwnNamespace(Namespace):
 
 
 def namespaces(prefix: str = "") -> list[Namespace]:
-    """Return also names whose namespace no longer exists."""
+    """Return the namespaces with this prefix, including names whose namespace no longer exists."""
     if not DIRECTORY.is_dir():
         return []
     names = sorted(entry.name for entry in DIRECTORY.iterdir())
@@ -268,7 +270,7 @@ def _directory_lock() -> Iterator[None]:
 
 
 def _is_mount_point(path: Path) -> bool:
-    """Find also a bind mount onto itself, which `os.path.ismount` misses."""
+    """Return whether a file system is mounted there, even a bind mount onto itself, which `os.path.ismount` misses."""
     with Path("/proc/thread-self/mountinfo").open(encoding="utf-8", errors="replace") as lines:
         return any(line.split(" ", 5)[4] == str(path) for line in lines)
 
@@ -307,12 +309,12 @@ def is_contained(root: Path = Path("/")) -> bool:
 
 
 def bridges(classes: Path = Path("/sys/class/net")) -> list[str]:
-    """A machine that runs containers has at least one, a container none."""
+    """Return the bridges: a machine that runs containers has at least one, a container none."""
     return sorted(link.name for link in classes.glob("*") if (link / "bridge").is_dir())
 
 
 def end_processes(pids: Sequence[int]) -> None:
-    """Send SIGTERM, then SIGKILL. A descriptor refers to each process, so a reused id is never signalled."""
+    """End processes with SIGTERM, then SIGKILL. A descriptor refers to each, so a reused id is never signalled."""
     descriptors: dict[int, int] = {}
     for pid in pids:
         with contextlib.suppress(OSError):

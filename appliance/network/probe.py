@@ -84,7 +84,7 @@ class ProbeResult:
 
 
 def probe_port(namespace: Namespace, port: int, uid: int = PROBE_UID) -> ProbeResult:
-    """Raises `NetworkError` if the probe cannot run."""
+    """Probe a port as an unprivileged user. Raises `NetworkError` if the probe cannot run."""
     if uid <= 0:
         raise ValueError("the probe must run as an unprivileged user, not as root")
     listening = namespace.run(lambda: listening_addresses(port))

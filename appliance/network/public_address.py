@@ -37,7 +37,7 @@ def outward_address(namespace: Namespace, *, without: Sequence[str]) -> PublicAd
 
 
 def only_address(namespace: Namespace, *, without: Sequence[str]) -> PublicAddress:
-    """Prefer IPv4. Raises as `outward_address` does."""
+    """Return the only address, preferably of IPv4. Raises as `outward_address` does."""
     held = interfaces.addresses_by_interface(namespace)
     own = [text.partition("/")[0] for name, texts in held.items() if name not in without for text in texts]
     found = sorted(
@@ -54,7 +54,7 @@ def only_address(namespace: Namespace, *, without: Sequence[str]) -> PublicAddre
 
 
 def _first(namespace: Namespace, route: interfaces.DefaultRoute, version: int) -> str | None:
-    """Without a gateway (a modem), return the interface's first address."""
+    """Return the address towards the gateway, or without a gateway (a modem), the interface's first address."""
     if route.gateway is not None:
         return interfaces.source_address_for(namespace, route.gateway)
     held = interfaces.addresses_by_interface(namespace).get(route.interface, [])

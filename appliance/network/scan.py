@@ -40,7 +40,7 @@ class ScanResult:
 
 
 def addresses_of(host: str) -> tuple[str, ...]:
-    """Raises `NetworkError` for an unknown name or an own address."""
+    """Return the addresses of a host. Raises `NetworkError` for an unknown name or an own address."""
     try:
         found = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)
     except socket.gaierror as error:
@@ -56,7 +56,7 @@ def addresses_of(host: str) -> tuple[str, ...]:
 
 
 def scan(address: str, ports: Iterable[int], seconds: float) -> ScanResult:
-    """Raises `NetworkError` for an unusable address."""
+    """Try to connect to each port. Raises `NetworkError` for an unusable address."""
     wanted = list(ports)
     opened: list[int] = []
     refused = silent = untried = 0
@@ -107,7 +107,7 @@ def _try(address: str, port: int, seconds: float) -> tuple[bool, int]:
 
 
 def _is_own(address: str) -> bool:
-    """Packets to an own address would also have it as source."""
+    """Return whether the address is our own: packets to it would also have it as source."""
     family = socket.AF_INET6 if ":" in address else socket.AF_INET
     try:
         with socket.socket(family, socket.SOCK_DGRAM) as probe:

@@ -37,7 +37,9 @@ class Backend(Protocol):
         """The families that the kernel supports."""
 
     def install(self, rules: tuple[PacketRule, ...]) -> None:
-        """Raises `BackendMissingError`, `FirewallError`; the old rules are then still in force."""
+        """Put the rules into force. Raises `BackendMissingError`, `FirewallError`; the old rules are then still in
+        force.
+        """
 
     def remove(self) -> None: ...
 

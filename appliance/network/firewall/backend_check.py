@@ -17,7 +17,7 @@ _LOOPBACK = ((socket.AF_INET, "127.0.0.1"), (socket.AF_INET6, "::1"))
 
 
 def prove(backend: Backend, namespace: Namespace) -> None:
-    """Raises `FirewallError`."""
+    """Raise `FirewallError` unless the kernel enforces the rules of this back end."""
     own, other = os.geteuid(), os.geteuid() + 1
     try:
         for family, address in _LOOPBACK:

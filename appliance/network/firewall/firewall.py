@@ -38,7 +38,7 @@ class Firewall:
         self._not_used: list[str] = []
 
     def install(self, settings: FirewallSettings) -> str:
-        """Remove rules of an earlier run first, whichever back end installed them. Raises `PrivilegeError`,
+        """Install the rules, after removing those of an earlier run by any back end. Raises `PrivilegeError`,
         `FirewallError`.
         """
         require_network_admin("the firewall")
@@ -50,7 +50,7 @@ class Firewall:
         return self._backend.name
 
     def update(self, settings: FirewallSettings) -> None:
-        """Raises `FirewallError`; the old rules then stay in force."""
+        """Replace the rules. Raises `FirewallError`; the old rules then stay in force."""
         if self._backend is None:
             raise FirewallError("the firewall is not installed yet: call install first")
         rules = appliance_rules(settings)
@@ -107,7 +107,7 @@ class Firewall:
 def statuses(
     rules: tuple[PacketRule, ...], counters: tuple[RuleCounter, ...], families: tuple[Family, ...] = (4, 6)
 ) -> tuple[FirewallRule, ...]:
-    """A rule is in force if the kernel has it once for each of `families`, or once for both."""
+    """Return the state of each rule: it is in force if the kernel has it for each of `families`, or once for both."""
     of_rule: dict[tuple[str, str], list[RuleCounter]] = {}
     for counter in counters:
         of_rule.setdefault((counter.chain, counter.purpose), []).append(counter)

@@ -337,7 +337,7 @@ def appliance_rules(settings: FirewallSettings) -> tuple[PacketRule, ...]:
 
 
 def family_of(address: str) -> Family:
-    """Raises `ValueError`."""
+    """Return the family of an address or network. Raises `ValueError`."""
     try:
         return 6 if ipaddress.ip_network(address).version == 6 else 4
     except ValueError as error:
@@ -368,7 +368,7 @@ def _rosmaster(settings: FirewallSettings) -> tuple[PacketRule, ...]:
 
 
 def _own_node(settings: FirewallSettings) -> tuple[PacketRule, ...]:
-    """Only control calls the own node."""
+    """Return the rules of the own node, which only control calls."""
     node = settings.own_node
     if node is None:
         return ()
@@ -388,7 +388,9 @@ def _own_node(settings: FirewallSettings) -> tuple[PacketRule, ...]:
 
 
 def _ports_of_others(uid: int, settings: FirewallSettings) -> Iterator[PacketRule]:
-    """Blocked instead of permitted ports are listed, because a new policy may change the permitted ones."""
+    """Yield rules that block ports, instead of rules that permit some, because a new policy may change the permitted
+    ones.
+    """
     chosen, faces = settings.client_ports, settings.node_ports
     if faces is not None and chosen is not None and faces.overlaps(chosen):
         yield _connecting("own node: faces and relays", PacketVerdict.RETURN, tcp_ports=faces, uid=uid)
@@ -480,7 +482,7 @@ def _rate_limits(settings: FirewallSettings) -> tuple[PacketRule, ...]:
 
 
 def _chosen_by_the_kernel(settings: FirewallSettings) -> Iterator[PacketRule]:
-    """Except for configured ports, other machines reach none: the own node listens there."""
+    """Yield rules that close these ports, except configured ones, to other machines: the own node listens there."""
     if settings.client_ports is None:
         return
     chosen = {
@@ -498,7 +500,9 @@ def _chosen_by_the_kernel(settings: FirewallSettings) -> Iterator[PacketRule]:
 
 
 def _rate_limit(limit: RateLimit | None, name: str, ports: PortRange) -> tuple[PacketRule, ...]:
-    """The first packet after the handshake counts: its sender received our SYN-ACK, so its address is not forged.
+    """Return rules that limit the new connections of each host.
+
+    The first packet after the handshake counts: its sender received our SYN-ACK, so its address is not forged.
     Against forged first packets, the kernel answers with SYN cookies, which need no memory.
     """
     if limit is None:

@@ -1,8 +1,8 @@
 """The iptables back end: legacy xtables through python-iptables (libiptc), IPv4 and IPv6.
 
-Address translation needs nft, because the library cannot build the NAT targets of current xtables. The library
-caches each table, with the namespace in which it was opened, for the whole process. So each call opens its tables
-in a thread inside the namespace, one call at a time, under the lock of the `iptables` programs.
+Address translation needs nft, because the library cannot build the NAT targets of current xtables. The library caches
+each table, with the namespace in which it was opened, for the whole process, so each call opens its tables in a
+thread inside the namespace, one call at a time, under the lock of the `iptables` programs.
 """
 
 import contextlib
@@ -80,7 +80,7 @@ class IptablesBackend:
         self._in_tables(lambda table: table.replace(rendered))
 
     def remove(self) -> None:
-        """Create no unused table."""
+        """Remove the rules, and create no unused table."""
         _in_used_tables(self._namespace, "filter", lambda table: table.replace([]))
 
     def counters(self) -> tuple[RuleCounter, ...]:
@@ -99,7 +99,7 @@ class IptablesBackend:
 
 
 def load_modules() -> None:
-    """Call this while the process may still load modules. A failure appears only as an error of `install`."""
+    """Load the kernel's modules while the process still may; a failure appears only as an error of `install`."""
     command = ["modprobe", "--quiet", "--all", "ip_tables", "ip6_tables"]
     with contextlib.suppress(OSError, subprocess.TimeoutExpired):  # a container has no modprobe
         subprocess.run(command, capture_output=True, timeout=_MODPROBE_SECONDS, check=False)
@@ -334,7 +334,7 @@ class _Table:
 
 
 def _comment(rule: Any) -> str:
-    """The library's own function would redirect our standard output."""
+    """Return a rule's comment; the library's own function would redirect our standard output."""
     for match in rule.matches:
         if match.name == "comment":
             content = bytes(match.match_buf)[_MATCH_HEADER:]

@@ -258,7 +258,7 @@ def _hook(chain: Chain, hook: Hook) -> list[Json]:
 
 
 def _delete_table() -> list[Json]:
-    """Adding an existing table first is not an error."""
+    """Return commands that delete the table; adding it first is not an error, even if it exists."""
     return [_table("add"), _table("delete")]
 
 
