@@ -55,7 +55,9 @@ def write_key(path: Path, key: Key, passphrase: bytes | None) -> None:
 
 
 def load_key(path: Path, certificate_file: str, kind: Kind, passphrase: bytes | None) -> Key:
-    """Raises `OSError`, and `SignerKeyError` for an invalid key or one of another kind."""
+    """Return the key, and encrypt its file if there is a passphrase. Raises `OSError`, and `SignerKeyError` for an
+    invalid key.
+    """
     if not path.exists():
         raise SignerKeyError(
             f"{path}: missing, but its certificate is there; restore it from a backup, or remove"

@@ -13,9 +13,7 @@ FOLDER = "joined"  # of the signer's directory
 
 
 def open_authority(directory: Path, kind: Kind, passphrase: bytes | None) -> tuple[CertificateAuthority, str]:
-    """Without the brought key, return the appliance's own authority with the reason. Raises `SignerKeyError` and
-    `OSError`.
-    """
+    """Return the brought authority, or the appliance's own with the reason. Raises `SignerKeyError` and `OSError`."""
     own, folder = CertificateAuthority(directory, kind, passphrase), directory / FOLDER
     if not (folder / KEY_FILE).exists():
         return own, ""

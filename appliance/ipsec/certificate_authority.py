@@ -44,7 +44,7 @@ _CLOCKS_DIFFER = datetime.timedelta(hours=1)
 
 @dataclass(frozen=True)
 class IssuedCertificate:
-    """`serial` is in hexadecimal, the end in seconds since the epoch."""
+    """A certificate (PEM); `serial` is in hexadecimal, the end in seconds since the epoch."""
 
     certificate: bytes
     serial: str
@@ -82,7 +82,10 @@ class CertificateAuthority:
     def issue(
         self, request: bytes, name: str, days: float, *, proof: bytes = b"", former: bytes = b""
     ) -> IssuedCertificate:
-        """`proof` is the signature over the request by the key of `former` (PEM). Raises `RequestRefusedError`."""
+        """Issue a certificate. Raises `RequestRefusedError`.
+
+        `proof`, if given, is the signature over the request by the key of `former` (PEM).
+        """
         if not _NAME.fullmatch(name):
             raise RequestRefusedError(
                 f"{name[:80]!r} is not a valid name for a certificate: letters, digits and . _ -, at most 63"
@@ -120,7 +123,9 @@ class CertificateAuthority:
         )
 
     def revocations(self, serials: Iterable[tuple[str, float]]) -> bytes:
-        """Serial numbers are in hexadecimal, times in seconds since the epoch."""
+        """Return a signed revocation list (PEM); serial numbers are in hexadecimal, times in seconds since the
+        epoch.
+        """
         now = clock.utc_now()
         builder = (
             x509.CertificateRevocationListBuilder()
@@ -151,7 +156,7 @@ class CertificateAuthority:
 
 
 def _key_of(request: bytes) -> ec.EllipticCurvePublicKey | ed25519.Ed25519PublicKey:
-    """Raise `RequestRefusedError` unless the request's own private key signed it."""
+    """Return the key of a request. Raises `RequestRefusedError` unless its own private key signed it."""
     if len(request) > LONGEST_REQUEST:
         raise RequestRefusedError(f"the signing request is longer than {LONGEST_REQUEST} bytes")
     try:

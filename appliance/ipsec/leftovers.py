@@ -20,10 +20,9 @@ class LeftoversError(Exception):
 
 
 def clear_leftovers(own: str) -> int:
-    """charon must not run in the calling thread's network namespace. `own` is the appliance's address in the
-    tunnels.
+    """Remove the leftovers; return their number. Raises `LeftoversError`.
 
-    Raises `LeftoversError`.
+    charon must not run in the calling thread's network namespace. `own` is the appliance's address in the tunnels.
     """
     orders = _orders(own)
     if orders:

@@ -24,8 +24,9 @@ def require_proof(
     authority: x509.Certificate,
     now: datetime.datetime,
 ) -> None:
-    """Raise `RequestRefusedError` unless the key of `former` (PEM), a valid certificate of the authority in this
-    name, signed the request.
+    """Raise `RequestRefusedError` unless the key of `former` signed the request.
+
+    `former` (PEM) must be a valid certificate of the authority in this name.
     """
     try:
         certificate = x509.load_pem_x509_certificate(former)

@@ -29,7 +29,7 @@ class RemovalRefusedError(Exception):
 
 @dataclass(frozen=True)
 class RetentionLimits:
-    """Age in days, size in bytes."""
+    """The limits of a log: age in days, size in bytes."""
 
     days: float | None = None
     size: int | None = None

@@ -16,13 +16,13 @@ from cryptography.x509.oid import NameOID
 
 
 def make_key() -> bytes:
-    """Use ECDSA on P-384; return PEM (PKCS #8)."""
+    """Return a new ECDSA key on P-384, in PEM (PKCS #8)."""
     key = ec.generate_private_key(ec.SECP384R1())
     return key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
 
 
 def signing_request(key: bytes, name: str) -> bytes:
-    """Return PKCS #10 in PEM."""
+    """Return a signing request (PKCS #10) in PEM."""
     private = load_pem_private_key(key, password=None)
     if not isinstance(private, ec.EllipticCurvePrivateKey):
         raise ValueError("the key is not an ECDSA key: remove its file; a new one is created")

@@ -27,7 +27,7 @@ class CheckpointRefusedError(Exception):
 
 
 def read_checkpoint(text: bytes) -> Checkpoint:
-    """Raises `CheckpointRefusedError`."""
+    """Return the parsed checkpoint. Raises `CheckpointRefusedError`."""
     try:
         return parse_checkpoint(text)
     except ValueError:
@@ -35,7 +35,7 @@ def read_checkpoint(text: bytes) -> Checkpoint:
 
 
 def newest_signing(directory: Path) -> int | None:
-    """Return nanoseconds since the epoch."""
+    """Return the time of the last signature (nanoseconds since the epoch), or None."""
     times = (path.read_bytes() for path in directory.glob("*.times"))
     return max(
         (int.from_bytes(kept[-_NUMBER:], "big") for kept in times if len(kept) > _NUMBER), default=None
@@ -50,7 +50,7 @@ class CheckpointMemory:
         self._clock = clock
 
     def approve(self, text: bytes) -> None:
-        """Raises `CheckpointRefusedError`, `OSError`."""
+        """Remember a checkpoint that may be signed. Raises `CheckpointRefusedError`, `OSError`."""
         wanted = read_checkpoint(text)
         path = self._path(wanted.log, "signed")
         if not path.exists():
@@ -148,7 +148,9 @@ def _extent(descriptor: int) -> tuple[int, int]:
 
 
 def _is_known(descriptor: int, wanted: Checkpoint, first: int, count: int) -> bool:
-    """Raise `CheckpointRefusedError` if the checkpoint does not follow the last one."""
+    """Return whether the checkpoint was signed before. Raises `CheckpointRefusedError` if it does not follow the last
+    one.
+    """
     index = wanted.number - first
     if index < 0 or index > count:
         raise CheckpointRefusedError(f"checkpoint {wanted.number} does not follow number {first + count - 1}")

@@ -57,7 +57,7 @@ class _Settings(msgspec.Struct):
 
 
 def load_or_create_key(directory: Path) -> Ed25519PrivateKey:
-    """Raises `SignerKeyError` or `OSError`."""
+    """Return the audit key, made if missing. Raises `SignerKeyError` or `OSError`."""
     path = directory / KEY_FILE
     if not path.exists():
         _create_key(directory)

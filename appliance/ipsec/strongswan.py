@@ -30,7 +30,7 @@ def plugins(esp: Esp) -> str:
 
 
 def configuration(directory: Path, esp: Esp) -> str:
-    """`directory` has the socket."""
+    """Return charon's configuration; `directory` has the socket."""
     return f"""\
 charon-systemd {{
   load = {plugins(esp)}
