@@ -25,7 +25,7 @@ Resource = tuple[str, str]
 
 @dataclass(frozen=True, slots=True)
 class FileGroup:
-    """`files` has the number of specifications in each, `resources` the topics and services that they use."""
+    """A group of files: the number of specifications in each, and the topics and services that they use."""
 
     files: Mapping[str, int]
     resources: frozenset[Resource]
@@ -178,7 +178,7 @@ class Allocation:
 
 
 def groups_of(checked: CheckedSpecifications) -> list[FileGroup]:
-    """Return the largest group first."""
+    """Return the groups of files, the largest first."""
     touched: dict[str, set[Resource]] = {file: set() for file in checked.monitors.values()}
     for name, file in checked.monitors.items():
         touched[file] |= {(TOPIC, topic) for topic in checked.topics[name]}

@@ -39,7 +39,7 @@ def contents(
     unbuilt: Mapping[str, str] = {},
     given_topics: Topics = NO_TOPICS,
 ) -> Contents:
-    """Raises `SpecificationsRefusedError` with all errors.
+    """Compile specifications. Raises `SpecificationsRefusedError` with all errors.
 
     `load`: also build and load the module. The monitors of the files in `unbuilt` do nothing.
     """
@@ -112,7 +112,9 @@ def _givens(monitors: MonitorSet, name: str) -> Iterator[GivenDeclared]:
 def contents_at_start(
     files: Mapping[str, str], texts: Mapping[str, str], given_topics: Topics = NO_TOPICS
 ) -> Contents:
-    """Monitors of files with errors do nothing. Raises `SpecificationsRefusedError` if the files exceed a limit."""
+    """Compile for a start: monitors of files with errors do nothing. Raises `SpecificationsRefusedError` beyond a
+    limit.
+    """
     try:
         return contents(files, texts, load=True, given_topics=given_topics)
     except SpecificationsRefusedError as error:
@@ -135,7 +137,7 @@ def contents_beside(
     broken: Collection[str],
     given_topics: Topics = NO_TOPICS,
 ) -> Contents:
-    """Files that had errors before, `broken`, may still have them."""
+    """Compile for a change; only the files in `broken`, which had errors before, may still have them."""
     found = contents_at_start(files, texts, given_topics)
     errors = found.left_out | {found.monitors[name]: error for name, error in found.unbuilt.items()}
     fresh = [error for file, error in errors.items() if file not in broken]
@@ -147,7 +149,7 @@ def contents_beside(
 def check(
     sources: Sources, site_keys: Sequence[str], *, compiler: Callable[..., Contents] = contents
 ) -> CheckedSpecifications:
-    """Compile in the caller's process. With `site_keys`, each text must be signed."""
+    """Compile in the caller's process; with `site_keys`, each text must be signed."""
     if not sources.files:
         return CheckedSpecifications()
     require_bounded(sources)
@@ -199,7 +201,7 @@ def _places(monitors: MonitorSet) -> dict[str, str]:
 
 
 def parts(compiled: bytes, wanted: Sequence[PartNames]) -> list[bytes]:
-    """Raises `SpecificationsRefusedError`."""
+    """Return the parts of compiled specifications. Raises `SpecificationsRefusedError`."""
     try:
         return [*map(_bounded, parts_of(compiled, [(names.monitors, names.shadows) for names in wanted]))]
     except SpecificationError as error:

@@ -31,7 +31,10 @@ _TRIES = 2  # an idle compiler may end just when a question is sent
 
 
 class SpecificationCompiler:
-    """Compilations raise `SpecificationsRefusedError`, also without an answer. `wanted()` requests the start."""
+    """Passes specifications to the compiler process, whose start `wanted()` requests.
+
+    Compilations raise `SpecificationsRefusedError`, even without an answer.
+    """
 
     def __init__(self, wanted: Callable[[], None]) -> None:
         self._wanted = wanted
@@ -129,7 +132,7 @@ class SpecificationCompiler:
     async def _asked(
         self, question: Callable[[int], messages.Message], *, goes_on: Callable[[], bool] = lambda: True
     ) -> Any:
-        """Ask the successor of a compiler that has just ended, while `goes_on()`."""
+        """Return the answer; while `goes_on()`, ask the successor of a compiler that has just ended."""
         for _ in range(_TRIES):
             try:
                 self.call()

@@ -19,7 +19,7 @@ _TOPIC = "topic"
 
 
 class Givens:
-    """`said` has the values by monitor and name. Topics belong to a revision's sources."""
+    """The values given to monitors; `said` has them by monitor and name. Topics belong to a revision's sources."""
 
     def __init__(self) -> None:
         self.said: dict[str, dict[str, GivenValue]] = {}
@@ -63,7 +63,7 @@ class Givens:
 def parsed(
     declared: tuple[GivenDeclared, ...], monitor: str, values: Mapping[str, GivenValue]
 ) -> dict[str, GivenValue]:
-    """Raises `SpecificationsRefusedError` with all errors."""
+    """Return the values to set. Raises `SpecificationsRefusedError` with all errors."""
     known = {one.name: one for one in declared}
     found: dict[str, GivenValue] = {}
     findings = []

@@ -108,7 +108,7 @@ _UNREAD = "monitors in shadow mode do not see its messages"
 
 
 def _difference(theirs: LiveType, ours: LiveType) -> str:
-    """As in ROS, `*` fits any type, and the md5sum decides."""
+    """Return the difference of two types, if any. As in ROS, `*` fits any type, and the md5sum decides."""
     if theirs.name not in (_ANY, ours.name):
         return f"{theirs.name}, not as {ours.name}"
     if {theirs.md5sum, ours.md5sum} & {"", _ANY} or theirs.md5sum == ours.md5sum:

@@ -38,7 +38,7 @@ class Relays(Protocol):
     """The interface to the relays."""
 
     def send(self, message: Message, relay: int) -> bool:
-        """Return False if the relay is not connected."""
+        """Send a message; return False if the relay is not connected."""
 
     async def carried_out(self) -> None:
         """Wait until every relay has carried out its messages."""
@@ -46,10 +46,10 @@ class Relays(Protocol):
     def live_resources(self) -> set[Resource]: ...
 
     def withdraw(self, moves: Sequence[Move]) -> None:
-        """Called before the new allocation is adopted."""
+        """Withdraw moving topics, before the new allocation is adopted."""
 
     def place(self, moves: Sequence[Move]) -> None:
-        """Called after the new allocation was adopted."""
+        """Place moved topics, after the new allocation was adopted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,7 +126,7 @@ class Rollout:
         return {name: why for names in self._held.values() for name, why in names.items()}
 
     async def start(self, now: Revision, *, restarted: bool, kept: str) -> None:
-        """After a crash of control (`restarted`), relays keep their specifications."""
+        """Begin with these specifications; after a crash of control (`restarted`), relays keep theirs."""
         self._now = now
         if restarted:
             self._known = set(range(self.allocation.relays))
@@ -160,7 +160,7 @@ class Rollout:
             self.relays.send(self.statement(relay), relay)
 
     def has_state(self) -> bool:
-        """Whether the state may be copied: no relay leaves it, and all have the inherited one."""
+        """Return whether the state may be copied: no relay leaves it, and all have the inherited one."""
         return bool(self._now.checked.monitors) and not self._leaving and not self._heirs
 
     def inherit(self, state: InheritedState, taken: Callable[[], None]) -> None:
@@ -168,7 +168,7 @@ class Rollout:
         self._inheritance_taken = taken
 
     def statement(self, relay: int) -> messages.SpecificationsStated:
-        """A restarted relay must hold topics as its monitors require."""
+        """Return the specifications for a relay; a restarted relay must hold topics as its monitors require."""
         restarted = relay in self._known
         self._known.add(relay)
         (self._fresh.add if restarted else self._fresh.discard)(relay)
@@ -198,8 +198,9 @@ class Rollout:
         return [name for name in names if name in self._began]
 
     async def take(self, coming: Revision) -> list[str]:
-        """Return the monitors that began again because they moved. `SpecificationsRefusedError` means that
-        nothing has changed.
+        """Roll out specifications; return the monitors that began again because they moved.
+
+        After a `SpecificationsRefusedError`, nothing has changed.
         """
         plan = self.allocation.plan(coming.checked, self.relays.live_resources())
         self._began = set()
@@ -217,7 +218,7 @@ class Rollout:
         return self.allocation.plan(coming, self.relays.live_resources()).moved_files
 
     async def all_taken(self) -> None:
-        """Refusals of relays that gave something up are in `refused`."""
+        """Wait for the relays that gave something up; their refusals are in `refused`."""
         answers, self._answers = self._answers, {}
         if answers:
             await asyncio.wait(answers.values(), timeout=_RELAY_SECONDS)
@@ -374,7 +375,7 @@ class Rollout:
                 self._merge_rows()
 
     def lost(self, relay: int) -> None:
-        """The relay may have ended because of specifications that it has not answered."""
+        """Answer for a relay that ended, perhaps because of specifications that it has not answered."""
         for at, statement in [entry for entry in self._waiting if entry[0] == relay]:
             self._answer(at, statement, ["a relay process exited during the load: try again"])
 
@@ -445,7 +446,7 @@ def _names(revision: Revision, relay: int, of_file: Callable[[str], int]) -> mes
 def parts_wanted(
     revision: Revision, relays: int, of_file: Callable[[str], int] | None = None
 ) -> list[messages.PartNames]:
-    """Without `of_file`, return the parts of a start on another appliance."""
+    """Return the parts of all relays; without `of_file`, those of a start on another appliance."""
     if of_file is None:
         of_file = _of(Allocation(relays).plan(revision.checked))
     names = dict.fromkeys(_names(revision, relay, of_file) for relay in range(relays))

@@ -23,7 +23,7 @@ _LONGEST = (
 
 
 class SpecificationsRefusedError(Exception):
-    """`findings` has every reason, as `file:line:column: error: text`."""
+    """Specifications are refused; `findings` has every reason, as `file:line:column: error: text`."""
 
     def __init__(self, findings: list[str]) -> None:
         super().__init__("\n".join(findings))
@@ -57,7 +57,7 @@ class Sources(msgspec.Struct, frozen=True):
         )
 
     def without(self, files: set[str]) -> "Sources":
-        """The message definitions stay."""
+        """Return the sources without these files; the message definitions stay."""
         left, signatures = (
             {name: text for name, text in texts.items() if name not in files}
             for texts in (self.files, self.signatures)
@@ -91,7 +91,7 @@ class Sources(msgspec.Struct, frozen=True):
         return found, unsigned
 
     def difference(self, before: "Sources") -> tuple[list[str], list[str], list[str]]:
-        """A definition is `msg/package/Type.msg`."""
+        """Return the added, changed and removed names; a definition is `msg/package/Type.msg`."""
         old, new = before.named(), self.named()
         return (
             [name for name in new if name not in old],
@@ -134,12 +134,12 @@ def _definitions(name: str, text: str) -> Definitions | None:
 
 
 def checked(contents: messages.Contents, sources: Sources, site_keys: Sequence[str]) -> CheckedSpecifications:
-    """Raises `SpecificationsRefusedError`."""
+    """Return the contents with their signers. Raises `SpecificationsRefusedError`."""
     return CheckedSpecifications(**msgspec.structs.asdict(contents), signed_by=sources.signers(site_keys))
 
 
 def require_bounded(sources: Sources) -> None:
-    """Raises `SpecificationsRefusedError`."""
+    """Raise `SpecificationsRefusedError` if the specifications exceed a limit."""
     if len(sources.files) > _MOST_FILES:
         raise SpecificationsRefusedError(
             [f"{len(sources.files)} specification files; the limit is {_MOST_FILES}"]
@@ -158,7 +158,7 @@ def _too_long(name: str) -> str:
 
 
 def read_folder(folder: Path) -> Sources:
-    """Read also definitions and signatures. Raises `SpecificationsRefusedError`."""
+    """Read specifications, definitions and signatures. Raises `SpecificationsRefusedError`."""
     sources, errors = _read_folder(folder)
     if errors:
         raise SpecificationsRefusedError([*errors.values()])
@@ -223,7 +223,7 @@ def _unreadable(path: Path, error: OSError) -> SpecificationsRefusedError:
 
 
 def _is(kind: Callable[[int], bool], path: Path) -> bool:
-    """Raise `OSError` if it is unknown whether the path exists."""
+    """Return whether the path is of this kind. Raises `OSError` if it is unknown whether it exists."""
     try:
         return kind(stat_given(path).st_mode)
     except (FileNotFoundError, NotADirectoryError):

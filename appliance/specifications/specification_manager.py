@@ -98,7 +98,7 @@ class MonitorsChangedError(Exception):
 
 
 class _Consent(NamedTuple):
-    """`force`: topics may be cut whose publishers have another type. `hold`: topics with traffic may be held."""
+    """The operator's consent to cut topics whose publishers have another type, and to hold topics with traffic."""
 
     force: bool = False
     hold: bool = False
@@ -168,9 +168,10 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
     # --- start ---
 
     async def start(self, *, restarted: bool, taken_over: bool = False) -> None:
-        """After a crash of control, the specifications that were in force are used; `taken_over`, those of the
-        active appliance. At the start of the appliance, the folder's are used, unless an operator's own revision
-        was in force.
+        """Bring specifications into force at the start of control.
+
+        After a crash of control, those that were in force are used; `taken_over`, those of the active appliance. At
+        the start of the appliance, the folder's are used, unless an operator's own revision was in force.
         """
         settings = self.store.settings()
         self.switches.restore(settings.get(SWITCHES, "{}"))
@@ -222,7 +223,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         return list(self.checked.monitors)
 
     def file_of(self, name: str) -> str:
-        """`name` is a monitor or a file."""
+        """Return the file of `name`, which is a monitor or a file."""
         if name in self.sources.files:
             return name
         if name not in self.checked.monitors:
@@ -246,8 +247,10 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
     # --- changing ---
 
     async def load(self, request: admin.MonitorLoad, who: str, *, enable: bool = False) -> Replacement:
-        """With `enable`, monitors that the setting of this name would disable are enabled. With `confirm_within`,
-        this change, like any other, is rolled back after that many seconds unless confirmed.
+        """Load specifications.
+
+        With `enable`, monitors that the setting of this name would disable are enabled. With `confirm_within`, the
+        change is rolled back after that many seconds unless confirmed.
         """
         async with self._changing(request.expected):
             topics, constants = split(request.given)
@@ -314,7 +317,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         return await self.load(load, who)
 
     async def reload(self, request: admin.MonitorReload, who: str) -> Replacement:
-        """Files that are not in the folder stay in force, unless `prune` is set."""
+        """Load the folder; files that are not in it stay in force, unless `prune` is set."""
         async with self._changing(request.expected):
             if self.folder is None:
                 raise SpecificationsRefusedError([_NO_FOLDER])
@@ -382,10 +385,9 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             return await self._change(sources, keeper, who, note, within, check=check, consent=_Consent())
 
     async def roll_back(self, request: admin.MonitorRollback, who: str) -> Replacement:
-        """None is the previous revision, 0 no specifications.
+        """Bring a revision into force again: None is the previous revision, 0 no specifications.
 
-        The rollback of an unconfirmed change must succeed: there a file with an error does nothing, as after a
-        start.
+        The rollback of an unconfirmed change must succeed, so a file with an error does nothing, as after a start.
         """
         check = self._as_at_start if who == UNCONFIRMED else self._strictly
         async with self._changing(request.expected):
@@ -577,7 +579,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         )
 
     async def resume(self, request: admin.MonitorResume, who: str) -> Switched:
-        """Return the monitors that held topics.
+        """Release the topics that monitors hold; return the monitors that held any.
 
         A relay that is not running is refused, because the next process will hold the topics again.
         """
@@ -706,8 +708,10 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         topics: Mapping[str, Mapping[str, str]] = MappingProxyType({}),
         constants: Given = NO_VALUES,
     ) -> Replacement:
-        """`kept` are files that are not in the folder, `loaded` those that the operator named. `switches`,
-        `given`, `shadow` and `enable` are for monitors that are not in force yet.
+        """Bring sources into force on all relays, or on none.
+
+        `kept` are files that are not in the folder, `loaded` those that the operator named. `switches`, `given`,
+        `shadow` and `enable` are for monitors that are not in force yet.
         """
         before, previous, switched = self.revision, self.sources, self.switches.said
         said = self.givens.said

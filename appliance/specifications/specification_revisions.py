@@ -18,17 +18,19 @@ from appliance.specifications.specification_files import (
 from appliance.store.state_file import MonitorRevisionRow, StateStore
 
 Check = Callable[[Sources, Sequence[str]], Awaitable[CheckedSpecifications]]
-"""Raises `SpecificationsRefusedError`."""
+"""Compiles sources. Raises `SpecificationsRefusedError`."""
 
 CheckBeside = Callable[[Sources, Sequence[str], Sequence[str]], Awaitable[CheckedSpecifications]]
-"""The files named last had errors before, and may still have them. Raises `SpecificationsRefusedError`."""
+"""Compiles sources; the files named last had errors before, and may still have them. Raises
+`SpecificationsRefusedError`.
+"""
 
 NOTHING = MonitorRevisionRow(0, "{}", 0.0, DISK, "")
 """The revision before the first one."""
 
 
 class StartingSpecifications(NamedTuple):
-    """`refused` has the folder's errors, if the last revision stays in force."""
+    """The specifications of a start; `refused` has the folder's errors, if the last revision stays in force."""
 
     sources: Sources
     checked: CheckedSpecifications
@@ -65,7 +67,7 @@ async def specifications_at_start(
 ) -> StartingSpecifications:
     """Return the stored revision `last`, the folder's sources, or `kept` if a reload would refuse the folder.
 
-    Raises `SpecificationsRefusedError`, also if a monitor that is `named` to be enabled is missing.
+    Raises `SpecificationsRefusedError`, even if a monitor that is `named` to be enabled is missing.
     """
     refused: list[str] = []
     if last is None:
@@ -109,7 +111,7 @@ async def _folder_or_kept(
 def _without_unusable(
     checked: CheckedSpecifications, sources: Sources, folder: SpecificationFolder, site_keys: Sequence[str]
 ) -> CheckedSpecifications:
-    """Files of the folder without a usable text count as left out."""
+    """Return the specifications, with the folder's files without a usable text as left out."""
     try:
         _, errors = folder.read_usable(site_keys)
     except SpecificationsRefusedError:
@@ -127,7 +129,7 @@ def unknown_monitors(names: Sequence[str], checked: CheckedSpecifications) -> st
 async def _check_kept(
     check: Check, row: MonitorRevisionRow, site_keys: Sequence[str]
 ) -> CheckedSpecifications:
-    """If this version refuses the revision, the error names the command that discards it."""
+    """Check a stored revision; if it is refused, the error names the command that discards it."""
     try:
         return await check(sources_of(row), site_keys)
     except SpecificationsRefusedError as error:
@@ -139,7 +141,7 @@ async def _check_kept(
 
 
 def forget_revision(store: StateStore, now: float) -> int | None:
-    """Return the discarded revision. Call this only while the appliance is not running."""
+    """Discard the last revision; return its number. Call this only while the appliance is not running."""
     last = next(iter(store.monitor_revisions(1)), NOTHING)
     if last.who == DISK:
         return None

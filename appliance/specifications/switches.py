@@ -14,7 +14,7 @@ SWITCHES = "monitor switches"
 
 
 class Switches:
-    """`said` has the switches of operators, `enable` is the start option."""
+    """The states of monitors; `said` has the switches of operators, `enable` is the start option."""
 
     def __init__(self, enable: str) -> None:
         self.starts_in_shadow = enable == "shadow"

@@ -44,7 +44,9 @@ def returns_moved(store: StateStore, seconds: float) -> None:
 
 
 class TimedSwitches:
-    """When a limit ends, `come_back(back)` is called, which calls `end` like every switch."""
+    """The time limits of switches. When a limit ends, `come_back(back)` is called, which calls `end` like every
+    switch.
+    """
 
     def __init__(
         self, store: StateStore, come_back: Callable[[Mapping[str, Switch]], Awaitable[None]]
@@ -84,7 +86,7 @@ class TimedSwitches:
         self._save()
 
     def begin(self, back: Mapping[str, Switch], seconds: float, of: Switch = False) -> None:
-        """A monitor that already has a limit returns to the switch of that limit."""
+        """Begin limits. A monitor that already has a limit returns to the switch of that limit."""
         until = clock.wall() + seconds
         self._kept |= {
             name: _Return(until, seconds, self._kept[name].back if name in self._kept else to, of)
