@@ -133,7 +133,7 @@ class Pool(Generic[Holder]):
         return self._held.get(host, _NOTHING)[1]
 
     def held_by(self, quota_class: QuotaClass) -> int:
-        """Count hosts by their class when they were last counted."""
+        """Return the holdings of a class, by the class of each host when it was last counted."""
         return self._by_class[quota_class]
 
     @property
