@@ -25,7 +25,7 @@ class Asker(NamedTuple):
 
 
 RecordDetails = Callable[[str, str | None, Severity, str | None, int], dict[str, str]]
-"""A function that returns what features add to the details of a record, by event, decision, severity, host and time."""
+"""Returns what features add to the details of a record, by event, decision, severity, host and time."""
 
 
 class AuditTrail:
@@ -85,7 +85,7 @@ class AuditTrail:
         reads: bool = False,
         **asked_of: str,
     ) -> str:
-        """Return the record's id. If the decision is only counted, no record has this id.
+        """Record a decision; return the record's id. If the decision is only counted, no record has this id.
 
         `asked_of` names the object of a command. `reads`: repetitions of an allowed call are only counted.
         """
@@ -139,8 +139,9 @@ class AuditTrail:
         whole: bool = False,
         **detail: Any,
     ) -> str:
-        """`reads`: repetitions are only counted. `whole`: every record is kept, even if the host is beyond its
-        quota.
+        """Record an event; return the record's id.
+
+        `reads`: repetitions are only counted. `whole`: every record is kept, even if the host is beyond its quota.
         """
         now, severity = clock.wall_ns(), severity or SEVERITIES.get(event, Severity.INFO)
         detail = {**(more or {}), **detail, **self._details(event, decision, severity, host, now)}

@@ -31,7 +31,7 @@ class LastMinute:
         self._seconds[-1][1][name] += number
 
     def counts(self) -> dict[str, int]:
-        """Leave out names without an event."""
+        """Return the counts, without names that had no event."""
         oldest = int(self._clock()) - _SECONDS
         total: Counter[str] = Counter()
         for second, counts in self._seconds:
@@ -77,7 +77,7 @@ class Meter:
         self.decision_seconds.observe(seconds)
 
     def called(self, call: str, seconds: float) -> None:
-        """`call` is a name of the call table, never text from a client."""
+        """Count a call; `call` is a name of the call table, never text from a client."""
         histogram = self.calls.get(call)
         if histogram is None:
             histogram = self.calls[call] = Histogram()
