@@ -90,7 +90,7 @@ def json_schema() -> dict[str, Any]:
 
 
 def read(values: Mapping[str, Any]) -> Settings:
-    """Raises `pydantic.ValidationError`."""
+    """Return the settings in the values. Raises `pydantic.ValidationError`."""
     return _reader().validate_python(values)
 
 
@@ -105,7 +105,7 @@ def _reader() -> TypeAdapter[Settings]:
 
 
 def resolve(file: Path | None, environment: Mapping[str, str], flags: Mapping[str, Any]) -> Settings:
-    """A flag whose value is None was not given. Raises `ConfigError`."""
+    """Return the settings from all sources; a flag whose value is None was not given. Raises `ConfigError`."""
     gathered = _Gathered()
     chosen = _choose_file(file, environment)
     if chosen is not None:

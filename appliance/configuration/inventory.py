@@ -49,7 +49,7 @@ def debian_packages(status: str) -> Iterator[Message]:
 
 
 def debian_licences(text: str) -> list[str]:
-    """Read Debian's machine-readable format and prose."""
+    """Return the licences in Debian's machine-readable format, or in prose."""
     return sorted(set(_LICENCE.findall(text) if "Format:" in text else _COMMON.findall(text)))
 
 

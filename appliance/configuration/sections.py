@@ -14,7 +14,7 @@ S = TypeVar("S", bound="FeatureSection")
 
 
 def key(*, description: str = "", default: Any = dataclasses.MISSING, **rules: Any) -> Any:
-    """`rules` are those of pydantic's `Field`."""
+    """Define a setting; `rules` are those of pydantic's `Field`."""
     metadata = {"description": description or None, **rules}
     if isinstance(default, list):
         metadata["json_schema_extra"] = {"default": default}
@@ -77,7 +77,7 @@ def is_loopback(host: str) -> bool:
 
 
 class FeatureSection:
-    """`place` is the section's key in `appliance.yaml`, such as `audit.syslog`.
+    """The settings of a feature; `place` is the section's key in `appliance.yaml`, such as `audit.syslog`.
 
     `stored_in` is a file in the state directory that also has values of the section; empty: none.
     """

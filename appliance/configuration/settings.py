@@ -204,7 +204,7 @@ class LivenessSection:
 
 @section
 class Relay:
-    """The limits of the relay; each key is a field of `appliance.relay.relay_limits.Limits`."""
+    """The limits of the relay; each key is a field of `appliance.relay.relay_limits.RelayLimits`."""
 
     connections: Count = key(default=16_384, description="of all hosts")
     connections_per_host: Count = key(default=8_192, description="connections of one host")
@@ -480,5 +480,5 @@ class Settings:
 
 
 def load_resolved(path: Path) -> Settings:
-    """Raises `OSError`, `msgspec.ValidationError`."""
+    """Read the settings that the supervisor wrote. Raises `OSError`, `msgspec.ValidationError`."""
     return msgspec.json.decode(path.read_bytes(), type=Settings, dec_hook=lambda kind, text: kind(text))
