@@ -29,7 +29,7 @@ if TYPE_CHECKING:  # the API's process accepts connections too, and does not loa
 
 Network = ipaddress.IPv4Network | ipaddress.IPv6Network
 Program = Callable[[], bytes]
-"""For the policy in force; the same object until the policy changes."""
+"""Returns the BPF program for the policy in force; the same object until the policy changes."""
 
 BACKLOG = 4096
 _CLOSING_SECONDS = 15e-6  # the processor time to accept and close a connection
@@ -55,7 +55,7 @@ _log = structlog.get_logger()
 
 
 class NamedFirst:
-    """This machine and hosts that the policy names are first, blocked hosts second."""
+    """Makes a policy's program: this machine and the named hosts use the first queue, blocked hosts the second."""
 
     def __init__(self, policy: "Callable[[], Policy]") -> None:
         self._policy = policy
@@ -167,7 +167,8 @@ def _instruction(operation: int, operand: int, if_true: int = 0, if_false: int =
 class Acceptor:
     """Accepts connections; `accepted` owns the socket, and the host is charged for the time.
 
-    If it returns False (too many connections), other connections of this host in the same turn are closed at once.
+    If `accepted` returns False (too many connections), other connections of this host in the same turn are closed at
+    once.
     """
 
     def __init__(

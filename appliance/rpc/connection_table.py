@@ -52,7 +52,7 @@ class TrackedConnection(Protocol):
 
 
 Patience = Callable[[QuotaClass, Stage, bool], float]
-"""A function that returns the seconds before a connection may be evicted. True: for a host of the same quota class."""
+"""Returns the seconds before a connection may be evicted. True: a host of the same quota class needs the room."""
 
 
 def _of_ros(_quota_class: QuotaClass, stage: Stage, own: bool) -> float:
@@ -135,7 +135,7 @@ class ConnectionTable(Generic[Holder]):
         self._queues[stage].put(connection, host, self._clock())
 
     def hold(self, host: Holder, size: int) -> str:
-        """Count bytes, unless there are too many; return the reason."""
+        """Count bytes. If there are too many, count none and return the reason."""
         return self._take(self.held, host, size)
 
     def release(self, host: Holder, size: int) -> None:
@@ -173,7 +173,9 @@ class ConnectionTable(Generic[Holder]):
     def _longest(
         self, stage: Stage, queue: Queue[Holder, TrackedConnection], quota_class: QuotaClass
     ) -> tuple[TrackedConnection, Holder, float] | None:
-        """Return the longest waiting connection, and move idle ones that were used since to their place."""
+        """Return the connection that waits longest; idle ones that were used since they were filed are moved back
+        first.
+        """
         for _ in range(_MOST_MOVED):
             found = queue.longest(quota_class)
             if found is None or stage is not Stage.IDLE or found[0].progress <= found[2]:

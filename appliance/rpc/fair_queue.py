@@ -144,7 +144,7 @@ def bulk_turns(quota_class: Callable[[Address], QuotaClass]) -> Turns[Address]:
 
 
 class Bulk:
-    """Reserved on demand, and released when the request ends."""
+    """The bulk of one request, reserved on demand and released when the request ends."""
 
     def __init__(self, turns: Turns[Address], host: Address, processor: ProcessorTime) -> None:
         self._turns = turns
@@ -187,7 +187,7 @@ class Bulk:
 
 
 class LargeWrites:
-    """Large values to the ROS master and to another appliance go one at a time for each host.
+    """Lets each host write one large value at a time to the ROS master, or to another appliance.
 
     The threads of the ROS master would block each other while they read such values.
     """
@@ -224,7 +224,7 @@ def text_weight(text: str) -> int:
 
 
 def weigh(value: Value, enough: int) -> int:
-    """Approximate bytes on the wire; stop counting at `enough`."""
+    """Return the approximate bytes on the wire; counting stops at `enough`."""
     total = 0
     waiting: list[Value] = [value]
     while waiting and total < enough:

@@ -1,11 +1,11 @@
 """Serve XML-RPC over HTTP on a listening socket, one request at a time for each connection.
 
-1. Each connection has at most one request in progress and one response in the write buffer. Further requests wait, and
-   reading pauses.
+1. Each connection has at most one request in progress and one response in the write buffer. Further requests wait,
+   and reading pauses.
 2. A request from a host that no policy rule names is refused before its body is complete. Only the beginning of the
    body is read, for the audit record of the refusal.
-3. A request no longer waits for its turn once its connection has ended. One that is answered without waiting does not
-   count its last bytes.
+3. A request leaves the queue when its connection ends. The last bytes of a request that need not wait are not
+   counted.
 4. A peer that exceeds a limit gets a fault that names the limit. At most a few connections wait for such a fault.
 """
 
@@ -81,7 +81,8 @@ class HttpServer:
     """A server; `handler` returns the response body of a request.
 
     `refuse(peer)` is called after the head of a request; the `Refusal` makes the answer from the beginning of the
-    body. `malformed(peer, reason)` is called for each request that is invalid HTTP or not served here.
+    body. `malformed(peer, reason)` is called for each request that is invalid HTTP or not served here, and
+    `troubled(peer, reason)` when a peer exceeds a limit.
     """
 
     sock: socket.socket
@@ -357,7 +358,7 @@ class _Connection(Front, asyncio.BufferedProtocol):
         return self._held + self._unsent + sum(_held_by(request) for request, _ in self._pending)
 
     def leave(self) -> None:
-        """A request being served continues, but its answer is dropped."""
+        """Leave the table. A request being served continues, but its answer is dropped."""
         if self._patience is not None:
             self._patience.cancel()
         self.server.connections.discard(self)
@@ -516,7 +517,7 @@ class _Connection(Front, asyncio.BufferedProtocol):
 
 
 def _has_ended(sock: socket.socket) -> bool:
-    """Opening the transport of a closed connection would take a hundred times as long."""
+    """Return whether the peer closed the connection: opening its transport would take a hundred times as long."""
     try:
         return not sock.recv(1, socket.MSG_PEEK)
     except BlockingIOError:

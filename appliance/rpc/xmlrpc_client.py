@@ -64,7 +64,7 @@ class XmlRpcClient:
         self._head = head.encode("ascii")
 
     async def call(self, method: str, *params: Value) -> Value:
-        """Make a call. Raises `CallFailedError`, also for a slow, silent or misbehaving peer."""
+        """Make a call. Raises `CallFailedError`, even if the peer is slow, silent or misbehaves."""
         body = await self._written(method, params)
         request = self._head % len(body) + body
         seconds = self._timeout + len(request) // _READ_IN_A_SECOND
@@ -84,7 +84,7 @@ class XmlRpcClient:
             raise CallFailedError(f"{self._where} answered {method} with nonsense: {error}") from error
 
     async def refuses(self, seconds: float) -> bool:
-        """A server that is silent for these seconds does not refuse."""
+        """Return whether the address refuses connections; a server that is silent for these seconds does not."""
         loop = asyncio.get_running_loop()
         try:
             async with asyncio.timeout(seconds):
