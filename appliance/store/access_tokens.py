@@ -58,7 +58,7 @@ def make_token(name: str, role: str, *, now: float, seconds: float) -> tuple[Tok
 
 
 def parse_token(text: str) -> tuple[str, str] | None:
-    """Return the id and the secret."""
+    """Return the id and the secret, or None for another text."""
     found = _FORM.fullmatch(text)
     return None if found is None else (found[1], found[2])
 

@@ -24,7 +24,7 @@ class ChangeFeed:
         self._lock = threading.Lock()
 
     def add(self, changes: Sequence[Encoded]) -> None:
-        """The numbers have no gap."""
+        """Add changes, whose numbers continue without a gap."""
         with self._lock:
             self._changes += changes
             self._size += sum(len(change.body) for change in changes)
@@ -37,7 +37,9 @@ class ChangeFeed:
             self._shrink()
 
     def after(self, number: int, most: int) -> list[Encoded] | None:
-        """Return at most `most` bytes of changes, but at least one; None if the feed does not have all of them."""
+        """Return the changes after `number`: at most `most` bytes, but at least one change. None: the feed
+        lacks some.
+        """
         with self._lock:
             skipped = number - self._before
             if not 0 <= skipped <= len(self._changes):

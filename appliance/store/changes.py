@@ -135,7 +135,9 @@ class Tables:
 
 
 def joined(changes: Sequence[tuple[Change, bool]]) -> Iterator[tuple[Change, bool]]:
-    """Join consecutive rows of a table if their second values are equal: each change delays the loop's thread."""
+    """Join consecutive rows of a table that have the same second value, because each change delays the loop's
+    thread.
+    """
     if len(changes) == 1:
         yield changes[0]
         return
@@ -192,7 +194,7 @@ class WriteAhead:
             yield self._open_descriptor
 
     def left(self, stored: int) -> LeftBehind:
-        """Leave out the changes up to `stored`. Raises `ValueError` for an intact change that this release does
+        """Return the changes after `stored`. Raises `ValueError` for an intact change that this release does
         not know.
         """
         with self._descriptor() as descriptor:
@@ -203,7 +205,7 @@ class WriteAhead:
         return LeftBehind([(number, decoder.decode(body)) for number, body in _after(stored, data)], [])
 
     def append(self, changes: Sequence[Encoded]) -> None:
-        """Raises `OSError` when the disk is full."""
+        """Append changes. Raises `OSError`, for example if the disk is full; then the file has none of them."""
         with self._descriptor() as descriptor:
             parts: list[bytes] = []
             last = self._last
@@ -220,7 +222,7 @@ class WriteAhead:
             self._last = last
 
     def stored(self, number: int) -> None:
-        """The database has all changes up to this number: empty the file when it has no others."""
+        """Note that the database has the changes up to `number`, and empty the file if it has no others."""
         with self._descriptor() as descriptor:
             if number >= self._last:
                 os.ftruncate(descriptor, 0)
@@ -230,7 +232,7 @@ class WriteAhead:
             os.ftruncate(descriptor, 0)
 
     def sync(self) -> None:
-        """Other threads may append. Raises `OSError`."""
+        """Flush the file to the disk, while other threads may append. Raises `OSError`."""
         with self._descriptor() as descriptor:
             own = os.dup(descriptor)
         try:
@@ -239,7 +241,7 @@ class WriteAhead:
             os.close(own)
 
     def close(self) -> None:
-        """Wait for any use in progress; do nothing if the file is already closed."""
+        """Close the file, after any use in progress."""
         with self._lock:
             if self._open_descriptor >= 0:
                 os.close(self._open_descriptor)

@@ -19,8 +19,8 @@ CREATE TABLE IF NOT EXISTS door_ticket (
 class DoorRow(NamedTuple):
     """The door of one identity; times are seconds since the epoch.
 
-    A name always keeps its address, also after its removal. `slot` is the number of its process. `port` is the
-    port of an agent (None: only tickets), and `source` its address or network (empty: any).
+    A name always keeps its address, even after its removal. `slot` is the number of its process. `port` is the port
+    of an agent (None: only tickets), and `source` its address or network (empty: any).
     """
 
     name: str

@@ -133,7 +133,7 @@ class ApplianceRow(NamedTuple):
 
 
 class HostTables:
-    """The tables of hosts, with methods to read and write them."""
+    """The rows of hosts in the state file."""
 
     def __init__(self, database: Database) -> None:
         self._database = database

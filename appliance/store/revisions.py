@@ -96,8 +96,9 @@ class Revisions(ABC, Generic[R]):
     # --- start ---
 
     def _find_last(self, *, restarted: bool) -> bool:
-        """Return whether the last stored revision takes precedence over the files on disk: after a crash of
-        control (`restarted`), or if an operator made it.
+        """Return whether the last stored revision takes precedence over the files on disk.
+
+        It does after a crash of control (`restarted`), or if an operator made it.
         """
         self.in_force = next(iter(self._rows(1)), self.in_force)
         return self.revision > 0 and (restarted or self.in_force.who != DISK)
@@ -122,7 +123,7 @@ class Revisions(ABC, Generic[R]):
         return next((row for row in await self._kept() if row.revision == revision), None)
 
     async def _wanted(self, revision: int | None) -> R:
-        """None is the revision before the present one. Raises `refusal` and `outdated`."""
+        """Return a stored revision; None is the revision before the present one. Raises `refusal` and `outdated`."""
         before = self.revision
         known = {row.revision: row for row in await self._kept()}
         if self.revision != before:
@@ -139,7 +140,7 @@ class Revisions(ABC, Generic[R]):
 
     @contextlib.asynccontextmanager
     async def _changing(self, expected: int | str | None) -> AsyncIterator[None]:
-        """Raises `outdated` unless `expected` is None or the present tag."""
+        """Make no other change during the block. Raises `outdated` unless `expected` is None or the present tag."""
         async with self._one_change:
             require_awaited()
             if expected not in (None, self.tag):

@@ -64,7 +64,9 @@ _EMPTY = msgspec.msgpack.encode({})
 
 
 class IncarnationRow(NamedTuple):
-    """`changed` is in monotonic seconds, for the order only. `relay_port` is the port on the first relay process."""
+    """An incarnation of a node. `changed` is in monotonic seconds, for the order only. `relay_port` is the port on
+    the first relay process.
+    """
 
     key: str
     name: str
@@ -80,7 +82,7 @@ class IncarnationRow(NamedTuple):
 
 
 class RegistrationRow(NamedTuple):
-    """`ordinal` counts registrations in the order they were made."""
+    """A registration; `ordinal` counts registrations in the order they were made."""
 
     key: str
     kind: str
@@ -136,11 +138,10 @@ class StateStore:
         self._noted: dict[str, list[int]] = {}  # the changes of each key since the tree was stored, by number
 
     async def settled(self) -> None:
-        """Raises `StoreError` if the changes cannot be written to the disk."""
+        """Wait until the changes are on the disk. Raises `StoreError` if they cannot be written."""
         await self.database.settled()
 
     def close(self, seconds: float | None = None) -> None:
-        """None: no limit."""
         self.database.close(seconds)
 
     # --- registry ---
@@ -197,7 +198,9 @@ class StateStore:
         self._only_in_tree = False
 
     def note_whole_parameters(self) -> None:
-        """Store also large values at once: another appliance must have each value before it is answered."""
+        """From now on, store even large values at once: another appliance must have each value before its caller is
+        answered.
+        """
         self._largest_change = math.inf
 
     @property
@@ -205,7 +208,7 @@ class StateStore:
         return self._only_in_tree or len(self._noted) > _MOST_NOTED
 
     def note_parameter(self, key: str, value: Any) -> None:
-        """Store one change until the next tree is stored; None: the parameter was deleted.
+        """Store the change of a parameter until the next tree is stored; None: it was deleted.
 
         The tree, which may be large, is stored rarely, and a value larger than `LARGEST_CHANGE` only with it.
         """
@@ -290,7 +293,7 @@ class StateStore:
     # --- tokens ---
 
     def save_tokens(self, *rows: TokenRow) -> None:
-        """After a crash, either all of these rows are stored or none."""
+        """Save tokens; after a crash, either all of these rows are stored or none."""
         with self.database.together():
             for row in rows:
                 if row.keys is not None:

@@ -20,7 +20,7 @@ class StoredDeadlines(Deadlines):
         self.limit(self._stored)
 
     def save(self) -> None:
-        """Raises `StoreError`."""
+        """Save the remaining times. Raises `StoreError`."""
         changed = {name: left for name, left in self.left().items() if self._stored.get(name) != left}
         if changed:
             self._store.database.require_room()

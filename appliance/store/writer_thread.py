@@ -129,8 +129,8 @@ class Database:
         self._driver = drive("store", self.turn, _GATHER_SECONDS)
 
     def query(self, sql: str, parameters: Sequence[Value] = ()) -> list[tuple[Any, ...]]:
-        """Read also queued rows. Call this in a thread, because it may wait for `_CATCH_UP_SECONDS`, though not
-        while writing fails.
+        """Return rows, including queued ones. Call this in a thread, because it may wait for `_CATCH_UP_SECONDS`,
+        though not while writing fails.
         """
         if not self._ended and not self._failing:
             written = threading.Event()
@@ -144,8 +144,8 @@ class Database:
             raise StoreError(f"{self._path}: {error}") from error
 
     def put(self, table: str, *row: Value, ahead: bool = True) -> None:
-        """With `ahead`, the row survives the process from then on. Raises `ChangeError`, and `StoreError` after
-        `close`.
+        """Store a row; with `ahead`, it survives the process from then on. Raises `ChangeError`, and `StoreError`
+        after `close`.
         """
         self._submit(Put(table, [row]), ahead=ahead)
 
@@ -246,7 +246,7 @@ class Database:
             raise StoreError(f"{why}; nothing was changed: free space and try again")
 
     async def settled(self) -> None:
-        """Raises `StoreError` if the changes queued so far cannot be written."""
+        """Wait until the changes queued so far are on the disk. Raises `StoreError` if they cannot be written."""
         loop = asyncio.get_running_loop()
         done: asyncio.Future[str] = loop.create_future()
 
@@ -341,7 +341,7 @@ class Database:
         return True
 
     def _sync(self) -> str:
-        """Return why the flush failed. The kernel may have dropped data that it could not write."""
+        """Flush to the disk; return why this failed. The kernel may then have dropped data that it could not write."""
         try:
             with self._path.with_name(f"{self._path.name}-wal").open("rb") as log:
                 os.fsync(log.fileno())
