@@ -1,7 +1,7 @@
 """Name the authors of revisions and records, including programs, and the hosts that are charged."""
 
 DISK = "disk"
-"""Read from the disk, at a start or by a signal to the appliance."""
+"""The author of a revision that was read from the disk, at a start or by a signal to the appliance."""
 UNCONFIRMED = "not confirmed in time"
 """The author of an automatic rollback. No token has this name or that of `DISK`."""
 

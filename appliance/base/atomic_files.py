@@ -22,7 +22,9 @@ def name_to_make(path: Path) -> Path:
 
 
 def remove_unfinished(folder: str, place: int) -> None:
-    """No writer may be active. `place` is the descriptor to which `folder` is relative."""
+    """Remove files that a crash left unfinished; no writer may be active. `folder` is relative to the descriptor
+    `place`.
+    """
     with contextlib.suppress(OSError):
         for _path, _folders, files, inside in os.fwalk(folder, follow_symlinks=False, dir_fd=place):
             for name in filter(_UNFINISHED.fullmatch, files):
@@ -31,11 +33,11 @@ def remove_unfinished(folder: str, place: int) -> None:
 
 
 def write_whole(path: Path, data: bytes | mmap, mode: int, owner: tuple[int, int] | None = None) -> None:
-    """Raises `OSError`, which leaves the old file unchanged, and `NotLastingError` if the new file is perhaps not
-    on the disk.
+    """Replace a file. Raises `OSError`, which leaves the old file unchanged, and `NotLastingError` if the new file is
+    perhaps not on the disk.
 
-    `owner` (user and group) is set before the file gets its final name. With concurrent writers, one complete
-    file remains.
+    `owner` (user and group) is set before the file gets its final name. With concurrent writers, one complete file
+    remains.
     """
     making = name_to_make(path)
     try:
@@ -70,9 +72,9 @@ def write_whole(path: Path, data: bytes | mmap, mode: int, owner: tuple[int, int
 def write_where_told(path: Path, data: bytes | mmap) -> None:
     """Write to the path that a person named. Raises `OSError`.
 
-    A regular file is replaced atomically and keeps its mode and owner, also behind a symbolic link. A pipe, a
-    device, or a file with an owner that this process cannot set is written in place. The process's own output
-    (/dev/stdout) is appended to.
+    A regular file is replaced atomically and keeps its mode and owner, even behind a symbolic link. A pipe, a device,
+    or a file with an owner that this process cannot set is written in place. The process's own output (/dev/stdout)
+    is appended to.
     """
     try:
         there = path.stat()

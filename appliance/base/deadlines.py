@@ -34,7 +34,7 @@ class Deadlines:
         self._deadlines = {name: known for name, known in self._deadlines.items() if name in names}
 
     def forget(self, name: str) -> None:
-        """The name is never used again."""
+        """Forget a name, which must never be used again."""
         self._deadlines.pop(name, None)
         self._limits.pop(name, None)
 

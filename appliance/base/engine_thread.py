@@ -24,7 +24,7 @@ class Driver(Protocol):
         """Call the engine at once, because a caller waits for the work."""
 
     def end(self, seconds: float | None) -> bool:
-        """Return whether the engine ended within `seconds`."""
+        """End the engine; return whether it ended within `seconds`."""
 
 
 Drive = Callable[[str, Turn, float], Driver]

@@ -27,7 +27,7 @@ _KINDS = {
 
 
 def open_given(path: Path) -> io.BufferedReader:
-    """Open also a pipe that a shell made for `<(command)` or `command |`. Raises `OSError`."""
+    """Open a regular file, or a pipe that a shell made for `<(command)` or `command |`. Raises `OSError`."""
     descriptor = open_named(path)
     try:
         about = os.fstat(descriptor)
@@ -44,7 +44,7 @@ def open_given(path: Path) -> io.BufferedReader:
 
 
 def read_given(path: Path, longest: int = LONGEST) -> bytes:
-    """Raises `OSError`, also for more than `longest` bytes."""
+    """Return a file's content. Raises `OSError`, for example for more than `longest` bytes."""
     with open_given(path) as file:
         data = file.read(longest + 1)
     if len(data) > longest:
@@ -70,13 +70,16 @@ def path_for_library(path: Path) -> Iterator[Path]:
 
 
 def read_given_text(path: Path, encoding: str = "utf-8", errors: str = "strict") -> str:
-    """Lines end with LF. Raises `OSError` and `UnicodeDecodeError`."""
+    """Return a file's text, whose lines end with LF. Raises `OSError` and `UnicodeDecodeError`."""
     with io.TextIOWrapper(io.BytesIO(read_given(path)), encoding, errors) as text:
         return text.read()
 
 
 def files_below(folder: Path) -> list[Path]:
-    """A link is a file. `Path.glob` takes a folder that may not be read for an empty one; here it raises `OSError`."""
+    """Return the files in a folder and below; a link is a file.
+
+    Raises `OSError` for a folder that may not be read, which `Path.glob` takes for empty.
+    """
     found: list[Path] = []
     for path, is_folder in entries_of(folder):
         found += files_below(path) if is_folder else [path]
@@ -84,7 +87,7 @@ def files_below(folder: Path) -> list[Path]:
 
 
 def entries_of(folder: Path) -> list[tuple[Path, bool]]:
-    """Return whether each entry is a folder; a link is not. Raises `OSError`."""
+    """Return the entries of a folder, and whether each is a folder; a link is not. Raises `OSError`."""
     descriptor = open_named(folder)
     try:
         with os.scandir(descriptor) as entries:
@@ -96,7 +99,7 @@ def entries_of(folder: Path) -> list[tuple[Path, bool]]:
 
 
 def stat_given(path: Path) -> os.stat_result:
-    """Follow a link. Raises `OSError`."""
+    """Return the status of a file, or of the target of a link. Raises `OSError`."""
     try:
         return path.stat()
     except (PermissionError, FileNotFoundError):  # as in `open_named`

@@ -13,7 +13,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class OptionGroup(Generic[T]):
-    """Options that several verbs share; typer reads them from the signature of a function."""
+    """Options that typer reads from the signature of a function."""
 
     function: Callable[..., T]
 

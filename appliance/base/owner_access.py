@@ -28,7 +28,7 @@ class MissingRightError(UserError, PermissionError):
 
 
 class FileLender:
-    """`open` returns an open file, or None if the role may not ask for it."""
+    """Opens files for a role of the appliance; `open` returns None if the role may not ask for the file."""
 
     # A setting of the process, as its user is: each reader of a named file would otherwise have to pass it on.
     open: ClassVar[Callable[[Path], int | None]] = lambda _path: None
@@ -39,7 +39,7 @@ class FileLender:
 
 
 def open_named(path: Path) -> int:
-    """Raises `OSError`."""
+    """Open a file or folder that an operator names. Raises `OSError`."""
     try:
         return os.open(path, OPENING)
     except PermissionError:
@@ -53,7 +53,7 @@ def open_named(path: Path) -> int:
 
 
 def is_named_there(path: Path) -> bool:
-    """Use the rights with which the file would be opened: root's own may not suffice."""
+    """Return whether the path exists, with the rights that open it: root's own may not suffice."""
     try:
         os.close(open_named(path))
     except (FileNotFoundError, NotADirectoryError):
@@ -64,12 +64,12 @@ def is_named_there(path: Path) -> bool:
 
 
 def open_as_owner(path: Path) -> int:
-    """Use the rights of the folder's owner, or of the file's. Raises `OSError`."""
+    """Open a file with the rights of the folder's owner, or of its own. Raises `OSError`."""
     return _open_in(_folder(path.absolute().parent), path.name, path)
 
 
 def open_below(folder: Path, path: Path) -> int:
-    """No folder between them may be a link. Raises `OSError`."""
+    """Open a file below a folder; no folder between them may be a link. Raises `OSError`."""
     place = _folder(folder)
     for name in path.relative_to(folder).parent.parts:
         place = _next(place, name, os.O_NOFOLLOW)
@@ -78,7 +78,7 @@ def open_below(folder: Path, path: Path) -> int:
 
 @contextlib.contextmanager
 def acting_as(uid: int) -> Iterator[None]:
-    """Without root, nothing changes."""
+    """Act as a user during the block; a process without root changes nothing."""
     # seteuid would also take root from the other threads.
     if os.geteuid() != 0 or uid == 0:
         yield

@@ -4,5 +4,5 @@ import re
 
 
 def without_number(error: Exception) -> str:
-    """Libraries put a number before the text of a system's error: `[Errno 111] Connection refused`."""
+    """Return the text without the number that libraries put before it: `[Errno 111] Connection refused`."""
     return re.sub(r"\[Errno -?\d{1,4}\] ", "", str(error))

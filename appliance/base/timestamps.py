@@ -8,7 +8,7 @@ _UNITS = {"s": 1, "m": 60, "h": 3600, "d": 86_400, "w": 604_800}
 
 
 class TimestampError(ValueError):
-    """The message lists the valid forms."""
+    """The text is not a time; the message lists the valid forms."""
 
 
 def parse_timestamp(text: str, now: int) -> int:

@@ -2,4 +2,4 @@
 
 
 class UserError(Exception):
-    """`rosrv` prints the text and exits with status 1."""
+    """An error for users: `rosrv` prints the text and exits with status 1."""

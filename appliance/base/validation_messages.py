@@ -83,7 +83,7 @@ def meant(word: str, candidates: Collection[str]) -> str:
 
 
 def must_be(error: Mapping[str, Any]) -> str:
-    """`error` is one of pydantic's `errors()`."""
+    """Return the requirement on a value; `error` is one of pydantic's `errors()`."""
     kind, context = str(error["type"]), error.get("ctx") or {}
     wanted = _MUST_BE.get(kind) or _MUST_BE.get(kind.partition("_")[0]) or f"of another type ({kind})"
     shown = {name: _plain(value) for name, value in context.items()}
@@ -93,7 +93,7 @@ def must_be(error: Mapping[str, Any]) -> str:
 
 
 def refusal(error: Mapping[str, Any]) -> str:
-    """`error` is one of pydantic's `errors()`."""
+    """Return the whole message; `error` is one of pydantic's `errors()`."""
     if error["type"] == "missing":
         return "must be given"
     if error["type"] == "value_error":  # raised by the appliance's own validator, with a complete message
@@ -102,7 +102,9 @@ def refusal(error: Mapping[str, Any]) -> str:
 
 
 def body_refusal(text: str, choices: Collection[str] = ()) -> str:
-    """`text` is msgspec's `ValidationError` without its path, `choices` are the valid strings of an enumeration."""
+    """Return the message for a body; `text` is msgspec's `ValidationError` without its path, `choices` are the valid
+    strings of an enumeration.
+    """
     no_choice = text.removeprefix("Invalid enum value ")
     if no_choice != text:
         return f"must be one of {', '.join(repr(str(one)) for one in choices)}, not {_cut(no_choice)}"

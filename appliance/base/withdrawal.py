@@ -21,7 +21,7 @@ class WithdrawnError(Exception):
 
 
 class _Order:
-    """`given_up()` no longer matters once `begun` is true."""
+    """An order of a client; `given_up()` no longer matters once `begun` is true."""
 
     def __init__(self, given_up: Callable[[], bool]) -> None:
         self.given_up = given_up
@@ -33,7 +33,7 @@ _PRESENT: ContextVar[_Order | None] = ContextVar("order", default=None)
 
 @contextlib.contextmanager
 def awaited(given_up: Callable[[], bool]) -> Iterator[None]:
-    """`given_up()` returns whether the client of the order in the block stopped waiting."""
+    """Run an order in the block; `given_up()` returns whether its client stopped waiting."""
     order = _Order(given_up)
     before = _PRESENT.set(order)
     try:
@@ -51,7 +51,7 @@ def require_awaited() -> None:
 
 
 def take_effect() -> None:
-    """Raises `WithdrawnError`."""
+    """Begin the changes of the order, which is then never withdrawn. Raises `WithdrawnError`."""
     require_awaited()
     order = _PRESENT.get()
     if order is not None:
