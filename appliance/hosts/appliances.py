@@ -1,4 +1,4 @@
-"""The appliances at which hosts open their tunnels. A single appliance is the only one."""
+"""The appliances at which hosts open their tunnels. Without a pair, this appliance is the only one."""
 
 from appliance.channel.messages import CertificateMade
 from appliance.hosts.revoked_certificates import RevokedCertificates

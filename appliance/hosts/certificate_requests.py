@@ -13,7 +13,7 @@ M = TypeVar("M", messages.AuthorityStated, messages.CertificateMade, messages.Re
 
 
 class AuthorityError(Exception):
-    """`refused`: the authority rejected the request, otherwise it did not answer."""
+    """The authority rejected a request (`refused`), or did not answer."""
 
     def __init__(self, reason: str, *, refused: bool = False) -> None:
         super().__init__(reason)
@@ -32,7 +32,7 @@ class Authority:
     async def issue(
         self, request: bytes, name: str, days: float, *, proof: bytes = b"", former: bytes = b""
     ) -> messages.CertificateMade:
-        """`proof` is a signature over the request by the key of `former` (PEM)."""
+        """Issue a certificate; `proof` is a signature over the request by the key of `former` (PEM)."""
         return await self._ask(
             lambda number: messages.CertificateWanted(number, request, name, days, proof, former),
             messages.CertificateMade,

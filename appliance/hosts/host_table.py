@@ -33,7 +33,7 @@ MOST_MACHINES = 1024
 
 
 class HostRefusedError(Exception):
-    """The message has the reason. `ours`: the appliance, not the request, is the cause."""
+    """A request is refused; the message has the reason. `ours`: the appliance, not the request, is the cause."""
 
     def __init__(self, reason: str, *, ours: bool = False) -> None:
         super().__init__(reason)
@@ -71,7 +71,7 @@ class HostTable:
         return str(self.pool.network_address + 1)
 
     def require(self, expected: int | None) -> None:
-        """Raises `HostsChangedError`."""
+        """Raise `HostsChangedError` unless `expected` is None or the present revision."""
         if expected not in (None, self.revision):
             raise HostsChangedError(f"the table of hosts has revision {self.revision}, not {expected}")
 
@@ -88,11 +88,11 @@ class HostTable:
         return [row for row in self.enrolled() if self.declared.wants(row.name)]
 
     def addresses(self) -> dict[str, Address]:
-        """The policy has these addresses for `host:NAME` while the tunnels are open."""
+        """Return the addresses that the policy has for `host:NAME` while the tunnels are open."""
         return {row.name: ipaddress.ip_address(row.address) for row in self.admitted()}
 
     def enrolled_row(self, name: str) -> HostRow:
-        """Raises `UnknownHostError`."""
+        """Return the row of an enrolled host. Raises `UnknownHostError`."""
         row = self.rows.get(name)
         if row is None or row.revoked is not None:
             known = ", ".join(host.name for host in self.enrolled()[:20]) or "none"
@@ -139,7 +139,9 @@ class HostTable:
             raise HostRefusedError(f"the table is full: {MOST_HOSTS} hosts, including revoked ones")
 
     def address_for(self, name: str, wanted: str | None, awaited: dict[str, str]) -> str:
-        """`awaited` maps addresses that tokens reserve to names. Raises `HostRefusedError`."""
+        """Return the address for a host; `awaited` maps addresses that tokens reserve to names. Raises
+        `HostRefusedError`.
+        """
         declared = self.declared.hosts.get(name)
         before = self.rows.get(name)
         kept = before.address if before else declared.address if declared else None
@@ -208,7 +210,7 @@ class HostTable:
         return self._set(row._replace(revoked=clock.wall()))
 
     def keep_ports(self, row: PortsRow) -> None:
-        """Raises `HostRefusedError`."""
+        """Keep the check of a machine's ports. Raises `HostRefusedError` if there are too many machines."""
         if row.name not in self.ports and len(self.ports) >= MOST_MACHINES:
             raise HostRefusedError(f"the limit of {MOST_MACHINES} machines with known ports is reached")
         self.ports[row.name] = row

@@ -1,6 +1,6 @@
 """Read `ipsec/hosts.yaml` (docs/tunnels.md), which declares the hosts to enrol, at start and on reload.
 
-The file is never written. An invalid file changes nothing, also at a start, and the status reports the error.
+The file is never written. An invalid file changes nothing, even at a start, and the status reports the error.
 """
 
 import contextlib
@@ -70,7 +70,7 @@ class DeclaredHosts:
         return bool(self.hosts)
 
     def reload(self) -> None:
-        """Raises `DeclaredHostsError`, and then keeps the earlier content."""
+        """Read the file again. Raises `DeclaredHostsError`, and then keeps the earlier content."""
         try:
             self.text, self.hosts = _read(self.path)
         except DeclaredHostsError as error:
@@ -79,7 +79,7 @@ class DeclaredHosts:
         self.error = self.bundled = ""
 
     def take(self, text: str) -> None:
-        """Raises `DeclaredHostsError`, and then changes nothing."""
+        """Take the text of a bundle. Raises `DeclaredHostsError`, and then changes nothing."""
         self.hosts = parse_declared(text, IN_BUNDLE)
         self.error, self.bundled = "", text or "\n"
 
@@ -93,7 +93,7 @@ class DeclaredHosts:
 
 
 def read_declared(path: Path) -> dict[str, DeclaredHost]:
-    """A missing file has no hosts. Raises `DeclaredHostsError`."""
+    """Return the hosts in a file; a missing file has none. Raises `DeclaredHostsError`."""
     return _read(path)[1]
 
 

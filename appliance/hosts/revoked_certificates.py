@@ -20,7 +20,7 @@ _AT_ONCE_BYTES = 2 * (_ENTRY_BYTES + 20)  # two entries: a certificate and its s
 
 
 class RevokedCertificates:
-    """`enrolled` are the names whose certificates charon accepts."""
+    """The revoked certificates; `enrolled` are the names whose certificates charon accepts."""
 
     def __init__(self, kept: HostTables) -> None:
         self._kept = kept

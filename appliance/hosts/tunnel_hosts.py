@@ -15,7 +15,7 @@ class TunnelHosts:
         return self._text
 
     async def take_bundle(self, text: str, who: str) -> object:
-        """An empty text stands for the file. Raises `HostRefusedError`."""
+        """Take the hosts of a bundle; an empty text stands for the file. Raises `HostRefusedError`."""
         del who
         if text.strip():
             raise HostRefusedError("the bundle declares hosts, and this appliance has no tunnels")
@@ -23,7 +23,7 @@ class TunnelHosts:
         return None
 
     async def read_again(self, who: str) -> None:
-        """Raises `HostRefusedError` and `StoreError`."""
+        """Read the file again. Raises `HostRefusedError` and `StoreError`."""
 
     def status(self) -> IpsecState:
         return IpsecState(

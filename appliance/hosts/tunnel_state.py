@@ -44,7 +44,7 @@ class SignedRevocations:
         self._signed = b""
 
     async def signed(self) -> bytes:
-        """Raises `AuthorityError`."""
+        """Return the list, signed again if needed. Raises `AuthorityError`."""
         async with self._one_at_a_time:
             state = (self._table.revision, int(clock.wall() // _SIGNED_SECONDS))
             if state != self._state:
@@ -116,7 +116,7 @@ class Tunnels:
         return self._table.addresses() if self.enclosed else {}
 
     async def start(self) -> None:
-        """Log a failure, which does not keep nodes from being served."""
+        """Open the tunnels if hosts are enrolled; a failure is only logged, so nodes are still served."""
         if not self._table.admitted():
             return
         try:
@@ -129,7 +129,7 @@ class Tunnels:
         self._answered.set()
 
     async def open(self) -> None:
-        """Let the supervisor block clear text for the pool first. Raises `HostRefusedError`."""
+        """Open the tunnels, after the supervisor has blocked clear text for the pool. Raises `HostRefusedError`."""
         async with self._opening:
             if self.enclosed:
                 return
@@ -259,7 +259,7 @@ class Tunnels:
         return _AGAIN_SECONDS[min(self._failures, len(_AGAIN_SECONDS)) - 1]
 
     async def _own_certificate(self, needed: messages.CertificateNeeded) -> bytes:
-        """Without the authority's key, the other appliance issued the certificate."""
+        """Return charon's certificate; without the authority's key, the other appliance issued it."""
         obstacle = await self._authority.obstacle()
         kept = self._appliances.certificate(needed.key) if obstacle else b""
         if kept:
