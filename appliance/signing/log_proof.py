@@ -18,7 +18,7 @@ from typing import Callable, NamedTuple
 
 NO_CHECKPOINT = "0" * 64  # the hash before the first checkpoint
 HasSigned = Callable[[bytes, bytes, bytes], bool]
-"""Returns whether a key signed: from its 32 raw bytes, the signature, and the text."""
+"""Returns whether a key (32 raw bytes) made the signature of the text."""
 
 
 class ProofFault(enum.Enum):
@@ -49,7 +49,7 @@ def link(previous: bytes, content: bytes) -> bytes:
 
 
 def follows(previous: bytes, packed: bytes, digest: bytes) -> bool:
-    """Whether `digest` is the hash of a record after `previous`, as this version or 0.1.0 computes it."""
+    """Return whether `digest` is the hash of a record after `previous`, as this version or 0.1.0 computes it."""
     return digest == link(previous, sha256(packed)) or digest == sha256(previous + packed)
 
 
@@ -93,7 +93,7 @@ class Checkpoint(NamedTuple):
         ).encode()
 
     def follows(self, before: Checkpoint | None) -> bool:
-        """None stands for the beginning of the log."""
+        """Return whether this checkpoint comes next after `before`; None stands for the beginning of the log."""
         if before is None:
             return (self.number, self.previous) == (1, NO_CHECKPOINT)
         expected = (before.log, before.number + 1, checkpoint_hash(before.text()))
@@ -117,7 +117,7 @@ _CHECKPOINT = re.compile(
 
 
 def parse_checkpoint(text: bytes) -> Checkpoint:
-    """Raises `ValueError` for any other text."""
+    """Return the checkpoint in a text. Raises `ValueError` for any other text."""
     match = _CHECKPOINT.fullmatch(text.decode("ascii", "replace"))
     if match is not None:
         log, number, sequence, digest, time, previous, last = match.groups()

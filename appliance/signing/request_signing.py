@@ -40,7 +40,7 @@ class TokenKeys(NamedTuple):
 
 
 def keys_of(token: str) -> TokenKeys:
-    """A token is `rosrv_ID_SECRET`."""
+    """Derive the stored keys from a token, `rosrv_ID_SECRET`."""
     return TokenKeys(reading_hash(reading_key(token)), _signing_key(token).public_key().public_bytes_raw())
 
 
@@ -56,14 +56,15 @@ def reading_id(shown: str) -> str | None:
 
 
 def reading_hash(key: str) -> bytes:
-    """The key has 256 random bits, so a fast hash is enough."""
+    """Hash a reading key; it has 256 random bits, so a fast hash is enough."""
     return hashlib.sha256(key.encode("ascii")).digest()
 
 
 def statement(
     challenge: str, *, method: str, target: str, if_match: str, content_type: str, body: bytes
 ) -> bytes:
-    """`target` is the path and query as sent; a missing header is an empty string.
+    """Return the text that signs a request. `target` is the path and query as sent; a missing header is an empty
+    string.
 
     Raises `BadProofError` for a part with a control or non-ASCII character.
     """

@@ -85,7 +85,7 @@ def signer(keys: Sequence[str], text: str, signature: str) -> str:
 
 
 def sign(text: str, key: "Ed25519PrivateKey") -> str:
-    """Return the bytes of `ssh-keygen -Y sign -n rosrv`."""
+    """Return the signature, as `ssh-keygen -Y sign -n rosrv` writes it."""
     raw = key.sign(_message(text, _HASHES[0]))
     public = _wire(_ED25519, key.public_key().public_bytes_raw())
     fields = _wire(public, _NAMESPACE, b"", _HASHES[0], _wire(_ED25519, raw))
