@@ -59,13 +59,13 @@ def is_bundle_file(name: str) -> bool:
 
 
 def pack(files: Mapping[str, bytes]) -> bytes:
-    """Raises `BundleArchiveError` if the files are not a valid bundle."""
+    """Return the archive. Raises `BundleArchiveError` if the files are not a valid bundle."""
     contents_of(files)
     return _packed(files)
 
 
 def unpack(archive: bytes) -> BundleContents:
-    """Raises `BundleArchiveError`."""
+    """Return the contents of an archive. Raises `BundleArchiveError`."""
     if len(archive) > LONGEST:
         raise BundleArchiveError(f"the archive has {len(archive)} bytes; the limit is {LONGEST}")
     files: dict[str, bytes] = {}
@@ -87,7 +87,7 @@ def unpack(archive: bytes) -> BundleContents:
 
 
 def contents_of(files: Mapping[str, bytes]) -> BundleContents:
-    """Raises `BundleArchiveError`."""
+    """Return the contents that the files have. Raises `BundleArchiveError`."""
     unknown = [name for name in files if not is_bundle_file(name)]
     if unknown:
         raise BundleArchiveError(f"{unknown[0][:200]!r} is not a file of a bundle: remove it")

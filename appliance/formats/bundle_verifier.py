@@ -69,7 +69,7 @@ Opener = Callable[[str], Any]
 
 
 def printable(text: str) -> str:
-    """A bundle may have any text in place of a number."""
+    """Escape unprintable characters: a bundle may have any text in place of a number."""
     return "".join(character if character.isprintable() else ascii(character)[1:-1] for character in text)
 
 
@@ -169,7 +169,7 @@ def foreign(archive: zipfile.ZipFile) -> Iterator[str]:
 
 
 def regular(path: Path, follow: bool = True) -> Any:
-    """Raise OSError for pipes and devices, which could block their reader forever."""
+    """Open a regular file. Raise OSError for pipes and devices, which could block their reader forever."""
     flags = os.O_RDONLY | getattr(os, "O_BINARY", 0) | getattr(os, "O_NONBLOCK", 0)
     descriptor = os.open(path, flags | (0 if follow else getattr(os, "O_NOFOLLOW", 0)))
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):

@@ -51,7 +51,10 @@ def settings_of(invitation: Invitation) -> dict[str, Any]:
 
 
 def joined_settings(state: Path) -> dict[str, Any]:
-    """Raises `OSError`, and `ValueError` for a file that is not JSON."""
+    """Return the settings of the last join, with absolute paths; empty if there was none.
+
+    Raises `OSError`, and `ValueError` for a file that is not JSON.
+    """
     folder = (state / FOLDER).absolute()
     try:
         section: dict[str, Any] = msgspec.json.decode((folder / SETTINGS).read_bytes(), type=dict[str, Any])

@@ -63,7 +63,7 @@ class SegmentHeader(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
 
 
 class SegmentSummary(NamedTuple):
-    """The times are those of the earliest and latest record (nanoseconds; 0: no record)."""
+    """The name and header of a segment, and the times of its earliest and latest record (nanoseconds; 0: no record)."""
 
     name: str
     header: SegmentHeader
@@ -107,7 +107,7 @@ class _Bytes:
 
 
 def write_segment(log: Path, number: int, write: Callable[[bytes], object]) -> SegmentSummary | None:
-    """Return None if checkpoint `number` is not signed yet, or its records were removed.
+    """Write the segment up to checkpoint `number`. Return None if it is not signed yet, or its records were removed.
 
     Raises `LogUnreadableError`, and the errors of `write`.
     """
@@ -178,7 +178,7 @@ class SegmentReader:
     """
 
     def __init__(self, file: LineReader, keys: Collection[bytes], most_bytes: int) -> None:
-        """Raises `SegmentError`."""
+        """Read the header. Raises `SegmentError`."""
         self._file = file
         self._left = most_bytes
         self._done = _Bytes()

@@ -40,7 +40,7 @@ class BundlePath(NamedTuple):
 
     @classmethod
     def parse(cls, text: str) -> Self:
-        """Raises `TermsError`."""
+        """Return the path that a text names. Raises `TermsError`."""
         found = _PATH.fullmatch(text)
         if found is None:
             raise TermsError(f"{text[:200]!r} is not SITE/GROUP/VERSION.tar")
@@ -48,7 +48,7 @@ class BundlePath(NamedTuple):
 
 
 def role_of(site: str, group: str) -> str:
-    """Raises `TermsError` for an invalid name."""
+    """Return the role that signs the bundles of a group. Raises `TermsError` for an invalid name."""
     for word in (site, group):
         if _WORD.fullmatch(word) is None:
             raise TermsError(
@@ -81,17 +81,17 @@ class Terms(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         raise TermsError("the last ring does not have 100 percent")
 
     def earliest(self, robot: str, path: BundlePath) -> float:
-        """Return seconds since the epoch."""
+        """Return when the robot may take the bundle, in seconds since the epoch."""
         return self.signed + self.rings[self.ring_of(robot, path)].after
 
 
 def _position(robot: str, path: BundlePath) -> int:
-    """The number from 0 to 99 is fixed for a robot and a bundle, and even among robots."""
+    """Return a number from 0 to 99, which is fixed for a robot and a bundle, and even among robots."""
     return int.from_bytes(hashlib.sha256(f"{path}\0{robot}".encode()).digest()[:8]) % 100
 
 
 def checked_terms(terms: Terms) -> Terms:
-    """Raise `TermsError` if the rings are not in order or do not cover all robots."""
+    """Return the terms. Raises `TermsError` if the rings are not in order or do not cover all robots."""
     rings = terms.rings
     if not 1 <= len(rings) <= _MOST_RINGS:
         raise TermsError(f"a bundle has 1 to {_MOST_RINGS} rings, not {len(rings)}")
@@ -117,7 +117,7 @@ def checked_terms(terms: Terms) -> Terms:
 
 
 def terms_of(custom: object) -> Terms:
-    """Raises `TermsError`."""
+    """Return the terms in a bundle's metadata. Raises `TermsError`."""
     found = custom.get(CUSTOM) if isinstance(custom, dict) else None
     try:
         return checked_terms(msgspec.convert(found, Terms))
@@ -126,5 +126,5 @@ def terms_of(custom: object) -> Terms:
 
 
 def custom_of(terms: Terms) -> dict[str, object]:
-    """Raises `TermsError`."""
+    """Return the metadata for the terms. Raises `TermsError`."""
     return {CUSTOM: msgspec.to_builtins(checked_terms(terms))}
