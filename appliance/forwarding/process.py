@@ -73,8 +73,10 @@ class ForwardingProcess:
 
 
 class ProgressReports:
-    """A new control process first gets the last report again: by comparing it with its predecessor's records, it
-    detects changes that were missed.
+    """Reports the progress to control.
+
+    A new control process first gets the last report again: by comparing it with its predecessor's records, it detects
+    changes that were missed.
     """
 
     def __init__(self, send: Callable[[messages.ForwardingReported], bool]) -> None:
