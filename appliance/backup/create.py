@@ -45,7 +45,7 @@ _ADVICE = "run this as root with the capability DAC_OVERRIDE (in a container: do
 
 
 def back_up(state: Path, file: Path) -> list[str]:
-    """Return the names in the tar archive. Raises `BackupError`."""
+    """Write the backup; return the names in the tar archive. Raises `BackupError`."""
     try:
         refuse_half_restored(state)
     except StartError as error:
@@ -112,7 +112,9 @@ def _write(state: Path, archive: tarfile.TarFile, beside: Path) -> list[str]:
 
 
 def _files(state: Path) -> Iterator[tuple[str, int]]:
-    """List the other files after the log is copied, so the key for the log's signatures exists by then."""
+    """Yield the log first; the other files are listed after it is copied, so the key for its signatures exists
+    by then.
+    """
     log = opened(state, AUDIT_LOG) if (state / AUDIT_LOG).exists() else None
     if log is not None:
         yield AUDIT_LOG, log
@@ -144,7 +146,10 @@ def _names(state: Path, part: str) -> Iterator[str]:
 
 
 def opened(state: Path, name: str) -> int | None:
-    """Follow no link; return None if it is not a regular file. Raises `BackupError` for a wrong owner."""
+    """Open a file of the state, following no link; return None if it is not a regular file.
+
+    Raises `BackupError` for a wrong owner.
+    """
     part, *folders, last = PurePosixPath(name).parts
     here = os.open(state / part, _FOLDER)
     owner = os.fstat(here).st_uid
@@ -204,10 +209,10 @@ _BUSY_SECONDS = 30
 
 
 def copy_database(path: Path, owner: os.stat_result, copy: Path) -> None:
-    """`owner` is the file status of the database. Raises `BackupError`, `OSError`, `sqlite3.Error`.
+    """Copy a database; `owner` is its file status. Raises `BackupError`, `OSError`, `sqlite3.Error`.
 
-    SQLite opens the database and its write-ahead log by name. The folder's owner could replace either by a link,
-    so root reads them with only the owner's rights.
+    SQLite opens the database and its write-ahead log by name. The folder's owner could replace either by a link, so
+    root reads them with only the owner's rights.
     """
     with closing(sqlite3.connect(copy)) as target:
         target.execute("PRAGMA journal_mode = OFF")  # the owner cannot create a file beside the copy
