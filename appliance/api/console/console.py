@@ -58,7 +58,7 @@ class _File(NamedTuple):
 
 
 def routes(settings: Settings) -> APIRouter:
-    """The routes are not part of the contract. Raise `ModuleError` if the modules cannot be joined."""
+    """Return the routes, which are not part of the contract. Raises `ModuleError` if the modules cannot be joined."""
     router = APIRouter(include_in_schema=False)
     served = _collect((files(__package__) / name for name in _SERVED), "")
     for feature in FEATURES:

@@ -37,7 +37,7 @@ _STYLE_COMMENT = re.compile(r"/\*.*?\*/", re.DOTALL)
 
 
 class ModuleError(Exception):
-    """The text names the file and, where known, the line."""
+    """The modules cannot be joined; the text names the file and, where known, the line."""
 
 
 class _Token(NamedTuple):
@@ -48,15 +48,16 @@ class _Token(NamedTuple):
 
 
 def join_modules(sources: Mapping[str, str], entry: str) -> str:
-    """`sources` maps paths, such as `js/main.js`, to texts. Raise `ModuleError`."""
+    """Return one script; `sources` maps paths, such as `js/main.js`, to texts. Raises `ModuleError`."""
     joining = _Joining(sources)
     joining.include(entry)
     return joining.script()
 
 
 def join_late_modules(sources: Mapping[str, str], entry: str) -> str:
-    """Modules of other folders are in the page's script, with their state, so the entry gets them as arguments.
-    Raise `ModuleError`.
+    """Return a script of the entry's folder. Raises `ModuleError`.
+
+    Modules of other folders are in the page's script, with their state, so the entry gets them as arguments.
     """
     folder = f"{posixpath.dirname(entry)}/"
     joining = _Joining({name: text for name, text in sources.items() if name.startswith(folder)})
@@ -65,7 +66,9 @@ def join_late_modules(sources: Mapping[str, str], entry: str) -> str:
 
 
 def join_styles(sources: Mapping[str, str], entry: str, within: tuple[str, ...] = ()) -> str:
-    """`within` are the files whose imports led to the entry. Raise `ModuleError`."""
+    """Return a style sheet with its imports; `within` are the files whose imports led to the entry. Raises
+    `ModuleError`.
+    """
     if entry not in sources:
         raise ModuleError(f"there is no file {entry}")
     way = (*within, entry)

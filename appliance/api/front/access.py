@@ -36,7 +36,7 @@ _MOST_KNOWN = 1024
 
 @dataclass(frozen=True, slots=True)
 class Bearer:
-    """`expires` is seconds since the epoch.
+    """The owner of a request's token; `expires` is seconds since the epoch.
 
     `shown` is the token (or its reading key) that the request carries. `asked` is the request, unless it is a GET;
     `gone` is set when the client disconnects.
@@ -52,7 +52,7 @@ class Bearer:
 
 
 class TokenAuthenticator:
-    """At most `failures_per_minute` wrong tokens of each peer are checked.
+    """Checks tokens, and at most `failures_per_minute` wrong ones of each peer.
 
     `used(id)` is called when a token was presented.
     """
@@ -73,7 +73,7 @@ class TokenAuthenticator:
         self._shown: OrderedDict[str, float] = OrderedDict()  # by peer: the time of its last valid token
 
     def quota_class(self, peer: str) -> QuotaClass:
-        """Peers with a recent valid token, and the operator's machine, are known."""
+        """Return the class of a peer; peers with a recent valid token, and the operator's machine, are known."""
         shown = self._shown.get(peer)
         lately = shown is not None and clock.now() - shown < _KNOWN_SECONDS
         return QuotaClass.REGISTERED if lately or is_loopback(peer) else QuotaClass.UNKNOWN
@@ -94,7 +94,7 @@ class TokenAuthenticator:
         return kept is not None and not self._ends.passed(kept.id, kept.expires)
 
     async def recognise(self, authorization: str | None, host: str) -> Bearer:
-        """Raises `ProblemError` (401, 429, 503)."""
+        """Return the bearer. Raises `ProblemError` (401, 429, 503)."""
         if authorization is None:
             raise self._refusal("no token: send it as `Authorization: Bearer TOKEN`")
         if not self._stated:

@@ -31,8 +31,9 @@ _CONTAINER_ID = re.compile("[0-9a-f]{12}")
 
 
 def tls_context(home: Path, names: Iterable[str], now: datetime.datetime) -> ssl.SSLContext:
-    """Make a new certificate unless a valid one with all `names` is stored. Raises `OSError`, `ValueError` and
-    `ssl.SSLError`.
+    """Return the server's context; make a new certificate unless a valid one with all `names` is stored.
+
+    Raises `OSError`, `ValueError` and `ssl.SSLError`.
     """
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.minimum_version = ssl.TLSVersion.TLSv1_2
@@ -43,7 +44,7 @@ def tls_context(home: Path, names: Iterable[str], now: datetime.datetime) -> ssl
 
 
 def renew(context: ssl.SSLContext, home: Path, names: Iterable[str], now: datetime.datetime) -> bool:
-    """Return whether the certificate was replaced. Raises as `tls_context` does."""
+    """Replace the certificate if needed; return whether it was. Raises as `tls_context` does."""
     made = _make_if_needed(home, names, now)
     if made:
         context.load_cert_chain(home / CERTIFICATE, home / KEY)
@@ -101,7 +102,7 @@ def _make(certificate_path: Path, key_path: Path, names: Iterable[str], now: dat
 
 
 def pin_of(home: Path) -> str:
-    """Return the format of curl's `--pinnedpubkey`."""
+    """Return the pin in the format of curl's `--pinnedpubkey`."""
     certificate = x509.load_pem_x509_certificate((home / CERTIFICATE).read_bytes())
     public = certificate.public_key().public_bytes(
         serialization.Encoding.DER, serialization.PublicFormat.SubjectPublicKeyInfo
@@ -110,7 +111,7 @@ def pin_of(home: Path) -> str:
 
 
 def fingerprint_of(home: Path) -> str:
-    """Return the SHA-256 in hexadecimal."""
+    """Return the certificate's SHA-256 in hexadecimal."""
     certificate = x509.load_pem_x509_certificate((home / CERTIFICATE).read_bytes())
     return certificate.fingerprint(hashes.SHA256()).hex()
 

@@ -44,8 +44,9 @@ _UNKNOWN = (
 
 
 class ControlAwayError(Exception):
-    """The text gives the client the reason; `active` is the address of the active appliance, if this one is the
-    standby.
+    """Control does not serve a request; the text gives the client the reason.
+
+    `active` is the address of the active appliance, if this one is the standby.
     """
 
     def __init__(self, reason: str, active: str = "") -> None:
@@ -62,7 +63,9 @@ def _made(
 
 
 class ControlLink:
-    """`tokens_stated(tokens)` gets the tokens that are valid from now on; `lost()` is called when control is gone."""
+    """The link to control; `tokens_stated(tokens)` gets the tokens that are valid from now on, and `lost()` is called
+    when control is gone.
+    """
 
     def __init__(self, tokens_stated: Callable[[list[TokenKept]], None], lost: Callable[[], None]) -> None:
         self._tokens_stated = tokens_stated
@@ -95,7 +98,7 @@ class ControlLink:
     async def ask(
         self, request: AdminRequest[A], bearer: Bearer | None, seconds: float | None = None
     ) -> AdminAnswer[A]:
-        """Raises `ControlAwayError`.
+        """Return control's answer. Raises `ControlAwayError`.
 
         A request is withdrawn if the client disconnects, or if it has not taken effect after `seconds`.
         """
@@ -163,7 +166,7 @@ class ControlLink:
         return answer.status, answer.reason
 
     def token_used(self, token: str) -> None:
-        """While control is away the report is dropped, and a later use is reported."""
+        """Report the use of a token; while control is away the report is dropped, and a later use is reported."""
         with contextlib.suppress(ChannelFullError):
             self._link.send(TokenUsed(token))
 

@@ -13,7 +13,7 @@ def etag(tag: int | str) -> str:
 
 
 class ConditionalGet:
-    """A JSON answer to GET that has no ETag gets the hash of its body.
+    """Gives a JSON answer to GET without an ETag the hash of its body.
 
     Any other ETag names a revision, for `If-Match` of a change, and does not cover the whole body.
     """
@@ -28,7 +28,7 @@ class ConditionalGet:
 
 
 class _Answer:
-    """Delays the start until the first part of the body is known."""
+    """Delays the start of an answer until the first part of the body is known."""
 
     def __init__(self, known: str, send: Send) -> None:
         self._known = {tag.strip().removeprefix("W/") for tag in known.split(",")}

@@ -51,7 +51,7 @@ class LastSample(NamedTuple):
 
 
 class SampleHistory:
-    """`measures()` returns control's answer to `MetricsWanted`."""
+    """Takes the samples; `measures()` returns control's answer to `MetricsWanted`."""
 
     def __init__(self, measures: Callable[[], Awaitable[Measures]]) -> None:
         self._measures = measures
@@ -81,8 +81,9 @@ class SampleHistory:
             return self.seen
 
     async def again(self, seconds: float) -> LastSample:
-        """If sampling takes longer than `seconds`, return the last sample. Control is queried at most once in
-        `LEAST_SECONDS`.
+        """Return a new sample, or the last one if sampling takes longer than `seconds`.
+
+        Control is queried at most once in `LEAST_SECONDS`.
         """
         self._sooner.set()
         with contextlib.suppress(TimeoutError):

@@ -15,7 +15,7 @@ _Kind = tuple[str, str, str, str, int, str]
 
 
 class Journal:
-    """The owner calls `flush` every `FOLD_SECONDS`."""
+    """Folds and reports calls; the owner calls `flush` every `FOLD_SECONDS`."""
 
     def __init__(self, tell: Callable[[RestCalled], None], *, kinds: int = 512) -> None:
         self._tell = tell

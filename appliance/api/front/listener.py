@@ -134,7 +134,7 @@ class _Connection(Front, asyncio.Protocol):
         self.connection_table.file(self, Stage.UNFINISHED if begun else Stage.IDLE)
 
     def reject(self, _status: bytes, what: str) -> None:
-        """Discard the bytes that the peer still sends: closing with unread bytes would lose the answer."""
+        """Answer, then discard the bytes that the peer still sends: closing with unread bytes would lose the answer."""
         self.closing = True
         self.transport.pause_reading()
         said = f"The peer {what}.\n".encode()
@@ -159,7 +159,7 @@ def _patience(quota_class: QuotaClass, stage: Stage, _own: bool) -> float:
 
 
 class Listener:
-    """`quota_class(peer)` distinguishes known from unknown peers."""
+    """The listener of REST; `quota_class(peer)` distinguishes known from unknown peers."""
 
     def __init__(
         self,

@@ -17,7 +17,7 @@ _OF_A_SECOND = 1_000_000  # a float has no more digits
 
 
 def in_full(value: Any) -> Any:
-    """msgspec can encode the result."""
+    """Return the value with each time written twice, for msgspec to encode."""
     if isinstance(value, msgspec.Struct):
         units = _units(type(value))
         if units is None:
@@ -49,7 +49,7 @@ def describe(schema: dict[str, Any]) -> None:
 
 
 def given(text: str) -> int:
-    """Raises `ProblemError` (422)."""
+    """Return nanoseconds since the epoch. Raises `ProblemError` (422)."""
     try:
         return parse_timestamp(text, clock.wall_ns())
     except (OverflowError, ValueError) as error:

@@ -46,7 +46,7 @@ class Problem(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 class ProblemError(Exception):
-    """`kind` is the end of the problem's type; `retry_after` is in seconds."""
+    """An error for the client; `kind` is the end of the problem's type, and `retry_after` is in seconds."""
 
     def __init__(
         self,
@@ -100,5 +100,5 @@ def bad_input(wrong: list[BadInput], *, besides: str = "") -> ProblemError:
 
 
 def defect(error: Exception) -> ProblemError:
-    """Reveal nothing about the cause of the error."""
+    """Return the answer to a defect, which reveals only the type of the error."""
     return ProblemError(500, "defect", f"a defect of rosrv, please report it: {type(error).__name__}")

@@ -40,7 +40,7 @@ class Buckets:
         return 0.0
 
     def wait(self, host: str, now: float) -> float:
-        """Like `take`, without taking a token."""
+        """Return the seconds until `take` succeeds, without taking a token."""
         left = self._left(host, now)
         return 0.0 if left >= 1 else (1 - left) / self._per_second
 

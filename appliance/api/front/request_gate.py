@@ -1,11 +1,11 @@
 """Check every request before it reaches a route, and report its answer.
 
-Order: rate → Host → Origin → size of the body → token.
+Order: rate → Host → Origin → tunnel → token → size of the body.
 
-1. A request that fails a check costs no more than reading its headers.
+1. A request that fails a check before its body costs no more than reading its headers.
 2. Without a token, an unknown path gets the same answer as a known path.
-3. A page of another site cannot misuse the browser of a person who can reach the appliance: a foreign name as
-   Host (DNS rebinding) and a foreign Origin are rejected, and no CORS header is ever sent.
+3. A page of another site cannot misuse the browser of a person who can reach the appliance: a foreign name as Host
+   (DNS rebinding) and a foreign Origin are rejected, and no CORS header is ever sent.
 4. A client that does not read its answer is disconnected.
 """
 
@@ -63,7 +63,7 @@ def is_console(path: str) -> bool:
 
 
 class RequestGate:
-    """`names` are REST's host names, besides addresses."""
+    """Checks requests; `names` are REST's host names, besides addresses."""
 
     def __init__(
         self,
@@ -115,7 +115,7 @@ class RequestGate:
                 gone.cancel()
 
     def admit_websocket(self, host: str, path: str) -> None:
-        """Raises `ProblemError`."""
+        """Check the rate and the tunnel of a WebSocket's request. Raises `ProblemError`."""
         wait = self._rate.take(host, clock.now())
         if wait:
             raise too_many("too-many-requests", "too many requests from this host", wait)
@@ -168,7 +168,7 @@ class RequestGate:
 
 
 def asked_of(scope: Scope, headers: Headers, body: bytes) -> ClientRequest:
-    """Control verifies the signature in this form."""
+    """Return the request in the form in which control verifies its signature."""
     query = scope["query_string"].decode("latin-1")
     return ClientRequest(
         host=scope["client"][0],
@@ -182,7 +182,7 @@ def asked_of(scope: Scope, headers: Headers, body: bytes) -> ClientRequest:
 
 
 class _Answer:
-    """Gets hardening headers and a time limit, and is reported when its status is known."""
+    """An answer, which gets hardening headers and a time limit, and is reported when its status is known."""
 
     def __init__(self, scope: Scope, send: Send, journal: Journal) -> None:
         self._scope = scope

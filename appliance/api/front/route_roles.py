@@ -73,12 +73,12 @@ _STANDBY_SECONDS = 2  # until a client may ask a standby again
 
 
 async def ask(control: ControlLink, request: AdminRequest[A], bearer: Bearer) -> A:
-    """Raises `ProblemError` for a rejection, `ControlAwayError` without an answer."""
+    """Return control's answer. Raises `ProblemError` for a rejection, `ControlAwayError` without an answer."""
     return answered(await control.ask(request, bearer))
 
 
 async def ask_optional(control: ControlLink, request: AdminRequest[A], bearer: Bearer) -> A | None:
-    """Return None for a rejection, such as a standby's, or without an answer."""
+    """Return control's answer, or None after a rejection, such as a standby's, or without an answer."""
     try:
         return await ask(control, request, bearer)
     except (ControlAwayError, ProblemError):
@@ -86,7 +86,7 @@ async def ask_optional(control: ControlLink, request: AdminRequest[A], bearer: B
 
 
 def answered(answer: AdminAnswer[A]) -> A:
-    """Raises `ProblemError` for a rejection."""
+    """Return what control's answer contains. Raises `ProblemError` for a rejection."""
     if answer.ok:
         return answer.given()
     if answer.trouble == "standby":

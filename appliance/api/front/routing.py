@@ -74,7 +74,7 @@ class _Body:
         self.text = text
 
     async def __call__(self, request: Request) -> Any:
-        """Raises `ProblemError` (415, 422)."""
+        """Return the struct. Raises `ProblemError` (415, 422)."""
         content_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
         if content_type == "text/plain" and self.text is not None:
             return self._of_text(_text(await request.body()))
@@ -123,7 +123,7 @@ def _text(data: bytes) -> str:
 
 
 def _all_wrong(given: Any, kind: Any) -> list[BadInput]:
-    """msgspec stops at the first error."""
+    """Return all mistakes, because msgspec stops at the first one."""
     if not isinstance(given, dict):
         return []
     known = {field.encode_name: field for field in msgspec.structs.fields(kind)}

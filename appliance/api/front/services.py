@@ -17,8 +17,9 @@ _SEARCHES = 4
 
 @dataclass(frozen=True, slots=True)
 class Services:
-    """`judging` shares the compiling of texts for queries and dry runs among tokens, `ordering` that for orders,
-    so that orders never wait for queries.
+    """The shared parts. `judging` gives tokens turns to compile texts for queries and dry runs.
+
+    `ordering` limits the compiling for orders separately, so that orders never wait for queries.
     """
 
     settings: Settings

@@ -97,7 +97,7 @@ def _class_of(token: tuple[str, TokenRole]) -> QuotaClass:
 
 
 async def in_thread(pieces: Iterator[A]) -> AsyncIterator[A]:
-    """Skip empty pieces."""
+    """Yield the pieces that a thread makes, except empty ones."""
     while (piece := await asyncio.to_thread(next, pieces, None)) is not None:
         if piece:
             yield piece

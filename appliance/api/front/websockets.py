@@ -103,7 +103,7 @@ class WebSocketHandover:
         self._gate = gate
 
     async def pass_on(self, passage: WebSocketPassage, head: bytes) -> None:
-        """Answer a refusal with its reason."""
+        """Pass a WebSocket on, or answer with the reason of the refusal."""
         host = passage.peer
         try:
             self._gate.admit_websocket(host, PREFIX.decode())
@@ -134,7 +134,7 @@ class WebSocketHandover:
 
 
 def _entry_of(target: bytes) -> tuple[str, str]:
-    """Raises `ProblemError`."""
+    """Return the door and the ticket. Raises `ProblemError`."""
     try:
         parts = urlsplit(target.decode("ascii"))
         ticket = parse_qs(parts.query).get("ticket", [""])[0]

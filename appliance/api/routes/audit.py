@@ -153,7 +153,7 @@ class LogReader:
         return await self.in_thread(with_networks, wanted, await ask(self._control, PolicyWanted(), bearer))
 
     async def record(self, bearer: Bearer, record_id: str, neighbours: int) -> RecordInContext:
-        """Raises `ProblemError`."""
+        """Return a record with its neighbours. Raises `ProblemError`."""
         shown = await self.read(bearer, show, self.path, record_id, neighbours)
         if shown is None:
             raise ProblemError(404, "unknown", f"there is no record {record_id}")

@@ -69,7 +69,7 @@ def _made(app: FastAPI) -> dict[str, Any]:
 
 
 def _plain(schema: Any) -> Any:
-    """Client generators need `maxItems` for a tuple's length."""
+    """Return the schema without `items: false`, because client generators take a tuple's length from `maxItems`."""
     if isinstance(schema, list):
         return [_plain(part) for part in schema]
     if not isinstance(schema, dict):

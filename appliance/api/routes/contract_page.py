@@ -1,4 +1,4 @@
-"""The contract as a page for people, without scripts. All texts are escaped. Pure."""
+"""The contract as a page for people, without scripts; all texts are escaped."""
 
 import json
 from collections.abc import Iterator, Mapping

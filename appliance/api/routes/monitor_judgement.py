@@ -34,7 +34,9 @@ def refusal(error: str, findings: list[str]) -> ProblemError:
 
 
 class Described(NamedTuple):
-    """`uses` are the monitors whose variables the specification uses, `hold` whether it is declared `hold`."""
+    """The contents of a specification. `uses` are the monitors whose variables it uses; `hold`: it is declared
+    `hold`.
+    """
 
     events: list[EventShown]
     properties: list[PropertyShown]
@@ -54,7 +56,7 @@ class Compiler:
         return self._last[1]
 
     def described(self, loaded: Monitors, name: str) -> Described:
-        """Raises `KeyError`."""
+        """Return the description of a monitor. Raises `KeyError`."""
         monitor = self._set(loaded).monitor(name)
         events = [
             EventShown(
@@ -80,7 +82,7 @@ class Compiler:
         return Described(events, properties, sorted(monitor.code.uses), monitor.code.hold)
 
     def picture(self, loaded: Monitors, name: str) -> str | None:
-        """Return None if no automaton is finite. Raises `KeyError`."""
+        """Return a monitor's picture, or None if no automaton is finite. Raises `KeyError`."""
         return self._set(loaded).monitor(name).picture()
 
     def warnings(self, file: str) -> list[Finding]:

@@ -41,7 +41,7 @@ class _Looking:
         self.desk = LogReader(services)
 
     async def state(self, bearer: Bearer, name: str) -> tuple[Monitors, MonitorState]:
-        """Raises `ProblemError` (404)."""
+        """Return the specifications, and the state of a monitor. Raises `ProblemError` (404)."""
         loaded = await ask(self._services.control, admin.MonitorsWanted(texts=True), bearer)
         row = next((monitor for monitor in loaded.monitors if monitor.name == name), None)
         if row is None:
@@ -193,7 +193,7 @@ async def _try(call: OperationCall[Any], order: admin.MonitorTry) -> Tagged[Repl
 
 
 async def _file_of(call: OperationCall[admin.MonitorReplace]) -> str:
-    """Raises `ProblemError` (404)."""
+    """Return the file of a monitor. Raises `ProblemError` (404)."""
     name, loaded = call.order.name, await call.ask(admin.MonitorsWanted(texts=True))
     files = {monitor.name: monitor.file for monitor in loaded.monitors}
     if name in (loaded.files or {}):

@@ -41,7 +41,7 @@ def host_in_words(known: PolicyInForce | None) -> HostInWords:
 
 
 def has_name(wanted: Filter) -> bool:
-    """Whether the policy must be known; addresses and globs need none."""
+    """Return whether the search needs the policy; addresses and globs do not."""
     if wanted.host is None or not _GLOB.isdisjoint(wanted.host):
         return False
     try:
@@ -55,7 +55,7 @@ def has_name(wanted: Filter) -> bool:
 
 
 def with_networks(wanted: Filter, known: PolicyInForce) -> Filter:
-    """Raises `FilterError` for an unknown name."""
+    """Replace the host's name with its networks. Raises `FilterError` for an unknown name."""
     try:
         networks = names_of(known).networks(wanted.host or "")
     except UnknownHostNameError as error:

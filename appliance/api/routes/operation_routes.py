@@ -68,7 +68,7 @@ class OperationCall(Generic[Q]):
     dry_run: bool
 
     async def ask(self, request: AdminRequest[A]) -> A:
-        """Raises `ProblemError` for a rejection, `ControlAwayError` without an answer."""
+        """Return control's answer. Raises `ProblemError` for a rejection, `ControlAwayError` without an answer."""
         control = self.services.control
         return self._answered(await control.ask(request, self.bearer))
 
@@ -82,7 +82,9 @@ class OperationCall(Generic[Q]):
 
 @dataclass(frozen=True)
 class Answer:
-    """Replaces control's answer. If it is not a struct, `success` describes it in the contract."""
+    """A function that replaces control's answer. If it returns no struct, `success` describes the answer in the
+    contract.
+    """
 
     function: Callable[[OperationCall[Any]], Awaitable[Any]]
     success: Mapping[str, Any] | None = None
@@ -158,7 +160,7 @@ def _check(
 
 
 def _order(asked: ClientRequest, *, dry_run: bool) -> AdminRequest[Any]:
-    """Raises `ProblemError`."""
+    """Return the order that a request means. Raises `ProblemError`."""
     try:
         return meant(asked, dry_run=dry_run)
     except BadTagError as error:

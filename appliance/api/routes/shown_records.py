@@ -64,7 +64,7 @@ def page_of(
     newest_first: bool,
     equality: bool = False,
 ) -> dict[str, Any]:
-    """The cursor reveals nothing about hidden records."""
+    """Return a page, whose cursor reveals nothing about hidden records."""
     found: list[LogEntry] = []
     more: str | None = cursor
     count = limit + 1
@@ -86,7 +86,7 @@ def streamed(entry: LogEntry, *, equality: bool) -> dict[str, Any]:
 
 
 def readable(entries: Iterable[LogEntry], bearer: Bearer, text: str | None = None) -> list[LogEntry]:
-    """Leave out records that match `text` only in their hidden parts."""
+    """Return the records as the client may read them, without those that match `text` only in hidden parts."""
     found = []
     for entry in entries:
         shown = readable_by(entry, bearer)
