@@ -16,7 +16,7 @@ def seconds_of(text: str, units: str) -> float | None:
 
 
 def span_given(option: str, text: str, spans: str, verb: str = "rosrv") -> float:
-    """`spans` lists one example of each accepted unit. Exits with status 2 for any other text."""
+    """Return seconds; `spans` lists one example of each accepted unit. Exit with status 2 for any other text."""
     seconds = seconds_of(text, "".join(filter(str.isalpha, spans.replace(" or ", ""))))
     if seconds is None:
         raise usage_error(f"{option} {text!r} is not a time: write {spans}", verb)

@@ -19,7 +19,7 @@ from rosmop.tool.options import SUMMARIES
 from rosmop.tool.terminal import printable
 
 _OF_THE_MACHINE = (errno.EACCES, errno.EPERM, errno.ENOSPC, errno.EDQUOT, errno.EROFS)
-"""Errors that an operator can remove, also where a verb does not expect them."""
+"""Errors that an operator can remove, even where a verb does not expect them."""
 
 _CONFIRM = "Keep a change loaded with --confirm-within. Exit status 1 if there is nothing to confirm."
 
@@ -158,7 +158,7 @@ def main() -> None:
 
 
 def _open_closed_streams() -> None:
-    """No other file may get the descriptors of closed streams (`>&-`)."""
+    """Open closed streams (`>&-`), so that no other file gets their descriptors."""
     while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
         os.set_inheritable(descriptor, True)
     os.close(descriptor)

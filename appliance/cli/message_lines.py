@@ -7,7 +7,7 @@ from rosmop.tool.terminal import printable
 
 
 def lines_of(value: Any, depth: int) -> Iterator[str]:
-    """Remove control characters."""
+    """Yield the lines of a value, without control characters."""
     indent = "  " * depth
     if isinstance(value, Mapping):
         for name, inner in value.items():

@@ -46,7 +46,7 @@ def usage_error(text: str, verb: str = "rosrv") -> typer.Exit:
 
 
 def write_told(path: Path, data: bytes | mmap) -> None:
-    """Warn if a power cut may lose the data. Raises `OSError`."""
+    """Write a file, and warn if a power cut may lose the data. Raises `OSError`."""
     try:
         write_where_told(path, data)
     except NotLastingError as error:

@@ -84,7 +84,7 @@ def status(
 
 
 def _look(appliance: Appliance) -> StatusView:
-    """Raises `NotRunningError` also for an appliance that cannot give its status now."""
+    """Return the status. Raises `NotRunningError` even for an appliance that cannot give its status now."""
     answer = _answer(appliance)
     if not answer.ok:
         raise NotRunningError(answer.error)
@@ -115,7 +115,7 @@ def _view(body: Status, appliance: Appliance) -> StatusView:
 
 
 def _is_attention(alarm: Alarm, body: Status) -> bool:
-    """Recent denials and drops, and silenced alarms, do not affect the exit status."""
+    """Return whether an alarm leaves the exit status, as recent denials and drops, and silenced alarms, do."""
     return alarm in activity(body) or (alarm.severity == "notice" and alarm.handled != "")
 
 

@@ -40,7 +40,7 @@ Look = Callable[[], StatusView]
 
 
 class _Looks:
-    """While the appliance does not answer, the view has the reason and the time since then."""
+    """The views of the status. While the appliance does not answer, a view has the reason and the time since then."""
 
     def __init__(self, look: Look) -> None:
         self._look = look
@@ -74,7 +74,7 @@ class _Looks:
 
 
 def watched(look: Look, seconds: float, *, as_json: bool) -> int:
-    """Return the exit status of the last status. Raises `AccessDeniedError`."""
+    """Show the status until Ctrl-C; return the exit status of the last one. Raises `AccessDeniedError`."""
     looks, console = _Looks(look), Console(highlight=False)
     try:
         if as_json or not console.is_terminal or console.is_dumb_terminal:

@@ -138,7 +138,7 @@ def _write(line: str, *, as_json: bool) -> None:
 
 
 def _announce(said: ControlReady, settings: Settings, *, as_json: bool) -> None:
-    """If the first token cannot be stored, print nothing and raise `StartError`."""
+    """Announce that nodes may connect. If the first token cannot be stored, print nothing and raise `StartError`."""
     rest = _rest_url(settings)
     more: list[str] = []
     if as_json:
@@ -193,7 +193,7 @@ def _rest_url(settings: Settings) -> str | None:
 
 
 def _keep_token(state: Path, token: str) -> Path:
-    """Only the owner can read the file. Raises `StartError`, and leaves no file, on an error."""
+    """Write the token to a file that only its owner can read. Raises `StartError`, and then leaves no file."""
     path = state / "first-token"
     try:
         path.unlink(missing_ok=True)

@@ -44,7 +44,7 @@ def read_inputs(settings: Settings, robot: str | None = None) -> range:
 
 
 def read_node_ports(settings: Settings, robot: str | None = None) -> range:
-    """Raises `StartError` with every error of the policy file, if there is no policy but this."""
+    """Return the range of ports for nodes. Raises `StartError` with every error of the file if no policy is stored."""
     stored = _Stored(None, {}, complete=True)
     state = settings.state / _STATE
     try:
@@ -61,7 +61,7 @@ def read_node_ports(settings: Settings, robot: str | None = None) -> range:
 
 
 class _Stored(NamedTuple):
-    """If the content is not `complete`, an earlier run left changes that are not in the database."""
+    """The stored policy and hosts. If they are not `complete`, an earlier run left changes outside the database."""
 
     policy: KeptPolicy | None
     hosts: Mapping[str, Address]
@@ -135,7 +135,9 @@ def _errors_in(folder: Path, site_keys: Sequence[str], *, kept: bool) -> str:
 
 
 def _last_author(state: Path) -> str:
-    """`DISK` means the folder; a question mark, that changes may not be in the database yet."""
+    """Return the author of the last specifications: `DISK` means the folder; a question mark, that changes may not be
+    in the database yet.
+    """
     try:
         if not state.exists():
             return ""

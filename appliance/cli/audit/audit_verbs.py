@@ -259,7 +259,7 @@ def export(
 
 
 def _filter_of(appliance: Appliance) -> Filter:
-    """Use networks instead of a host's name. Raises `FilterError`."""
+    """Return the filter, with networks instead of a host's name. Raises `FilterError`."""
     wanted = FILTER.value(appliance.params)
     for warning in unrecorded(wanted):
         note(printable(warning))
@@ -269,7 +269,7 @@ def _filter_of(appliance: Appliance) -> Filter:
 
 
 def _known(appliance: Appliance, wanted: Filter) -> PolicyKnown:
-    """Raises `FilterError` if no appliance answers."""
+    """Return the policy in force. Raises `FilterError` if no appliance answers."""
     try:
         answer = appliance.ask(PolicyWanted())
     except NotRunningError:

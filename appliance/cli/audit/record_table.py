@@ -28,7 +28,7 @@ _GAP = 2
 
 
 def print_entries(entries: list[LogEntry], host_in_words: HostInWords, *, each: bool = False) -> None:
-    """On a terminal, equal records are one row unless `each`."""
+    """Print records; on a terminal, equal records are one row unless `each`."""
     if sys.stdout.isatty():
         rows = [row for entry in entries for row in grouped([entry])] if each else grouped(entries)
         cells = [
@@ -126,7 +126,7 @@ def _elsewhere(found: Elsewhere) -> Iterator[str]:
 
 
 def write(text: str) -> None:
-    """Escape characters that the encoding of standard output lacks."""
+    """Print a line; characters that the encoding of standard output lacks are escaped."""
     encoding = sys.stdout.encoding or "ascii"
     sys.stdout.write(text.encode(encoding, "backslashreplace").decode(encoding) + "\n")
 

@@ -54,7 +54,7 @@ class AdminSocket:
         return answer.given().name if answer.ok else ""
 
     def ask(self, request: AdminRequest[A]) -> AdminAnswer[A]:
-        """Raises `NotRunningError`."""
+        """Return the appliance's answer. Raises `NotRunningError`."""
         line = encoded(request)
         path = self.state / ADMIN_SOCKET
         if not self.state.is_dir():
@@ -99,7 +99,7 @@ class AdminSocket:
 
 
 def encoded(request: AdminRequest[Any]) -> bytes:
-    """Raises `NotRunningError` for text that is not valid UTF-8."""
+    """Return the request's bytes. Raises `NotRunningError` for text that is not valid UTF-8."""
     try:
         return msgspec.json.encode(request)
     except UnicodeEncodeError as error:

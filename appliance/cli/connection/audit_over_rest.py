@@ -78,7 +78,7 @@ class RestLog:
                     yield int(json.loads(line)["sequence"]), line
 
     def follow(self, wanted: Filter, lines: int, *, on: bool) -> Iterator[list[LogEntry]]:
-        """Reconnect when the connection breaks."""
+        """Yield the last records, then new ones; reconnect when the connection breaks."""
         position = self.last()
         if lines:
             yield self.search(wanted, str(position + 1), lines, newest_first=True).entries[::-1]

@@ -40,7 +40,7 @@ class RestWay:
 
 
 def _carry_out(rest: RestClient, request: AdminRequest[A]) -> A:
-    """Raises `NotRunningError` for a request that REST does not offer."""
+    """Return the answer. Raises `NotRunningError` for a request that REST does not offer."""
     asked: Any = request  # its kind is checked below
     if isinstance(asked, admin.RegistrationsWanted):
         return cast(A, _registrations(_carry_out(rest, admin.GraphWanted())))

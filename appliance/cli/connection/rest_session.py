@@ -74,8 +74,9 @@ class RestClient:
         match: bool = False,
         order: bool = True,
     ) -> dict[str, Any]:
-        """`match`: accept any present revision (`If-Match: *`). An `order` is signed unless it is a GET; a dry
-        run is not an order.
+        """Return the answer's object. `match`: accept any present revision (`If-Match: *`).
+
+        An `order` is signed unless it is a GET; a dry run is not an order.
         """
         headers = {"If-Match": "*"} if match else {}
         with self.streamed(

@@ -122,7 +122,7 @@ class Appliance(typer.Context):
         return named_by(self.way)
 
     def ask_or_exit(self, request: AdminRequest[A]) -> A:
-        """Exits with status 1 for a rejected request, and 2 if no appliance answers."""
+        """Return the answer; exit with status 1 for a rejected request, and 2 if no appliance answers."""
         try:
             return self.body_or_exit(self.way.ask(request))
         except NotRunningError as error:
@@ -209,7 +209,7 @@ def _choose(
         ),
     ] = None,
 ) -> _Target:
-    """Exits with status 2 for options that exclude each other."""
+    """Return the chosen appliance; exit with status 2 for options that exclude each other."""
     sources = {name: context.get_parameter_source(name) for name in ("state", "api", "api_ca")}
     said = {name: "" if source is None else source.name for name, source in sources.items()}
     typed = {name for name, source in said.items() if source == "COMMANDLINE"}

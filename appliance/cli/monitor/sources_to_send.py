@@ -16,7 +16,10 @@ _STRING_CONSTANT = re.compile(r"\s*string\s+\w+\s*=")  # its value extends to th
 
 
 def read_to_send(files: Sequence[Path], folders: Sequence[Path]) -> Sources:
-    """Accept the same files as `read_specifications` and `read_definitions`. Raises `SpecificationError`."""
+    """Return the sources to send, from the files that `read_specifications` and `read_definitions` accept.
+
+    Raises `SpecificationError`.
+    """
     named: dict[str, Path] = {}
     for file in files:
         other = named.setdefault(file.name, file)
@@ -42,7 +45,7 @@ def read_to_send(files: Sequence[Path], folders: Sequence[Path]) -> Sources:
 
 
 def _sendable(text: str, place: str) -> str:
-    """Invalid UTF-8 is replaced in comments of definitions, and rejected elsewhere."""
+    """Replace invalid UTF-8 in comments of definitions, and reject it elsewhere."""
     lines = text.split("\n")
     for number, line in enumerate(lines):
         if line.isascii() or not _NOT_UTF_8.search(line):
