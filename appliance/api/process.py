@@ -50,8 +50,6 @@ def main(lifeline_fd: int, config: Path) -> None:
 
 
 class _Application:
-    """Makes the application at its first call."""
-
     def __init__(self, services: Services) -> None:
         self._services = services
         self._made: ASGIApp | None = None

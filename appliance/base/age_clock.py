@@ -25,7 +25,7 @@ _log = structlog.get_logger()
 
 
 class _Kept(msgspec.Struct):
-    """Times are in nanoseconds."""
+    """The state of the clock; times are in nanoseconds."""
 
     lived: int  # running time of the machine while the process ran
     credited: int  # time since the epoch that counts in addition to `lived`

@@ -45,8 +45,6 @@ def _nothing() -> None:
 
 def _group_of(verbs: Verbs, further: Callable[[], Verbs]) -> type[TyperGroup]:
     class _Lazy(TyperGroup):
-        """A group whose commands are imported when they are run."""
-
         # click sets it
         commands = property(lambda self: self.all_commands, lambda _self, _given: None)
 

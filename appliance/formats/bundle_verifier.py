@@ -101,7 +101,7 @@ def extra(*sizes: int) -> bytes:
 
 
 def ends(file: Any, size: int, unpacked: int) -> bool:
-    """Whether the compressed data that begins here has `size` bytes, with zeros in the unused bits of the last
+    """Return whether the compressed data that begins here has `size` bytes, with zeros in the unused bits of the last
     byte.
 
     Reading stops after `unpacked` bytes.

@@ -1,11 +1,11 @@
 """Write and verify segments: the records between two consecutive signed checkpoints, as they leave the appliance.
 
-A segment is NDJSON in ASCII: the header (`SegmentHeader`), and the records as `rosrv audit export` writes them.
-Its name is the SHA-256 of its bytes. At the beginning of a log, `begin` is null; if retention removed the
-checkpoint before, `after` has the last removed record.
+A segment is NDJSON in ASCII: the header (`SegmentHeader`), and the records as `rosrv audit export` writes them. Its
+name is the SHA-256 of its bytes. At the beginning of a log, `begin` is null; if retention removed the earlier
+checkpoint, `after` has the last removed record.
 
-1. The chain of the records leads from the hash of `begin` to the hash of `end`, and one key signed both. The hash
-   in `after` is not signed, but no other one leads to the signed hash of `end`.
+1. The chain of the records leads from the hash of `begin` to the hash of `end`, and one key signed both. The hash in
+   `after` is not signed, but no other one leads to the signed hash of `end`.
 2. Each segment has exactly one valid spelling, so equal records have equal names.
 3. Reading and writing need the memory of one record.
 """

@@ -1,4 +1,6 @@
-"""Define what other parts of control need of the hosts in tunnels, as for a product without tunnels."""
+"""Define what other parts of control need of the hosts in tunnels; these classes are for an appliance without
+tunnels.
+"""
 
 from appliance.channel.answers.host_answers import Host
 from appliance.channel.answers.status import IpsecState

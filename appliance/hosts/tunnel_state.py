@@ -180,7 +180,7 @@ class Tunnels:
                 asyncio.get_running_loop().call_later(self._again(), self._dirty.set)
 
     def _until_it_changes(self) -> float:
-        """charon does not close a tunnel whose certificate ends, so an update is due then."""
+        """Return the seconds until the next update: charon does not close a tunnel whose certificate ends."""
         now = clock.wall()
         ends = [row.expires - now for row in self._table.admitted() if row.expires > now]
         return min([_RESTATE_SECONDS, *(end + _JUST_AFTER_SECONDS for end in ends)])

@@ -1,4 +1,4 @@
-"""Names of hosts: `robot`, the groups of the policy, and enrolled hosts. Only this module resolves them. Pure.
+"""Names of hosts: `robot`, the groups of the policy, and enrolled hosts. Only this module resolves them.
 
 A name means every network of its group, at any depth, and the enrolled host of this name. `host:NAME` means only the
 enrolled host, `door:NAME` the door. The label of an address is the name of the smallest network that contains it: of

@@ -119,7 +119,7 @@ Value = TypeVar("Value")
 
 @dataclass(slots=True)
 class _Node(Generic[Value]):
-    """`value` belongs to a key that ends here, `subtree` to a key that goes on with `/**`."""
+    """A node of the tree: `value` belongs to a key that ends here, `subtree` to a key that goes on with `/**`."""
 
     names: dict[str, "_Node[Value]"] = field(default_factory=dict)
     # The literal beginnings of levels with a star: one table for each length, longest first.

@@ -131,7 +131,7 @@ def first_for(networks: Iterable[Network], blocked: Iterable[Address] = ()) -> b
 
 
 def _program(tests: Sequence[tuple[Network, int]]) -> list[bytes]:
-    """The first network that contains the source decides."""
+    """Return a program in which the first network that contains the source decides."""
     code = [_instruction(_LOAD, _PROTOCOL)]
     for version, ethertype in ((4, 0x0800), (6, 0x86DD)):
         own = _tests(version, [test for test in tests if test[0].version == version])

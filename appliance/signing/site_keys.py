@@ -140,7 +140,7 @@ def _wire(*strings: bytes) -> bytes:
 
 
 def _strings(data: bytes, count: int) -> list[bytes]:
-    """Raises `ValueError` unless there are exactly `count` strings."""
+    """Return the `count` strings; raise `ValueError` if there is another number."""
     found = []
     while data:
         length = int.from_bytes(data[:4])

@@ -170,8 +170,8 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
     async def start(self, *, restarted: bool, taken_over: bool = False) -> None:
         """Bring specifications into force at the start of control.
 
-        After a crash of control, those that were in force are used; `taken_over`, those of the active appliance. At
-        the start of the appliance, the folder's are used, unless an operator's own revision was in force.
+        After a crash of control, or when it has `taken_over` from another appliance, they are those that were in
+        force. At the start of the appliance, they are the folder's, unless an operator's own revision was in force.
         """
         settings = self.store.settings()
         self.switches.restore(settings.get(SWITCHES, "{}"))
@@ -423,8 +423,8 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             return answers.MonitorsConfirmed(waited, self.revision, self.tag)
 
     async def switch(self, request: admin.MonitorSwitch, who: str) -> Switched:
-        """Return the monitors that changed. A monitor in shadow mode, or that shares variables with such a
-        monitor, is not enabled.
+        """Switch monitors; return those that changed. A monitor is not enabled if it is in shadow mode, or shares
+        variables with such a monitor.
         """
         async with self._changing(request.expected):
             self._all_known(request.names)
@@ -782,7 +782,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
     async def _beside_broken(
         self, check: CheckBeside, sources: Sources, loaded: Collection[str] = ()
     ) -> CheckedSpecifications:
-        """Let files that have done nothing since the start, because of an error, do nothing still, unless `loaded`."""
+        """Let files that have done nothing since the start, because of an error, remain so unless they are `loaded`."""
         present, following = self.sources.named(), sources.named()
         errors = {
             file: error

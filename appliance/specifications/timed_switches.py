@@ -44,8 +44,8 @@ def returns_moved(store: StateStore, seconds: float) -> None:
 
 
 class TimedSwitches:
-    """The time limits of switches. When a limit ends, `come_back(back)` is called, which calls `end` like every
-    switch.
+    """The time limits of switches; `come_back(back)` is called at the end of a limit, and calls `end` as every switch
+    does.
     """
 
     def __init__(

@@ -11,7 +11,7 @@ _SAVE_SECONDS = 30.0
 
 
 class StoredDeadlines(Deadlines):
-    """Ends whose remaining time is stored, so that no token has more time left after a restart than before."""
+    """Ends whose remaining time is stored, so that a restart never extends it."""
 
     def __init__(self, store: StateStore) -> None:
         super().__init__()

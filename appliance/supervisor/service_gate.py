@@ -7,7 +7,9 @@ from typing import Any
 
 @dataclass(frozen=True)
 class RoleChanges:
-    """`suspend()` keeps all state until `resume()`; it returns False if that is not possible now."""
+    """The changes of the role. `suspend()` keeps all state until `resume()`; it returns False if that is not possible
+    now.
+    """
 
     activate: Callable[[int], None]
     passivate: Callable[[], None]

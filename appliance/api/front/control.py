@@ -130,7 +130,6 @@ class ControlLink:
     async def _asked(
         self, request: AdminRequest[Any], bearer: Bearer | None, until: float, longest: float
     ) -> bytes:
-        """Raises as `Link.ask` does."""
         number = 0
 
         def question(given: int) -> RequestMade:

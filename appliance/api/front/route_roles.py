@@ -37,7 +37,7 @@ def requires(least: TokenRole) -> Any:
 
 
 VIEWER = requires("viewer")
-"""For `dependencies=` of a route that does not use the bearer."""
+"""The value for `dependencies=` of a route that does not use the bearer."""
 
 OPERATOR = requires("operator")
 Viewer = Annotated[Bearer, VIEWER]

@@ -193,7 +193,6 @@ async def _try(call: OperationCall[Any], order: admin.MonitorTry) -> Tagged[Repl
 
 
 async def _file_of(call: OperationCall[admin.MonitorReplace]) -> str:
-    """Return the file of a monitor. Raises `ProblemError` (404)."""
     name, loaded = call.order.name, await call.ask(admin.MonitorsWanted(texts=True))
     files = {monitor.name: monitor.file for monitor in loaded.monitors}
     if name in (loaded.files or {}):

@@ -160,7 +160,6 @@ def _check(
 
 
 def _order(asked: ClientRequest, *, dry_run: bool) -> AdminRequest[Any]:
-    """Return the order that a request means. Raises `ProblemError`."""
     try:
         return meant(asked, dry_run=dry_run)
     except BadTagError as error:

@@ -70,7 +70,7 @@ class HostDenials(msgspec.Struct, frozen=True):
 
 
 class DenialSummary(msgspec.Struct, frozen=True):
-    """The denials in a time, by host, the most first."""
+    """The denials of a period, by host; the host with the most comes first."""
 
     denials: Annotated[int, msgspec.Meta(description="number of denials of all hosts")]
     hosts: list[HostDenials]

@@ -1,4 +1,4 @@
-"""Show equal records as one row: a flood of one cause is one row for a person. Pure.
+"""Show equal records as one row: a flood of one cause is one row for a person.
 
 1. Records are equal if they differ only in time, ids, contents of messages and the numbers in the reason.
 2. A record that stands for several (`12 more in the same second`) equals the record that it continues, and counts

@@ -33,7 +33,7 @@ _Found = TypeVar("_Found")
 
 
 class SearchPage(NamedTuple):
-    """`cursor` begins the next page; None at the end."""
+    """A page of records; `cursor` begins the next page, and is None at the end."""
 
     entries: list[LogEntry]
     cursor: str | None

@@ -15,7 +15,7 @@ _RANKS: dict[str, int] = {"viewer": 1, "investigator": 1, "operator": 2, "admin"
 
 
 def may(held: str, least: TokenRole) -> bool:
-    """Return whether a role includes another; only investigators have the rights of investigators."""
+    """Return whether a role includes another; no other role includes `investigator`."""
     return held == least if least == "investigator" else _RANKS[held] >= _RANKS[least]
 
 

@@ -62,7 +62,7 @@ class ConnectionPassed(Message):
 
 
 class ConnectionAnswered(Message):
-    """Whether a connection is accepted; otherwise an HTTP status and the reason."""
+    """Tells whether a connection is accepted; otherwise, it has an HTTP status and the reason."""
 
     number: int
     status: int

@@ -105,7 +105,7 @@ class ProcessesChanged(Message):
 
 
 class ClockRead(Message):
-    """Whether a time service synchronises the machine's clock; sent at the start, and on changes."""
+    """Tells whether a time service synchronises the machine's clock; sent at the start, and on changes."""
 
     synchronised: bool | None
 
@@ -189,7 +189,7 @@ class OwnNetworkWanted(Message):
 
 
 class OwnNetworkOpened(Message):
-    """Whether the own network is open; otherwise the reason of the failure."""
+    """Tells whether the own network is open; otherwise, it has the reason of the failure."""
 
     reason: str = ""
 

@@ -269,7 +269,6 @@ def _filter_of(appliance: Appliance) -> Filter:
 
 
 def _known(appliance: Appliance, wanted: Filter) -> PolicyKnown:
-    """Return the policy in force. Raises `FilterError` if no appliance answers."""
     try:
         answer = appliance.ask(PolicyWanted())
     except NotRunningError:

@@ -22,8 +22,8 @@ def open_audit(
     kept_for: Callable[[str], bool],
     receipts: ReceiptFloor,
 ) -> AuditLog:
-    """Open the log. `kept_for(host)`: the last of the disk is kept for the host. `held_by` gets processes that lock
-    the log.
+    """Open the log. `kept_for(host)`: the host gets the last part of the reserve. `held_by` gets the processes that
+    lock the log.
     """
     audit = settings.audit
     reserve = AUDIT_RESERVE.bounds.sized(

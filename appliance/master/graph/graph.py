@@ -137,7 +137,7 @@ class RosGraph:
     def _give_up(self, subscriber: Incarnation, topic: str) -> None:
         """Remove the subscriber's grants for all publishers of a topic, even lost ones.
 
-        Grants are for a name and a host, so another subscriber with the same two keeps them.
+        Grants are for a name and a host, so another subscriber with the same name and host keeps them.
         """
         other = self.registry.holder(subscriber.name)
         subscribed = other is not None and (Kind.SUBSCRIPTION, topic) in other.registrations

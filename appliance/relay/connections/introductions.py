@@ -26,7 +26,7 @@ class Introductions:
         self.fields: Mapping[str, str] = {"type": _ANY, "md5sum": _ANY}
 
     def refused(self) -> bool:
-        """Choose the next fields; return False if all are refused. The next attempt then begins with the first ones."""
+        """Choose the next fields; return False if all are refused."""
         self._refused.add(_key(self.fields))
         named = (claim for claim in self._claims() if _named(claim, "md5sum"))
         for claim in (*islice(named, _MOST), {}):

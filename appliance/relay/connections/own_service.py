@@ -1,8 +1,8 @@
 """The services that the appliance itself offers (`std_srvs/Trigger`); control answers them through the relay.
 
 Control gets at most one call of a service from a host at a time, and one a second, so no host keeps control busy.
-Further calls of that host get the same answer if it `repeats`. Otherwise, such as about a group's holder, it may be
-outdated, so they wait for the end of the second.
+Further calls of that host get the same answer if it `repeats`. Other answers, such as the name of a group's holder,
+may be outdated, so these calls wait for the end of the second.
 """
 
 from collections.abc import Callable
