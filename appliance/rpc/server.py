@@ -4,8 +4,7 @@
    and reading pauses.
 2. A request from a host that no policy rule names is refused before its body is complete. Only the beginning of the
    body is read, for the audit record of the refusal.
-3. A request leaves the queue when its connection ends. The last bytes of a request that need not wait are not
-   counted.
+3. A request leaves the queue when its connection ends. If a request need not wait, its last bytes are not counted.
 4. A peer that exceeds a limit gets a fault that names the limit. At most a few connections wait for such a fault.
 """
 
