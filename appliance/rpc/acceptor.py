@@ -1,8 +1,8 @@
 """Accept connections, from two accept queues of the kernel, by source address.
 
-An acceptor empties a queue quickly, and `accepted` then decides by host whether a connection may wait. But a flood
-still delays all later connections of its queue. So two sockets of one port (`SO_REUSEPORT`) have two queues, and a BPF
-program picks the queue by address. Accepting from the second queue waits for the turn of unknown hosts (`paced`).
+A flood delays all later connections of its accept queue. So two sockets of one port (`SO_REUSEPORT`) have two queues,
+and a BPF program picks the queue by address. Accepting from the second queue waits for the turn of unknown hosts
+(`paced`).
 
 The queue affects only the order: every connection is judged by its address afterwards. While the second socket does
 not exist (control restarts), the first socket gets all connections.
@@ -116,7 +116,7 @@ class SourceQueues:
 def first_for(networks: Iterable[Network], blocked: Iterable[Address] = ()) -> bytes:
     """Return the program that sends these sources, except blocked ones, to the first socket.
 
-    If there are too many addresses for a program, it ignores the blocks, and then sends all sources to the first
+    If there are too many addresses for a program, it ignores the blocks, or even sends all sources to the first
     socket.
     """
     networks = list(networks)

@@ -388,10 +388,7 @@ class _Connection(Front, asyncio.BufferedProtocol):
             self._begin(request, keep, _held_by(request))
 
     def _begin(self, request: HttpRequest, keep: bool, held: int) -> None:
-        """Serve a request, of which `held` bytes are counted; the others count once it waits.
-
-        A request that waits for a slot while there are too many bytes is refused.
-        """
+        """Serve a request, of which `held` bytes are counted; the others count once it waits."""
         self.deadline = float("inf")  # the handler has limits of its own
         self._serving = held
         serving = HostTask(self.server.time, self.peer.host, self._serve(request, keep))

@@ -1,7 +1,7 @@
 """Make and verify the access tokens of REST. No I/O.
 
-A token is `rosrv_<id>_<secret>`; the secret has 256 random bits. Only its salted scrypt hash and the data to
-verify its keys are stored. The comparison takes constant time.
+A token is `rosrv_<id>_<secret>`; the secret has 256 random bits. Only its salted scrypt hash and the data to verify
+its keys are stored.
 """
 
 import hashlib
