@@ -1,13 +1,13 @@
 """Write the state directory of a running appliance to one file, for `restore.py`.
 
 1. SQLite copies each database as a consistent snapshot.
-2. The log is copied first. Then the signer's memory is cut to the checkpoints in that copy, so that a restored log can
-   be continued.
-3. `state.ahead` has acknowledged changes that `state.db` lacks. It is copied before `state.db`, so no change is in
-   neither; a start skips those that are in both.
+2. The log is copied first. Then the signer's memory is cut to the checkpoints in that copy, so that a restored log
+   can be continued.
+3. `state.ahead` has acknowledged changes that `state.db` lacks. It is copied before `state.db`, so each change is in
+   at least one of them; a start skips those in both.
 4. The file contains keys, so only its owner may read it.
-5. Root reads folders of users whose processes may be compromised. Therefore links are not followed with root's rights,
-   and a file that belongs to another user is an error.
+5. Root reads folders of users whose processes may be compromised. Therefore links are not followed with root's
+   rights, and a file that belongs to another user is an error.
 """
 
 import errno

@@ -249,7 +249,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
     async def load(self, request: admin.MonitorLoad, who: str, *, enable: bool = False) -> Replacement:
         """Load specifications.
 
-        With `enable`, monitors that the setting of this name would disable are enabled. With `confirm_within`, the
+        With `enable`, monitors are enabled even if the setting `enable` would disable them. With `confirm_within`, the
         change is rolled back after that many seconds unless confirmed.
         """
         async with self._changing(request.expected):

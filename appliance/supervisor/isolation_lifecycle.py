@@ -268,7 +268,7 @@ class ContainerIsolation(NoIsolation):
                 self._namespace.run(lambda: clear_leftovers(address))
 
     def endpoint(self) -> PublicAddress:
-        """Return the only address; among several, it is unknown which one hosts outside reach."""
+        """Return the only address; if there are several, it is unknown which of them other hosts reach."""
         found = only_address(self._namespace, without=("lo", USER_SPACE_INTERFACE))
         if is_contained() and not lives_on_the_machines_network():
             reason = f"{found.reason}, in a container: outside the machine the address may differ"

@@ -1,7 +1,7 @@
 """Request signatures of checkpoints, and store the valid ones.
 
 The key of the first valid signature is pinned in `<log>.pub` (PEM); the program never replaces it. A signer refuses
-all checkpoints before the last that it signed, so a new signer gets the oldest first.
+checkpoints older than its last one, so a new signer gets the oldest first.
 """
 
 from collections.abc import Callable

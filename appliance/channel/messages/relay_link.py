@@ -325,8 +325,8 @@ class SpecificationsStated(Message):
     monitors.
 
     After a takeover, `left` has the states that the other appliance's relays left (`StateLeft`), `left_at` the time
-    of its monitors by then (0: that in the states), and `lost` why other states are lost. The relay then ignores its
-    own memory.
+    of its monitors at that moment (0: the time in the states), and `lost` why other states are lost. The relay then
+    ignores its own memory.
 
     `unbuilt` has the monitors whose files have errors. They hold their topics unless they are declared `begin`.
     """

@@ -152,7 +152,7 @@ class Subscribers:
         self.parameter_set(key, {}, None)
 
     def parameter_set(self, key: str, value: Value, caller_id: str | None) -> None:
-        """Send a value to the subscribers; its setter gets no update of exactly this key."""
+        """Send a value to the subscribers. The node that set it gets no update of the same key."""
         if not self.registry.tells_parameters:
             return
         calls: dict[str, NodeCall] = {}

@@ -258,9 +258,9 @@ class FirewallSettings:
     """The values for the rules of the appliance's namespace.
 
     Hosts in `tunnel_only` are accepted through IPsec only: on `tunnel_interface` if ESP runs in user space.
-    `own_network` has addresses of the appliance's own doors. `neighbours` are addresses of the machine at the
-    other end of the link (isolation netns); only packets with a full TTL may have them. In `client_ports`, rosout
-    listens on every address, even with ROS_IP.
+    `own_network` has addresses of the appliance's own doors. `neighbours` are addresses of the machine at the other
+    end of the link (isolation netns); only packets with a full TTL may have them. Even with ROS_IP, rosout listens on
+    every address in `client_ports`.
     """
 
     control_uid: int

@@ -32,7 +32,7 @@ class CallApprovals:
         self._number = 0
 
     def ask(self, caller: tuple[str, str, str], type_: str, body: bytes, answered: Answered) -> int:
-        """Return the request's number. `caller` has the service, and the host and name of the client.
+        """Return the request's number. `caller` is the service, with the host and name of its client.
 
         `answered` is called once, in a later turn of the loop, unless the request is forgotten.
         """
