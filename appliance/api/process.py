@@ -1,7 +1,6 @@
 """Run the api process: its lifeline, its link to control, its certificate, and the listener.
 
-It outlives control. Routes and contract are made when the first request passes the gate, so an unused api needs
-little memory.
+It outlives control. Routes and contract are made when a request first passes the gate, so an unused api is small.
 """
 
 import asyncio

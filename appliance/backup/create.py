@@ -112,9 +112,7 @@ def _write(state: Path, archive: tarfile.TarFile, beside: Path) -> list[str]:
 
 
 def _files(state: Path) -> Iterator[tuple[str, int]]:
-    """Yield the log first; the other files are listed after it is copied, so the key for its signatures exists
-    by then.
-    """
+    """Yield the log first; the others are listed after it is copied, so the key for its signatures exists by then."""
     log = opened(state, AUDIT_LOG) if (state / AUDIT_LOG).exists() else None
     if log is not None:
         yield AUDIT_LOG, log

@@ -22,9 +22,7 @@ def name_to_make(path: Path) -> Path:
 
 
 def remove_unfinished(folder: str, place: int) -> None:
-    """Remove files that a crash left unfinished; no writer may be active. `folder` is relative to the descriptor
-    `place`.
-    """
+    """Remove files that a crash left unfinished; no writer may be active. `folder` is relative to `place`."""
     with contextlib.suppress(OSError):
         for _path, _folders, files, inside in os.fwalk(folder, follow_symlinks=False, dir_fd=place):
             for name in filter(_UNFINISHED.fullmatch, files):
@@ -36,8 +34,7 @@ def write_whole(path: Path, data: bytes | mmap, mode: int, owner: tuple[int, int
     """Replace a file. Raises `OSError`, which leaves the old file unchanged, and `NotLastingError` if the new file is
     perhaps not on the disk.
 
-    `owner` (user and group) is set before the file gets its final name. With concurrent writers, one complete file
-    remains.
+    `owner` (user and group) is set before the file gets its final name. Concurrent writers leave one complete file.
     """
     making = name_to_make(path)
     try:

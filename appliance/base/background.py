@@ -13,8 +13,8 @@ _log = structlog.get_logger()
 async def run_always(what: str, work: Callable[[], Awaitable[object]]) -> None:
     """Start `work` again a second after each error, until it returns or is cancelled.
 
-    Any such error is a defect, which must not end other work of the process: its traceback is logged as a fault
-    in `what`.
+    Any such error is a defect, which must not end other work of the process: its traceback is logged as a fault in
+    `what`.
     """
     while True:
         try:

@@ -7,11 +7,10 @@ from appliance.base import clock
 
 
 class Deadlines:
-    """Ends in seconds since the epoch. An end has passed once the system time *or* the time since the boot shows
-    it.
+    """Ends in seconds since the epoch. An end has passed once the system time *or* the time since boot shows it.
 
-    An end is compared with the system time when it is first seen. From then on, a step back of the clock, such as
-    by a false time service, postpones nothing.
+    An end is compared with the system time when it is first seen. From then on, a step back of the clock, such as by
+    a false time service, postpones nothing.
     """
 
     def __init__(self) -> None:

@@ -12,8 +12,8 @@ class TimestampError(ValueError):
 
 
 def parse_timestamp(text: str, now: int) -> int:
-    """Return nanoseconds since the epoch; a time without a zone is UTC, and a time outside the log's range the
-    nearest end.
+    """Return nanoseconds since the epoch; without a zone, a time is UTC; outside the log's range, it is the nearest
+    end.
 
     Raises `TimestampError`.
     """

@@ -102,9 +102,7 @@ def refusal(error: Mapping[str, Any]) -> str:
 
 
 def body_refusal(text: str, choices: Collection[str] = ()) -> str:
-    """Return the message for a body; `text` is msgspec's `ValidationError` without its path, `choices` are the valid
-    strings of an enumeration.
-    """
+    """Return the message for msgspec's `ValidationError` without its path; `choices` are those of an enumeration."""
     no_choice = text.removeprefix("Invalid enum value ")
     if no_choice != text:
         return f"must be one of {', '.join(repr(str(one)) for one in choices)}, not {_cut(no_choice)}"

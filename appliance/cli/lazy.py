@@ -25,9 +25,7 @@ def application(
     callback: Callable[..., None] | None = None,
     **settings: Any,
 ) -> typer.Typer:
-    """Return an application; `further` returns more verbs, for the help, for completion and for a name that `verbs`
-    lacks.
-    """
+    """Return an application; `further` returns more verbs, for help, completion and a name that `verbs` lacks."""
     app = typer.Typer(
         cls=_group_of(verbs, further),
         no_args_is_help=True,

@@ -115,9 +115,7 @@ def _view(body: Status, appliance: Appliance) -> StatusView:
 
 
 def _is_attention(alarm: Alarm, body: Status) -> bool:
-    """Return whether an alarm is shown without an effect on the exit status: recent denials and drops, and silenced
-    alarms.
-    """
+    """Return whether an alarm has no effect on the exit status: recent denials and drops, and silenced alarms."""
     return alarm in activity(body) or (alarm.severity == "notice" and alarm.handled != "")
 
 

@@ -135,9 +135,7 @@ def _errors_in(folder: Path, site_keys: Sequence[str], *, kept: bool) -> str:
 
 
 def _last_author(state: Path) -> str:
-    """Return the author of the last specifications: `DISK` means the folder; a question mark, that changes may not be
-    in the database yet.
-    """
+    """Return the author of the last specifications; a question mark if changes may not be in the database yet."""
     try:
         if not state.exists():
             return ""

@@ -31,9 +31,7 @@ class Verb:
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """A command with its own verbs, such as `rosrv audit`. A feature adds verbs to a group of the core with the
-    same name.
-    """
+    """A command with its own verbs, such as `rosrv audit`. A feature adds verbs to a group with the same name."""
 
     help: str
     verbs: "Verbs"

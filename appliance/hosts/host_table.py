@@ -139,9 +139,7 @@ class HostTable:
             raise HostRefusedError(f"the table is full: {MOST_HOSTS} hosts, including revoked ones")
 
     def address_for(self, name: str, wanted: str | None, awaited: dict[str, str]) -> str:
-        """Return the address for a host; `awaited` maps addresses that tokens reserve to names. Raises
-        `HostRefusedError`.
-        """
+        """Return the address for a host; `awaited` has the names of promised addresses. Raises `HostRefusedError`."""
         declared = self.declared.hosts.get(name)
         before = self.rows.get(name)
         kept = before.address if before else declared.address if declared else None

@@ -1,6 +1,4 @@
-"""Define what other parts of control need of the hosts in tunnels; these classes are for an appliance without
-tunnels.
-"""
+"""Define what other parts of control need of the hosts in tunnels; this is an appliance without tunnels."""
 
 from appliance.channel.answers.host_answers import Host
 from appliance.channel.answers.status import IpsecState

@@ -55,9 +55,7 @@ def write_key(path: Path, key: Key, passphrase: bytes | None) -> None:
 
 
 def load_key(path: Path, certificate_file: str, kind: Kind, passphrase: bytes | None) -> Key:
-    """Return the key, and encrypt its file if there is a passphrase. Raises `OSError`, and `SignerKeyError` for an
-    invalid key.
-    """
+    """Return the key; encrypt its file if there is a passphrase. Raises `OSError` and `SignerKeyError`."""
     if not path.exists():
         raise SignerKeyError(
             f"{path}: missing, but its certificate is there; restore it from a backup, or remove"

@@ -1,11 +1,10 @@
 """Run the certificate authority of an appliance: issue certificates of hosts, and sign the revocation list.
 
-1. The key never leaves the process. A key without its certificate, a certificate of another key, or a key that
-   others may read is an error; nothing is replaced.
+1. The key never leaves the process. A key without its certificate, a certificate of another key, or a key that others
+   may read is an error; nothing is replaced.
 2. Only the public key of a request is used: this module sets the names, times and usages of a certificate.
 3. A certificate is never valid for longer than the authority's own.
-4. charon ignores a revocation list with a lower number, so the list's number always grows, even after the clock
-   is set back.
+4. charon ignores a revocation list with a lower number, so its number always grows, even if the clock is set back.
 """
 
 import contextlib
@@ -123,9 +122,7 @@ class CertificateAuthority:
         )
 
     def revocations(self, serials: Iterable[tuple[str, float]]) -> bytes:
-        """Return a signed revocation list (PEM); serial numbers are in hexadecimal, times in seconds since the
-        epoch.
-        """
+        """Return a signed revocation list (PEM); serial numbers are hexadecimal, times seconds since the epoch."""
         now = clock.utc_now()
         builder = (
             x509.CertificateRevocationListBuilder()

@@ -148,9 +148,7 @@ def _extent(descriptor: int) -> tuple[int, int]:
 
 
 def _is_known(descriptor: int, wanted: Checkpoint, first: int, count: int) -> bool:
-    """Return whether the checkpoint was signed before. Raises `CheckpointRefusedError` if it does not follow the last
-    one.
-    """
+    """Return whether the checkpoint was signed before. Raises `CheckpointRefusedError` unless it follows."""
     index = wanted.number - first
     if index < 0 or index > count:
         raise CheckpointRefusedError(f"checkpoint {wanted.number} does not follow number {first + count - 1}")

@@ -1,7 +1,7 @@
 """Run the signer: the process with the audit key and the authority's key. It has no network.
 
-1. The audit key never leaves the process. A damaged key file, or a file that others may read, is an error; it is
-   never replaced.
+1. The audit key never leaves the process. A damaged key file, or one readable by others, is an error; it is never
+   replaced.
 2. The signer parses only the messages of its lifeline and its link to control, and the signing requests in them.
 3. Every signing request is answered, even if parsing it raises an unexpected error, so later messages are served.
 """

@@ -1,8 +1,8 @@
 """Call the hidden ROS master over reused connections. A *door* holds calls back while the ROS master is rebuilt.
 
 The reconcile loop shuts and opens the door, and calls through it in the meantime (`call_now`, `all_now`). Calls whose
-order matters are sent as one `system.multicall`, which also saves most of their cost: the ROS master does only one
-thing at a time.
+order matters are sent as one `system.multicall`, which also saves most of their cost: the ROS master does one thing
+at a time.
 """
 
 import asyncio

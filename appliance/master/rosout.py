@@ -1,7 +1,7 @@
 """Publish reports of monitors on `/rosout`, if configured.
 
-At most `_A_SECOND` reports are published per second, with the number of omitted ones. Like a node's own logger, this
-omits DEBUG.
+At most `_A_SECOND` reports are published per second, with the number of omitted ones. As in a node's own logger,
+DEBUG is omitted.
 """
 
 from collections.abc import Callable

@@ -74,9 +74,7 @@ def local_port_range() -> PortRange:
 def protection(
     appliances: Sequence[str], ports: PortRange, services: Sequence[OpenService], *, tunnelled: bool = False
 ) -> str:
-    """Return the nftables file. `tunnelled`: the appliances' addresses are accepted only through IPsec, where they
-    cannot be forged.
-    """
+    """Return the nftables file. `tunnelled`: the appliances' addresses are accepted only through IPsec."""
     if not appliances:
         raise ValueError("give the address of at least one appliance")
     rules, leaving = ['iifname "lo" accept'], []

@@ -53,9 +53,7 @@ def run_program(program: Start, text: str, what: str) -> tuple[int, str, str]:
 
 
 def communicate(process: "subprocess.Popen[str]", text: str, what: str) -> tuple[str, str]:
-    """Send the input, and return both outputs; log long waits for `what`. Raises `TimeoutError` after killing a
-    hanging process.
-    """
+    """Send the input, and return both outputs; log long waits for `what`. Raises `TimeoutError` if it hangs."""
     began, progress, said = clock.now(), ProcessActivity(process.pid), _SAY_SECONDS
     # Send the input here: a second call of `Popen.communicate` would not continue it.
     with ThreadPoolExecutor(1, "communicate") as pool:

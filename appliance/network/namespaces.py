@@ -1,8 +1,7 @@
 """Make network namespaces, run code and programs in them, and delete them.
 
 Each call gets its own thread, which ends in the namespace, because a return could fail. A program with
-`PR_SET_PDEATHSIG` would be killed when `popen` returns, because its parent thread then ends; use `entered()` for
-it.
+`PR_SET_PDEATHSIG` would be killed when `popen` returns, because its parent thread then ends; it needs `entered()`.
 """
 
 import contextlib
@@ -160,9 +159,7 @@ class Namespace:
         return self.run(lambda: subprocess.Popen(args, **options))
 
     def sysctl(self, key: str, value: str | None = None) -> str:
-        """Return a setting, after writing `value` if given; in `key`, slashes replace dots if an interface name has a
-        dot.
-        """
+        """Return a setting, after writing `value` if given; `key` has slashes if an interface name has a dot."""
         path = Path("/proc/sys", *key.split("/" if "/" in key else "."))
 
         def access() -> str:

@@ -1,7 +1,6 @@
 """Read `[Limits]`: the number of messages and bytes that may pass in a second (docs/reference/policy-file.md).
 
-If several clauses of the most specific key match a host, the strictest counts. A limit never allows or denies a
-request.
+If several clauses of the most specific key match a host, the strictest counts. A limit neither allows nor denies.
 """
 
 import re

@@ -26,8 +26,7 @@ COMMAND_FOR = {Category.CALL: "lookupService", Category.READ: "getParam", Catego
 class Right(NamedTuple):
     """A question to the policy.
 
-    `namespace`: the parameter contains other parameters. `alone`: the question excludes everything below the
-    parameter.
+    `namespace`: the parameter contains other parameters. `alone`: the question excludes those.
     """
 
     request: Request

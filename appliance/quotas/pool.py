@@ -58,8 +58,8 @@ class Bounds:
     def sized(self, whole: int, host: int | None = None) -> "Bounds":
         """Return bounds with the operator's `whole` and `host` (None: scaled with `whole`).
 
-        A nonzero `unknown` stays at least one, so that a small pool can still answer an unknown host with the reason
-        of a refusal.
+        A nonzero `unknown` stays at least one, so that a small pool can still tell an unknown host the reason of a
+        refusal.
         """
         host = self.host * whole // self.whole if host is None else host
         unknown = self.unknown * whole // self.whole

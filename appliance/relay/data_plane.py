@@ -270,9 +270,7 @@ class DataPlane:
                 subscriber.limit(flow)
 
     def _allowance(self, grant: messages.GrantInstalled) -> RateAllowance | None:
-        """Return the allowance of a grant; None for own topics, so that motions cannot use up the allowance of a
-        guard's stop.
-        """
+        """Return the allowance of a grant; None for own topics, so motions cannot use up that of a guard's stop."""
         node = self._table.node(grant.key)
         if node is not None and node.monitors:
             return None

@@ -234,9 +234,7 @@ class EventLoop:
         return _WorkThread(self, work, done)
 
     def used(self) -> int:
-        """Return the running handler's processor time (ns), or the time since the first call if its start is
-        unknown.
-        """
+        """Return the running handler's processor time (ns), or the time since the first call if it is unknown."""
         now = self._processor_time()
         if self._since == _UNKNOWN:
             self._since = now

@@ -1,7 +1,6 @@
 """The relay as a process of the appliance: lifeline, link to control, and the loop.
 
-Without a link to control, it continues under the existing grants until the supervisor opens a link to the next
-control.
+Without a link to control, it continues under the existing grants until it gets a link to the next control.
 """
 
 import contextlib

@@ -116,8 +116,7 @@ class SourceQueues:
 def first_for(networks: Iterable[Network], blocked: Iterable[Address] = ()) -> bytes:
     """Return the program that sends these sources, except blocked ones, to the first socket.
 
-    If there are too many addresses for a program, it ignores the blocks, or even sends all sources to the first
-    socket.
+    If there are too many addresses for a program, it ignores the blocks, or sends all sources to the first socket.
     """
     networks = list(networks)
     tests = [(network, FIRST) for network in networks]
@@ -167,8 +166,7 @@ def _instruction(operation: int, operand: int, if_true: int = 0, if_false: int =
 class Acceptor:
     """Accepts connections; `accepted` owns the socket, and the host is charged for the time.
 
-    If `accepted` returns False (too many connections), other connections of this host in the same turn are closed at
-    once.
+    If `accepted` returns False (too many connections), its host's other connections in the same turn are closed.
     """
 
     def __init__(

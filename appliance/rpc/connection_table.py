@@ -1,9 +1,9 @@
 """Count the connections of each host and the bytes that they hold; evict connections to make room.
 
-1. A host within its own quota evicts another connection of the same or a lower quota class if the pool or the host's
-   class is full.
-2. The lowest class is evicted first. In a class, idle connections are evicted before unfinished connections, and these
-   before served connections. In each stage, the longest wait is evicted first.
+1. A host within its own quota evicts another connection of the same or a lower quota class if the pool or its class
+   is full.
+2. The lowest class is evicted first. In a class, idle connections are evicted before unfinished connections, and
+   these before served connections. In each stage, the longest wait is evicted first.
 3. `patience` is the minimum wait before an eviction. At RVMaster, an idle connection is evicted at once, because ROS
    clients reconnect. A served connection is never evicted.
 4. If bytes are short, the largest unfinished connection of a host with more bytes or a lower class is evicted.
@@ -173,9 +173,7 @@ class ConnectionTable(Generic[Holder]):
     def _longest(
         self, stage: Stage, queue: Queue[Holder, TrackedConnection], quota_class: QuotaClass
     ) -> tuple[TrackedConnection, Holder, float] | None:
-        """Return the connection that waits longest; idle ones that were used since they were filed are moved back
-        first.
-        """
+        """Return the connection that waits longest; idle ones that were used again are moved back first."""
         for _ in range(_MOST_MOVED):
             found = queue.longest(quota_class)
             if found is None or stage is not Stage.IDLE or found[0].progress <= found[2]:

@@ -39,8 +39,7 @@ def itself(host: Hashable) -> Hashable:
 class Turns(Generic[Holder]):
     """The turns of hosts. While a slot is free, only a host or group that has used up its quota waits.
 
-    A host must pay for its audit records before it gets a slot: `pause(host)` returns the seconds until the next
-    check.
+    A host must pay for its audit records before it gets a slot: `pause(host)` returns the seconds to the next check.
     """
 
     def __init__(

@@ -193,8 +193,7 @@ class ProcessorTime:
 class HostTask(asyncio.Future[T]):
     """A coroutine that runs in the turns of a host, which is charged for each step.
 
-    The first step runs at once, because most requests wait for nothing, and asyncio would start a task in a later
-    turn.
+    The first step runs at once, because most requests wait for nothing; asyncio would start a task in a later turn.
     """
 
     def __init__(self, time: ProcessorTime, host: Address, work: Coroutine[Any, Any, T]) -> None:

@@ -1,10 +1,9 @@
 """Decide what the parts of an audit log prove: records, checkpoints, removals. Standard library only, no I/O.
 
-Every verifier of a log decides with this module. The bundle's verifier contains this text, and must run on Python
-3.8.
+Every verifier of a log decides with this module. The bundle's verifier contains it, and must run on Python 3.8.
 
-1. The hash of a record covers the hash of its columns and the hash of the previous record (`link`), so an excerpt
-   can prove the chain without the records that it omits. Version 0.1.0 hashed the columns directly.
+1. The hash of a record covers the hash of its columns and the hash of the previous record (`link`), so an excerpt can
+   prove the chain without the records that it omits. Version 0.1.0 hashed the columns directly.
 2. A checkpoint contains the hash of the previous one, and from version 2 on the last removed record.
 3. Each statement has exactly one valid text. Any other spelling, such as a leading zero, is invalid.
 """
@@ -100,9 +99,7 @@ class Checkpoint(NamedTuple):
         return (self.log, self.number, self.previous) == expected and before.sequence <= self.sequence
 
     def contradiction(self, last: int, here: bytes | None) -> ProofFault | None:
-        """Compare with a chain that ends with record `last` and has the hash `here` at this sequence (None: it
-        has no such record).
-        """
+        """Compare with a chain that ends with record `last`, and has the hash `here` at this sequence (None: none)."""
         if self.sequence > last:
             return ProofFault.CUT_OFF
         if here is None:
@@ -148,8 +145,7 @@ def signature_fault(
 class Removal(NamedTuple):
     """A removal of all records up to a checkpoint.
 
-    `sealed` is the checkpoint's own hash. `limit` is the setting that required the removal, as the signer writes
-    it.
+    `sealed` is the checkpoint's own hash. `limit` is the setting that required it, as the signer writes it.
     """
 
     log: str

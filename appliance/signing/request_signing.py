@@ -63,8 +63,7 @@ def reading_hash(key: str) -> bytes:
 def statement(
     challenge: str, *, method: str, target: str, if_match: str, content_type: str, body: bytes
 ) -> bytes:
-    """Return the text that signs a request. `target` is the path and query as sent; a missing header is an empty
-    string.
+    """Return the text that signs a request. `target` is the path and query as sent; a missing header is empty.
 
     Raises `BadProofError` for a part with a control or non-ASCII character.
     """

@@ -5,8 +5,8 @@ which is on one relay with everything that it uses, so every message meets all i
 
 1. At any time, exactly one relay carries a topic or service, for all its publishers.
 2. A plan moves as few running monitors as possible, then as few topics and services, and then balances loads.
-3. In a plan, no relay both loses and gains monitored topics. A relay has the monitors before and after it carries
-   their topics.
+3. In a plan, no relay both loses and gains monitored topics. A relay has monitors before and after it carries their
+   topics.
 4. The allocation survives the death of control, as do connections in the relays.
 """
 

@@ -112,9 +112,7 @@ def _givens(monitors: MonitorSet, name: str) -> Iterator[GivenDeclared]:
 def contents_at_start(
     files: Mapping[str, str], texts: Mapping[str, str], given_topics: Topics = NO_TOPICS
 ) -> Contents:
-    """Compile for a start: monitors of files with errors do nothing. Raises `SpecificationsRefusedError` beyond a
-    limit.
-    """
+    """Compile for a start: files with errors do nothing. Raises `SpecificationsRefusedError` beyond a limit."""
     try:
         return contents(files, texts, load=True, given_topics=given_topics)
     except SpecificationsRefusedError as error:

@@ -1,8 +1,7 @@
 """Control's link to the compiler process, which parses specifications for it.
 
-Specifications that exceed the compiler's limits end it, and are refused. A new order ends a dry run. The last
-answer for a start is kept, so a standby that has checked its start compiles nothing when it takes over, while the
-robot waits.
+Specifications that exceed the compiler's limits end it, and are refused. A new order ends a dry run. The last answer
+for a start is kept, so a standby that has checked its start compiles nothing while the robot waits for its takeover.
 """
 
 import asyncio

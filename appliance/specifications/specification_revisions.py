@@ -21,9 +21,7 @@ Check = Callable[[Sources, Sequence[str]], Awaitable[CheckedSpecifications]]
 """Compiles sources. Raises `SpecificationsRefusedError`."""
 
 CheckBeside = Callable[[Sources, Sequence[str], Sequence[str]], Awaitable[CheckedSpecifications]]
-"""Compiles sources; the files named last had errors before, and may still have them. Raises
-`SpecificationsRefusedError`.
-"""
+"""Compiles sources; the files named last may still have errors. Raises `SpecificationsRefusedError`."""
 
 NOTHING = MonitorRevisionRow(0, "{}", 0.0, DISK, "")
 """The revision before the first one."""

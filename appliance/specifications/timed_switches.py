@@ -44,9 +44,7 @@ def returns_moved(store: StateStore, seconds: float) -> None:
 
 
 class TimedSwitches:
-    """The time limits of switches; `come_back(back)` is called at the end of a limit, and calls `end` as every switch
-    does.
-    """
+    """The time limits of switches; `come_back(back)` is called at the end of a limit, and calls `end`."""
 
     def __init__(
         self, store: StateStore, come_back: Callable[[Mapping[str, Switch]], Awaitable[None]]

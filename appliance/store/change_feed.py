@@ -37,9 +37,7 @@ class ChangeFeed:
             self._shrink()
 
     def after(self, number: int, most: int) -> list[Encoded] | None:
-        """Return the changes after `number`: at most `most` bytes, but at least one change. None: the feed
-        lacks some.
-        """
+        """Return the changes after `number`: at most `most` bytes, but at least one change. None: some are missing."""
         with self._lock:
             skipped = number - self._before
             if not 0 <= skipped <= len(self._changes):

@@ -1,5 +1,4 @@
-"""The changes of the state file as typed rows, the SQL that carries them out, and the file that keeps them until
-then.
+"""The changes of the state file as typed rows, the SQL that carries them out, and their write-ahead file.
 
 Only `Tables` makes SQL, and it checks each change against the schema. So a change from a file or from another
 appliance can only put or delete rows of known tables, with values of the columns' types.
@@ -135,9 +134,7 @@ class Tables:
 
 
 def joined(changes: Sequence[tuple[Change, bool]]) -> Iterator[tuple[Change, bool]]:
-    """Join consecutive rows of a table that have the same second value, because each change delays the loop's
-    thread.
-    """
+    """Join consecutive rows of a table with the same second value, because each change delays the loop's thread."""
     if len(changes) == 1:
         yield changes[0]
         return
@@ -176,8 +173,7 @@ class WriteAheadClosedError(OSError):
 class WriteAhead:
     """The write-ahead file at `path`, for any thread. Raises `OSError`.
 
-    The descriptor's number is read only under the lock, so no write after `close` goes to another file that
-    reuses it.
+    The descriptor's number is read only under the lock, so no write after `close` goes to another file with it.
     """
 
     def __init__(self, path: Path) -> None:
@@ -194,9 +190,7 @@ class WriteAhead:
             yield self._open_descriptor
 
     def left(self, stored: int) -> LeftBehind:
-        """Return the changes after `stored`. Raises `ValueError` for an intact change that this release does
-        not know.
-        """
+        """Return the changes after `stored`. Raises `ValueError` for an intact change that is not known here."""
         with self._descriptor() as descriptor:
             data = os.pread(descriptor, os.fstat(descriptor).st_size, 0)
         if data[:1] < b"\x80":

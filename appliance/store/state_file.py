@@ -64,9 +64,7 @@ _EMPTY = msgspec.msgpack.encode({})
 
 
 class IncarnationRow(NamedTuple):
-    """An incarnation of a node. `changed` is in monotonic seconds, for the order only. `relay_port` is the port on
-    the first relay process.
-    """
+    """An incarnation of a node. `changed` is for the order only; `relay_port` is on the first relay process."""
 
     key: str
     name: str
@@ -198,9 +196,7 @@ class StateStore:
         self._only_in_tree = False
 
     def note_whole_parameters(self) -> None:
-        """From now on, store even large values at once: another appliance must have each value before its caller is
-        answered.
-        """
+        """Store even large values at once from now on: another appliance must have a value before its answer."""
         self._largest_change = math.inf
 
     @property

@@ -87,8 +87,7 @@ class StoreError(Exception):
 class Database:
     """The state file at `path`, created with `schema` when it is new. Raises `StoreError`.
 
-    `failed` is called once when writing fails (a full disk); the write is tried again until the database is
-    closed.
+    `failed` is called once when writing fails (a full disk); the write is repeated until the database is closed.
     """
 
     def __init__(
@@ -129,9 +128,7 @@ class Database:
         self._driver = drive("store", self.turn, _GATHER_SECONDS)
 
     def query(self, sql: str, parameters: Sequence[Value] = ()) -> list[tuple[Any, ...]]:
-        """Return rows, including queued ones. Call this in a thread, because it may wait for `_CATCH_UP_SECONDS`,
-        though not while writing fails.
-        """
+        """Return rows, including queued ones. Call this in a thread, because it may wait for `_CATCH_UP_SECONDS`."""
         if not self._ended and not self._failing:
             written = threading.Event()
             self._queue.append(_Waiter(lambda _problem: written.set(), synced=False))
@@ -144,9 +141,7 @@ class Database:
             raise StoreError(f"{self._path}: {error}") from error
 
     def put(self, table: str, *row: Value, ahead: bool = True) -> None:
-        """Store a row; with `ahead`, it survives the process from then on. Raises `ChangeError`, and `StoreError`
-        after `close`.
-        """
+        """Store a row; with `ahead`, it survives the process from then on. Raises `ChangeError` and `StoreError`."""
         self._submit(Put(table, [row]), ahead=ahead)
 
     def delete(self, table: str, *conditions: Condition, ahead: bool = True, **equal: Value) -> None:

@@ -4,7 +4,7 @@ All calls block, the probe for seconds, so a running supervisor makes them in a 
 
 1. No process starts before the firewall is in force.
 2. A hidden port counts as open if another local user can reach it, or if it cannot be probed.
-3. Missing rules are installed again and logged, but none after `remove`: it waits for a running call, and later calls
+3. Missing rules are installed again and logged, but none after `remove`: it waits for a running call; later calls
    fail.
 """
 

@@ -34,9 +34,7 @@ _SCHED_SETATTR = {"x86_64": 314, "aarch64": 274}
 
 
 def die_with_parent(parent: int) -> None:
-    """Let the kernel kill this process if its parent dies. The change of user clears the setting, so call this after
-    it.
-    """
+    """Let the kernel kill this process if its parent dies. A change of user clears this, so call it afterwards."""
     prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:
         os._exit(1)

@@ -53,8 +53,8 @@ def run_appliance(
 ) -> None:
     """Run the appliance until it is stopped. Raises `StartError`.
 
-    `ready` is called once, with the settings after all ports are chosen; `waits` once, if an appliance with `pairing`
-    stands by.
+    `ready` is called once, with the settings after all ports are chosen; `waits` once, if one with `pairing` stands
+    by.
     """
     if settings.isolation == "none":
         log.warning(

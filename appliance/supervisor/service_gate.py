@@ -7,9 +7,7 @@ from typing import Any
 
 @dataclass(frozen=True)
 class RoleChanges:
-    """The changes of the role. `suspend()` keeps all state until `resume()`; it returns False if that is not possible
-    now.
-    """
+    """The changes of the role. `suspend()` keeps all state until `resume()`; it returns False if it cannot."""
 
     activate: Callable[[int], None]
     passivate: Callable[[], None]

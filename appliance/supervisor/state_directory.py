@@ -1,5 +1,4 @@
-"""Prepare the state directory: set owners and modes of its parts, and lock it, so that only one appliance uses
-it.
+"""Prepare the state directory: set owners and modes of its parts, and lock it for one appliance.
 
 A foreign directory is refused, because `--state /tmp` would close /tmp to all users.
 

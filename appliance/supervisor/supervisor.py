@@ -1,7 +1,6 @@
 """Start, watch and restart the processes of the appliance.
 
-1. The supervisor parses no data from a node or a browser. A child that sends a message that it may not send is
-   killed.
+1. The supervisor parses no data from a node or a browser. A child that sends a foreign message is killed.
 2. A dead process is restarted within a second; a dispensable process that cannot serve, within a minute. A process
    that does not answer for five seconds is killed.
 3. Once nodes may connect, only a request of control ends the appliance, never the death of a process.

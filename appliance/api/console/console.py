@@ -1,10 +1,8 @@
 """Serve the console: one page for operators, with all its files.
 
 1. The files are part of the program, need no token and contain no secret.
-2. Only files that existed when the routes were made are served, by exact name: a request's path never reaches the
-   file system.
-3. The headers restrict the page to this origin and to its own scripts. A string never becomes markup (Trusted
-   Types).
+2. Only files that existed when the routes were made are served, by exact name: no path of a request reaches the disk.
+3. The headers restrict the page to this origin and its own scripts. No string becomes markup (Trusted Types).
 """
 
 import gzip

@@ -66,9 +66,7 @@ def join_late_modules(sources: Mapping[str, str], entry: str) -> str:
 
 
 def join_styles(sources: Mapping[str, str], entry: str, within: tuple[str, ...] = ()) -> str:
-    """Return a style sheet with its imports; `within` are the files whose imports led to the entry. Raises
-    `ModuleError`.
-    """
+    """Return a style sheet with its imports; `within` are the files that led to the entry. Raises `ModuleError`."""
     if entry not in sources:
         raise ModuleError(f"there is no file {entry}")
     way = (*within, entry)

@@ -1,11 +1,9 @@
 """Authenticate bearer tokens.
 
-1. Before control's first list of tokens arrives, clients are asked to try again, because "revoked" would end
-   their sessions.
-2. The costly check (scrypt) runs in a thread, for one request at a time. A peer that keeps sending wrong tokens
-   must wait between checks.
-3. A valid token is remembered only as a hash under a random key of this process, until the list of tokens
-   changes.
+1. Before control's first list of tokens, clients are asked to try again: "revoked" would end their sessions.
+2. The costly check (scrypt) runs in a thread, for one request at a time. A peer that keeps sending wrong tokens must
+   wait between checks.
+3. A valid token is remembered only as a hash under a random key of this process, until the list changes.
 4. The use of a token is reported at once, and then at most once in `USE_SECONDS`.
 """
 

@@ -1,7 +1,6 @@
 """Send the api's requests to control, and notices of REST calls without an answer.
 
-At most `_MOST_OPEN` requests are open. A notice never waits: the last `_MOST_KEPT` are kept for the next control
-process.
+At most `_MOST_OPEN` requests are open. A notice never waits: the last `_MOST_KEPT` are kept for the next control.
 """
 
 import asyncio
@@ -63,9 +62,7 @@ def _made(
 
 
 class ControlLink:
-    """The link to control; `tokens_stated(tokens)` gets the tokens that are valid from now on, and `lost()` is called
-    when control is gone.
-    """
+    """The link to control; `tokens_stated(tokens)` gets the present tokens; `lost()` is called when control is gone."""
 
     def __init__(self, tokens_stated: Callable[[list[TokenKept]], None], lost: Callable[[], None]) -> None:
         self._tokens_stated = tokens_stated

@@ -34,9 +34,7 @@ def refusal(error: str, findings: list[str]) -> ProblemError:
 
 
 class Described(NamedTuple):
-    """The contents of a specification. `uses` are the monitors whose variables it uses; `hold`: it is declared
-    `hold`.
-    """
+    """The contents of a specification; `uses` are the monitors whose variables it uses; `hold` is its modifier."""
 
     events: list[EventShown]
     properties: list[PropertyShown]

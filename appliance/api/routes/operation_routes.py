@@ -82,9 +82,7 @@ class OperationCall(Generic[Q]):
 
 @dataclass(frozen=True)
 class Answer:
-    """A function that replaces control's answer. If it returns no struct, `success` describes the answer in the
-    contract.
-    """
+    """A function that replaces control's answer. If it returns no struct, `success` is the answer in the contract."""
 
     function: Callable[[OperationCall[Any]], Awaitable[Any]]
     success: Mapping[str, Any] | None = None

@@ -1,8 +1,7 @@
 """Limit the bytes of audit records that each host causes over time, and more strictly on a nearly full disk. No I/O.
 
 A host's debt shrinks by `RATE`, and only the calls of a host above its quota wait. The last part of the disk's
-reserve is kept for the robot and for hosts that the policy names. Unknown hosts are not charged: their denials are
-folded.
+reserve is kept for the robot and for hosts that the policy names. Unknown hosts are not charged, but folded.
 """
 
 import dataclasses

@@ -12,9 +12,7 @@ _OF_THE_DATABASE = range(0x40000000, 0x40000002)  # bytes of the database: pendi
 
 
 def holders(log: Path) -> list[int]:
-    """Return the ids of the processes with such a lock; -1 is a lock without a process (an open file
-    description lock).
-    """
+    """Return the ids of the processes with such a lock; -1 is a lock without a process (open file description)."""
     bytes_of = {}
     for path, needed in ((log.with_name(f"{log.name}-shm"), _OF_WRITING), (log, _OF_THE_DATABASE)):
         try:

@@ -95,9 +95,7 @@ class Remover:
         return True
 
     def refused(self, number: int, reason: str, *, early: bool = False) -> None:
-        """Request this removal again later. `early`: by the signer's clock, the records are too young, which is
-        normal.
-        """
+        """Request this removal again later. `early`: the records are too young by the signer's clock, as is normal."""
         wanted = self._wanted
         if wanted is not None and wanted.gone.last_checkpoint == number:
             self._wanted = None

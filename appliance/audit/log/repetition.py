@@ -1,8 +1,8 @@
 """Define the kinds of folded records: the key that repetitions share, and the summary of a kind.
 
 Texts from peers cannot create an unlimited number of kinds: only the plain words of an error are part of a key, not
-the numbers, names and quotations that the peer chooses, and the key of an unknown host's kind has no resource and no
-caller.
+the numbers, names and quotations that the peer chooses, and the key of an unknown host's kind has neither resource
+nor caller.
 """
 
 from typing import Any

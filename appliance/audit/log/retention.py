@@ -1,8 +1,7 @@
 """Choose which old records to remove, and which of these to write again. No I/O.
 
 A size limit keeps denials and alarms longer than other records: they are written again at the end of the log, with
-their id and time, at most half of a step. Hosts take turns, so a flood from one host cannot displace the records of
-another.
+their id and time, at most half of a step. Hosts take turns, so a flood from one host displaces no records of others.
 """
 
 from collections import OrderedDict

@@ -23,9 +23,7 @@ _TYPES = (int, int, bytes, bytes | None, bytes | None)
 
 
 class SignerMemory(msgspec.Struct, frozen=True):
-    """The hashes of the checkpoints that the signer signed, from number `first` on, and the last removal that it
-    approved.
-    """
+    """The hashes of the checkpoints that the signer signed, from number `first` on, and the last approved removal."""
 
     first: int
     hashes: bytes

@@ -94,9 +94,7 @@ class SignedCheckpoint(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 def select_signed(connection: sqlite3.Connection, where: str, *values: int) -> list[SignedCheckpoint]:
-    """Return the signed checkpoints for which the SQL condition `where` holds. Raises `ValueError` for a
-    damaged one.
-    """
+    """Return the signed checkpoints for which the SQL condition `where` holds. Raises `ValueError` for a bad one."""
     query = "SELECT text, signature, public_key FROM checkpoint WHERE signature IS NOT NULL AND public_key IS NOT NULL"
     found = connection.execute(f"{query} AND {where}", values)
     return [SignedCheckpoint.of(*row) for row in found]
@@ -121,8 +119,7 @@ def _read(log: Path, where: str, *values: int) -> list[SignedCheckpoint]:
 
 
 def read_copies(file: Path) -> list[SignedCheckpoint]:
-    """Return the checkpoints in NDJSON (`rosrv audit checkpoints`) or in a syslog receiver's output; skip other
-    lines.
+    """Return the checkpoints in NDJSON (`rosrv audit checkpoints`) or a syslog receiver's output; skip the rest.
 
     Raises `CopiesUnreadableError` if there is no checkpoint.
     """

@@ -321,8 +321,7 @@ class SpecificationsStated(Message):
     with the modifier `hold` block their topics, as do those in `moved`, which come from another relay.
 
     The answer repeats `statement`, because the same revision may be sent again. With `ahead`, the relay carries out
-    later messages only after these specifications are in force or rejected, so no topic is placed before its
-    monitors.
+    later messages only after these specifications are in force or rejected, so no topic comes before its monitors.
 
     After a takeover, `left` has the states that the other appliance's relays left (`StateLeft`), `left_at` the time
     of its monitors at that moment (0: the time in the states), and `lost` why other states are lost. The relay then

@@ -1,6 +1,4 @@
-"""Print audit records as text: a table on a terminal, lines in a pipe. Text from the network is escaped
-(`printable`).
-"""
+"""Print audit records as text: a table on a terminal, lines in a pipe. Text from the network is escaped."""
 
 import sys
 from collections.abc import Iterator

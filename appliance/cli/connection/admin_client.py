@@ -32,9 +32,7 @@ class AccessDeniedError(NotRunningError):
 
 
 class AdminSocket:
-    """A client of the admin socket; after `seconds`, a request is withdrawn, and its outcome may take `grace`
-    seconds.
-    """
+    """A client of the admin socket; a request is withdrawn after `seconds`; its outcome may take `grace` seconds."""
 
     def __init__(self, state: Path, seconds: float = SECONDS, grace: float = _GRACE_SECONDS) -> None:
         self.state = state

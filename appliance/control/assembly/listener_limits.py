@@ -156,7 +156,7 @@ def class_of(
 ) -> str:
     """Return the class that is charged for a host's processor time, and that shares turns.
 
-    A host can have many addresses, so the hosts that only `*` names share one class, and those with a registration
+    A host can have many addresses, so the hosts that only `*` names share one class, those with a registration
     another.
     """
     standing = policy().standing(host)

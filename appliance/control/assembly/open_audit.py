@@ -22,9 +22,7 @@ def open_audit(
     kept_for: Callable[[str], bool],
     receipts: ReceiptFloor,
 ) -> AuditLog:
-    """Open the log. `kept_for(host)`: the host gets the last part of the reserve. `held_by` gets the processes that
-    lock the log.
-    """
+    """Open the log. `kept_for(host)`: the host gets the last of the reserve. `held_by` gets processes that lock it."""
     audit = settings.audit
     reserve = AUDIT_RESERVE.bounds.sized(
         int(audit.reserve_bytes), int(audit.reserve_bytes) // _HOSTS_IN_RESERVE

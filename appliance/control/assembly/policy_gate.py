@@ -50,9 +50,7 @@ class StartingPolicy(NamedTuple):
 def policy_at_start(
     kept: KeptPolicy | None, file: Path, known: PolicyContext, *, kept_first: bool
 ) -> StartingPolicy:
-    """Return `kept` if it comes first or the file does not pass, else the file's policy. Raises
-    `PolicyRefusedError`.
-    """
+    """Return `kept` if it comes first or the file fails, else the file's policy. Raises `PolicyRefusedError`."""
     if kept is not None and kept_first:
         try:
             return StartingPolicy(judged(kept.text, kept.signature, kept.file, known), kept.signature)

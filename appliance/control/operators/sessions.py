@@ -1,7 +1,6 @@
 """Define people's sessions, which a feature that signs people in offers to the rest of control.
 
-A session is a token that a person's browser made for itself, so roles, quotas, signed orders and records treat both
-alike.
+A session is a token that a person's browser made for itself, so roles, quotas, orders and records treat both alike.
 """
 
 from typing import NamedTuple, Protocol

@@ -10,9 +10,7 @@ from appliance.policy.model import Address
 
 @dataclass(frozen=True, slots=True)
 class HostSigns:
-    """The signs of a host's life. `live(host)`: it has a live node; `moved(host, names)`: when it last published on
-    these topics, or 0.
-    """
+    """The signs of a host's life. `live(host)`: it has a live node; `moved(host, names)`: last publication, or 0."""
 
     live: Callable[[Address], bool]
     moved: Callable[[Address, frozenset[str]], float]

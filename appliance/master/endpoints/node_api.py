@@ -49,9 +49,7 @@ class NodeApiClient:
         return await client.call(method, *params)
 
     def _kept(self, incarnation: Incarnation) -> XmlRpcClient:
-        """Return a client with a kept connection (at most `_MOST_KEPT`): a starting node gets a dozen calls in a
-        second.
-        """
+        """Return a client with a kept connection (at most `_MOST_KEPT`): a starting node gets ten calls in a second."""
         uri = incarnation.call_uri
         client = self._used.get(uri) or self._unused.pop(uri, None)
         if client is None:

@@ -186,8 +186,7 @@ class AdvertisedAddresses:
     """Chooses the appliance's address that each host gets in URIs.
 
     A (network, address) pair of `advertised` has priority; otherwise, a host gets the address at which it reached the
-    appliance. `fixed` is the address of the active one of two appliances, for all hosts outside the network
-    `tunnels`.
+    appliance. `fixed` is the address of the active one of two appliances, for hosts outside the network `tunnels`.
     """
 
     def __init__(

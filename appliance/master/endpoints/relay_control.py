@@ -77,7 +77,7 @@ _log = structlog.get_logger()
 class RelayControl:
     """Control's end of the links to the relays.
 
-    `own_call` answers calls of the appliance's own service, and decides calls of monitors and requests that need an
+    `own_call` answers calls of the appliance's own service, and decides monitors' calls and requests that need an
     approval.
     """
 

@@ -126,7 +126,7 @@ class Subscribers:
     ) -> Iterator[tuple[Incarnation, str, list[Incarnation]]]:
         """Yield subscribers and topics, with the publishers to which the subscriber is not connected.
 
-        Grants do not matter: if one was withdrawn unnoticed, the subscriber asks again only after it drops the
+        Grants do not matter: if one was withdrawn unnoticed, the subscriber asks again only after dropping the
         publisher.
         """
         used = self.grants.used()

@@ -37,9 +37,7 @@ class Backend(Protocol):
         """The families that the kernel supports."""
 
     def install(self, rules: tuple[PacketRule, ...]) -> None:
-        """Put the rules into force. Raises `BackendMissingError`, `FirewallError`; the old rules are then still in
-        force.
-        """
+        """Put the rules into force. Raises `BackendMissingError`, `FirewallError`; the old rules then stay in force."""
 
     def remove(self) -> None: ...
 

@@ -1,7 +1,6 @@
 """Test on a loopback port of our own that a back end works on this machine.
 
-A kernel may accept rules that it never applies: a match extension is a stub, or a container engine filters the
-calls.
+A kernel may accept rules that it never applies: a match extension is a stub, or an engine filters the calls.
 """
 
 import errno

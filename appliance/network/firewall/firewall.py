@@ -38,9 +38,7 @@ class Firewall:
         self._not_used: list[str] = []
 
     def install(self, settings: FirewallSettings) -> str:
-        """Install the rules, after removing those of an earlier run by any back end. Raises `PrivilegeError`,
-        `FirewallError`.
-        """
+        """Install the rules, after removing those of an earlier run. Raises `PrivilegeError`, `FirewallError`."""
         require_network_admin("the firewall")
         if self._backend is None:
             rules = appliance_rules(settings)

@@ -1,7 +1,6 @@
 """Define the rules of the firewall as data. No I/O.
 
-1. The rules only refuse, or RETURN to the rules of other programs, so they open no port that another firewall
-   closed.
+1. The rules only refuse, or RETURN to the rules of other programs, so they open no port that others closed.
 2. A connection is refused at its SYN, without the connection tracker, so a `NOTRACK` rule cannot open the port.
    Packets of closed sockets pass, because rejecting them would delay the end of a connection.
 3. Packets without a known owner are refused.
@@ -388,9 +387,7 @@ def _own_node(settings: FirewallSettings) -> tuple[PacketRule, ...]:
 
 
 def _ports_of_others(uid: int, settings: FirewallSettings) -> Iterator[PacketRule]:
-    """Yield rules that block ports, instead of rules that permit some, because a new policy may change the permitted
-    ones.
-    """
+    """Yield rules that block ports instead of permitting some: a new policy may change the permitted ones."""
     chosen, faces = settings.client_ports, settings.node_ports
     if faces is not None and chosen is not None and faces.overlaps(chosen):
         yield _connecting("own node: faces and relays", PacketVerdict.RETURN, tcp_ports=faces, uid=uid)

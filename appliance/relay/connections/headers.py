@@ -1,7 +1,6 @@
 """Write the connection headers for peers, services and publishers.
 
-Received headers are not trusted: the sender gets its registered name, and fields that ROS does not define are
-dropped.
+Received headers are not trusted: the sender gets its registered name, and fields unknown to ROS are dropped.
 """
 
 from collections.abc import Mapping

@@ -5,9 +5,7 @@ from typing import Any, Protocol
 
 
 class MessageStream(Protocol):
-    """The messages of one connection to a publisher. If it `keeps` them, it needs the frames as the publisher sent
-    them.
-    """
+    """The messages of one connection to a publisher. If it `keeps` them, it needs the frames as they were sent."""
 
     @property
     def keeps(self) -> bool: ...

@@ -67,9 +67,7 @@ class Upstream:
         """Apply the specifications that are in force now."""
 
     def silence(self, *, silent: bool) -> None:
-        """If `silent`, close the connection at once and take no message; otherwise connect again if the topic is
-        wanted.
-        """
+        """If `silent`, close the connection at once and take no message; otherwise connect if the topic is wanted."""
 
     def check_stall(self) -> None:
         """Cut a publisher that holds memory for a message and sends nothing of it."""
@@ -107,7 +105,7 @@ class _Monitoring:
 class RelayedTopic:
     """A topic of an incarnation at `host`, with its subscribers; `share` counts the memory of its kept messages.
 
-    The upstream stays open while a subscriber, a monitor or a tap needs it, and a little longer during a reload or
+    The upstream stays open while a subscriber, a monitor or a tap needs it, and a little longer in a reload or
     restart.
     """
 

@@ -90,9 +90,7 @@ class Subscriber:
         return True
 
     def deliver(self, batch: Batch) -> int:
-        """Send or queue the batch; while the host's memory is exhausted, drop a large one, whose unsent rest could
-        not be kept.
-        """
+        """Send or queue the batch; drop a large one while the host has no memory: its rest could not be kept."""
         if self._flow is not None:
             passing = self._limited(self._flow, batch)
             if passing is None:

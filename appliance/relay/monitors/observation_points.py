@@ -36,9 +36,7 @@ class PointHolder(Protocol):
 
 
 class Senders:
-    """Numbers observation points, so that the senders of earlier messages can be named; the last `_SENDERS` are
-    known.
-    """
+    """Numbers observation points, so that senders of earlier messages can be named; the last `_SENDERS` are known."""
 
     def __init__(self) -> None:
         self._points: OrderedDict[int, ObservationPoint] = OrderedDict()

@@ -81,9 +81,7 @@ class _Entry:
 
 
 class StateKeeper:
-    """Keeps the state of one relay in `own`, and recovers it from there or, if `own` is empty, from `earlier`
-    memories.
-    """
+    """Keeps the state of one relay in `own`, and recovers it from there or, if that is empty, from `earlier` ones."""
 
     def __init__(self, given: StateGiven, own: Memory, earlier: Sequence[Memory] = ()) -> None:
         self._given = given

@@ -4,8 +4,7 @@ The file contains a magic number, a byte with the valid half (1 or 2; 0: none), 
 `head` (the writer's data), a table, and *sections*. A section contains two places for the `base` state of a group of
 monitors, two for its `cells`, and one byte that marks the valid places. A writer changes only invalid places, and
 then the byte. Stores of one thread become visible in order, so a process killed at any point leaves the state before
-or after a write. A power cut can lose this order, so the reader uses the head to check whether the machine has
-restarted.
+or after a write. A power cut can lose this order, so the reader sees from the head whether the machine has restarted.
 """
 
 import mmap

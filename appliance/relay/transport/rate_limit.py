@@ -215,8 +215,8 @@ class RateLimits:
 class PublicationRateLimit:
     """The limit of a publication's host on its topic, and the limit of the topic.
 
-    The last message of a latching publisher is not lost: it waits (`later`) until it may pass, or until the next
-    message comes.
+    The last message of a latching publisher is not lost: it waits (`later`) until it may pass, or the next message
+    comes.
     """
 
     def __init__(self, share: HostMemory, dropped: Callable[[Part, int, int], None]) -> None:

@@ -1,7 +1,6 @@
 """Limit files and TCP ports of a process with Landlock, which needs no privilege and which children inherit.
 
-Limits that the kernel lacks are reported: files need Linux 5.13, TCP ports 6.7, signals and abstract sockets
-6.12.
+Limits that the kernel lacks are reported: files need Linux 5.13, TCP ports 6.7, signals and abstract sockets 6.12.
 """
 
 import contextlib

@@ -125,9 +125,7 @@ def _closed_above(path: Path) -> Path | None:
 
 
 def _is_open(folder: Path) -> bool:
-    """Return whether other users may read the folder; of the program, every file counts, as a pull may use another
-    umask.
-    """
+    """Return whether other users may read the folder; of the program, every file counts: pulls may use other umasks."""
     if folder.name not in _PARTS:
         return _permits(folder, _ENTER | _READ)
     return all(
