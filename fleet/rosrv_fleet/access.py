@@ -14,7 +14,7 @@ from rosrv_fleet.tokens import FleetRole, OperatorToken, OperatorTokens
 PEER_CERTIFICATE = "peer_certificate"
 """The key in the ASGI scope's `state` with the verified client certificate (DER)."""
 IS_ROBOT = "is_robot"
-"""The key in `state` that tells whether this is the certificate of an enrolled robot."""
+"""The key in `state` that is true if this certificate belongs to an enrolled robot."""
 COOKIE = "__Host-rosrv-fleet"
 """The console's cookie: sent only over TLS and to this host, and hidden from scripts."""
 
@@ -34,7 +34,7 @@ def certificate_of(request: Request) -> bytes | None:
 
 
 def robot_of(robots: Robots) -> Callable[[Request], Awaitable[Robot]]:
-    """Answer 403 to any other caller."""
+    """Return a dependency that identifies the robot, and answers 403 to any other caller."""
 
     async def identify(request: Request) -> Robot:
         certificate = certificate_of(request)
@@ -55,7 +55,7 @@ def token_of(request: Request) -> str:
 
 
 def holder_of(tokens: OperatorTokens, role: FleetRole) -> Callable[[Request], Awaitable[OperatorToken]]:
-    """Answer 401 or 403 without a token of this role."""
+    """Return a dependency that identifies the operator: 401 without a valid token, 403 if its role is too low."""
 
     async def identify(request: Request) -> OperatorToken:
         text = token_of(request)

@@ -1,7 +1,7 @@
 """Record each change of robots, invitations, tokens and evidence with its author (docs/reference/fleet.md, Acts).
 
-No change takes effect without a record on the disk. An act without a second line ended in between, and may have
-taken effect.
+No change takes effect before its record is on the disk. An act without a second line was cut off by a crash, and may
+or may not have taken effect.
 """
 
 import contextlib
@@ -21,9 +21,10 @@ FILE = "acts.ndjson"
 
 @contextmanager
 def recorded(data: Path, act: str, about: str, detail: str = "", who: str = "") -> Iterator[None]:
-    """Record an act of `who` (default: this command's user, or the user who called sudo) around the block.
+    """Record an act around the block that carries it out.
 
-    Raises `OSError` if the act cannot be recorded; then the block does not run.
+    `who` defaults to this command's user, or the user who called sudo. If the act cannot be recorded, raise `OSError`
+    before the block runs.
     """
     fields = {"who": who or _user(), "act": act, "about": about, "detail": detail}
     _append(data, fields | {"result": "asked"})

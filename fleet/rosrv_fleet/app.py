@@ -1,4 +1,4 @@
-"""Make the REST application of the collector. Each part of the API has a separate router."""
+"""Make the REST application of the collector from one router for each part of the API."""
 
 import asyncio
 import threading
@@ -46,7 +46,7 @@ ROUTERS: tuple[Callable[[Collector], APIRouter], ...] = (
     evidence_router,
     bundle_router,
 )
-"""The parts of the API. To add one, write a function that returns its router, and name it here."""
+"""Each function returns the router of one part; a new part is added here."""
 
 
 async def _damaged(_request: Request, error: Exception) -> Response:

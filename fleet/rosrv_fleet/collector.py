@@ -1,4 +1,4 @@
-"""The parts of a running collector, made from its configuration."""
+"""Make the parts of a running collector from its configuration."""
 
 import os
 from dataclasses import dataclass
@@ -30,9 +30,9 @@ _BUNDLE_CONNECTIONS = 4
 
 @dataclass(frozen=True)
 class Collector:
-    """The parts of a collector, which the routers use.
+    """The parts that the routers use.
 
-    Searches and indexing have separate connections, so they never use up those of rollouts and retention.
+    Searches and indexing have their own connections, so they cannot take those of rollouts and retention.
     """
 
     config: FleetConfig
@@ -52,7 +52,6 @@ class Collector:
 
 
 def make_collector(config: FleetConfig) -> Collector:
-    """Raises `ReceiptKeyError` and `OSError`."""
     limits = config.limits
     key = read_receipt_key(config.data)
     robots = Robots(config.data / "robots")

@@ -1,6 +1,6 @@
 """Define the configuration of the collector: one YAML file, checked against these types.
 
-Relative paths are relative to the file.
+Relative paths are relative to the folder of this file.
 """
 
 import os
@@ -23,12 +23,12 @@ class FleetConfigError(Exception):
 
 
 class Limits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The limits of uploads and searches.
+    """The limits of uploads, searches and connections.
 
-    `check_seconds` is processor time. `uploads` run at the same time, one for each robot. The bytes per day count
-    what a robot sends in 24 hours, stored or refused. `reserve_bytes` of the disk stay free. `searches` run at
-    the same time, half of them with the same token. `header_seconds` limits a TLS handshake and a request's
-    headers. `address_connections` are those of one address without a robot's certificate.
+    `uploads` limits simultaneous uploads; each robot has at most one. The bytes per day include rejected uploads.
+    `reserve_bytes` of the disk stay free. `check_seconds` is processor time. `searches` limits simultaneous searches;
+    one token gets at most half. `header_seconds` limits a TLS handshake, and then each request's headers.
+    `address_connections` limits one address, not counting connections of robots.
     """
 
     segment_bytes: _Positive = 512 << 20
@@ -48,7 +48,7 @@ class Limits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
 
 class EvidenceConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The limits of evidence bundles, which operators add.
+    """The limits of evidence bundles.
 
     `robot_bytes` limits the stored bundles of one robot; `check_seconds` is processor time.
     """
@@ -60,9 +60,9 @@ class EvidenceConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
 
 
 class RetentionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The days after arrival until records are removed from the index, and segments from the disk; None: never.
+    """The days after arrival until records leave the index, and segments the disk. None means never.
 
-    Records never stay in the index longer than their segments: `reindex` could not restore them.
+    Records must leave the index no later than their segments, because `reindex` could not restore them.
     """
 
     index_days: _Positive | None = None
@@ -81,9 +81,7 @@ class RetentionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
 
 
 class BundlesConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """`folder` is the folder of `rosrv-fleet bundle publish`, `timestamp_key` the file of the operator's
-    repository.
-    """
+    """The folder to which `rosrv-fleet bundle publish` copies, and a copy of the repository's timestamp key."""
 
     folder: Path
     timestamp_key: Path
@@ -92,8 +90,8 @@ class BundlesConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
 class FleetConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The configuration of a collector.
 
-    `database` is a libpq connection string; libpq also reads PGPASSWORD and PGPASSFILE. A robot is silent if it
-    was not heard for `silent_seconds`. Without `retention`, nothing is removed.
+    `database` is a libpq connection string; libpq also reads PGPASSWORD and PGPASSFILE. A robot is silent after
+    `silent_seconds` without a sign of life.
     """
 
     data: Path = _DATA
@@ -109,13 +107,12 @@ class FleetConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 
     @property
     def address(self) -> tuple[str, int]:
-        """Raises `ValueError`."""
         host, _, port = self.listen.rpartition(":")
         return host.strip("[]"), int(port)
 
 
 def load_config(path: Path) -> FleetConfig:
-    """Raises `FleetConfigError`."""
+    """Return the configuration with absolute paths, or raise `FleetConfigError`."""
     try:
         fields = yaml.safe_load(path.read_text(encoding="utf-8"))
         if isinstance(fields, dict) and not fields.keys() & {"certificate", "key"}:

@@ -1,11 +1,11 @@
-"""Limit the open connections: of each robot, of each address without a robot's certificate, and of all together.
+"""Limit the open connections of each robot, of each address, and in total.
 
-A connection is counted from `accept` to `close`, for its address (IPv6: its /64 network) until a robot's
-certificate is known.
+A connection counts from `accept` to `close`: for its address (in IPv6 its /64 network) until a robot's certificate is
+verified, then for the robot.
 
-An address is *proven* once a robot or an operator connected from it. All other addresses together get at most
-half of the connections; if there are too few, a connection of the unproven address with most is closed.
-Handshakes and requests without a robot or an operator also have shares.
+An address is *proven* once a robot or an operator has connected from it. All unproven addresses together get at most
+half of the connections. When this half or the total is used up, the unproven address with the most connections loses
+its oldest one. `Shares` limits the rate of handshakes, and of requests without a certificate or token.
 """
 
 import asyncio
@@ -35,11 +35,11 @@ _log = structlog.get_logger()
 
 
 class TooFewFilesError(OSError):
-    """The limit of open files is too small to serve."""
+    """The limit of open files is too low to serve."""
 
 
 class Shares:
-    """The rate of a costly operation that any client may request, by address. Only for one thread."""
+    """The rate at which each address may request a costly operation. Not thread-safe."""
 
     def __init__(self) -> None:
         # By address, unless its whole share is left: the time of its last request, and the rest of its share then.
@@ -48,7 +48,7 @@ class Shares:
         self._all_others = (clock.now(), _ALL_OTHERS_AT_ONCE)
 
     def take(self, owner: str, *, proven: bool) -> bool:
-        """Return False if nothing is left."""
+        """Count one operation, or return False if the address or all unproven addresses have used up their rate."""
         now = clock.now()
         if now - self._looked >= 1.0:
             self._looked = now
@@ -82,10 +82,10 @@ class Shares:
 
 
 class ClientConnections:
-    """The open connections by owner. Only for the event loop's thread."""
+    """The open connections by owner. For the event loop's thread only."""
 
     def __init__(self, limits: Limits) -> None:
-        """Raise the limit of open files as far as permitted. Raises `TooFewFilesError`."""
+        """Raise the limit of open files as far as permitted, or raise `TooFewFilesError` if that is not enough."""
         self._limits = limits
         self._most = permitted_connections(limits.connections)
         self._owners: Counter[str] = Counter()
@@ -153,7 +153,10 @@ class ClientConnections:
         return owner in self._proven
 
     def _made_room(self, owner: str, proven: bool) -> bool:
-        """Close a connection of the unproven address that has most; False if this address would have as many."""
+        """Close the oldest connection of the unproven address with the most.
+
+        Return False if this would only move the shortage to the new connection's own address.
+        """
         most = max(self._others, key=lambda one: len(self._others[one]), default=None)
         if most is None or (not proven and len(self._others[most]) <= len(self._others.get(owner, ())) + 1):
             return False
@@ -203,12 +206,11 @@ class CountedSocket(socket.socket):
 
 
 class CountingListener(socket.socket):
-    """A listening socket that closes each connection above its owner's limit."""
+    """A listening socket that immediately closes connections above a limit."""
 
     table: ClientConnections
 
     def accept(self) -> tuple[socket.socket, Any]:
-        """Raises `ConnectionAbortedError` if the connection was above a limit and is closed."""
         number, address = self._accept()  # type: ignore[attr-defined]  # `socket.accept` also calls it
         connection = CountedSocket(self.family, self.type, self.proto, fileno=number)
         connection.table = self.table
@@ -219,7 +221,6 @@ class CountingListener(socket.socket):
 
 
 def listen(host: str, port: int, table: ClientConnections) -> CountingListener:
-    """Raises `OSError`."""
     (family, kind, protocol, _name, address), *_others = socket.getaddrinfo(
         host or None, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
     )
@@ -243,7 +244,10 @@ def owner_of(address: str) -> str:
 
 
 def permitted_connections(wanted: int) -> int:
-    """Raise the limit of open files; return how many connections it permits. Raises `TooFewFilesError`."""
+    """Raise the limit of open files, and return the number of connections that it permits.
+
+    Raise `TooFewFilesError` if the number is too low to serve.
+    """
     _soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     needed = wanted + _OTHER_FILES
     files = needed if hard == resource.RLIM_INFINITY else min(needed, hard)

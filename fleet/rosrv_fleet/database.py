@@ -1,7 +1,8 @@
 """Connect to PostgreSQL and apply the migrations.
 
-The rows are an index of the stored segments: `rosrv-fleet reindex` rebuilds them. Each migration
-`migrations/NNNN_name.sql` runs once, in order, in one transaction. Applied files never change.
+The tables `segment` and `record` are an index, which `rosrv-fleet reindex` rebuilds from the stored segments. Each
+migration `migrations/NNNN_name.sql` runs once, in order, and all pending ones in one transaction. Applied files never
+change.
 """
 
 from collections.abc import Iterator
@@ -22,10 +23,9 @@ Connection = psycopg.Connection[tuple[Any, ...]]
 
 
 class IndexDatabase:
-    """A bounded pool of connections to the index. Thread-safe."""
+    """A bounded pool of connections. Thread-safe."""
 
     def __init__(self, conninfo: str, *, connections: int, statement_seconds: float) -> None:
-        """Connect in the background after `open`. `statement_seconds` limits the statements of `reading`."""
         self._statement_ms = int(statement_seconds * 1000)
         self._pool: ConnectionPool[Connection] = ConnectionPool(
             conninfo,
@@ -39,7 +39,7 @@ class IndexDatabase:
         )
 
     def open(self) -> None:
-        """A database that is down is not an error."""
+        """Start connecting in the background. The database may be down."""
         self._pool.open(wait=False)
 
     def close(self) -> None:
@@ -47,13 +47,13 @@ class IndexDatabase:
 
     @contextmanager
     def writing(self) -> Iterator[Connection]:
-        """Run a block in one transaction. Raises `psycopg.Error`; then nothing was written."""
+        """Run the block in one transaction. After a `psycopg.Error`, nothing is written."""
         with self._pool.connection() as connection:
             yield connection
 
     @contextmanager
     def reading(self) -> Iterator[Connection]:
-        """Run a block in one read-only transaction with the time limit of searches. Raises `psycopg.Error`."""
+        """Run the block in one read-only transaction with the time limit of searches. Raise `psycopg.Error`."""
         with self._pool.connection() as connection:
             connection.execute("SET TRANSACTION READ ONLY")
             connection.execute("SELECT set_config('statement_timeout', %s, true)", (str(self._statement_ms),))

@@ -1,7 +1,6 @@
-"""Answer requests of robots and operators, and of all other clients within the share of their address.
+"""Limit the requests of clients that are neither robots nor operators, by address.
 
-The door comes before every route, so a login, a wrong token or the health check costs an address its own share
-only.
+The limit is checked before any route, so logins, wrong tokens and health checks count as well.
 """
 
 from starlette.requests import Request
@@ -14,13 +13,13 @@ from rosrv_fleet.tokens import OperatorTokens
 
 
 class Door:
-    """The application behind the shares of addresses."""
+    """An ASGI application that passes on the requests within the limits of `ClientConnections`."""
 
     def __init__(self, app: ASGIApp, table: ClientConnections, tokens: OperatorTokens) -> None:
         self._app, self._table, self._tokens = app, table, tokens
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer 429 above the share. An operator's token proves its address."""
+        """Answer 429 above the limit. The address of a request with a valid token counts as proven."""
         if scope["type"] == "http" and not scope.get("state", {}).get(IS_ROBOT):
             request = Request(scope)
             owner = owner_of(request.client.host if request.client else "127.0.0.1")
@@ -39,7 +38,7 @@ class Door:
         await self._app(scope, receive, send)
 
     def _is_held(self, token: str) -> bool:
-        """If the tokens are unreadable, the route answers with the error."""
+        """Return False if the tokens are unreadable: the route then reports the error."""
         try:
             return self._tokens.holder(token) is not None
         except OSError:

@@ -16,7 +16,7 @@ from appliance.formats.terms import TermsError, role_of
 from appliance.signing.own_certificate import untimely
 
 FIRST = "a"
-"""The name of a robot's first appliance; a robot without a standby has no other."""
+"""The default name of a robot's first appliance."""
 _MOST_APPLIANCES = 2  # that may connect
 _MOST_KNOWN = 100  # with those that were removed
 _NAME = re.compile("[a-z0-9][a-z0-9._-]{0,62}")
@@ -49,7 +49,7 @@ class RobotGroup(NamedTuple):
 class RobotAppliance(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """An appliance of a robot: the raw public key of its log in hexadecimal, and its certificate (PEM).
 
-    An appliance with `removed` (nanoseconds since the epoch) may not connect.
+    An appliance with `removed` (nanoseconds since the epoch) must not connect.
     """
 
     key: str
@@ -71,9 +71,9 @@ class RobotAppliance(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
 
 
 class Robot(RobotAppliance, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """An enrolled robot: its name, its appliance, and with a standby the other one, by name, in `others`.
+    """An enrolled robot. Its inherited fields describe its first `appliance`; `others` has the rest by name.
 
-    A removed appliance stays in `others`, because its segments are still verified. A robot without `group`
+    Removed appliances stay in `others`, because their segments are still verified. A robot without a `group`
     (`SITE/GROUP`) gets no bundles.
     """
 
@@ -102,14 +102,13 @@ class Robot(RobotAppliance, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
 
 def new_appliance(key: bytes, certificate: bytes) -> RobotAppliance:
-    """Raises `EnrolmentError`."""
     return RobotAppliance(
         key=_log_key(key), certificate=valid_certificate(certificate), added=clock.wall_ns()
     )
 
 
 def valid_certificate(pem: bytes) -> str:
-    """Raises `EnrolmentError`, also if the certificate is not valid now: no connection could use it."""
+    """Return the certificate as normalised PEM, or raise `EnrolmentError` if it is invalid now."""
     text = _certificate(pem)
     fault = untimely(text.encode(), "the collector")
     if fault:
@@ -135,7 +134,7 @@ def with_appliance(robot: Robot, appliance: str, made: RobotAppliance) -> Robot:
 
 
 def renewed(robot: Robot, appliance: str, certificate: str) -> Robot:
-    """A removed robot may connect again."""
+    """Return the robot with a new certificate. A removed robot may connect again; its removed appliances may not."""
     if appliance == robot.appliance:
         return msgspec.structs.replace(robot, certificate=certificate, removed=None)
     before = robot.others[appliance]
@@ -177,7 +176,7 @@ def check_name(name: str) -> None:
 
 
 def check_stored(robot: Robot) -> None:
-    """Raise `EnrolmentError` or `ValueError` for a robot that no command has stored."""
+    """Raise `EnrolmentError` or `ValueError` for a robot that cannot have been stored by a command."""
     for one in robot.appliances.values():
         _certificate(one.certificate.encode())
         Ed25519PublicKey.from_public_bytes(one.public_key)
@@ -200,8 +199,10 @@ def _log_key(pem: bytes) -> str:
 
 
 def _certificate(pem: bytes) -> str:
-    """A certificate is parsed only where it is read, and TLS has another parser, so a certificate that passes
-    here must fail nowhere else.
+    """Return a certificate as normalised PEM, or raise `EnrolmentError`.
+
+    Later code reads its dates, and TLS parses it with another parser. All of this is tried here, so that a stored
+    certificate fails nowhere else.
     """
     try:
         found = x509.load_pem_x509_certificate(pem)
@@ -215,7 +216,7 @@ def _certificate(pem: bytes) -> str:
 
 
 def require_own_signature(pem: bytes) -> None:
-    """Raise `EnrolmentError` unless the certificate is signed with its own key, so that its sender has the key."""
+    """Raise `EnrolmentError` unless the certificate is self-signed, which proves that its sender has the key."""
     certificate = x509.load_pem_x509_certificate(_certificate(pem).encode())
     try:
         certificate.verify_directly_issued_by(certificate)

@@ -1,4 +1,4 @@
-"""Name the part that failed in the collector's background work, which continues after every failure."""
+"""Name the part that failed in the collector's background work, which continues after each failure."""
 
 from concurrent.futures.process import BrokenProcessPool
 
@@ -14,7 +14,7 @@ _log = structlog.get_logger()
 
 
 def failure_of(error: Exception) -> str:
-    """Return the part that failed, and the reason. An error of no part is a defect, logged with its traceback."""
+    """Return the failed part and the reason. Any other error is a defect, and logged with its traceback."""
     reason = str(error).strip() or type(error).__name__
     for kind, part in _PARTS:
         if isinstance(error, kind):

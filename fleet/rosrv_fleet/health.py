@@ -1,4 +1,4 @@
-"""Report the state of robots and of the collector, from the store alone."""
+"""Report the state of robots and of the collector without the database."""
 
 import msgspec
 
@@ -13,9 +13,9 @@ _MOST_MARKS = 1000
 
 
 class RobotState(msgspec.Struct, frozen=True, kw_only=True):
-    """A robot: its newest segment (log, number, seconds since it arrived), and its problems.
+    """A robot's newest segment (log, number, seconds since its arrival), and its problems.
 
-    `heard_seconds` is the time since each appliance was heard; the robot is silent if one of them is. `gaps` and
+    `heard_seconds` has the time since each appliance was heard; the robot is silent if one of them is. `gaps` and
     `forks` are counted up to 1,000.
     """
 
@@ -31,7 +31,9 @@ class RobotState(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class FleetHealth(msgspec.Struct, frozen=True, kw_only=True):
-    """`waiting` segments are not in the index yet, counted up to 10,000; `trouble` and `disk` are reasons of
+    """The state of all robots, of the index (`waiting`, `trouble`) and of the disk.
+
+    `waiting` is the number of segments that are not indexed yet, up to 10,000. `trouble` and `disk` are reasons of
     failures.
     """
 
@@ -42,7 +44,6 @@ class FleetHealth(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def health_of(collector: Collector) -> FleetHealth:
-    """Raises `OSError`."""
     store = collector.store
     marked = {
         kind: {robot: len(store.marked(kind, robot, _MOST_MARKS)) for robot in store.robots_with(kind)}

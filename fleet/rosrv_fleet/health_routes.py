@@ -46,7 +46,7 @@ def health_router(collector: Collector) -> APIRouter:
 
 
 class _Source(MetricSource):
-    """The metrics of one scrape."""
+    """The metrics of robots for one scrape."""
 
     def __init__(self, health: FleetHealth) -> None:
         self._health = health
@@ -89,7 +89,7 @@ class _Source(MetricSource):
 
 
 class _RolloutMetrics(MetricSource):
-    """Few labels, so that robots cannot fill Prometheus."""
+    """The metrics of rollouts by group. No label has a robot's text, so robots cannot fill Prometheus."""
 
     def __init__(self, service: BundleService) -> None:
         self._service = service

@@ -16,7 +16,6 @@ _SECONDS = 5.0
 
 
 def check(config: FleetConfig) -> None:
-    """Raises `OSError` if the collector does not answer."""
     context = ssl.create_default_context(cafile=config.certificate)
     context.check_hostname = False  # it may name another address of this machine
     context.verify_flags |= ssl.VERIFY_X509_PARTIAL_CHAIN  # exactly this certificate

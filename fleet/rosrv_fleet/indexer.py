@@ -1,7 +1,7 @@
-"""Copy stored segments to the index. The store works without it; the index catches up later.
+"""Copy stored segments to the index. The store works without it, and the index catches up later.
 
-Robots take turns, with one segment each, and large segments have turns of their own (`LANES`). A segment that
-cannot be indexed is set aside, and tried again every hour.
+Robots take turns with one segment each, and large segments have their own turns (`LANES`). A segment that cannot be
+indexed is set aside, and `retention.py` lets it try again every hour.
 """
 
 import gzip
@@ -30,7 +30,7 @@ from rosrv_fleet.segment_store import FileStamp, SegmentPlace, SegmentStore
 from rosrv_fleet.workers import Workers
 
 LANES = ("pending", "large")
-"""The markers of waiting segments; segments with different markers are indexed in parallel."""
+"""The markers of waiting segments. Each lane is indexed by a separate thread."""
 _IDLE_SECONDS = 1.0
 _PAUSE_SECONDS = 5.0
 _SECOND = 1_000_000_000
@@ -40,7 +40,7 @@ _WHOLE = {"reason", "detail"}  # not in such an index
 _UNREADABLE = (SegmentError, OSError, EOFError, zlib.error, ValueError)
 _UNSTORABLE = (psycopg.DataError, psycopg.IntegrityError, psycopg.errors.ProgramLimitExceeded)
 NOT_INDEXABLE = (*_UNREADABLE, *_UNSTORABLE)
-"""The errors of a segment that the index cannot have; the store keeps it."""
+"""The errors of segments that cannot be indexed, but stay stored."""
 _MOST_KILLED = 3  # workers that one segment may cost
 _PARTITION_LOCK = (
     0x726F7370  # of the transactions that make partitions: the second of two with one name would fail
@@ -49,7 +49,7 @@ _log = structlog.get_logger()
 
 
 class Indexer:
-    """The indexer of a store."""
+    """Indexes the marked segments of a store. `run` is called by one thread for each lane."""
 
     def __init__(self, store: SegmentStore, robots: Robots, workers: Workers, config: FleetConfig) -> None:
         self._store = store
@@ -97,9 +97,9 @@ class Indexer:
                 self._wake[lane].wait(_IDLE_SECONDS)
 
     def step(self, lane: str) -> bool:
-        """Index one segment of each robot; return whether there were any.
+        """Index one segment of each robot, and return whether there were any.
 
-        Raises `psycopg.Error`, `BrokenProcessPool` if a worker was killed, and `OSError`.
+        Raise `psycopg.Error`, `OSError`, and `BrokenProcessPool` if a worker was killed.
         """
         found = False
         killed: BrokenProcessPool | None = None
@@ -149,7 +149,7 @@ class Indexer:
             self._killed.pop(place, None)
 
     def _set_aside(self, place: SegmentPlace, stamp: FileStamp | None, reason: str) -> None:
-        """If the robot has replaced the file since, the segment waits for its next turn."""
+        """Set a segment aside, unless the robot has replaced the file since: then it stays marked for its next turn."""
         if self._store.set_aside(place, stamp):
             self._damage = f"{self._store.path(place)}: {reason}; run 'rosrv-fleet verify {place.robot}'"
             _log.error("a segment is stored, but cannot be indexed", reason=self._damage)
@@ -182,9 +182,9 @@ def index(
     keys: Collection[bytes],
     config: FleetConfig,
 ) -> bool:
-    """Return whether the segment was new and of a day that the index keeps.
+    """Index one segment. Return False if it was already indexed, or of a day that the index no longer keeps.
 
-    Raises `psycopg.Error`; for an unreadable segment `OSError`, `EOFError`, `zlib.error` and `SegmentError`.
+    Raise `psycopg.Error`; for an unreadable segment `OSError`, `EOFError`, `zlib.error` or `SegmentError`.
     """
     received = store.received(place)
     day = datetime.fromtimestamp(received // _SECOND, UTC).date()
@@ -222,8 +222,9 @@ def index(
 
 
 def make_partition(database: IndexDatabase, day: date) -> None:
-    """The partition is attached after it was made, so neither it nor a search waits for the other. Raises
-    `psycopg.Error`.
+    """Make the partition of a day, unless it exists.
+
+    The table is made first and then attached, because that does not block searches or wait for them.
     """
     name = f"record_{day:%Y%m%d}"
     with database.writing() as connection:
@@ -241,7 +242,7 @@ def make_partition(database: IndexDatabase, day: date) -> None:
 
 
 def rows(records: Iterable[StoredColumns], day: str, place: SegmentPlace) -> Iterator[tuple[Any, ...]]:
-    """The index shows NUL as U+2400, and the beginning of names that are too long for it."""
+    """Yield the rows of the index. NUL becomes U+2400, and names that are too long for the index are cut."""
     for columns in records:
         detail = columns.detail.decode()
         who = msgspec.json.decode(columns.detail).get("who")

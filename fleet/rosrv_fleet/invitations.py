@@ -1,10 +1,10 @@
 """Keep the invitations with which robots enrol themselves.
 
-1. Only the output of `add` has a token; its hash is the name of its file. The secret has 256 random bits, so a
-   fast hash is enough.
-2. A token is valid for one request of one robot, which is noted in the file before the robot is enrolled.
-   Repeating it is harmless, also after a crash; any other request with this token is rejected.
-3. Whatever else changes a robot's certificate withdraws its invitations, so no repeated request can undo it.
+1. Only the output of `add` contains the token. Its hash is the file name; as the secret has 256 random bits, a fast
+   hash is enough.
+2. A token is valid for one request. Its hash is stored before the robot is enrolled, so the robot may repeat the
+   request, even after a crash, and any other request with this token is rejected.
+3. Every other change of a robot's certificate withdraws its invitations, so a repeated request cannot undo it.
 """
 
 import hashlib
@@ -26,7 +26,7 @@ _TOKEN = re.compile("rosrv-join_[A-Za-z0-9_-]{43}")
 
 
 class InvalidInvitationError(Exception):
-    """A token is not valid; the text does not reveal why."""
+    """A token is not valid. The message does not reveal the reason."""
 
     def __init__(self) -> None:
         super().__init__(
@@ -49,13 +49,13 @@ class PendingRobot(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
 
 
 class Invitations:
-    """The invitations in a folder, one file each; a running collector immediately accepts new ones."""
+    """The invitations in a folder, one file each. A running collector accepts new ones immediately."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
 
     def add(self, name: str, group: str, seconds: float, appliance: str = "") -> tuple[PendingRobot, str]:
-        """Replace earlier invitations of the appliance; return the token. Raises `OSError`."""
+        """Make an invitation, which replaces earlier ones of the same appliance, and return it with its token."""
         pending = PendingRobot(name=name, group=group, expires=clock.wall() + seconds, appliance=appliance)
         token = f"rosrv-join_{secrets.token_urlsafe(32)}"
         with changing(self._folder), recorded(self._folder.parent, "robot invite", name, group):
@@ -64,7 +64,7 @@ class Invitations:
         return pending, token
 
     def withdraw(self, name: str) -> None:
-        """Remove also used invitations. Raises `OSError`."""
+        """Remove all invitations of a robot, including used ones."""
         with changing(self._folder):
             kept = map(_read, self._folder.glob("*.json"))
             if any(pending is not None and pending.name == name for pending in kept):
@@ -80,10 +80,10 @@ class Invitations:
 
     @contextmanager
     def using(self, token: str, request: bytes) -> Iterator[PendingRobot]:
-        """`request` is set if the request is repeated. If the block raises `EnrolmentError`, another request may
-        use the token.
+        """Mark the token as used by this request, and yield the robot that it invites.
 
-        Raises `InvalidInvitationError` and `OSError`.
+        The yielded `request` is empty unless the robot repeats its request. If the block raises `EnrolmentError`, the
+        token can be used again. Raise `InvalidInvitationError` if the token is not valid.
         """
         digest = hashlib.sha256(request).hexdigest()
         with changing(self._folder):

@@ -1,7 +1,7 @@
-"""Enrol a robot that sends an invitation's token, the key of its log and its certificate.
+"""Enrol robots that send an invitation's token, the key of their log and their certificate.
 
-The certificate's own signature proves that the sender has its private key. A robot that lost the answer repeats
-its request. Every wrong token gets the same answer, and an address that sends many has to wait.
+The certificate is self-signed, which proves that the sender has its private key. Every wrong token gets the same
+answer, and an address that sends many of them has to wait.
 """
 
 from collections import deque
@@ -71,7 +71,7 @@ def _enrol(collector: Collector, invitations: Invitations, given: JoinRequest) -
 
 
 class _WrongTokens:
-    """The addresses that sent wrong tokens within the last minute."""
+    """The wrong tokens of the last minute, by address."""
 
     def __init__(self) -> None:
         self._sent: deque[tuple[float, str]] = deque(maxlen=_MOST_WRONG)

@@ -42,7 +42,8 @@ def answer_to(
 ) -> Iterator[httpx.Response]:
     """Yield the collector's answer before its body is read.
 
-    `not_found` explains the status 404. Prints an error and exits with status 1, also for errors of the block.
+    `not_found` is added to the error for the status 404. An error, including one of the block, is printed, and the
+    command exits with status 1.
     """
     try:
         token = read_given(token_file, 4096).decode().strip()

@@ -1,4 +1,4 @@
-"""Define the options that several commands have."""
+"""Define the options that several commands share."""
 
 from pathlib import Path
 from typing import Annotated

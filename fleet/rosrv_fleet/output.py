@@ -20,7 +20,7 @@ def say_json(fields: dict[str, Any]) -> None:
 
 
 def configure_log() -> None:
-    """Tracebacks never show local variables, because a key or a password might be among them."""
+    """Log to standard error. Tracebacks omit local variables, which might include a key or a password."""
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
     *processors, _renderer = structlog.get_config()["processors"]
     renderer = structlog.dev.ConsoleRenderer(

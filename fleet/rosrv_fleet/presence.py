@@ -1,6 +1,6 @@
-"""Note when each appliance of a robot was last heard: it pushed a segment, or stated that it has nothing to push.
+"""Note when each appliance of a robot was last heard: when it pushed a segment, or reported that it had none to push.
 
-The times are those of files, so that a restart does not make robots silent, and commands see them.
+The times are modification times of files, so they survive restarts, and commands see them.
 """
 
 import contextlib
@@ -14,7 +14,7 @@ _SECOND = 1_000_000_000
 
 
 class RobotPresence:
-    """The times in a folder of the data folder, in seconds since the epoch."""
+    """The times at which robots were heard, in seconds since the epoch."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder

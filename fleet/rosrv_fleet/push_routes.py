@@ -1,4 +1,4 @@
-"""Accept segments from robots: bounded, verified, stored, and only then answered with a signed receipt."""
+"""Accept segments from robots. An upload is bounded, verified, stored, and only then answered with a signed receipt."""
 
 import asyncio
 import math
@@ -89,7 +89,7 @@ def _later(status: int, detail: str, seconds: float) -> HTTPException:
 
 
 class _Cost(msgspec.Struct):
-    """Compressed and uncompressed bytes, and seconds of processor time."""
+    """The cost of an upload: compressed and uncompressed bytes, and seconds of processor time."""
 
     received: int = 0
     unpacked: int = 0
@@ -97,9 +97,9 @@ class _Cost(msgspec.Struct):
 
 
 class _Uploads:
-    """At most one upload runs for each robot, and a limited number in total.
+    """The running uploads: at most one for each robot, and a limited number in total.
 
-    The first try of each segment is short; a segment that takes longer waits among the large segments.
+    The first check of a segment is short. A segment that takes longer waits for its turn with other large ones.
     """
 
     def __init__(self, collector: Collector) -> None:
@@ -110,7 +110,7 @@ class _Uploads:
         self._long = asyncio.Semaphore(LONG_CHECKS)
 
     async def accept(self, request: Request, robot: Robot, place: SegmentPlace) -> SegmentReceipt:
-        """Return the receipt of a segment that is stored, now or before. Raises `HTTPException` and `OSError`."""
+        """Store the segment unless it is stored already, and return its receipt. Raise `HTTPException` or `OSError`."""
         async with self._turn(robot):
             if await asyncio.to_thread(self._collector.store.has, place):
                 return await asyncio.to_thread(self._repeated, place)

@@ -1,7 +1,7 @@
-"""Limit the bytes of each robot in a day, and pause a robot after refused uploads.
+"""Limit the bytes that each robot uploads in a day, and pause a robot after a rejected upload.
 
-The used bytes are on the disk, so that a restart gives no robot a new quota. They decrease evenly to below 0: a
-robot that was off may send its backlog faster.
+The used bytes are on the disk, so a restart gives no robot a new quota. They decrease evenly, and below 0: a robot
+that was off may send its backlog faster.
 """
 
 from collections.abc import Callable
@@ -31,7 +31,7 @@ class OverQuotaError(Exception):
 
 
 class UsedBytes(msgspec.Struct, frozen=True):
-    """The bytes that a robot has used at a time (seconds since the epoch); negative numbers are saved bytes."""
+    """The bytes that a robot has used at `time` (seconds since the epoch). A negative number is a saved quota."""
 
     time: float = 0.0
     received: float = 0.0
@@ -39,7 +39,7 @@ class UsedBytes(msgspec.Struct, frozen=True):
 
 
 class RobotQuotas:
-    """The quotas of robots in a folder. One call for a robot at a time."""
+    """The quotas of robots in a folder. For each robot, only one call may run at a time."""
 
     def __init__(self, folder: Path, limits: Limits, clock: Callable[[], float] = clock.wall) -> None:
         make_folder(folder)
@@ -50,7 +50,6 @@ class RobotQuotas:
         """The end of each robot's last pause."""
 
     def check(self, robot: str) -> None:
-        """Raise `OverQuotaError` while the robot has used its quota, or has to pause. Raises `OSError`."""
         rest = self._pauses.get(robot, 0.0) - clock.now()
         if rest > 0:
             raise OverQuotaError("uploads of this robot were refused: it has to pause", rest)
@@ -68,7 +67,6 @@ class RobotQuotas:
                 )
 
     def charge(self, robot: str, received: int, unpacked: int) -> None:
-        """Count also refused uploads. Raises `OSError`."""
         used = self._used(robot)
         added = msgspec.structs.replace(
             used,

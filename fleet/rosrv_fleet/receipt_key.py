@@ -1,4 +1,4 @@
-"""Keep the collector's own key, which signs receipts."""
+"""Make and read the key with which the collector signs receipts."""
 
 from pathlib import Path
 
@@ -19,7 +19,7 @@ class ReceiptKeyError(Exception):
 
 
 def make_receipt_key(folder: Path) -> Path:
-    """Return the file of the public key, which robots need. Raises `OSError`."""
+    """Make the key if there is none. Return the file of its public key, which robots need."""
     file, public = folder / "receipts.key", folder / "receipts.pub"
     if not file.exists():
         made = Ed25519PrivateKey.generate()
@@ -30,7 +30,6 @@ def make_receipt_key(folder: Path) -> Path:
 
 
 def read_receipt_key(folder: Path) -> Ed25519PrivateKey:
-    """Raises `ReceiptKeyError`."""
     file = folder / "receipts.key"
     try:
         key = load_pem_private_key(file.read_bytes(), password=None)

@@ -9,7 +9,6 @@ _SECONDS = 30.0
 
 
 async def read_body(request: Request, longest: int) -> bytes:
-    """Raises `HTTPException`, also if the client is slow or gone."""
     body = b""
     try:
         async with asyncio.timeout(_SECONDS):

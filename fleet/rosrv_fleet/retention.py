@@ -1,7 +1,7 @@
 """Remove old data: whole partitions of the index, and segments from the beginning of a log.
 
-The last segment of a log stays. The last removed checkpoint is noted before, so that `verify` can prove the rest.
-Afterwards, segments that were set aside wait for the index again, because the reason may have passed.
+The last segment of a log stays. The last removed checkpoint is noted first, so that `verify` can prove the rest. Then
+segments that were set aside wait for the index again, because the reason may have passed.
 """
 
 import threading
@@ -34,7 +34,7 @@ _log = structlog.get_logger()
 
 
 class Pruner:
-    """The retention of a collector."""
+    """Removes old data every hour, in its own thread."""
 
     def __init__(
         self, store: SegmentStore, robots: Robots, database: IndexDatabase, retention: RetentionConfig
@@ -59,7 +59,7 @@ class Pruner:
         self._ending.set()
 
     def step(self) -> None:
-        """A damaged log stays, and is reported. Raises `psycopg.Error` and `OSError`."""
+        """Remove the data that is old now. A damaged log stays and is reported."""
         trouble = None
         if self._retention.segment_days is not None:
             by = f"retention.segment_days: {self._retention.segment_days}"
@@ -85,7 +85,6 @@ class Pruner:
 
 
 def drop_partitions(database: IndexDatabase, oldest: date) -> list[date]:
-    """Return the dropped days. Raises `psycopg.Error`."""
     with database.writing() as connection:
         found = connection.execute(_DAYS, (oldest,))
         days: list[date] = [day for (day,) in found]

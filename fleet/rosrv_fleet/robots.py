@@ -1,7 +1,7 @@
-"""Keep the enrolled robots: one file for each, so that uploads need no database.
+"""Keep the enrolled robots in one file each, so that uploads need no database.
 
-The exact client certificates, the keys of the audit logs' signers and the group are pinned here. A removed robot
-keeps its file, because its segments are still verified.
+A file pins the exact client certificates, the keys of the audit logs' signers, and the group. A removed robot keeps
+its file, because its segments are still verified.
 """
 
 import fcntl
@@ -40,7 +40,6 @@ _log = structlog.get_logger()
 
 @contextmanager
 def changing(folder: Path) -> Iterator[None]:
-    """Exclude other changes of a folder, also those of other processes. Raises `OSError`."""
     make_folder(folder)
     descriptor = os.open(folder, os.O_RDONLY | os.O_CLOEXEC)
     try:
@@ -51,7 +50,7 @@ def changing(folder: Path) -> Iterator[None]:
 
 
 class Robots:
-    """The robots in a folder. Thread-safe; changes by another process are noticed.
+    """The robots in a folder. Thread-safe; changes by other processes are noticed.
 
     The methods raise `EnrolmentError` and `OSError`.
     """
@@ -70,16 +69,13 @@ class Robots:
         return next(iter(self.unreadable.values()), None)
 
     def all(self) -> dict[str, Robot]:
-        """Raise `EnrolmentError` for an unreadable file."""
         known = self.known()
         if self.trouble is not None:
             raise EnrolmentError(self.trouble)
         return known
 
     def known(self) -> dict[str, Robot]:
-        """A damaged file does not stop the others: its robot keeps its last valid state, and `unreadable` has the
-        reason.
-        """
+        """Return the robots. A robot with an unreadable file is in `unreadable`, and keeps its last valid state."""
         with self._lock:
             now = clock.wall_ns()
             changed = self.folder.stat().st_mtime_ns if self.folder.is_dir() else 0
@@ -132,7 +128,6 @@ class Robots:
             return self._keep(robot, "robot add", f"{group} {_detail(robot, own)}".strip())
 
     def renew(self, name: str, certificate: bytes, appliance: str = "") -> Robot:
-        """A removed robot may connect again."""
         with changing(self.folder):
             known = self.named(name)
             own = appliance or (known.appliance if len(known.connecting) < 2 else "")
@@ -157,10 +152,9 @@ class Robots:
         *,
         again: bool = False,
     ) -> Robot:
-        """Enrol a robot or its second appliance, or replace the certificate of an enrolled one with the same log
-        key.
+        """Enrol a robot or its second appliance, or replace the certificate of the appliance with this log key.
 
-        Without a `group`, an enrolled robot keeps its group. `again`: the robot repeats its request.
+        Without a `group`, an enrolled robot keeps its group. With `again`, the robot repeats its request.
         """
         with changing(self.folder):
             known = self.all().get(name)
@@ -170,7 +164,7 @@ class Robots:
             return self._keep(robot, "robot join", _detail(robot, own))
 
     def remove(self, name: str, appliance: str = "") -> None:
-        """Reject the connections of a robot, or of one of its two appliances; its segments stay."""
+        """Reject the connections of a robot, or of one of its two appliances. Its segments stay."""
         with changing(self.folder):
             known = self.named(name)
             if appliance:
@@ -189,7 +183,10 @@ class Robots:
     def _with(
         self, known: Robot | None, name: str, appliance: str, made: RobotAppliance, group: str
     ) -> tuple[Robot, str]:
-        """The log key identifies the appliance: a known appliance gets the certificate. Return also its name."""
+        """Return the robot with the appliance, and the appliance's name.
+
+        The log key identifies an appliance, so a known one gets the new certificate.
+        """
         if appliance:
             check_name(appliance)
         if known is None:
@@ -207,7 +204,7 @@ class Robots:
         return self._unique(moved(robot, group) if group else robot), own or appliance or FIRST
 
     def _unique(self, robot: Robot) -> Robot:
-        """Raise `EnrolmentError` if another robot has its certificate or key, or is unreadable."""
+        """Return the robot. Raise `EnrolmentError` if another one has its certificate or key, or is unreadable."""
         for other in self.all().values():
             if other.name == robot.name:
                 continue

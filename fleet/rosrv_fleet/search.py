@@ -28,11 +28,11 @@ class IndexDownError(Exception):
 
 
 class TooManySearchesError(Exception):
-    """Too many searches run at the same time, with this token or in total."""
+    """The limit of simultaneous searches is reached, for this token or in total."""
 
 
 class Searches:
-    """The database of searches, and the limit of simultaneous searches: half of it with one token. Thread-safe."""
+    """The database of searches, and the limit of simultaneous ones. One token gets at most half of it. Thread-safe."""
 
     def __init__(self, database: IndexDatabase, most: int) -> None:
         self.database = database
@@ -42,7 +42,6 @@ class Searches:
 
     @contextmanager
     def turn(self, token: str) -> Iterator[IndexDatabase]:
-        """Raises `TooManySearchesError`."""
         with self._lock:
             if self._running[token] >= max(1, self._most // 2):
                 raise TooManySearchesError(
@@ -61,9 +60,9 @@ class Searches:
 
 
 class FleetPage(msgspec.Struct, frozen=True, kw_only=True):
-    """The records with `robot` and `log`, newest first, and the cursor of the next page.
+    """A page of records, newest first, each with its `robot` and `log`, and the cursor of the next page.
 
-    A search misses the `waiting` segments, counted up to 1,000.
+    `waiting` segments, counted up to 1,000, are not indexed yet, so the search misses them.
     """
 
     records: list[dict[str, Any]]
@@ -74,7 +73,7 @@ class FleetPage(msgspec.Struct, frozen=True, kw_only=True):
 def search_fleet(
     database: IndexDatabase, wanted: FleetFilter, cursor: str | None, limit: int, waiting: int
 ) -> FleetPage:
-    """Raises `FilterError`, `SearchTooLongError` and `IndexDownError`."""
+    """Return a page of matching records. Raise `FilterError`, `SearchTooLongError` or `IndexDownError`."""
     after = None if cursor is None else parse_cursor(cursor)
     try:
         rows = _rows(database, wanted, after, limit + 1)

@@ -1,4 +1,4 @@
-"""Search over REST: the parameters are the options of `rosrv audit search`, and `robot`."""
+"""Search over REST. The parameters are `robot` and the options of `rosrv audit search`."""
 
 import functools
 from typing import Annotated, Any

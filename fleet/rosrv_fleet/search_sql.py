@@ -1,7 +1,7 @@
 """Translate a search over all robots to SQL. No I/O; each value is a parameter, never a part of the statement.
 
-Pages are ordered by time, robot and id, newest first, and a cursor continues after the last row (keyset). Ids are
-compared within one robot only, so a robot cannot hide records of another with equal ids.
+Pages are ordered by time, robot and id, newest first, and a cursor continues after the last row. Because the robot
+comes before the id, a robot cannot hide another's records behind equal ids.
 """
 
 import base64
@@ -28,14 +28,14 @@ assert _COLUMNS.split(", ")[2:] == list(StoredColumns._fields)  # noqa: S101  `S
 
 
 class FleetFilter(NamedTuple):
-    """The glob `robot` (None: all robots), and the words of one log."""
+    """The glob of the robots' names (None for all robots), and the filter of each log."""
 
     robot: str | None
     record: Filter
 
 
 class SearchCursor(msgspec.Struct, frozen=True, array_like=True):
-    """The last row of a page."""
+    """The key of a page's last row."""
 
     time: int
     robot: str
@@ -46,7 +46,7 @@ class SearchCursor(msgspec.Struct, frozen=True, array_like=True):
 
 
 def parse_cursor(text: str) -> SearchCursor:
-    """Raises `FilterError`."""
+    """Return the cursor. Raise `FilterError` if no search made it."""
     try:
         cursor = msgspec.json.decode(base64.urlsafe_b64decode(text), type=SearchCursor)
     except (binascii.Error, ValueError) as error:
@@ -89,7 +89,7 @@ class _Conditions:
 
 
 def days_statement(record: Filter) -> SearchStatement | None:
-    """Return None without a time range."""
+    """Return the query for the days that a time range covers, or None without a range."""
     if record.since is None and record.until is None:
         return None
     found = _Conditions()
@@ -103,7 +103,7 @@ def days_statement(record: Filter) -> SearchStatement | None:
 def search_statement(
     wanted: FleetFilter, cursor: SearchCursor | None, limit: int, days: list[object] | None
 ) -> SearchStatement:
-    """Return a page in the partitions `days`. Raises `FilterError`."""
+    """Return the query for a page, limited to the partitions `days` unless None. Raise `FilterError`."""
     found, record = _Conditions(), wanted.record
     if days is not None:
         found.add("day = ANY(%s::date[])", days)
@@ -138,7 +138,7 @@ def _escaped(text: str) -> str:
 
 
 def regex_of(glob: str) -> str:
-    """Translate a pattern of SQLite's GLOB to PostgreSQL. Raises `FilterError`."""
+    """Translate a pattern of SQLite's GLOB to a regular expression of PostgreSQL. Raise `FilterError`."""
     parts, at = ["^"], 0
     while at < len(glob):
         sign = glob[at]

@@ -1,4 +1,4 @@
-"""Verify an upload within a limit of processor time. This runs in a worker."""
+"""Verify an upload within a limit of processor time. Runs in a worker."""
 
 import gzip
 import time
@@ -12,7 +12,7 @@ from rosrv_fleet.workers import OutOfTimeError, processor_time
 
 
 class SegmentVerdict(NamedTuple):
-    """The summary of a valid segment, or the error; `late` if the time was too short.
+    """The summary of a valid segment, or the reason why it is invalid. `late`: the time limit was too short.
 
     `size` is the number of uncompressed bytes that were read, `seconds` the processor time.
     """
@@ -25,7 +25,7 @@ class SegmentVerdict(NamedTuple):
 
 
 def check_segment(upload: Path, keys: Collection[bytes], most_bytes: int, seconds: float) -> SegmentVerdict:
-    """`keys` are raw public keys, `seconds` limit the processor time. Raises `OSError`."""
+    """Verify a segment with raw public keys, in at most `seconds` of processor time. Raise `OSError`."""
     begun = time.process_time()
     summary, reason, late = None, "", False
     with gzip.open(upload) as file:

@@ -1,17 +1,20 @@
-"""Store segments as files, before any other part of the collector uses them (docs/reference/fleet.md lists the
-files).
+"""Store segments as files (listed in docs/reference/fleet.md), before any other part of the collector uses them.
 
-A marker KIND/ROBOT/LOG~NUMBER~NAME names a segment: `pending` and `large` ones are not in the index yet; the
-index could not have a `damaged` one, which with `large` is tried again; `gaps` do not follow a stored segment,
-and `forks` have the number of another.
+A marker, an empty file KIND/ROBOT/LOG~NUMBER~NAME, states a fact about a segment:
 
-1. A stored segment was verified, and is on the disk with its folder before `keep` returns. It never changes,
-   unless the disk has damaged it and the robot uploads it again.
-2. Everything that refers to a segment is written before it, and repaired by `keep`, so a crash leaves a segment
-   either stored or absent.
-3. The state that uploads need is in names: no database, and no memory that grows with the number of segments.
-4. Work for one robot does not grow with the data of others, and the names that a robot can choose are limited, so
-   it can neither slow down nor hide others.
+- `pending`, `large`: it is not in the index yet.
+- `damaged`: it could not be indexed; with `large` as well, it is tried again.
+- `gaps`: it does not follow a stored segment.
+- `forks`: another segment has its number.
+
+1. A stored segment was verified, and is on the disk with its folder before `keep` returns. It never changes, unless
+   the disk has damaged it and the robot uploads it again.
+2. Markers are written before their segment, and `keep` repairs them, so a crash leaves a segment either stored or
+   absent.
+3. The state that uploads need is in file names, not in a database, nor in memory that grows with the number of
+   segments.
+4. Work for one robot does not grow with the data of others, and the number of names that a robot can choose is
+   limited. So a robot can neither slow down nor hide others.
 """
 
 import contextlib
@@ -53,18 +56,18 @@ FileStamp = tuple[int, int, int]
 
 
 class StoreFullError(OSError):
-    """The disk has too little free space for more segments."""
+    """The disk has too little free space for another segment."""
 
 
 class NotStorableError(ValueError):
-    """The store cannot keep a valid segment at its place."""
+    """A valid segment cannot be stored: retention removed it before, or a limit of the store is exceeded."""
 
 
 class RemovalNote(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The segments at the beginning of a log that retention removed; the numbers count from its beginning.
+    """The segments that retention removed from the beginning of a log. Its numbers are totals since the beginning.
 
-    `ends` are the headers of the last removed number, `time` is in nanoseconds since the epoch, `by` is the
-    setting.
+    `ends` are the headers of the segments with the last removed number. `time` is in nanoseconds since the epoch;
+    `by` is the setting.
     """
 
     ends: list[SegmentHeader]
@@ -80,7 +83,7 @@ class RemovalNote(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 
 
 class SegmentPlace(NamedTuple):
-    """Robot, log, the number of the segment's checkpoint, and its name."""
+    """The key of a segment: its robot, its log, its checkpoint's number, and its name."""
 
     robot: str
     log: str
@@ -93,13 +96,13 @@ class SegmentPlace(NamedTuple):
 
 
 class SegmentStore:
-    """The segments of a collector, in a folder. Thread-safe; one process writes.
+    """The segments of a collector, in a folder. Thread-safe, but only one process may write.
 
     The methods raise `OSError`.
     """
 
     def __init__(self, folder: Path, reserve: int) -> None:
-        """`reserve` bytes of the disk stay free."""
+        """Open the store, which keeps `reserve` bytes of the disk free."""
         self._folder = folder
         self._reserve = reserve
         self._locks: dict[str, threading.Lock] = {}
@@ -110,7 +113,7 @@ class SegmentStore:
         return self._locks.setdefault(robot, threading.Lock())
 
     def remove_unfinished(self) -> None:
-        """Remove the uploads that a killed collector left; no other may run."""
+        """Remove the uploads that a killed collector left. No other upload may be running."""
         for file in (self._folder / "incoming").iterdir():
             file.unlink()
 
@@ -134,7 +137,7 @@ class SegmentStore:
         return self.path(place).exists() and self._readable(place) is not None
 
     def header(self, place: SegmentPlace) -> SegmentHeader:
-        """Raises `OSError`, `EOFError`, `zlib.error` and `ValueError`."""
+        """Return a segment's header. Raise `OSError`, `EOFError`, `zlib.error` or `ValueError` if it is unreadable."""
         with gzip.open(self.path(place)) as file:
             return msgspec.json.decode(file.readline(LONGEST_LINE), type=SegmentHeader)
 
@@ -146,11 +149,10 @@ class SegmentStore:
             return None
 
     def headers(self, places: list[SegmentPlace]) -> list[SegmentHeader]:
-        """Leave out unreadable headers."""
         return [header for header in map(self._readable, places) if header is not None]
 
     def keep(self, robot: str, upload: Path, summary: SegmentSummary, size: int) -> SegmentPlace:
-        """Return when the upload of `size` uncompressed bytes is on the disk. Raises `NotStorableError`."""
+        """Store an upload of `size` uncompressed bytes durably, or raise `NotStorableError`."""
         header = summary.header
         place = SegmentPlace(robot, header.end.log, header.end.number, summary.name)
         path = self.path(place)
@@ -167,7 +169,6 @@ class SegmentStore:
         return place
 
     def _check(self, place: SegmentPlace) -> None:
-        """Raise `NotStorableError` for a segment that was removed, or is above a limit."""
         note = self.removal(place.robot, place.log)
         if note is not None and place.number <= note.number:
             raise NotStorableError(
@@ -203,7 +204,7 @@ class SegmentStore:
         return None if found is None else (arrived, _place(robot, found))
 
     def settle(self, place: SegmentPlace, header: SegmentHeader) -> None:
-        """Complete the files of a stored segment after a killed collector."""
+        """Complete the work of `keep` that a killed collector left, except for `newest`."""
         with self._lock(place.robot):
             self._settle(place, header)
 
@@ -262,7 +263,7 @@ class SegmentStore:
         )
 
     def numbered(self, robot: str, log: str, number: int) -> list[SegmentPlace]:
-        """Return one segment, unless the robot signed two histories."""
+        """Return the segments with a number: at most one, unless the robot signed two histories."""
         bucket = self.path(SegmentPlace(robot, log, number, "")).parent
         return [one for one in _in_bucket(robot, log, bucket) if one.number == number]
 
@@ -284,7 +285,7 @@ class SegmentStore:
             yield from _in_bucket(robot, log, bucket)
 
     def received(self, place: SegmentPlace) -> int:
-        """Return nanoseconds since the epoch."""
+        """Return the time of arrival in nanoseconds since the epoch."""
         return self.path(place).stat().st_mtime_ns
 
     def marked(self, kind: str, robot: str, most: int) -> list[SegmentPlace]:
@@ -322,7 +323,7 @@ class SegmentStore:
         return found.st_ino, found.st_size, found.st_mtime_ns
 
     def set_aside(self, place: SegmentPlace, stamp: FileStamp | None) -> bool:
-        """Return False if the file with this stamp was replaced since."""
+        """Mark a segment as damaged. Return False if the file with this stamp was replaced since."""
         with self._lock(place.robot):
             if self.stamp(place) != stamp:
                 return False
@@ -332,13 +333,13 @@ class SegmentStore:
             return True
 
     def try_again(self) -> None:
-        """Let the segments that the index could not have wait for it again; they stay reported."""
+        """Let the damaged segments wait for the index again. They stay marked as damaged."""
         for robot in self.robots_with("damaged"):
             for place in self.marked("damaged", robot, sys.maxsize):
                 self._touch("large", place)
 
     def forget_absent(self, place: SegmentPlace) -> None:
-        """Remove the marker of a segment that a crash left unstored; the robot pushes it again."""
+        """Remove the index's markers of a segment if a crash came before it was stored. The robot pushes it again."""
         with self._lock(place.robot):  # `keep` writes the marker before the segment
             if not self.path(place).exists():
                 self.indexed(place)
@@ -353,10 +354,10 @@ class SegmentStore:
         return self._folder / "removed" / robot / f"{log}.json"
 
     def prune(self, robot: str, log: str, before: int, by: str) -> int:
-        """Return the number of removed segments, which arrived before a time (ns).
+        """Remove the segments at the beginning of a log that arrived before a time (ns), and return their number.
 
-        The last segment of a log stays. So does every segment that is not in the index yet, with all later ones.
-        Raises also `EOFError`, `zlib.error` and `ValueError`.
+        A segment that is not in the index yet stays with all later ones, and so does the last segment of a log. Also
+        raise `EOFError`, `zlib.error` and `ValueError`.
         """
         with self._lock(robot):
             note = self.removal(robot, log)
@@ -410,7 +411,7 @@ def _place(robot: str, mark: re.Match[str]) -> SegmentPlace:
 
 
 def _folders(folder: Path) -> list[Path]:
-    """Make no call for each folder, as there may be thousands."""
+    """Return the folders in a folder without a system call for each, as there may be thousands."""
     try:
         with os.scandir(folder) as entries:
             return [folder / name for name in sorted(one.name for one in entries if one.is_dir())]

@@ -1,6 +1,6 @@
 """Serve the collector over TLS. Robots present a client certificate, operators a token.
 
-The trusted certificates are exactly those of the enrolled robots: no authority can certify another robot.
+The trusted certificates are exactly those of the enrolled robots, so no authority can certify another robot.
 """
 
 import asyncio
@@ -29,10 +29,9 @@ _log = structlog.get_logger()
 
 
 class ServerTls:
-    """The TLS context of the server. Certificates of robots that are enrolled later are added to it."""
+    """The TLS context of the server, to which certificates of new robots are added."""
 
     def __init__(self, certificate: str, key: str, robots: Robots) -> None:
-        """Raises `ssl.SSLError` and `OSError`."""
         self.context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
         self.context.minimum_version = ssl.TLSVersion.TLSv1_3
         self.context.load_cert_chain(certificate, key)
@@ -45,7 +44,7 @@ class ServerTls:
         self._fingerprints: set[str] = set()
 
     def reload(self) -> None:
-        """Trust new robots; each request of a removed robot is refused."""
+        """Trust new robots. A removed robot stays trusted by TLS, but each of its requests is rejected."""
         for robot in self._robots.known().values():
             for appliance in robot.connecting.values():
                 if appliance.certificate not in self._trusted:
@@ -97,7 +96,7 @@ def _protocol(header_seconds: float, table: ClientConnections, tls: ServerTls) -
 
 
 class _Server(uvicorn.Server):
-    """The server also watches for enrolled robots, and ends the robots' event streams when it stops."""
+    """A server that also trusts new robots, and ends the robots' event streams when it stops."""
 
     def __init__(self, config: uvicorn.Config, tls: ServerTls, bundles: BundleService | None) -> None:
         super().__init__(config)
@@ -121,7 +120,7 @@ class _Server(uvicorn.Server):
             ending.cancel()
 
     async def _end_idle(self) -> None:
-        """A client that only waits does not answer the end of TLS."""
+        """Cut idle connections, because an idle client does not answer the end of TLS."""
         while True:
             await asyncio.sleep(_CLOSE_SECONDS)
             for connection in list(self.server_state.connections):
@@ -139,7 +138,6 @@ class _Server(uvicorn.Server):
 
 
 def serve(collector: Collector) -> None:
-    """Raises `OSError` and `ssl.SSLError`."""
     config = collector.config
     tls = ServerTls(str(config.certificate), str(config.key), collector.robots)
     tls.reload()

@@ -1,4 +1,4 @@
-"""Make the collector's certificate, and find in it what robots need: an address, and the authority that they trust."""
+"""Make the collector's certificate, and read from it the address and the authority that invitations contain."""
 
 from pathlib import Path
 
@@ -17,7 +17,7 @@ class ServerCertificateError(Exception):
 
 
 def make_certificate(config: FleetConfig, address: str | None) -> bool:
-    """Return whether a key and a certificate were made. Raises `ServerCertificateError` and `OSError`."""
+    """Make a key and a certificate, or return False if there is one. Raise `ServerCertificateError` or `OSError`."""
     if config.certificate.exists():
         named = _addresses(config.certificate)
         if address is not None and address not in named:
@@ -38,7 +38,7 @@ def make_certificate(config: FleetConfig, address: str | None) -> bool:
 
 
 def authority_of(certificate: Path) -> str:
-    """Return the last certificate (PEM), which must sign itself. Raises `ServerCertificateError`."""
+    """Return the last certificate of the file as PEM. Raise `ServerCertificateError` unless it is self-signed."""
     last = x509.load_pem_x509_certificates(certificate.read_bytes())[-1]
     if last.issuer != last.subject:
         raise ServerCertificateError(
@@ -48,7 +48,7 @@ def authority_of(certificate: Path) -> str:
 
 
 def url_of(config: FleetConfig) -> str:
-    """Raises `ServerCertificateError`."""
+    """Return the URL with the certificate's first address, or raise `ServerCertificateError` if it names none."""
     addresses = _addresses(config.certificate)
     if not addresses:
         raise ServerCertificateError(

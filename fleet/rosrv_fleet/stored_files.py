@@ -1,4 +1,4 @@
-"""Read the small files of the data folder: a damaged one is an error with its path, as an unreadable one is."""
+"""Read the small files of the data folder. A damaged one is an `OSError` with its path, like an unreadable one."""
 
 import errno
 from pathlib import Path
@@ -14,7 +14,6 @@ class DamagedFileError(OSError):
 
 
 def read_stored(file: Path, type_: type[T]) -> T:
-    """Raises `OSError`, also if the file is damaged (`DamagedFileError`)."""
     try:
         return msgspec.json.decode(file.read_bytes(), type=type_)
     except ValueError as error:

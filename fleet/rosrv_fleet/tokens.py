@@ -1,4 +1,4 @@
-"""Keep the tokens of operators: only their SHA-256, because a token is random and as long as a key."""
+"""Keep the tokens of operators as SHA-256. A fast hash is enough, because a token has 256 random bits."""
 
 import enum
 import hashlib
@@ -18,7 +18,7 @@ _NAME = re.compile("[a-z0-9][a-z0-9._-]{0,62}")
 
 
 class FleetRole(enum.StrEnum):
-    """The roles of operators, ascending: a role may do what those before it may do."""
+    """The roles of operators. Each includes the rights of those before it."""
 
     VIEWER = "viewer"
     OPERATOR = "operator"
@@ -26,7 +26,7 @@ class FleetRole(enum.StrEnum):
 
 
 class OperatorToken(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """`added` is in nanoseconds since the epoch."""
+    """An operator's token, made at `added` (nanoseconds since the epoch)."""
 
     name: str
     role: FleetRole
@@ -43,7 +43,7 @@ class TokenError(Exception):
 
 
 class OperatorTokens:
-    """The tokens in a file; changes by another process are noticed at once. The methods raise `OSError`."""
+    """The tokens in a file. Changes by another process are noticed immediately. The methods raise `OSError`."""
 
     def __init__(self, file: Path) -> None:
         self._file = file
@@ -59,7 +59,6 @@ class OperatorTokens:
         return next((one for one in self.all() if secrets.compare_digest(one.hash, digest)), None)
 
     def add(self, name: str, role: FleetRole) -> str:
-        """Return the token's text, which is stored nowhere. Raises `TokenError`."""
         if _NAME.fullmatch(name) is None:
             raise TokenError(
                 f"{name!a}: use 1 to 63 small letters, digits, '.', '_', '-'; first a letter or digit"
@@ -78,7 +77,6 @@ class OperatorTokens:
         return text
 
     def remove(self, name: str) -> None:
-        """Raises `TokenError`."""
         with changing(self._file.parent):
             tokens = self.all()
             left = [one for one in tokens if one.name != name]

@@ -1,7 +1,7 @@
 """Prove from the stored segments that no record of a robot is missing.
 
-A log is complete if its segments form one chain. The first segment begins at the log's beginning, after records
-whose removal the signer signed, or after segments that the collector's own retention noted as removed.
+The segments of a complete log form one chain. It starts at the log's beginning, after records whose removal the
+signer signed, or after segments whose removal the collector's own retention noted.
 """
 
 import gzip
@@ -21,8 +21,8 @@ _UNREADABLE = (SegmentError, OSError, EOFError, zlib.error, gzip.BadGzipFile)
 class LogProof(msgspec.Struct, kw_only=True):
     """The result for one log: `records` in `segments` are proven, up to sequence `last`.
 
-    `begins_after` is the last record that retention removed before the collector had it. `missing` is the number
-    of records that no segment has.
+    `begins_after` is the last record that the appliance's retention removed before the collector had it. `removed` is
+    the last record that the collector removed. `missing` is the number of records that no segment has.
     """
 
     robot: str
@@ -46,7 +46,7 @@ def prove(store: SegmentStore, robot: Robot, segment_bytes: int) -> list[LogProo
 
 
 def _prove_log(store: SegmentStore, robot: Robot, log: str, segment_bytes: int) -> LogProof:
-    """Prove a log again if retention has just removed segments: it writes its note before."""
+    """Prove a log. Repeat it if retention, which writes its note first, has removed segments during the proof."""
     for _attempt in range(_MOST_ATTEMPTS):
         note, damage = _removal(store, robot, log)
         proof = _proof_after(note, store, robot, log, segment_bytes)

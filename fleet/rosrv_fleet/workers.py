@@ -1,7 +1,7 @@
-"""Run work on segments in separate processes, with a lower priority than the server.
+"""Run work on segments and evidence in separate processes, with a lower priority than the server.
 
-A segment may need minutes of processor time, and would block the server's interpreter lock. Workers are not a
-sandbox: they have the server's user, and the server unpickles their results.
+The work may take minutes of processor time, in which it would hold the server's interpreter lock. Workers are not a
+sandbox: they run as the server's user, and the server unpickles their results.
 """
 
 import multiprocessing
@@ -25,12 +25,12 @@ _END_SECONDS = 10.0
 class OutOfTimeError(BaseException):
     """The work took more processor time than its limit.
 
-    It is not an `Exception`, because the work may catch each of those and continue.
+    It is not an `Exception`, because the work may catch all exceptions and continue.
     """
 
 
 class Workers:
-    """At most `count` processes, started when there is work. Thread-safe."""
+    """At most `count` processes, started on demand. Thread-safe."""
 
     def __init__(self, count: int) -> None:
         self._count = count
@@ -38,7 +38,7 @@ class Workers:
         self._pool: ProcessPoolExecutor | None = None
 
     def submit(self, work: Callable[P, T], *arguments: P.args, **named: P.kwargs) -> Future[T]:
-        """The future raises `BrokenProcessPool` if a worker was killed; the next work has new ones."""
+        """Run the work in a worker. The future raises `BrokenProcessPool` if that was killed."""
         with self._lock:
             try:
                 return self._present().submit(work, *arguments, **named)
@@ -54,7 +54,7 @@ class Workers:
         return self._pool
 
     def close(self) -> None:
-        """End the workers at once, and wait for their end; unfinished work is lost."""
+        """Kill the workers and wait for their end. Unfinished work is lost."""
         with self._lock:
             if self._pool is not None:
                 self._pool.shutdown(wait=False, cancel_futures=True)
@@ -82,7 +82,7 @@ def _end_with_server() -> None:
 
 @contextmanager
 def processor_time(seconds: float) -> Iterator[None]:
-    """Raise `OutOfTimeError` when a block has used this processor time, in seconds. Only in a worker."""
+    """Raise `OutOfTimeError` when the block has used `seconds` of processor time. Only in a worker."""
 
     def late(_signal: int, _frame: object) -> None:
         raise OutOfTimeError(f"it took more than {seconds:g} s of processor time")
@@ -98,7 +98,7 @@ def processor_time(seconds: float) -> Iterator[None]:
 
 @contextmanager
 def memory(most: int) -> Iterator[None]:
-    """Raise `MemoryError` when a block needs more than `most` further bytes. Only in a worker."""
+    """Raise `MemoryError` when the block needs more than `most` additional bytes. Only in a worker."""
     soft, hard = resource.getrlimit(resource.RLIMIT_AS)
     used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     limits = [used + most, *(limit for limit in (soft, hard) if limit != resource.RLIM_INFINITY)]

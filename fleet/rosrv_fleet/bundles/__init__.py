@@ -1,1 +1,1 @@
-"""Bundles: the operator's repository with its offline keys, and what the collector publishes of it."""
+"""Bundles: the operator's repository, signed with offline keys, and its publication by the collector."""

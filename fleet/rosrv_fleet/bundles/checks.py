@@ -1,4 +1,4 @@
-"""Check a bundle's contents on the operator's machine, with those checks of robots that need no robot."""
+"""Check a bundle on the operator's machine as robots do, except for the checks that need a robot."""
 
 import ipaddress
 
@@ -11,8 +11,9 @@ from appliance.specifications.specification_files import Sources, Specifications
 
 
 def findings_of(contents: BundleContents) -> list[str]:
-    """The policy may name hosts only if hosts.yaml declares their addresses. Robots check the signatures of the
-    site.
+    """Return the errors of a bundle's contents.
+
+    The policy may only name hosts whose addresses hosts.yaml declares. The site's signatures are left to the robots.
     """
     found: list[str] = []
     hosts = {}

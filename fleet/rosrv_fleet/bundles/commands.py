@@ -189,8 +189,6 @@ def publish(
 
 @contextmanager
 def _opened(repository: Path, keys: Path | None, passphrase_file: Path | None) -> Iterator[BundleRepository]:
-    """Print an error and exit with status 1 instead of raising it."""
-
     def passphrase(key: Path) -> str:
         if passphrase_file is not None:
             return read_given(passphrase_file, 4096).decode().partition("\n")[0]

@@ -1,4 +1,4 @@
-"""Keep the signing keys of bundles as encrypted PEM files: one Ed25519 key each, named by role and key id."""
+"""Keep the signing keys of bundles as encrypted PEM files, each with one Ed25519 key, named by role and key id."""
 
 import re
 from collections.abc import Callable, Collection
@@ -26,7 +26,7 @@ class KeyFileError(Exception):
 
 
 class KeyFolder:
-    """The folder of key files; each passphrase is asked once."""
+    """The folder of key files. It asks for each passphrase once."""
 
     def __init__(self, folder: Path, passphrase: Callable[[Path], str]) -> None:
         self.folder = folder
@@ -34,7 +34,6 @@ class KeyFolder:
         self._signers: dict[Path, CryptoSigner] = {}
 
     def make(self, role: str) -> Key:
-        """Return the public half. Raises `KeyFileError`."""
         signer = CryptoSigner.generate_ed25519()
         path = self.folder / f"{role}.{signer.public_key.keyid[:_ID_DIGITS]}.pem"
         passphrase = self._passphrase(path)
@@ -46,7 +45,7 @@ class KeyFolder:
         return signer.public_key
 
     def signers(self, role: str, keyids: Collection[str]) -> list[CryptoSigner]:
-        """Raises `KeyFileError` if there is no key with these ids."""
+        """Return the role's keys with these ids. Raise `KeyFileError` if there are none."""
         found = []
         for path in sorted(self.folder.glob("*.pem")):
             name = _FILE.fullmatch(path.name)
@@ -83,7 +82,6 @@ def make_online_key(path: Path) -> Key:
 
 
 def load_online_key(path: Path) -> CryptoSigner:
-    """Raises `KeyFileError`."""
     try:
         key = load_pem_private_key(path.read_bytes(), None)
     except (OSError, ValueError, TypeError) as error:

@@ -1,6 +1,6 @@
-"""Read what the operator published, check that it is complete, and sign the timestamp that names it.
+"""Verify the operator's publication, and sign the timestamp that makes it visible to robots.
 
-Robots never see half of a publication: a snapshot is named only if everything in it is there and verifies.
+The timestamp names a snapshot only if every file in it is present and verifies, so no robot sees half a publication.
 """
 
 import datetime
@@ -21,18 +21,18 @@ S = TypeVar("S", Root, Snapshot, Targets)
 _ROOT = re.compile(r"([1-9][0-9]*)\.root\.json")
 _SNAPSHOT = re.compile(r"([1-9][0-9]*)\.snapshot\.json")
 LIFETIME = datetime.timedelta(hours=24)
-"""Robots notice within this time that newer metadata are withheld."""
+"""The lifetime of a timestamp. After it, robots notice that newer metadata are withheld."""
 
 _RENEW = datetime.timedelta(hours=8)  # the age at which a timestamp is signed again
 
 
 class PublicationError(Exception):
-    """The published files are not complete or not valid."""
+    """The published files are incomplete or invalid."""
 
 
 @dataclass(frozen=True, slots=True)
 class PublishedBundles:
-    """A complete publication: the root, the snapshot's version, and the signed bundles with their terms."""
+    """A complete publication: the root, the snapshot's version, the terms of each bundle, and the earliest expiry."""
 
     root: Root
     snapshot: int
@@ -41,7 +41,7 @@ class PublishedBundles:
 
 
 def read_publication(folder: Path) -> PublishedBundles:
-    """Raises `PublicationError` if the newest publication does not verify."""
+    """Return the newest publication, or raise `PublicationError` if it does not verify."""
     metadata = folder / "metadata"
     try:
         root = _load(metadata / f"{_newest(metadata, _ROOT)}.root.json", Root)
@@ -70,9 +70,10 @@ def read_publication(folder: Path) -> PublishedBundles:
 def next_timestamp(
     publication: PublishedBundles, last: bytes | None, key: CryptoSigner, now: datetime.datetime
 ) -> bytes | None:
-    """Return None if the last timestamp is good. Raises `PublicationError`.
+    """Return a new timestamp, or None if the last one still serves.
 
-    Versions follow the clock, so a collector that lost its state still signs later versions than before.
+    The version is at least the time in seconds, so a collector that lost its state still signs higher versions than
+    before. Raise `PublicationError` if the key is not the root's, or if robots already know a newer snapshot.
     """
     keyids = publication.root.roles["timestamp"].keyids
     if key.public_key.keyid not in keyids:
@@ -98,7 +99,7 @@ def next_timestamp(
 
 
 def _signed_before(last: bytes | None, root: Root) -> Timestamp | None:
-    """Return None if the present root does not accept the timestamp, so that robots also discard it."""
+    """Return None also if the present root does not accept the timestamp: robots then discard it as well."""
     if last is None:
         return None
     try:

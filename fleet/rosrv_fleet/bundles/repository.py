@@ -1,11 +1,11 @@
 """Edit the operator's repository of bundles: delegate groups, add and withdraw bundles, sign, rotate keys.
 
-Each group has a delegated role with a path pattern of its own, so the holder of its key can sign for no other
-group. Only the timestamp is online, because it is signed every few hours: a stolen timestamp key can freeze the
-fleet until the snapshot expires, but it cannot mix versions.
+Each group has a delegated role with its own path pattern, so the holder of its key cannot sign for another group.
+Only the timestamp key is online, because it signs every few hours. A thief of that key can freeze the fleet until the
+snapshot expires, but cannot mix versions.
 
-Metadata files are never changed: each new version is a new file, and a snapshot lists only files on the disk. So
-a killed command leaves the former state, and the next one completes it.
+Metadata files never change: each version is a new file, and the snapshot is written last. So a killed command leaves
+the former state, and the next command completes it.
 """
 
 import datetime
@@ -44,12 +44,12 @@ def _utc_now() -> datetime.datetime:
 
 
 class RepositoryError(Exception):
-    """The repository cannot be changed like this."""
+    """The repository does not allow this change."""
 
 
 @dataclass(frozen=True, slots=True)
 class Lifetimes:
-    """The days after which metadata expire."""
+    """The number of days until metadata of each kind expire."""
 
     root: int = 365
     targets: int = 180
@@ -58,7 +58,7 @@ class Lifetimes:
 
 
 class BundleRepository:
-    """A repository in a folder, with the keys that sign it; the methods raise `RepositoryError`."""
+    """A repository in a folder, and the keys that sign it. Its methods raise `RepositoryError`."""
 
     def __init__(
         self,
@@ -110,7 +110,7 @@ class BundleRepository:
     ) -> BundlePath:
         """Sign a bundle of these files as the next version of a group, and withdraw all but the newest `keep`.
 
-        Raises also `TermsError` and `BundleArchiveError`.
+        Also raise `TermsError` and `BundleArchiveError`.
         """
         role = self._require_role(site, group)
         listed = self._open(role, Targets)
@@ -144,10 +144,10 @@ class BundleRepository:
         self.snapshot()
 
     def rotate(self, role: str) -> None:
-        """Replace the key of a role; a new root is signed with the old root key and the new one.
+        """Replace the key of a role.
 
-        If the snapshot or timestamp key is replaced, robots discard the old key's metadata, so they recover from
-        versions that a thief set too high.
+        A new root key is signed with the old one. After a new snapshot or timestamp key, robots discard the metadata
+        of the old key, and so recover from versions that a thief set too high.
         """
         if role in _TOP:
             before = self._open("root", Root)
@@ -204,7 +204,7 @@ class BundleRepository:
         self._save("snapshot", snapshot)
 
     def _save_root(self, root: Root, before: Root) -> None:
-        """Write the root also as the robots' trusted root, signed with its own keys and those of the former one."""
+        """Sign a root with its own keys and those of the root before it. Write `root.json` for new robots."""
         keyids = {*before.roles["root"].keyids, *root.roles["root"].keyids}
         path = self._save("root", root, keyids)
         write_whole(self.folder / "root.json", path.read_bytes(), 0o644)
@@ -259,6 +259,6 @@ class BundleRepository:
         return [BundlePath.parse(name).version for name in listed.targets]
 
     def _last_version(self, site: str, group: str) -> int:
-        """Count also versions that were withdrawn."""
+        """Return the highest version, including withdrawn ones, so that no version is used twice."""
         names = (path.name.split(".")[1] for path in (self.targets / site / group).glob("*.tar"))
         return max(map(int, names), default=0)

@@ -1,6 +1,6 @@
-"""Serve bundles to robots: metadata and targets as immutable files, their selection, events, and their reports.
+"""Serve bundles to robots as immutable files, with selections and their events, and receive the robots' reports.
 
-A robot gets targets, selections and events only of its own group, which was pinned at the enrolment.
+A robot gets targets, selections and events only of the group in which it is enrolled.
 """
 
 import asyncio
@@ -35,14 +35,13 @@ Identify = Callable[[Request], Robot | Awaitable[Robot]]
 
 
 class EventStreams:
-    """The open event streams of robots, at most `_MOST_LISTENERS` for each."""
+    """The open event streams, at most `_MOST_LISTENERS` for each robot."""
 
     def __init__(self, service: BundleService) -> None:
         self._service = service
         self._open: Counter[str] = Counter()
 
     def open(self, robot: str, group: RobotGroup) -> AsyncIterator[bytes]:
-        """Raises `HTTPException` if the robot has too many streams."""
         if self._open[robot] >= _MOST_LISTENERS:
             raise HTTPException(429, "this robot has too many event streams")
         return self._stream(robot, group)
@@ -71,13 +70,13 @@ class EventStreams:
 
 
 class OwnGroups:
-    """The groups of robots, as enrolled. A robot that asks for another group is logged once."""
+    """Compares the group that a robot claims with its enrolled group. Logs a wrong claim once."""
 
     def __init__(self) -> None:
         self._logged: set[str] = set()
 
     def of(self, robot: Robot, site: str, group: str) -> RobotGroup:
-        """Raises `HTTPException` (403) if the robot claims another group."""
+        """Return the robot's group. Raise `HTTPException` (403) if it claims another one."""
         claimed = f"{site[:80]}/{group[:80]}"
         if robot.group == claimed:
             self._logged.discard(robot.name)

@@ -1,1 +1,1 @@
-"""The collector's console: pages that are rendered on the server. No script runs in them."""
+"""The collector's console: pages rendered on the server, without scripts."""

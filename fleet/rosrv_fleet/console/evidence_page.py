@@ -1,4 +1,4 @@
-"""The page of the evidence bundles, which only the command `rosrv-fleet evidence` adds."""
+"""The page that lists evidence bundles."""
 
 from collections.abc import Mapping
 

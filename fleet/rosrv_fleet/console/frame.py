@@ -1,4 +1,7 @@
-"""The frame of every page of the console, and its parts. Every text is escaped here or by its caller."""
+"""The frame of each page of the console, and its elements.
+
+Functions escape the strings that they get, except `body`, `rows`, `cells`, and labels that are constants.
+"""
 
 import datetime
 from collections.abc import Iterable, Sequence
@@ -25,7 +28,7 @@ Tone = Literal["good", "bad", "warn", "plain"]
 
 
 class Column(NamedTuple):
-    """A column of a table; numbers are aligned to the right."""
+    """A column of a table. A number is aligned to the right."""
 
     name: str
     number: bool = False
@@ -94,7 +97,7 @@ def row(columns: Sequence[Column], cells: Sequence[str]) -> str:
 
 
 def link(path: str, label: str, **parameters: str) -> str:
-    """Leave out empty parameters."""
+    """Return a link with the parameters that are not empty."""
     given = {name: value for name, value in parameters.items() if value}
     return f'<a href="{escape(path + ("?" + urlencode(given) if given else ""))}">{text(label)}</a>'
 

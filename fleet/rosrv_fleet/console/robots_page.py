@@ -1,4 +1,4 @@
-"""The page of the robots: what is wrong first, a filter, and pages of a hundred rows."""
+"""The page of the robots, problems first, with a filter and a hundred rows a page."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -39,11 +39,11 @@ _TONES: dict[str, Tone] = {
 }
 _RENEWAL_SECONDS = 30 * 86_400.0
 _PROBLEMS = ("fork", "gap", "unhealthy", "silent", "certificate ends", "never seen", "behind")
-"""The words of problems, the worst first."""
+"""The words for problems, the worst first."""
 
 
 class RobotRow(NamedTuple):
-    """A robot with the state of its log, its group, and its bundle (None: the collector has no bundles for it)."""
+    """A robot with the state of its log, its group and its bundle. `condition` is None if it can have no bundles."""
 
     state: RobotState
     group: str
@@ -67,7 +67,6 @@ class RobotRow(NamedTuple):
 
     @property
     def rank(self) -> tuple[int, str]:
-        """The worst problem is first."""
         worst = min(
             (_PROBLEMS.index(word) for word in self.words if word in _PROBLEMS), default=len(_PROBLEMS)
         )
@@ -96,7 +95,6 @@ def _bundles(service: BundleService) -> dict[str, tuple[RobotCondition, str]]:
 
 
 def robots_page(collector: Collector, asked: Mapping[str, str]) -> str:
-    """Raises `OSError`."""
     health = health_of(collector)
     rows = robot_rows(collector, health)
     shown = [one for one in rows if _wanted(one, asked)]

@@ -1,4 +1,4 @@
-"""The pages of rollouts: all groups, one group, and the confirmations of stop and revert."""
+"""The pages of rollouts: all groups, one group, and the confirmation of a stop or revert."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal

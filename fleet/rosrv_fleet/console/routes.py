@@ -1,7 +1,7 @@
-"""The routes of the console: log in, look, and stop or revert a rollout after a confirmation.
+"""The routes of the console: log in, show the pages, and stop or revert a rollout after a confirmation.
 
-A change needs the operator's role, the cookie (which browsers send from this site only), and an `Origin` of this
-site, if there is one.
+A change requires the role operator and the cookie, which browsers send only from this site. An `Origin` of another
+site is rejected.
 """
 
 from collections.abc import Callable
@@ -177,7 +177,7 @@ def _forbidden(holder: OperatorToken) -> Response:
 
 
 def _require_own_origin(request: Request) -> None:
-    """Browsers send `Origin` with every form; other clients need not."""
+    """Raise `HTTPException` (403) for a form of another site. Clients other than browsers may omit `Origin`."""
     own = f"https://{request.headers.get('host', '')}"
     if request.headers.get("origin", own) != own:
         raise HTTPException(403, "this form was sent by another site")

@@ -1,4 +1,4 @@
-"""The page of the search over all robots."""
+"""The page that searches the records of all robots."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any

@@ -1,1 +1,1 @@
-"""Evidence bundles of robots, which operators carry to the collector: verified, stored, listed and returned."""
+"""Evidence bundles of robots: operators add them, and the collector verifies, stores, lists and returns them."""

@@ -1,7 +1,6 @@
-"""Verify an evidence bundle with the appliance's verifier and a robot's pinned key. This runs in a worker.
+"""Verify an evidence bundle with the robot's pinned keys. Runs in a worker.
 
-The robot's collected segments are the checkpoints that were kept elsewhere: a bundle of a rewritten log is
-invalid.
+The bundle is also compared with the robot's collected segments, so a bundle of a rewritten log is invalid.
 """
 
 import contextlib
@@ -32,7 +31,7 @@ _Time = Annotated[int, msgspec.Meta(ge=0, le=(1 << 63) - 1)]
 
 
 class _Manifest(msgspec.Struct, frozen=True):
-    """The part of a bundle's manifest that is shown; the robot may have signed anything."""
+    """The displayed part of a bundle's manifest. Its values are bounded, because a robot may sign anything."""
 
     log: Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{32}$")]
     since: _Time
@@ -46,11 +45,11 @@ class EvidenceError(Exception):
 
 
 class _OtherKeyError(Exception):
-    """The message is the bundle's key in hexadecimal, which is not the robot's."""
+    """The bundle has a key that is not the robot's. The message is the key in hexadecimal."""
 
 
 class _RobotVerifier(Verifier):
-    """Runs no other program, which would have no limits."""
+    """The appliance's verifier without its calls of other programs, which would have no limits."""
 
     def __init__(self, bundle: Path, robot: Robot, store: SegmentStore) -> None:
         self._robot, self._store = robot, store
@@ -79,7 +78,7 @@ class _RobotVerifier(Verifier):
 
 
 def check_evidence(config: FleetConfig, bundle: Path, robot: Robot) -> EvidenceContent:
-    """Raises `EvidenceError` and `OSError`."""
+    """Return the verified content. Raise `EvidenceError` if it is invalid, and `OSError`."""
     store = SegmentStore(config.data, config.limits.reserve_bytes)
     try:
         with memory(_MEMORY), processor_time(config.evidence.check_seconds):

@@ -1,4 +1,4 @@
-"""Add, list and return evidence bundles over REST: bounded, verified, and only then stored."""
+"""Add, list and return evidence bundles over REST. An upload is bounded, verified, and only then stored."""
 
 import asyncio
 import hashlib
@@ -31,7 +31,7 @@ RobotName = Annotated[str, Query(max_length=63)]
 
 
 def evidence_router(collector: Collector) -> APIRouter:
-    """Viewers list bundles; their content is for operators, as on the appliance."""
+    """Return the routes. Viewers may list bundles; their content is for operators, as on the appliance."""
     router = APIRouter(prefix="/v1/evidence")
     additions = _Additions(collector)
     viewer = [Depends(holder_of(collector.tokens, FleetRole.VIEWER))]
@@ -74,7 +74,7 @@ def evidence_router(collector: Collector) -> APIRouter:
 
 
 class _Additions:
-    """The running additions: few uploads at a time, and one verification."""
+    """The running additions: a few uploads at the same time, but one verification."""
 
     def __init__(self, collector: Collector) -> None:
         self._collector = collector
@@ -83,7 +83,7 @@ class _Additions:
         self._turn = asyncio.Lock()
 
     async def add(self, request: Request, robot: Robot, who: str) -> tuple[StoredEvidence, bool]:
-        """Return the stored bundle, and whether it is new. Raises `HTTPException` and `OSError`."""
+        """Return the stored bundle, and whether it is new. Raise `HTTPException` or `OSError`."""
         if self._uploads.locked():
             raise _later(f"{_MOST_UPLOADS} evidence bundles are being added", 60)
         async with self._uploads:
@@ -97,7 +97,7 @@ class _Additions:
                 await asyncio.to_thread(shutil.rmtree, upload, ignore_errors=True)
 
     async def _receive(self, request: Request, bundle: Path) -> None:
-        """Segments have the last reserve of the disk to themselves."""
+        """Write the upload to a file. Evidence leaves twice the reserve free, so that it cannot keep out segments."""
         most, seconds = self._limits.bundle_bytes, self._limits.upload_seconds
         reserve = self._collector.config.limits.reserve_bytes
         try:

@@ -1,7 +1,7 @@
-"""Store verified evidence bundles as files: `evidence/ID`, where the id is the bundle's SHA-256.
+"""Store verified evidence bundles as files in `evidence/ID`, where the id is the bundle's SHA-256.
 
-A folder gets its id in one step, when both files are on the disk. Uploads that are not verified, and bundles
-while they are removed, are in `evidence/incoming`.
+A folder is renamed to its id when both of its files are on the disk. Until then, and while a bundle is removed, it is
+in `evidence/incoming`.
 """
 
 import re
@@ -28,10 +28,10 @@ _log = structlog.get_logger()
 
 
 class EvidenceContent(msgspec.Struct, frozen=True, kw_only=True):
-    """The verified content of an evidence bundle; times are nanoseconds since the epoch.
+    """The verified content of an evidence bundle. Times are nanoseconds since the epoch.
 
-    `collected` of its `checkpoints` are also in the robot's collected segments. `unproven` lists facts that the
-    robot's log does not prove.
+    `collected` is the number of its `checkpoints` that are also in the robot's collected segments. `unproven` lists
+    facts that the robot's log does not prove.
     """
 
     log: str
@@ -45,7 +45,7 @@ class EvidenceContent(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class StoredEvidence(EvidenceContent, frozen=True, kw_only=True):
-    """A stored bundle of `robot`, and the operator (`by`) who added it."""
+    """A stored bundle of `robot`, added by the operator `by`."""
 
     id: str
     robot: str
@@ -59,7 +59,7 @@ class StoredEvidence(EvidenceContent, frozen=True, kw_only=True):
 
 
 class EvidenceStore:
-    """The evidence bundles in a folder. Thread-safe; one process adds."""
+    """The evidence bundles in a folder. Thread-safe, but only one process may add bundles."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -68,16 +68,15 @@ class EvidenceStore:
         make_folder(folder / "incoming")
 
     def remove_unfinished(self) -> None:
-        """Remove the uploads that a killed collector left; no other may run."""
         for upload in (self._folder / "incoming").iterdir():
             shutil.rmtree(upload)
 
     def incoming(self) -> Path:
-        """Return a new folder for the file `BUNDLE`; the caller removes it unless it was kept."""
+        """Return a new folder for the file `BUNDLE`. The caller removes it unless `keep` was called."""
         return Path(tempfile.mkdtemp(dir=self._folder / "incoming"))
 
     def keep(self, upload: Path, about: StoredEvidence) -> None:
-        """Record the act; when this returns, the upload is on the disk. Raises `OSError`."""
+        """Record the act and store the bundle durably."""
         bundle = upload / BUNDLE
         bundle.chmod(0o400)
         sync(bundle)
@@ -87,7 +86,6 @@ class EvidenceStore:
             sync(self._folder)
 
     def remove(self, evidence: str) -> StoredEvidence | None:
-        """Record the act; return None for an unknown ID. Raises as `get` does."""
         about = self.get(evidence) if _ID.fullmatch(evidence) else None
         if about is not None:
             removed = self.incoming()  # a killed command leaves it there
@@ -101,14 +99,13 @@ class EvidenceStore:
         return self._folder / evidence / BUNDLE
 
     def get(self, evidence: str) -> StoredEvidence | None:
-        """Raises `OSError`."""
         try:
             return read_stored(self._folder / evidence / _ABOUT, StoredEvidence)
         except FileNotFoundError:
             return None
 
     def all(self, robot: str = "") -> list[StoredEvidence]:
-        """Return the latest bundle first. A damaged description is left out, and logged once. Raises `OSError`."""
+        """Return the bundles of a robot or of all, the latest first. Damaged ones are left out, and logged once."""
         names = {path.name for path in self._folder.iterdir() if _ID.fullmatch(path.name)}
         for name in names - self._known.keys():
             try:

@@ -1,1 +1,1 @@
-"""Rollouts: which robot gets which signed bundle, in rings that advance only while the robots stay healthy."""
+"""Rollouts bring signed bundles to robots, in rings that open only while the robots stay healthy."""

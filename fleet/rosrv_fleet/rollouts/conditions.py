@@ -1,4 +1,4 @@
-"""Determine the condition of each robot of a group: whether it has the bundle that it should have. No I/O."""
+"""Determine whether each robot of a group has the bundle that it should have. No I/O."""
 
 import enum
 from collections.abc import Mapping
@@ -8,7 +8,7 @@ from rosrv_fleet.rollouts.machine import BundleRollout, HealthGates, RobotSeen, 
 
 
 class ConditionKind(enum.StrEnum):
-    """The conditions of a robot, the most severe first. A robot has one of them."""
+    """The conditions of a robot, the most severe first."""
 
     UNHEALTHY = "unhealthy"
     SILENT = "silent"
@@ -19,7 +19,7 @@ class ConditionKind(enum.StrEnum):
 
 
 class RobotCondition(NamedTuple):
-    """The reason is empty if the condition needs none."""
+    """A robot's condition, with the reason if it needs one."""
 
     kind: ConditionKind
     why: str = ""
@@ -28,7 +28,10 @@ class RobotCondition(NamedTuple):
 def conditions(
     rollout: BundleRollout | None, robots: Mapping[str, RobotSeen], now: float
 ) -> dict[str, RobotCondition]:
-    """`rollout` is the group's last one. A report about the bundle of a reverted rollout no longer counts."""
+    """Return the condition of each robot. `rollout` is the group's last one.
+
+    After a revert, reports about the reverted bundle no longer count.
+    """
     sick = {} if rollout is None or rollout.state == "reverted" else unhealthy(rollout, robots, now)
     silent = (HealthGates() if rollout is None else rollout.gates).silent_seconds
     found = {}

@@ -1,10 +1,9 @@
-"""Advance a rollout from ring to ring while its robots stay healthy, and stop it when they do not. No I/O, no
-clock.
+"""Advance a rollout from ring to ring while its robots stay healthy, and otherwise stop it. No I/O, no clock.
 
 1. A robot gets the bundle only if its ring is open, and no ring opens before its signed time.
-2. The next ring opens only after enough robots of all open rings have had the bundle in force, healthy, for a
-   time without interruption.
-3. If too many robots of an open ring are unhealthy, the rollout stops, and never starts again automatically.
+2. The next ring opens only after enough robots of all open rings have had the bundle in force, and been healthy, for
+   a time without interruption.
+3. If too many robots of an open ring are unhealthy, the rollout stops, and never continues.
 4. Every selection is the bundle of the rollout or the one before it.
 5. A robot that has left the group does not count, but a ring that has lost all its robots stops the rollout.
 """
@@ -20,7 +19,7 @@ RolloutState = Literal["running", "stopped", "reverted", "done"]
 
 
 class RobotSeen(msgspec.Struct, frozen=True):
-    """The last report of a robot, at `seen` (seconds since the epoch; 0: it never reported)."""
+    """The last report of a robot, which arrived at `seen` (seconds since the epoch), or 0 if it never reported."""
 
     seen: float = 0.0
     in_force: str = ""
@@ -34,7 +33,7 @@ class RobotSeen(msgspec.Struct, frozen=True):
 
 
 class HealthGates(msgspec.Struct, frozen=True):
-    """When a ring is healthy (docs/fleet-bundles.md). Shares are of the ring's robots, times in seconds."""
+    """The conditions for a healthy ring (docs/fleet-bundles.md): shares of the ring's robots, and times in seconds."""
 
     share: float = 0.95
     tolerance: float = 0.05
@@ -46,14 +45,14 @@ class HealthGates(msgspec.Struct, frozen=True):
 
 
 class Baseline(msgspec.Struct, frozen=True):
-    """A robot's health when its ring opened."""
+    """A robot's numbers when its ring opened: denials a minute, and failing monitors."""
 
     denials: int
     failing: int
 
 
 class OperatorAct(msgspec.Struct, frozen=True):
-    """`who` is the name of a token, the time is in seconds since the epoch."""
+    """An act of an operator: its time in seconds since the epoch, and the name of the token."""
 
     at: float
     who: str
@@ -61,11 +60,11 @@ class OperatorAct(msgspec.Struct, frozen=True):
 
 
 class BundleRollout(msgspec.Struct, frozen=True):
-    """A rollout of the bundle `path` over the bundle `before` (empty: none).
+    """A rollout of the bundle `path`, which replaces the bundle `before` (empty for none).
 
-    The rings up to `ring` are open; -1: none yet. `opened` is the time at which the last ring opened, or the
-    earliest one for the first. `healthy` is the time since which all open rings have been taken and healthy.
-    `baselines` has the robots that were not silent when their ring opened.
+    The rings up to `ring` are open; it is -1 before the first one opens at `opened`. `healthy` is the time since
+    which all open rings have had the bundle and been healthy. `baselines` has the robots that were not silent when
+    their ring opened; no other robots are counted.
     """
 
     path: str
@@ -106,7 +105,7 @@ def fault_of_rings(rollout: BundleRollout, robots: Collection[str]) -> str:
 
 
 def selected(rollout: BundleRollout, robot: str, seen: RobotSeen | None) -> str:
-    """Return an empty text for none. After a stop, only robots that have the bundle in force keep it."""
+    """Return the bundle that a robot should have, or "". After a stop, robots with the new one in force keep it."""
     if rollout.state == "reverted":
         return rollout.before
     if rollout.state == "done":
@@ -148,14 +147,13 @@ def stopped(rollout: BundleRollout, why: str) -> BundleRollout:
 
 
 def reverted(rollout: BundleRollout, why: str) -> BundleRollout:
-    """All robots get the previous bundle."""
     if rollout.state == "reverted":
         return rollout
     return msgspec.structs.replace(rollout, state="reverted", healthy=None, why=why)
 
 
 def resumed(rollout: BundleRollout, seconds: float) -> BundleRollout:
-    """No gate counts the `seconds` in which the collector heard no robot."""
+    """Start the times of all gates again after `seconds` in which the collector heard no robot."""
     if rollout.state != "running":
         return rollout
     why = f"the collector heard no robot for {seconds:.0f} s; the time of health begins again"

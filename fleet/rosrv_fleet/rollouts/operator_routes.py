@@ -1,4 +1,4 @@
-"""The REST operations of operators: published bundles, rollouts, and the robots of a group."""
+"""The REST operations of operators on bundles, rollouts and the robots of a group."""
 
 import asyncio
 from collections import Counter

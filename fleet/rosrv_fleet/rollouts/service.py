@@ -1,7 +1,7 @@
-"""Serve bundles to robots and advance their rollouts: the state in memory, refreshed from the database.
+"""Serve bundles to robots and advance their rollouts, from a state in memory that the database refreshes.
 
-While the database is unreachable, robots get the last known selections, and no rollout advances. Time in which
-the collector or the database was down counts neither as silence nor as health of robots.
+While the database is unreachable, robots get the last known selections, and no rollout advances. Time in which the
+collector or the database was down counts neither as silence nor as health of robots.
 """
 
 import asyncio
@@ -43,16 +43,16 @@ _Stamp = tuple[tuple[str, int, int], ...]
 
 
 Members = Callable[[], Mapping[str, RobotGroup]]
-"""Returns the group of each enrolled robot that has one. Raises `OSError`."""
+"""Returns the group of each enrolled robot that has one, or raises `OSError`."""
 
 
 class RolloutRefusedError(Exception):
-    """An order about a rollout is rejected."""
+    """An operator's order or a robot's report about a rollout is rejected."""
 
 
 @dataclass(eq=False)
 class SelectionListener:
-    """`changed` is set when the robot's selection differs from the last one."""
+    """An open event stream. `changed` is set when the robot's selection differs from `last`."""
 
     robot: str
     group: RobotGroup
@@ -61,7 +61,7 @@ class SelectionListener:
 
 
 class BundleService:
-    """The collector's bundles; orders raise `RolloutRefusedError`.
+    """The published bundles and their rollouts. Orders raise `RolloutRefusedError`.
 
     `folder` has the operator's publication; `key` is the file of the timestamp's key.
     """
@@ -102,7 +102,10 @@ class BundleService:
             await asyncio.sleep(_TICK_SECONDS)
 
     async def tick(self) -> None:
-        """Allow one tick at a time: the older of two would replace what the newer has read."""
+        """Publish, read the reports and rollouts, and advance.
+
+        Ticks exclude each other: an older one would otherwise overwrite the state that a newer one has read.
+        """
         async with self._ticking:
             await self._publish()
             members = await asyncio.to_thread(self._members)
@@ -121,7 +124,7 @@ class BundleService:
     # --- robots ---
 
     def selection(self, robot: str, group: RobotGroup) -> str:
-        """Return an empty text for none, or if the bundle is no longer signed."""
+        """Return the bundle that a robot should have, or "" if there is none or it is no longer signed."""
         stored = self.rollouts.get(group)
         if stored is None:
             return ""
@@ -129,7 +132,6 @@ class BundleService:
         return chosen if chosen in self._signed() else ""
 
     async def report(self, robot: str, group: RobotGroup, report: RobotReport) -> None:
-        """Raises `RolloutRefusedError` for an invalid report."""
         seen = _checked(report, self._clock())
         await asyncio.to_thread(self.store.save_report, robot, group, seen)
         self._arrived[robot] = StoredReport(group, seen)
@@ -137,16 +139,13 @@ class BundleService:
             self.robots[group][robot] = seen
 
     def group(self, site: str, group: str) -> RobotGroup:
-        """Raises `RolloutRefusedError` for invalid names."""
         try:
             return RobotGroup.parse(f"{site}/{group}")
         except EnrolmentError as error:
             raise RolloutRefusedError(str(error)) from error
 
     def listen(self, robot: str, group: RobotGroup) -> SelectionListener:
-        """Return a listener, which is woken at once if the robot may have missed an event, and if the collector
-        stops.
-        """
+        """Return a listener. It is already set if the robot may have missed an event, or if the collector stops."""
         listener = SelectionListener(robot, group, last=self.selection(robot, group))
         seen = self.robots.get(group, {}).get(robot)
         behind = listener.last and (seen is None or seen.in_force != listener.last)
@@ -199,7 +198,7 @@ class BundleService:
         return await self._change(group, stop, number)
 
     async def revert(self, group: RobotGroup, who: str, number: int | None = None) -> StoredRollout:
-        """Give all robots the bundle that preceded the last rollout; with `number`, only of this rollout."""
+        """Give all robots the bundle from before the last rollout, or from before `number` if that is the last."""
 
         def back(rollout: BundleRollout) -> BundleRollout:
             if not rollout.before:
@@ -233,7 +232,7 @@ class BundleService:
         return msgspec.structs.replace(changed, acts=[*before.acts, OperatorAct(self._clock(), who, act)])
 
     def _heard(self, group: RobotGroup) -> dict[str, RobotSeen]:
-        """Time in which the collector could hear none of the robots is not silence."""
+        """Return the robots' reports, without counting the time in which the collector heard none of them."""
         since, seconds = self._deaf
         return {
             robot: msgspec.structs.replace(seen, seen=seen.seen + seconds) if 0 < seen.seen <= since else seen
@@ -257,7 +256,10 @@ class BundleService:
     async def _change(
         self, group: RobotGroup, change: Callable[[BundleRollout], BundleRollout], number: int | None
     ) -> StoredRollout:
-        """Repeat the change if a tick changes the rollout at the same time, but not if an operator does."""
+        """Apply an operator's change to the last rollout.
+
+        Try again if a tick has changed the rollout in between, but not if another operator has.
+        """
         acts: list[OperatorAct] | None = None
         for _attempt in range(_MOST_ATTEMPTS):
             stored = (await asyncio.to_thread(self.store.latest)).get(group)
@@ -338,7 +340,6 @@ def _by_group(
 
 
 def _checked(report: RobotReport, now: float) -> RobotSeen:
-    """Raise `RolloutRefusedError` if no robot can have written the report."""
     for path in filter(None, (report.in_force, report.trying, report.refused)):
         try:
             BundlePath.parse(path)

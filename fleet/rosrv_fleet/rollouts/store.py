@@ -1,4 +1,4 @@
-"""Store rollouts, robots' reports and the timestamp in PostgreSQL. Each method blocks: call it in a thread.
+"""Store rollouts, robots' reports and the timestamp in PostgreSQL. Each method blocks, so it is called in a thread.
 
 Several collectors may share the database. A change of a rollout names the state that it was computed from, so a
 collector with an old state changes nothing.
@@ -19,14 +19,14 @@ _LOCK_GROUP = "SELECT pg_advisory_xact_lock(hashtextextended(%s, 0))"
 
 
 class StoredReport(NamedTuple):
-    """The last report of a robot, and its group at that time."""
+    """A robot's last report, and its group at that time."""
 
     group: RobotGroup
     seen: RobotSeen
 
 
 class StoredRollout(NamedTuple):
-    """A rollout with its number."""
+    """A rollout with its number in the database."""
 
     number: int
     rollout: BundleRollout
@@ -36,7 +36,7 @@ class Connections(Protocol):
     """A pool of connections to the database."""
 
     def writing(self) -> AbstractContextManager[Connection[tuple[Any, ...]]]:
-        """Run a block in one transaction. Raises `psycopg.Error`."""
+        """Run the block in one transaction. Raise `psycopg.Error`."""
 
 
 class RolloutStore:
@@ -58,7 +58,7 @@ class RolloutStore:
             connection.execute(query, (name, *group, document))
 
     def reports(self) -> dict[str, StoredReport]:
-        """Leave out unreadable reports."""
+        """Return the last reports by robot. Unreadable ones are logged and left out."""
         query = "SELECT name, site, robot_group, report::text FROM bundle_robot"
         found = {}
         with self._database.writing() as connection:
@@ -90,7 +90,7 @@ class RolloutStore:
     def begin(
         self, group: RobotGroup, last: StoredRollout | None, rollout: BundleRollout, now: float
     ) -> int | None:
-        """Return the number; None if `last` is no longer the last one, or runs."""
+        """Store a new rollout and return its number, or None if `last` is not the last one any more or still runs."""
         newest = """
             SELECT id, document = %s::jsonb FROM rollout WHERE site = %s AND robot_group = %s
             ORDER BY id DESC LIMIT 1
