@@ -1,1 +1,1 @@
-"""ROS 1 on the wire, without I/O: names, URIs, XML-RPC, TCPROS and message definitions."""
+"""ROS 1 on the wire: names, URIs, XML-RPC, TCPROS and message definitions. Only `node` does I/O."""

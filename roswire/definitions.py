@@ -33,7 +33,7 @@ _Answer = TypeVar("_Answer")
 
 
 class Definitions:
-    """A set of definitions, which never changes."""
+    """An immutable set of definitions. Its methods raise `DefinitionError` for an unknown or unusable type."""
 
     def __init__(
         self,
@@ -50,9 +50,9 @@ class Definitions:
 
     @classmethod
     def from_files(cls, files: Mapping[str, str]) -> Self:
-        """Return the definitions in files, by name: `pkg/T.msg`, `pkg/msg/T.msg`, `pkg/T.srv` or `pkg/srv/T.srv`.
+        """Parse files by name: `pkg/T.msg`, `pkg/msg/T.msg`, `pkg/T.srv` or `pkg/srv/T.srv`.
 
-        Raises `DefinitionError` with the file and line.
+        Raise `DefinitionError` with the file and line.
         """
         messages: dict[str, MessageDefinition] = {}
         services: dict[str, ServiceDefinition] = {}
@@ -71,10 +71,7 @@ class Definitions:
 
     @classmethod
     def from_full_text(cls, name: str, text: str) -> Self:
-        """Return the definitions in a text that also has all nested types, as in connection headers.
-
-        Raises `DefinitionError`.
-        """
+        """Parse the text of a type and all nested types, as connection headers contain it."""
         messages: dict[str, MessageDefinition] = {}
         for section, body, line in split_full_text(name, text):
             if _TYPE.match(section) is None:
@@ -87,12 +84,12 @@ class Definitions:
         return cls(messages)
 
     def extended(self, other: "Definitions") -> "Definitions":
-        """Return the definitions of both; a type of `other` replaces one of the same name."""
+        """Return the definitions of both. A type of `other` replaces one of the same name."""
         return Definitions(self._messages | other._messages, self._services | other._services)
 
     @property
     def message_types(self) -> list[str]:
-        """Include requests and responses."""
+        """Return the names of all messages, including the requests and responses of services."""
         return sorted(self._messages)
 
     @property
@@ -100,11 +97,9 @@ class Definitions:
         return sorted(self._services)
 
     def message(self, name: str) -> MessageDefinition:
-        """Raises `DefinitionError` with similar names."""
         return _lookup(name, self._messages, "message")
 
     def service(self, name: str) -> ServiceDefinition:
-        """Raises `DefinitionError` with similar names."""
         return _lookup(name, self._services, "service")
 
     def md5sum(self, name: str) -> str:
@@ -128,7 +123,6 @@ class Definitions:
         return "\n".join([own.text, *(f"{_RULE}\nMSG: {part.name}\n{part.text}" for part in parts)])
 
     def layout(self, name: str) -> MessageLayout:
-        """Raises `DefinitionError`."""
         return self._layout(name, ())
 
     # `outer` always lists the types that contain this type, outermost first.

@@ -6,11 +6,11 @@ class RosError(Exception):
 
 
 class EncodingError(RosError):
-    """ROS cannot encode a value, such as a control character or a 64-bit integer."""
+    """A value that ROS cannot encode, such as a control character or a 64-bit integer."""
 
 
 class PeerError(RosError):
-    """The sender's fault; the text may be sent back to the sender."""
+    """An error of the sender, to whom the text may be sent back."""
 
 
 class InvalidNameError(PeerError):
@@ -26,11 +26,11 @@ class ProtocolError(PeerError):
 
 
 class LimitExceededError(ProtocolError):
-    """A limit is exceeded, though the part that was read is well-formed."""
+    """A limit is exceeded. The part that was read is well-formed."""
 
 
 class DefinitionError(PeerError):
-    """A definition is invalid; `source` names the file or type, `line` counts from 1 (0: unknown)."""
+    """An invalid definition. `source` names the file or type; `line` counts from 1, and 0 means unknown."""
 
     def __init__(self, text: str, source: str, line: int = 0) -> None:
         super().__init__(f"{source}:{line}: {text}" if line else f"{source}: {text}")

@@ -1,4 +1,4 @@
-"""Lines of `rosgraph_msgs/Log`, as rqt_console and `rosbag` show them."""
+"""Encode messages of `rosgraph_msgs/Log`, which rqt_console displays."""
 
 import struct
 

@@ -1,4 +1,4 @@
-"""The common definitions of mavros_msgs in ROS Noetic (fields and constants), which the type store lacks."""
+"""The commonly used definitions of mavros_msgs in ROS Noetic, which the type store of `rosbags` lacks."""
 
 _HEADER = "std_msgs/Header header\n"
 _MOTION = "geometry_msgs/Vector3 velocity\ngeometry_msgs/Vector3 acceleration_or_force\nfloat32 yaw\nfloat32 yaw_rate\n"

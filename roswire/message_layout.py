@@ -1,7 +1,7 @@
-"""The layout of a message in its bytes, for reading a few fields without decoding the rest.
+"""The positions of fields in the bytes of a message, for reading a few fields without decoding the rest.
 
-A layout flattens nested messages. Consecutive fields of fixed size form one `FixedPart`; two such parts are
-never adjacent, so everything before the first string or array has the same offset in every message.
+A layout flattens nested messages. Consecutive fields of fixed size form one `FixedPart`. Two such parts are never
+adjacent, so everything before the first string or array has the same offset in every message.
 """
 
 from collections.abc import Mapping
@@ -10,17 +10,17 @@ from dataclasses import dataclass, field, replace
 from roswire.message_text import PRIMITIVES
 
 MAX_ITEMS = 20_000
-"""The most leaves, strings and arrays in a layout; nested definitions can need exponentially many."""
+"""The limit of leaves, strings and arrays in a layout. Nested definitions can multiply exponentially."""
 
 MAX_SIZE = 1 << 32
-"""The most bytes of a fixed part or array of fixed length; a TCPROS message is never longer."""
+"""The limit of bytes in a fixed part or a fixed array: a TCPROS message is never longer."""
 
 
 @dataclass(frozen=True, slots=True)
 class FixedField:
-    """A field of fixed size; `offset` and `size` are in bytes, and `count` is None for a scalar.
+    """A field of fixed size. `offset` and `size` are in bytes; `count` is None for a scalar.
 
-    `type` is primitive, or for arrays also a message of fixed size, with its `layout`.
+    `type` is a primitive type. In an array, it may also be a message of fixed size with a `layout`.
     """
 
     path: str
@@ -33,7 +33,7 @@ class FixedField:
 
 @dataclass(frozen=True, slots=True)
 class FixedPart:
-    """Consecutive fields of fixed size; `size` is in bytes."""
+    """Consecutive fields of fixed size, together `size` bytes."""
 
     size: int
     leaves: tuple[FixedField, ...]
@@ -41,7 +41,7 @@ class FixedPart:
 
 @dataclass(frozen=True, slots=True)
 class StringPart:
-    """A string: its length (4 bytes), then its bytes."""
+    """A string: 4 bytes for the length, then the bytes."""
 
     path: str
 
@@ -50,8 +50,8 @@ class StringPart:
 class ArrayPart:
     """An array of variable length, or of elements of variable size.
 
-    `count` is the length of a fixed array; otherwise it is None, and the length (4 bytes) precedes the
-    elements. `element_size` is in bytes, or None if it varies.
+    `count` is the length of a fixed array. If it is None, the length (4 bytes) precedes the elements. `element_size`
+    is in bytes, or None if it varies.
     """
 
     path: str
@@ -66,7 +66,7 @@ Part = FixedPart | StringPart | ArrayPart
 
 @dataclass(frozen=True, slots=True)
 class FieldLocation:
-    """The place of a field; `part` is the index of its part."""
+    """A field, and the index of the part that contains it."""
 
     part: int
     item: FixedField | StringPart | ArrayPart
@@ -74,9 +74,9 @@ class FieldLocation:
 
 @dataclass(frozen=True, slots=True)
 class MessageLayout:
-    """The layout of a message; `size` is None if it varies, and `minimum` is the size of the shortest message.
+    """The layout of a message. `size` is None if it varies; `minimum` is the size of the shortest message.
 
-    `places` finds the items by path (`pose.position.x`); elements of an array are in the array's layout.
+    `places` finds items by path (`pose.position.x`). Elements of an array are in the layout of the array.
     """
 
     parts: tuple[Part, ...]
@@ -86,11 +86,11 @@ class MessageLayout:
 
 
 class LayoutTooLargeError(Exception):
-    """The layout would have more items or bytes than a message can have."""
+    """The layout would have more items or bytes than the limits allow."""
 
 
 class LayoutBuilder:
-    """Builds a layout from the fields of a message in order."""
+    """Builds a layout from the fields of a message in order. The methods raise `LayoutTooLargeError`."""
 
     def __init__(self) -> None:
         self._parts: list[Part] = []
@@ -99,7 +99,7 @@ class LayoutBuilder:
         self._items = 0
 
     def add_primitive(self, path: str, type_name: str, count: int | None) -> None:
-        """`count` makes a fixed array."""
+        """Add a scalar, or with `count` an array of fixed length."""
         size = PRIMITIVES[type_name][1] * (1 if count is None else count)
         self._add_leaf(FixedField(path, type_name, self._offset, size, count))
 

@@ -27,7 +27,7 @@ PRIMITIVES = {
     "time": ("II", 8),
     "duration": ("ii", 8),
 }
-"""Types of fixed size: the `struct` code (little-endian, unpadded) and the bytes of one value."""
+"""The types of fixed size: their `struct` codes (little-endian, unpadded) and sizes in bytes."""
 
 BUILTINS = frozenset({*PRIMITIVES, "string"})
 
@@ -49,7 +49,7 @@ _SEPARATOR = re.compile(r"={40,}+[ \t\r]*+\Z")
 
 @dataclass(frozen=True, slots=True)
 class Constant:
-    """A constant; md5sums are made from `text`, the value as written."""
+    """A constant. The md5sum of its message uses `text`, the value as written."""
 
     type: str
     name: str
@@ -59,9 +59,7 @@ class Constant:
 
 @dataclass(frozen=True, slots=True)
 class Field:
-    """A field; `type` is the type of an element, and `length` is None for a scalar and for an array of
-    variable length.
-    """
+    """A field. `type` is the type of an element; `length` is None unless the field is an array of fixed length."""
 
     type: str
     name: str
@@ -77,7 +75,7 @@ class Field:
 
 @dataclass(frozen=True, slots=True)
 class MessageDefinition:
-    """A message type; `name` is `package/Type`, `text` the source."""
+    """A message type named `package/Type`, with its source `text`."""
 
     name: str
     fields: tuple[Field, ...]
@@ -87,7 +85,7 @@ class MessageDefinition:
 
 @dataclass(frozen=True, slots=True)
 class ServiceDefinition:
-    """A service type; its messages are named `package/TypeRequest` and `package/TypeResponse`."""
+    """A service type. Its messages are named `package/TypeRequest` and `package/TypeResponse`."""
 
     name: str
     request: MessageDefinition
@@ -96,7 +94,7 @@ class ServiceDefinition:
 
 
 def parse_message(name: str, text: str, source: str, first_line: int = 1) -> MessageDefinition:
-    """Raises `DefinitionError` at a position that `source` and `first_line` give."""
+    """Parse a message type. Errors (`DefinitionError`) name `source`, and count lines from `first_line`."""
     fields: dict[str, Field] = {}
     constants: dict[str, Constant] = {}
     for number, line in enumerate(text.split("\n"), first_line):
@@ -119,7 +117,6 @@ def parse_message(name: str, text: str, source: str, first_line: int = 1) -> Mes
 
 
 def parse_service(name: str, text: str, source: str) -> ServiceDefinition:
-    """Raises `DefinitionError`."""
     lines = text.split("\n")
     breaks = [index for index, line in enumerate(lines) if line.startswith("---")]
     if len(breaks) != 1:
@@ -133,7 +130,8 @@ def parse_service(name: str, text: str, source: str) -> ServiceDefinition:
 def split_full_text(name: str, text: str) -> list[tuple[str, str, int]]:
     """Return (type, text, number of its first line) for `name`, then for each nested type.
 
-    A nested type follows the lines `===…` and `MSG: package/Type`. Raises `DefinitionError`.
+    A line of `=` and a line `MSG: package/Type` precede each nested type. Raise `DefinitionError` for other text
+    there.
     """
     lines = text.split("\n")
     starts = [index for index, line in enumerate(lines) if _SEPARATOR.match(line)]

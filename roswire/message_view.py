@@ -1,6 +1,6 @@
-"""Show a message to a person, within limits, as far as its bytes can be read: they may be cut off, or malicious.
+"""Display a message within limits. Bytes that are cut off or malicious are displayed as far as they are readable.
 
-An unreadable value is shown as `…`; the rest of a long one as a note (`… 344 more`).
+`…` replaces an unreadable value, and a note such as `… 344 more` the rest of a long one.
 """
 
 import hashlib
@@ -26,7 +26,7 @@ _OF_NOTHING = hashlib.md5(b"", usedforsecurity=False).hexdigest()  # the md5sum 
 
 
 class _EndError(Exception):
-    """The bytes end here, or the limit is reached."""
+    """The bytes end here, or a limit is reached."""
 
 
 class _Reader:
@@ -127,7 +127,7 @@ class _Reader:
 
 
 class _CutError(Exception):
-    """The bytes end inside a value; `value` is the part that was read."""
+    """The bytes end inside a value. `value` is the part that was read."""
 
     def __init__(self, value: Any) -> None:
         super().__init__()
@@ -153,7 +153,7 @@ def read_fields(definitions: Definitions, name: str, data: bytes) -> dict[str, A
 
 
 class PublisherReader:
-    """Reads messages by the definition in the publisher's connection header."""
+    """Reads messages with the definition in the publisher's connection header."""
 
     def __init__(self, header: Mapping[str, str]) -> None:
         self.type = header.get("type", "")
@@ -165,7 +165,7 @@ class PublisherReader:
             self._why = f": {str(error)[:300]}"
 
     def read(self, data: bytes) -> tuple[dict[str, Any], str]:
-        """Return the fields and an empty text; if the definition cannot be used, the first bytes and the reason."""
+        """Return the fields and "". Without a usable definition, return the first bytes and the reason."""
         fields = read_fields(self._definitions, self.type, data) if self._definitions is not None else None
         if fields is not None:
             return fields, ""

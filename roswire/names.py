@@ -1,14 +1,14 @@
-"""ROS graph names: the spelling that `rosmaster` acts on, or an error.
+"""ROS graph names: return the name that `rosmaster` acts on, or raise.
 
-A decision of this side must be about the name that `rosmaster` acts on, which checks almost no characters.
+Access is decided by name, so a name must mean the same here and in `rosmaster`, which checks almost no characters.
 Invariants:
 
 1. `resolve` returns the same as `resolve_name` of `rosmaster`, or raises.
 2. A returned name is canonical: it starts with `/`, has no empty segment, and resolves to itself.
-3. Two different returned names mean different things to `rosmaster` and look different: ASCII only, no control
-   characters. Only slashes are normalised.
+3. Two different returned names mean different things to `rosmaster` and look different: they are ASCII without
+   control characters. Only slashes are normalised.
 4. `rosmaster` never resolves a `caller_id`. rospy and roscpp fold its slashes before they send it, but rosgo sends
-   `//name`. So this side folds them, and passes on only the result.
+   `//name`. So this module folds them, and only the result is passed on.
 """
 
 import re
@@ -16,7 +16,7 @@ import re
 from roswire.errors import InvalidNameError, quoted
 
 MAX_NAME_LENGTH = 1024
-"""Names on robots have far less than a quarter of this length."""
+"""A generous limit: names on robots are shorter than a quarter of it."""
 
 _NAME = re.compile(r"[A-Za-z/~][A-Za-z0-9_/]*+\Z")
 _CANONICAL = re.compile(r"(?:/[A-Za-z0-9_]++){1,512}\Z")  # a name of MAX_NAME_LENGTH has at most 512 segments
@@ -29,10 +29,10 @@ _SLASHES = re.compile("/{2,}+")
 
 
 def resolve(name: str, caller_id: str) -> str:
-    """Return the canonical form of a name; an empty `caller_id` is the global namespace, as for `rosmaster`.
+    """Return the canonical form of a name. An empty `caller_id` is the global namespace, as for `rosmaster`.
 
-    Raises `InvalidNameError` for a name outside the ROS grammar, for the global namespace, and for a relative
-    name if the caller's own name is invalid.
+    Raise `InvalidNameError` for a name outside the ROS grammar, for the global namespace, and for a relative name of
+    a caller whose own name is invalid.
     """
     resolved = _resolve(name, caller_id, _NAME)
     if resolved == "/":
@@ -46,9 +46,9 @@ def resolve_namespace(name: str, caller_id: str) -> str:
 
 
 def resolve_parameter(name: str, caller_id: str) -> str:
-    """Like `resolve_namespace`, but segments may have any printable ASCII, as in YAML keys.
+    """Like `resolve_namespace`, but segments may have any printable ASCII character, as in YAML keys.
 
-    Rejected are `~` (except as the first character), `*`, `?`, quotes, backslash, and spaces at the ends of a
+    Exceptions are `~` (except as the first character), `*`, `?`, quotes, backslashes, and spaces at the ends of a
     segment.
     """
     return _resolve(name, caller_id, _PARAMETER)
@@ -57,28 +57,27 @@ def resolve_parameter(name: str, caller_id: str) -> str:
 def canonical_caller_id(caller_id: str) -> str:
     """Return the canonical form of a node's name: `//a//b/` becomes `/a/b`, as with rospy and roscpp.
 
-    Raises `InvalidNameError`, also for a relative name.
+    Raise `InvalidNameError` for any name that is not global.
     """
     return _canonical_id(caller_id, _CANONICAL)
 
 
 def canonical_tool_id(caller_id: str) -> str:
-    """Like `canonical_caller_id`, for a caller that need not be a node, such as `/rosparam-4711`."""
+    """Like `canonical_caller_id`, for a caller that may be a tool, such as `/rosparam-4711`."""
     return _canonical_id(caller_id, _TOOL)
 
 
 def is_global_name(name: str) -> bool:
-    """Whether a name is like `/a/b`, not `/`, `//a` or `a`."""
+    """Return whether a name is canonical and global: `/a/b`, not `/`, `//a` or `a`."""
     return len(name) <= MAX_NAME_LENGTH and _CANONICAL.match(name) is not None
 
 
 def is_relative_member(name: str) -> bool:
-    """Whether a name is relative (not `/a` or `~a`), and has no empty segment."""
+    """Return whether a name is relative (not `/a` or `~a`) and has no empty segment."""
     return not name.startswith("~") and all(name.split("/"))
 
 
 def is_valid_type_name(name: str) -> bool:
-    """Whether a name is `package/Type`, or `*` for any type."""
     return name == "*" or (len(name) <= MAX_NAME_LENGTH and _TYPE_NAME.match(name) is not None)
 
 
@@ -87,7 +86,7 @@ def namespace(name: str) -> str:
 
 
 def searched(key: str, caller_id: str) -> list[str]:
-    """Return the keys that a search tries, from the caller's own namespace upwards."""
+    """Return the keys that `searchParam` tries, from the caller's namespace upwards."""
     if key.startswith("/"):
         return [resolve_parameter(key, caller_id)]
     levels = [part for part in caller_id.split("/") if part]
@@ -96,7 +95,7 @@ def searched(key: str, caller_id: str) -> list[str]:
 
 
 def join(namespace: str, name: str) -> str:
-    """Return a name in a namespace; a global or private name stays unchanged."""
+    """Return a name in a namespace. A global or private name is returned unchanged."""
     if name.startswith(("/", "~")) or not namespace:
         return name
     return f"{namespace}{name}" if namespace.endswith("/") else f"{namespace}/{name}"

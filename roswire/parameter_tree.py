@@ -1,4 +1,4 @@
-"""The parameter tree as in `rosmaster`: lookups by key, and values that block a key."""
+"""The parameter tree of `rosmaster`: lookups by key, and values that block a key."""
 
 from collections.abc import Iterator
 from functools import lru_cache
@@ -10,19 +10,18 @@ Tree = dict[str, Value]
 
 @lru_cache(256)
 def parts_of(key: str) -> tuple[str, ...]:
-    """Cached, because setters call it often."""
     return tuple([part for part in key.split("/") if part])
 
 
 def holds_others(value: Value) -> bool:
-    """Whether a value is a namespace with other parameters, whose keys also need rights."""
+    """Return whether a value is a non-empty namespace: access to it also requires rights to the keys in it."""
     return isinstance(value, dict) and bool(value)
 
 
 def standing_at(tree: Tree, key: str) -> tuple[Value, str | None]:
     """Return the value at a canonical key (or None), and the name of a parent that is not a namespace (or None).
 
-    If a key below such a parent is set, `rosmaster` replaces the parent by a namespace.
+    If a key below such a parent is set, `rosmaster` replaces the parent with a namespace.
     """
     node: Value = tree
     passed = ""
@@ -39,7 +38,7 @@ def standing_at(tree: Tree, key: str) -> tuple[Value, str | None]:
 def names_in(tree: Tree, above: str = "/") -> Iterator[str]:
     """Yield the names of parameters as `rosmaster` lists them, without namespaces.
 
-    A key of a dictionary may begin with `/` or `~`: `rosmaster` lists it unchanged.
+    `rosmaster` does not prefix a key of a dictionary that begins with `/` or `~`.
     """
     for key, value in tree.items():
         name = key if key.startswith(("/", "~")) else above + key

@@ -1,7 +1,7 @@
 """The definitions that ROS Noetic ships.
 
-Messages come from the type store of `rosbags`. It lacks services, the messages of actions, and the message of
-`/tf`: the common ones among these are here and in `mavros`.
+Messages come from the type store of `rosbags`. It lacks services, the messages of actions, and the message of `/tf`;
+this module and `mavros` add the common ones.
 """
 
 from itertools import islice
@@ -73,7 +73,7 @@ _ACTIONS = {
     ),
     "control_msgs/GripperCommand": ("GripperCommand command\n", _GRIPPER, _GRIPPER),
 }
-"""Goal, result and feedback of each action, from which the messages of `actionlib` are made."""
+"""Goal, result and feedback of each action, from which its messages are generated as by actionlib."""
 
 _CONSTANTS_BEFORE = {
     "actionlib_msgs/GoalStatus": {"text": 10},
@@ -86,7 +86,7 @@ _CONSTANTS_BEFORE = {
 }
 """The number of constants directly before a field, in types whose file does not begin with all constants.
 
-The type store loses this order, and viewers report a definition that differs from their own.
+The type store loses this order, and viewers would report that the definition differs from theirs.
 """
 
 _NOT_ROS_1 = "builtin_interfaces"  # has `time` and `duration` as ROS 2 messages

@@ -1,13 +1,13 @@
 """TCPROS without I/O: connection headers, message frames and service replies.
 
-One header in each direction (a length, then fields `name=value`, each with its own length), then frames: a
-length and a body. A service reply has one byte before its frame: 1, or 0 if the body is the text of an error.
-All lengths are little-endian and have 32 bits. Invariants:
+Each side sends a header: a length, then fields `name=value`, each with its own length. Frames follow: a length and a
+body. In a service reply, one byte precedes the frame: 1, or 0 if the body is an error message. All lengths are 32-bit
+little-endian. Invariants:
 
-1. Before any byte of data is stored, its length is checked against the limit; that of a field also against its header.
-2. A header that is accepted has each field once, and every field has a name.
-3. Header text is UTF-8. Only `message_definition` may have other bytes, because roscpp copies comments unchanged; they
-   survive decoding and encoding as surrogate escapes.
+1. The length of a frame, header or field is checked before any of its bytes are stored.
+2. In an accepted header, each field has a name and occurs once.
+3. Header text is UTF-8. Only `message_definition` may have other bytes, because roscpp copies comments unchanged;
+   they survive decoding and encoding as surrogate escapes.
 """
 
 import struct
@@ -23,14 +23,14 @@ HEADER_LIMIT = 65536
 MESSAGE_LIMIT = 256 << 20
 
 Body: TypeAlias = bytes | bytearray
-"""Shared by all receivers of a message, which never change it."""
+"""A message in bytes. All receivers share it, so they must not change it."""
 
 _LENGTH = struct.Struct("<I")
 _ANY_BYTES = frozenset({"message_definition"})
 
 
 def encode_header(fields: Mapping[str, str]) -> bytes:
-    """Return a header with its length."""
+    """Return a header, including its length."""
     lines = [f"{name}={value}".encode("utf-8", "surrogateescape") for name, value in fields.items()]
     body = b"".join([_LENGTH.pack(len(line)) + line for line in lines])
     return _LENGTH.pack(len(body)) + body
@@ -49,7 +49,7 @@ def encode_service_error(text: str) -> bytes:
 
 
 def decode_header(body: bytes) -> dict[str, str]:
-    """Take the body of a header, without its length. Raises `ProtocolError`."""
+    """Parse the body of a header, without its length. Raise `ProtocolError`."""
     fields: dict[str, str] = {}
     position = 0
     while position < len(body):
@@ -73,7 +73,7 @@ def decode_header(body: bytes) -> dict[str, str]:
 
 
 class HeaderParser:
-    """Parses a header; bytes after it are in `rest`."""
+    """Parses a header. Bytes that follow it are in `rest`."""
 
     def __init__(self, limit: int = HEADER_LIMIT) -> None:
         self.rest = b""
@@ -82,10 +82,10 @@ class HeaderParser:
         self._done = False
 
     def feed(self, data: bytes) -> dict[str, str] | None:
-        """Take bytes; return the header once it is complete.
+        """Take bytes, and return the header once it is complete.
 
-        Raises `LimitExceededError` as soon as the announced length exceeds the limit, `ProtocolError` for a
-        malformed header, and RuntimeError if the header was already returned.
+        Raise `LimitExceededError` as soon as the announced length exceeds the limit, `ProtocolError` for a malformed
+        header, and RuntimeError after the header was returned.
         """
         if self._done:
             raise RuntimeError("the header is complete; what followed it is in .rest")
@@ -117,7 +117,7 @@ class FrameParser:
         self._buffer = bytearray()
 
     def feed(self, data: bytes) -> list[bytes]:
-        """Take bytes; return the bodies that are now complete. Raises `LimitExceededError`."""
+        """Take bytes, and return the bodies that are now complete. Raise `LimitExceededError`."""
         buffer = self._buffer
         buffer += data
         frames = []
@@ -136,7 +136,7 @@ class FrameParser:
 
 @dataclass(frozen=True, slots=True)
 class ServiceReply:
-    """A reply; `body` is the serialised response, or the text of the error."""
+    """A reply. `body` is the serialised response, or an error message."""
 
     ok: bool
     body: bytes
@@ -150,9 +150,9 @@ class ServiceReplyParser:
         self._buffer = bytearray()
 
     def feed(self, data: bytes) -> list[ServiceReply]:
-        """Take bytes; return the replies that are now complete.
+        """Take bytes, and return the replies that are now complete.
 
-        Raises `ProtocolError` if the first byte is neither 0 nor 1, and `LimitExceededError`.
+        Raise `ProtocolError` if the first byte is neither 0 nor 1, and `LimitExceededError`.
         """
         buffer = self._buffer
         buffer += data

@@ -1,8 +1,8 @@
 """Node API URIs (`http://host:port/`) and service URIs (`rosrpc://host:port`), as nodes announce them.
 
-A URI that two parsers could read differently is rejected. The host is a name or an address, the port is 1 to
-65535, and there is no user info, query or fragment. rospy writes an IPv6 address without brackets
-(`http://::1:4000/`); there, the port follows the last colon.
+A URI that two parsers could read differently is rejected. The host is a name or an address, the port is 1 to 65535,
+and user info, query and fragment are not allowed. rospy writes an IPv6 address without brackets (`http://::1:4000/`);
+then the port follows the last colon.
 """
 
 import ipaddress
@@ -24,7 +24,7 @@ _URI = re.compile(
 
 @dataclass(frozen=True, slots=True)
 class NodeUri:
-    """A URI; `host` is without brackets, `path` starts with `/` (empty for a service)."""
+    """A URI. `host` has no brackets; `path` starts with `/`, or is empty for a service."""
 
     scheme: str
     host: str
@@ -34,12 +34,11 @@ class NodeUri:
 
 @lru_cache(4096)  # a node sends its own URI with every call
 def parse_node_uri(text: str) -> NodeUri:
-    """Raises `InvalidUriError`."""
     return _parse(text, "http", "node API", "http://host:port/")
 
 
 def parse_service_uri(text: str) -> NodeUri:
-    """Raises `InvalidUriError`, also if there is a path."""
+    """Parse the URI of a service. Raise `InvalidUriError`, including for a URI with a path."""
     uri = _parse(text, "rosrpc", "service", "rosrpc://host:port")
     if uri.path not in ("", "/"):
         raise InvalidUriError(f"service URI {quoted(text)} has a path; write rosrpc://host:port")

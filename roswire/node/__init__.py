@@ -1,4 +1,4 @@
-"""A ROS 1 node in asyncio: topics as bytes, services, and the node API, from one source address."""
+"""A ROS 1 node in asyncio: topics as bytes, services, and the node API. All connections use one source address."""
 
 from roswire.node.network import (
     MasterDenialError,

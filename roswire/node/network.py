@@ -1,7 +1,6 @@
 """TCP with one source address, and the tasks and errors of a node.
 
-Every connection leaves from the source address, and servers listen only there, so that peers can identify the
-node by it.
+Every connection leaves from the source address, and servers listen only there, so peers can identify the node by it.
 """
 
 import asyncio
@@ -15,19 +14,19 @@ BUFFER_BYTES = 1 << 19
 
 
 class NodeCallError(RosError):
-    """A call of the master, a node or a service has no usable result; the text has the call and the reason."""
+    """A call of the master, a node or a service has no usable result. The text names the call and the reason."""
 
 
 class PeerUnreachableError(NodeCallError):
-    """The peer cannot be reached, broke off the connection, or did not answer in time."""
+    """The peer cannot be reached, broke the connection, or did not answer in time."""
 
 
 class MasterDenialError(NodeCallError):
-    """The master denied a call; the text is the master's."""
+    """The master denied a call, with this text."""
 
 
 class ServiceFailedError(NodeCallError):
-    """A service failed; the text is the service's."""
+    """A service failed, with this text."""
 
 
 class ByteWriter(Protocol):
@@ -36,7 +35,7 @@ class ByteWriter(Protocol):
     def write(self, data: Body) -> None: ...
 
     async def drain(self) -> None:
-        """Wait until the peer has room for more. Raises `OSError` if the connection has ended."""
+        """Wait until the peer has read enough. Raise `OSError` if the connection has ended."""
 
     def close(self) -> None: ...
 
@@ -45,13 +44,13 @@ Serve = Callable[[asyncio.StreamReader, ByteWriter], Awaitable[None]]
 
 
 class NodeMemory(Protocol):
-    """A memory that a node shares with others."""
+    """A budget of bytes, which several nodes may share."""
 
     def add(self, size: int) -> None:
-        """Take bytes; a negative `size` returns them."""
+        """Take bytes from the budget, or return them if `size` is negative."""
 
     def refusal(self, size: int) -> str:
-        """Return the reason why `size` more bytes have no room; empty if they have."""
+        """Return the reason why `size` more bytes would exceed the budget, or ""."""
 
 
 class ListeningServer(Protocol):
@@ -63,23 +62,23 @@ class ListeningServer(Protocol):
 
 
 class NodeNetwork(Protocol):
-    """A network as a node uses it."""
+    """The operations of a network that a node uses. They raise `OSError`."""
 
     @property
     def source(self) -> str: ...
 
     async def connect(self, host: str, port: int) -> tuple[asyncio.StreamReader, ByteWriter]:
-        """Raises `OSError`."""
+        """Connect from the source address."""
 
     async def receive(self, host: str, port: int, receiver: asyncio.BufferedProtocol) -> None:
-        """Give the bytes of the peer to `receiver`. Raises `OSError`."""
+        """Connect from the source address, and give the peer's bytes to `receiver`."""
 
     async def serve(self, serve: Serve) -> ListeningServer:
-        """Listen at a free port. Raises `OSError`."""
+        """Listen on a free port of the source address."""
 
 
 class SourceNetwork:
-    """This machine's network, from one of its addresses."""
+    """The network of this machine, used from one of its addresses."""
 
     def __init__(self, source: str) -> None:
         self.source = source

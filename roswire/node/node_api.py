@@ -1,4 +1,4 @@
-"""The node API (slave API): the master's and other nodes' calls to a node."""
+"""The node API (slave API): calls of the master and other nodes to a node."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Protocol
@@ -8,7 +8,7 @@ from roswire.node.topics import NodePublication, NodeSubscription
 from roswire.xmlrpc import MethodCall, Value
 
 ParameterChanged = Callable[[str, Value], None]
-"""Takes the changed key and its new value; `{}` if it was deleted."""
+"""Takes a changed key and its new value, which is `{}` if the key was deleted."""
 
 _DONE: list[Value] = [1, "", 0]
 
@@ -34,7 +34,7 @@ class NodeTables(Protocol):
 
 
 class NodeApi:
-    """The API of a node. A call with other parameters than the API defines gets an error, and changes nothing."""
+    """The API of a node. A call with parameters other than those of the API gets an error and has no effect."""
 
     def __init__(self, node: NodeTables, master: str, pid: int, shut_down: Callable[[str], None]) -> None:
         self._node = node

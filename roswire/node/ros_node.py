@@ -2,8 +2,8 @@
 
 Invariants:
 
-1. A topic, service or subscribed parameter is in the node's tables from before its registration until after the end of
-   it, so that a call of the master about it always finds it.
+1. A topic, service or subscribed parameter is in the node's tables from before its registration until after its
+   unregistration, so a call of the master about it always finds it.
 2. Registrations of one name happen one after another.
 3. After `close`, the node has no task and no connection.
 """
@@ -45,11 +45,11 @@ _Kind = Literal["publisher", "subscriber", "service", "parameter"]
 
 
 class RosNode:
-    """A node; `name` is canonical, `master` is a URI.
+    """A node with a canonical `name`; `master` is a URI.
 
-    `shut_down` is called with the reason if the master ends the node, for example because another node has
-    its name. `memory` bounds the messages that wait for other nodes. `skipped()` is called for each message
-    dropped for `NodeLimits.arriving_bytes`.
+    `shut_down` is called with the reason if the master ends the node, for example because another node took its name.
+    `memory` bounds the messages that wait for other nodes. `skipped` is called for each message that is dropped
+    because of `NodeLimits.arriving_bytes`.
     """
 
     def __init__(
@@ -80,7 +80,7 @@ class RosNode:
         self._locks: WeakValueDictionary[tuple[_Kind, str], asyncio.Lock] = WeakValueDictionary()
 
     async def start(self) -> None:
-        """Listen at the source address. Raises `OSError` if it cannot be used."""
+        """Listen on the source address. Raise `OSError` if that is not possible."""
         for serve in (self._serve_api, self._serve_tcpros):
             self._servers.append(await self._network.serve(serve))
         self._uri = node_uri(self._network.source, self._servers[0].port)
@@ -118,7 +118,7 @@ class RosNode:
     # --- the master ---
 
     async def master(self, method: str, *params: Value) -> Value:
-        """Raises `MasterDenialError` with the master's reason, or another `RosError`."""
+        """Call the master. Raise `MasterDenialError` with its reason, or another `RosError`."""
         return await self._call_master(self.name, method, *params)
 
     async def _call_master(self, caller_id: str, method: str, *params: Value) -> Value:
@@ -142,7 +142,7 @@ class RosNode:
     async def subscribe(
         self, topic: str, received: Received, wanted: MessageType = ANY_TYPE
     ) -> NodeSubscription:
-        """Raises ValueError if the node already has a subscription, and `RosError` if the master denies it."""
+        """Subscribe to a topic. Raise ValueError if the node already does, and `RosError` if the master denies it."""
         async with self._lock("subscriber", topic):
             if topic in self.subscribers:
                 raise ValueError(f"{self.name} already subscribes to {topic}")
@@ -175,10 +175,10 @@ class RosNode:
     async def advertise(
         self, topic: str, kind: MessageType, *, latched: bool, queue: int, replay: float = 0.0
     ) -> NodePublication:
-        """Publish a topic; `queue` messages may wait for each subscriber.
+        """Publish a topic. At most `queue` messages wait for each subscriber.
 
-        Subscribers that connect within `replay` seconds get the messages published until then. Raises
-        ValueError if the node already publishes it, and `RosError` if the master denies it.
+        Subscribers that connect within `replay` seconds get all messages published in that time. Raise ValueError if
+        the node already publishes the topic, and `RosError` if the master denies it.
         """
         async with self._lock("publisher", topic):
             if topic in self.publishers:
@@ -200,7 +200,7 @@ class RosNode:
             return publisher
 
     async def advertise_again(self, topic: str) -> None:
-        """Register a publication again, to learn whether the master still grants it. Raises `RosError`."""
+        """Register a publication again, to learn whether the master still grants it. Raise `RosError` if not."""
         await self.master("registerPublisher", topic, self.publishers[topic].type.name, self._uri)
 
     async def unadvertise(self, topic: str) -> None:
@@ -212,9 +212,9 @@ class RosNode:
     # --- parameters ---
 
     async def subscribe_parameter(self, key: str, changed: ParameterChanged) -> None:
-        """Call `changed` for each new value of the canonical key, or of a key below.
+        """Call `changed` for each new value of a canonical key, or of a key below it.
 
-        Raises ValueError if the node already subscribes to it, and `RosError` if the master denies it.
+        Raise ValueError if the node already subscribes to the key, and `RosError` if the master denies it.
         """
         async with self._lock("parameter", key):
             if key in self.parameters:
@@ -233,10 +233,10 @@ class RosNode:
                 del self.parameters[key]
 
     async def set_parameter(self, name: str, value: Value) -> None:
-        """Set a parameter under a name of its own. Raises `RosError`.
+        """Set a parameter as the caller NODE/parameters. Raise `RosError`.
 
-        A master sends the setter no update; with another name, this node's subscriptions get all values in
-        the master's order.
+        A master sends no update to the node that sets a parameter. With another caller's name, this node's own
+        subscriptions get all values, in the master's order.
         """
         key = resolve_parameter(name, self.name)
         await self._call_master(f"{self.name}/parameters", "setParam", key, value)
@@ -246,7 +246,7 @@ class RosNode:
     async def offer(
         self, service: str, kind: ServiceType, answer: Callable[[bytes], Awaitable[bytes]]
     ) -> ServiceServer:
-        """Raises ValueError if the node already offers it, and `RosError` if the master denies it."""
+        """Offer a service. Raise ValueError if the node already does, and `RosError` if the master denies it."""
         async with self._lock("service", service):
             if service in self.services:
                 raise ValueError(f"{self.name} already offers {service}")
@@ -265,11 +265,11 @@ class RosNode:
                 del self.services[service]
 
     async def probe_service(self, service: str) -> dict[str, str]:
-        """Return the connection header of a service, with `type` and `md5sum`. Raises `RosError`."""
+        """Return the connection header of a service, which has its `type` and `md5sum`. Raise `RosError`."""
         return await probe_service(self._link, service, await self._service_uri(service))
 
     async def call_service(self, service: str, md5sum: str, request: bytes, seconds: float) -> bytes:
-        """Raises `ServiceFailedError` with the service's reason, or another `RosError`."""
+        """Return the serialised response. Raise `ServiceFailedError` with a reason, or another `RosError`."""
         uri = await self._service_uri(service)
         return await call_service(self._link, service, uri, md5sum=md5sum, request=request, seconds=seconds)
 
@@ -323,6 +323,6 @@ class RosNode:
         return lock
 
     async def _forget(self, method: str, *params: Value) -> None:
-        """If the master has ended, it has forgotten the registration, or will notice the end of the node."""
+        """Call the master, and ignore errors: if it has ended, it has lost the registration or will miss the node."""
         with contextlib.suppress(RosError):
             await self.master(method, *params)

@@ -1,4 +1,4 @@
-"""The services of a node: calls of other nodes' services, and services that it offers."""
+"""The services of a node: calls of other nodes' services, and the services that it offers."""
 
 import asyncio
 import contextlib
@@ -32,13 +32,11 @@ class ServiceType:
 
     @classmethod
     def defined(cls, definitions: Definitions, name: str) -> "ServiceType":
-        """Raises `DefinitionError`."""
         service = definitions.service(name)
         return cls(name, definitions.service_md5sum(name), service.request.name, service.response.name)
 
 
 async def probe_service(link: NodeLink, service: str, uri: NodeUri) -> dict[str, str]:
-    """Raises `RosError`."""
     fields = {"callerid": link.name, "service": service, "md5sum": ANY, "probe": "1"}
     header, _reply = await _connected(
         link, service, uri, fields, request=b"", seconds=link.limits.call_seconds
@@ -49,7 +47,6 @@ async def probe_service(link: NodeLink, service: str, uri: NodeUri) -> dict[str,
 async def call_service(
     link: NodeLink, service: str, uri: NodeUri, *, md5sum: str, request: bytes, seconds: float
 ) -> bytes:
-    """Raises `ServiceFailedError` with the service's reason, or another `RosError`."""
     fields = {"callerid": link.name, "service": service, "md5sum": md5sum, "persistent": "0"}
     _header, reply = await _connected(
         link, service, uri, fields, request=encode_frame(request), seconds=seconds
@@ -60,7 +57,7 @@ async def call_service(
 async def _connected(
     link: NodeLink, service: str, uri: NodeUri, fields: Mapping[str, str], *, request: bytes, seconds: float
 ) -> tuple[dict[str, str], bytes]:
-    """Return the header and the reply of a service; without a request, no reply is awaited."""
+    """Return the header and the reply of a service. Without a request, wait for no reply."""
     try:
         async with asyncio.timeout(seconds):
             reader, writer = await link.network.connect(uri.host, uri.port)
@@ -90,7 +87,7 @@ async def _read_reply(link: NodeLink, reader: asyncio.StreamReader) -> bytes:
 
 
 class ServiceServer:
-    """An offered service; `answer` returns the serialised response, or raises `ServiceFailedError`."""
+    """An offered service. `answer` returns the serialised response, or raises `ServiceFailedError`."""
 
     def __init__(
         self, link: NodeLink, name: str, kind: ServiceType, answer: Callable[[bytes], Awaitable[bytes]]

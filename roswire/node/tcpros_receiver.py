@@ -1,13 +1,13 @@
-"""Receive the frames of one TCPROS connection: small ones many at once, each large one into memory of its own.
+"""Receive the frames of one TCPROS connection: small ones in batches, each large one into its own buffer.
 
-The kernel writes a large frame where it stays, so it is never copied. Invariants:
+The kernel writes a large frame directly into its buffer, so the frame is never copied. Invariants:
 
 1. A frame of more than `limit` bytes ends the connection as soon as its length is known.
-2. A large frame takes memory only if `memory` has room for all of it; otherwise its bytes are dropped. The memory is
-   given back immediately before delivery: the receiver may take it.
-3. A frame is delivered only while one is wanted: bytes after it wait, and the connection is not read.
-4. After a large frame, and after `_TURN` small ones, other tasks have a turn.
-5. Each frame is delivered once. An error of the receiver of a frame ends the connection.
+2. A large frame is stored only if `memory` has room for all of it; otherwise its bytes are dropped. The memory is
+   returned immediately before delivery, so that the receiver can take it.
+3. A frame is delivered only while one is wanted. Until then, its bytes wait, and the connection is not read.
+4. Other tasks have a turn after each large frame, and after `_TURN` small ones.
+5. Each frame is delivered once. An error of the receiver ends the connection.
 """
 
 import asyncio
@@ -24,7 +24,7 @@ _LENGTH_BYTES = 4
 
 
 class TcprosReceiver(asyncio.BufferedProtocol):
-    """The protocol of one connection. `skipped()` is called for each frame that is dropped."""
+    """The protocol of one connection. `skipped` is called for each dropped frame."""
 
     def __init__(self, memory: NodeMemory, skipped: Callable[[], None]) -> None:
         self._limit = 0
@@ -39,7 +39,7 @@ class TcprosReceiver(asyncio.BufferedProtocol):
         self._ended: asyncio.Future[None] = asyncio.get_running_loop().create_future()
 
     async def next(self, limit: int) -> Body:
-        """Return the next frame. Raises `LimitExceededError`, or `OSError` if the connection ends."""
+        """Return the next frame. Raise `LimitExceededError`, or `OSError` if the connection ends."""
         frame: asyncio.Future[Body] = asyncio.get_running_loop().create_future()
 
         def take(body: Body) -> None:
@@ -51,7 +51,7 @@ class TcprosReceiver(asyncio.BufferedProtocol):
         return await (frame if frame.done() else self._end())
 
     async def deliver_to(self, deliver: Callable[[Body], None], limit: int) -> None:
-        """Deliver frames until the connection ends. Raises the errors of `next`."""
+        """Deliver frames until the connection ends, then raise as `next` does."""
         self._begin(deliver, limit)
         await self._end()
 

@@ -1,4 +1,4 @@
-"""TCPROS on a node's connections: the exchange of headers, with limits of size and time."""
+"""TCPROS on a node's connections: frames and the exchange of headers, with limits of size and time."""
 
 import asyncio
 import contextlib
@@ -12,7 +12,7 @@ from roswire.node.network import ByteWriter, NodeMemory
 from roswire.tcpros import HEADER_LIMIT, decode_header, encode_header
 
 ANY = "*"
-"""The md5sum, or the name, of any type."""
+"""The md5sum or name that matches any type."""
 
 _LENGTH = struct.Struct("<I")
 _SMALL_BYTES = 1 << 16  # a frame that is read without asking for memory
@@ -21,7 +21,7 @@ _COPIES = 2  # of a frame that has just come whole
 
 @dataclass(frozen=True, slots=True)
 class NodeLimits:
-    """The limits of a node; times are in seconds."""
+    """The limits of a node. Times are in seconds."""
 
     message_bytes: int = 64 << 20
     connections: int = 256  # from other nodes, to its topics, services and API
@@ -34,7 +34,7 @@ class NodeLimits:
 
 @dataclass(frozen=True, slots=True)
 class MessageType:
-    """A message type; `definition` is the full text."""
+    """A message type with the full text of its `definition`."""
 
     name: str
     md5sum: str
@@ -42,7 +42,6 @@ class MessageType:
 
     @classmethod
     def defined(cls, definitions: Definitions, name: str) -> "MessageType":
-        """Raises `DefinitionError`."""
         return cls(name, definitions.md5sum(name), definitions.full_text(name))
 
 
@@ -50,9 +49,7 @@ ANY_TYPE = MessageType(ANY, ANY, "")
 
 
 async def read_frame(reader: asyncio.StreamReader, limit: int) -> bytes:
-    """Raises `LimitExceededError` as soon as the announced length is too large, and `OSError` if the
-    connection ends.
-    """
+    """Return the next frame. Raise `LimitExceededError` before reading a frame that is too long, or `OSError`."""
     try:
         return await reader.readexactly(await _read_size(reader, limit))
     except asyncio.IncompleteReadError:
@@ -61,7 +58,10 @@ async def read_frame(reader: asyncio.StreamReader, limit: int) -> bytes:
 
 @contextlib.asynccontextmanager
 async def held_frame(reader: asyncio.StreamReader, limit: int, memory: NodeMemory) -> AsyncIterator[bytes]:
-    """Hold the frame's memory during the block. Raises the errors of `read_frame`, also if there is no room."""
+    """Yield the next frame, and hold its memory during the block.
+
+    Raise `LimitExceededError` if the frame is too long or does not fit into the memory, or `OSError`.
+    """
     try:
         size = await _read_size(reader, limit)
         held = _COPIES * size
@@ -88,7 +88,7 @@ def _ended() -> ConnectionResetError:
 
 
 async def read_header(reader: asyncio.StreamReader, seconds: float) -> dict[str, str]:
-    """Raises `ProtocolError`, or `OSError` if the connection ends or the time limit passes."""
+    """Return the peer's header. Raise `ProtocolError`, or `OSError` if the connection ends or the time has passed."""
     async with asyncio.timeout(seconds):
         return decode_header(await read_frame(reader, HEADER_LIMIT))
 
@@ -96,19 +96,19 @@ async def read_header(reader: asyncio.StreamReader, seconds: float) -> dict[str,
 async def exchange_headers(
     reader: asyncio.StreamReader, writer: ByteWriter, header: Mapping[str, str], seconds: float
 ) -> dict[str, str]:
-    """Return the answer. Raises the errors of `accepted`, or `OSError`."""
+    """Send a header and return the answer. Raise `ProtocolError` with the peer's reason, or `OSError`."""
     writer.write(encode_header(header))
     return accepted(await read_header(reader, seconds))
 
 
 def accepted(answer: dict[str, str]) -> dict[str, str]:
-    """Raises `ProtocolError` with the peer's reason if it rejects the connection."""
+    """Return a peer's answer, or raise `ProtocolError` with its reason if it rejects the connection."""
     if "error" in answer:
         raise ProtocolError(f"the peer rejected the connection: {answer['error'][:1000]}")
     return answer
 
 
 def refuse(writer: ByteWriter, reason: str) -> None:
-    """Refuse a connection with a reason, which the peer's node logs."""
+    """End a connection with a reason, which the peer's node logs."""
     writer.write(encode_header({"error": reason}))
     writer.close()

@@ -1,6 +1,6 @@
-"""The topics of a node: subscribers that follow their publishers, and publishers with a queue for each subscriber.
+"""The topics of a node: subscriptions that follow publishers, and publications with a queue for each subscriber.
 
-A publisher never waits for a subscriber: the oldest waiting messages are dropped and counted.
+A publisher never waits for a subscriber. Instead, the oldest waiting messages are dropped and counted.
 """
 
 import asyncio
@@ -35,7 +35,7 @@ _OVERHEAD = 64  # bytes that a waiting frame takes besides its own
 
 
 class OwnMemory:
-    """A memory of at most `most` bytes for one node."""
+    """A `NodeMemory` of at most `most` bytes for one node."""
 
     def __init__(self, most: int) -> None:
         self._most = most
@@ -51,9 +51,9 @@ class OwnMemory:
 
 @dataclass(frozen=True, slots=True)
 class NodeLink:
-    """The name, network and send queues of a node, as its topics and services use them.
+    """The parts of a node that its topics and services use.
 
-    Large received frames take `arriving`; `skipped()` is called for each message that finds no room there.
+    Large frames take memory from `arriving` until they are complete. `skipped` is called for each that finds none.
     """
 
     name: str
@@ -65,7 +65,7 @@ class NodeLink:
 
 
 class NodeSubscription:
-    """A subscription: one connection for each publisher, opened again whenever it ends.
+    """A subscription with one connection for each publisher, which is reopened whenever it ends.
 
     `problems` has the reason for each publisher that cannot be reached.
     """
@@ -86,7 +86,7 @@ class NodeSubscription:
         ] = {}  # number and checksum of each latched publisher's last message
 
     def update(self, uris: Sequence[str]) -> None:
-        """Connect to the publishers in the list, and drop all others."""
+        """Connect to the publishers in the list, and disconnect from all others."""
         self.updates += 1
         wanted = dict.fromkeys(uris[: self._link.limits.publishers])
         for uri in [uri for uri in self._followed if uri not in wanted]:
@@ -97,13 +97,13 @@ class NodeSubscription:
                 self._followed[uri] = self._tasks.start(self._follow(uri))
 
     async def headers(self) -> list[Mapping[str, str]]:
-        """Wait until a publisher is connected."""
+        """Wait until a publisher is connected, and return the headers of all that are."""
         while not self.connected:
             await self._connection.wait()
         return [*self.connected.values()]
 
     def hear_own(self, body: Body, header: Mapping[str, str]) -> None:
-        """Ignore messages of other types than the wanted one."""
+        """Receive a message of this node's own publication, unless it has another type."""
         if self.wanted.md5sum in (ANY, header["md5sum"]):
             self._received(body, header)
 
@@ -168,9 +168,9 @@ class NodeSubscription:
             receiver.close()
 
     def repeat(self, received: Received) -> None:
-        """Give `received` the last message of each latched publisher, which sends it over a connection of its own.
+        """Give `received` the last message of each latched publisher, which sends it over an additional connection.
 
-        A message that the present connection brings at the same time, or later, comes only from there.
+        A message that the present connection delivers at the same time or later is not given twice.
         """
         for uri in [uri for uri, header in self.connected.items() if header.get("latching") == "1"]:
             self._tasks.start(self._repeat(uri, received))
@@ -214,11 +214,11 @@ class NodeSubscription:
 
 
 class NodePublication:
-    """A publication; `queue` messages wait for each subscriber, and `dropped` counts those lost.
+    """A publication. At most `queue` messages wait for each subscriber; `dropped` counts the lost ones.
 
-    A latched publication sends its last message to each new subscriber. Subscribers connect some time after
-    the registration, so those within `replay` seconds get all messages until then. `own` returns the node's
-    own subscription: as with rospy and roscpp, its messages take no connection.
+    A latched publication sends its last message to each new subscriber. Subscribers connect some time after the
+    registration, so those that connect within `replay` seconds get all messages until then. `own` returns the node's
+    own subscription, which gets the messages without a connection, as with rospy and roscpp.
     """
 
     def __init__(
@@ -267,7 +267,7 @@ class NodePublication:
         return self._dropped + sum(one.dropped for one in self._served)
 
     def publish(self, body: bytes) -> None:
-        """Raises `LimitExceededError` if a latched message cannot be kept."""
+        """Send a message to all subscribers. Raise `LimitExceededError` if a latched message cannot be kept."""
         stays = self.latched or self._replays()
         frame = encode_frame(body) if self._served or stays else b""
         if stays:
@@ -278,7 +278,7 @@ class NodePublication:
             own.hear_own(body, self._header)
 
     def repeat(self, received: Received) -> None:
-        """Give `received` the last message, if the publication is latched."""
+        """Give `received` the last message of a latched publication."""
         if self.latched:
             for frame in self._kept.frames:
                 received(frame[4:], self._header)  # without its length
@@ -330,16 +330,17 @@ class NodePublication:
 
 
 class SendQueues:
-    """All messages of a node that wait for other nodes. Without room, the longest queue loses its oldest message."""
+    """All messages of a node that wait for other nodes. They share a memory."""
 
     def __init__(self, memory: NodeMemory) -> None:
         self.memory = memory
         self.queues: set[_SendQueue] = set()
 
     def make_room(self, own: "_SendQueue", size: int) -> str:
-        """Drop messages until `own` has room for a message of this size; return the reason if it gets none.
+        """Drop messages until `own` has room for one of this size, or return the reason why it gets none.
 
-        A queue drops messages of others only while it would not be the longest itself, unless it is pinned.
+        The longest queue loses its oldest message first, so a queue drops messages of others only until it would be
+        the longest itself. A pinned queue drops those of others in any case.
         """
         claim = 0 if own.pinned else own.bytes + size
         wanted = size - own.bytes if own.pinned else size  # a pinned message is replaced
@@ -355,7 +356,7 @@ class SendQueues:
 
 
 class _SendQueue:
-    """The messages that wait for one subscriber, or for later ones. Those `pinned` are never dropped."""
+    """The messages that wait for one subscriber, or for later ones. A pinned queue loses none to others."""
 
     def __init__(self, name: str, most: int, queues: SendQueues, *, pinned: bool = False) -> None:
         self.name = name
@@ -370,7 +371,10 @@ class _SendQueue:
             queues.queues.add(self)
 
     def put(self, frame: bytes) -> None:
-        """Without room, drop older frames or this one. Raises `LimitExceededError` if this one is pinned."""
+        """Add a message, for which older ones make room. If they cannot, drop it.
+
+        Raise `LimitExceededError` instead if the queue is pinned.
+        """
         size = _held(frame)
         reason = self._queues.make_room(self, size)
         if reason and self.pinned:

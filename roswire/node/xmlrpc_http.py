@@ -1,4 +1,4 @@
-"""XML-RPC over HTTP on a node's connections: one call as a client, and a server for the node API.
+"""XML-RPC over HTTP on a node's connections: calls as a client, and a server for the node API.
 
 Every wait has a time limit, and every request and answer a size limit.
 """
@@ -26,9 +26,9 @@ from roswire.xmlrpc import (
 )
 
 CALL_LIMITS = XmlRpcLimits(body=1 << 20, elements=20_000, depth=8, string=1 << 16, parts=1)
-"""The largest answer of a node names its topics."""
+"""The limits of a node's answer. The longest answers list the node's topics."""
 SERVED_LIMITS = XmlRpcLimits(parts=1)
-"""The largest call to a node has the value of a parameter."""
+"""The limits of a call to a node. The longest calls contain the value of a parameter."""
 
 _HEAD_BYTES = 16 << 10
 _IDLE_SECONDS = 120.0
@@ -44,7 +44,7 @@ async def call_xmlrpc(
     seconds: float,
     limits: XmlRpcLimits = DEFAULT_LIMITS,
 ) -> Value:
-    """Raises `PeerUnreachableError`, or another `RosError` if the answer is not usable."""
+    """Return the result of a call. Raise `PeerUnreachableError`, or another `RosError` if the answer is unusable."""
     where = node_uri(uri.host, uri.port, uri.path)
     host = f"[{uri.host}]" if ":" in uri.host else uri.host
     body = build_call(method, params)
@@ -72,8 +72,6 @@ async def call_xmlrpc(
 
 
 class _Message:
-    """Collects the bodies of complete messages for httptools."""
-
     def __init__(self) -> None:
         self.bodies: deque[bytes] = deque()
         self._body = bytearray()
@@ -90,7 +88,7 @@ class _Message:
 
 
 def _value(status: int, answer: bytes, limits: XmlRpcLimits) -> Value:
-    """A status other than 200 may come with the reason as a fault."""
+    """Return the value of an answer. With a status other than 200, its reason may still be a fault."""
     try:
         value = parse_response(answer, limits)
     except FaultReceived:
@@ -130,7 +128,7 @@ def _feed(parser: "httptools.HttpResponseParser | httptools.HttpRequestParser", 
 async def serve_xmlrpc(
     reader: asyncio.StreamReader, writer: ByteWriter, answer: Callable[[MethodCall], Awaitable[Value]]
 ) -> None:
-    """Answer calls in order, until the peer ends the connection, is idle, or breaks the protocol."""
+    """Answer calls in order until the peer ends the connection, is idle, or breaks the protocol."""
     message = _Message()
     parser = httptools.HttpRequestParser(message)
     received = 0  # bytes since the last complete request

@@ -1,4 +1,4 @@
-"""XML-RPC as ROS 1 uses it, without I/O. Received bytes are never forwarded: values are parsed, then encoded again."""
+"""XML-RPC as ROS 1 uses it, without I/O. Received bytes are never forwarded, but parsed and encoded again."""
 
 from roswire.xmlrpc.common_documents import FaultReceived, MethodCall, parse_call, parse_response
 from roswire.xmlrpc.xmlrpc_values import DEFAULT_LIMITS, Value, XmlRpcLimits

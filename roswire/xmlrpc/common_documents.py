@@ -1,9 +1,9 @@
-"""Parse requests and answers; common ones fast: names, numbers, and lists of both, as ROS clients write them.
+"""Parse requests and answers, with a fast path for common ones: names, numbers, and lists of both.
 
-One pattern matches the whole document, or each part of a multicall. It accepts a subset of the documents that
-`xmlrpc_reader` accepts, with the same values; all others, and all errors, are left to `xmlrpc_reader`. A
-single complex part of a multicall also is, so that it does not slow the other parts. Strings are printable
-ASCII that XML need not escape.
+On the fast path, one pattern matches the whole document, or each part of a multicall. It accepts a subset of the
+documents that `xmlrpc_reader` accepts, with the same values. Strings are printable ASCII that needs no XML escapes.
+`xmlrpc_reader` parses all other documents and reports all errors. It also parses a complex part of a multicall, so
+that the other parts stay on the fast path.
 """
 
 import re
@@ -25,7 +25,6 @@ _DOUBLE = rb"-?[0-9]++(?:\.[0-9]++)?(?:e[-+]?[0-9]++)?"
 
 
 def _scalar(group: bytes = b"(?:") -> bytes:
-    """Return the pattern of a scalar; the group of each kind of content has a name that begins with `group`."""
     kinds = (
         (b"string", _TEXT), (b"int", _INTEGER), (b"i4", _INTEGER), (b"boolean", b"[01]"), (b"double", _DOUBLE)
     )  # fmt: skip
@@ -44,7 +43,6 @@ def _spaced(*parts: bytes) -> re.Pattern[bytes]:
 
 
 def _list_in(group: bytes) -> bytes:
-    """Return the pattern of a list whose last item may be a list of scalars."""
     each = group + _EACH + b")"
     return _ARRAY + each + b"(?:" + _ARRAY + each + _END + b")?" + _END
 
@@ -82,7 +80,7 @@ _STRUCT_END = re.compile(b"</struct>" + _SPACE + b"</value>" + _SPACE)
 
 
 def read_common_call(body: bytes, limits: XmlRpcLimits) -> tuple[str, list[Value]] | None:
-    """Return the method and the parameters (of a multicall: of all parts); None unless all are scalars."""
+    """Return the method and its parameters (of a multicall: of all parts), or None unless all are scalars."""
     if not _fits(body, limits):
         return None
     found = _CALL.match(body) if len(body) <= _LONGEST else None
@@ -93,7 +91,7 @@ def read_common_call(body: bytes, limits: XmlRpcLimits) -> tuple[str, list[Value
 
 
 def read_common_answer(body: bytes, limits: XmlRpcLimits) -> list[Value] | None:
-    """Return the answers; None unless each is a list of scalars whose last item may be such a list."""
+    """Return the answers, or None unless each is a list of scalars, of which the last may be a list of scalars."""
     if not _fits(body, limits):
         return None
     found = _ANSWER.match(body) if len(body) <= _LONGEST else None
@@ -108,7 +106,7 @@ def _several(
     patterns: tuple[re.Pattern[bytes], re.Pattern[bytes], re.Pattern[bytes]],
     read: Callable[[re.Match[bytes]], Value],
 ) -> list[Value] | None:
-    """Return the parts of a document; None unless it has at least one, and nothing else between its head and end."""
+    """Return the parts of a document, or None unless it has at least one part and nothing else."""
     head, part, end = patterns
     found = head.match(body)
     if found is None:
@@ -126,7 +124,7 @@ def _several(
 
 
 def _struct(body: bytes, begin: int, limits: XmlRpcLimits) -> tuple[Value, int]:
-    """Return the struct as `reader` does, and its end. Raises `PeerError` if there is no struct.
+    """Return a part as `xmlrpc_reader` parses it, and the position of its end. Raise `PeerError` unless a struct.
 
     A value that is valid alone in a document is also valid in any other position one level deeper.
     """
@@ -176,14 +174,14 @@ def _values(text: bytes) -> list[Value]:
 
 @dataclass(frozen=True, slots=True)
 class MethodCall:
-    """`method` is as received."""
+    """A call. `method` is as received, not checked."""
 
     method: str
     params: tuple[Value, ...]
 
 
 class FaultReceived(PeerError):  # noqa: N818 - named as the event it is: the answer was a fault
-    """The method failed."""
+    """The answer is a fault: the method failed."""
 
     def __init__(self, code: int, text: str) -> None:
         super().__init__(f"fault {code}: {text}")
@@ -192,7 +190,7 @@ class FaultReceived(PeerError):  # noqa: N818 - named as the event it is: the an
 
 
 def parse_call(body: bytes, limits: XmlRpcLimits = DEFAULT_LIMITS) -> MethodCall:
-    """Raises `ProtocolError` or `LimitExceededError`."""
+    """Return the call in a request. Raise `ProtocolError` or `LimitExceededError`."""
     parsed = read_common_call(body, limits)
     if parsed is None:
         document = XmlRpcDocument(body, limits, "methodCall")
@@ -208,7 +206,7 @@ def parse_call(body: bytes, limits: XmlRpcLimits = DEFAULT_LIMITS) -> MethodCall
 
 
 def parse_response(body: bytes, limits: XmlRpcLimits = DEFAULT_LIMITS) -> Value:
-    """Raises `FaultReceived` if the answer is a fault, `ProtocolError` or `LimitExceededError`."""
+    """Return the value of an answer. Raise `FaultReceived` for a fault, `ProtocolError` or `LimitExceededError`."""
     parsed = read_common_answer(body, limits)
     if parsed is not None:
         return parsed

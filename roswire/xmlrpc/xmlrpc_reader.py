@@ -1,13 +1,13 @@
 """Parse an XML-RPC document into values, under limits.
 
-The parser follows one table, `_GRAMMAR`, and rejects everything else. It also accepts some forms outside the
+The parser follows the table `_GRAMMAR`, and rejects everything else. It also accepts some forms outside the
 specification, because ROS clients send them: values without a type (strings; XmlRpc++), `<nil/>`, `inf` and `nan`,
 space around numbers, CDATA sections (rosnodejs), and the extensions of Apache XML-RPC (rosjava). Invariants:
 
 1. A document type and processing instructions are rejected, so only the five entities of XML exist, and there are no
    external references.
 2. The parser takes one pass, in linear time, and stores only values, whose number, depth and size are bounded.
-3. Every error is a `PeerError` with a byte offset.
+3. Every error is a `PeerError`. It names the byte offset, except for `LimitExceededError`.
 """
 
 import binascii
@@ -76,7 +76,7 @@ _NO_SPACE = str.maketrans("", "", _SPACE)
 
 
 class XmlRpcDocument:
-    """Reads a document; afterwards `method`, `values` and `is_fault` have its contents."""
+    """Parses a document. Afterwards, `method`, `values` and `is_fault` have its contents."""
 
     __slots__ = ("_depth", "_elements", "_expat", "_follow", "_keys", "_limits", "_stack", "_state", "_text",
                  "_value", "is_fault", "method", "values")  # fmt: skip
@@ -114,9 +114,9 @@ class XmlRpcDocument:
     def _parse(self, body: bytes) -> None:
         """Feed the parser in pieces, and reject a tag that is longer than a piece.
 
-        When a handler raises, expat still reads the rest of its piece and keeps a stack of the elements
-        there. An unfinished tag is scanned again with the next piece, and its attributes are collected. Small
-        pieces and short tags keep all three cheap.
+        When a handler raises, expat still reads the rest of its piece and keeps a stack of the elements there. It
+        scans an unfinished tag again with the next piece, and collects the attributes of a tag. Small pieces and
+        short tags bound this work.
         """
         parser = self._expat
         if len(body) <= _PIECE:
@@ -194,7 +194,7 @@ class XmlRpcDocument:
         return string
 
     def _scalar(self) -> str:
-        """Return the text of a scalar; it is limited because a pattern is matched to it without interruption."""
+        """Return the text of a scalar. Its length is limited because a pattern match cannot be interrupted."""
         text = self._string()
         if len(text) > _LONGEST_SCALAR:
             raise self._error(
@@ -260,7 +260,6 @@ class XmlRpcDocument:
         return self._state if self._state != "full" else "an element that is complete"
 
     def _pass_space(self) -> None:
-        """ROS clients write a line feed between elements."""
         if self._text != _LINE_FEED:
             text = "".join(self._text).strip(_SPACE)
             if text:

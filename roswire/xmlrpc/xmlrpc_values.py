@@ -9,12 +9,12 @@ Value: TypeAlias = "bool | int | float | str | bytes | datetime | list[Value] | 
 
 @dataclass(frozen=True, slots=True)
 class XmlRpcLimits:
-    """The defaults exceed the documents of a large robot."""
+    """The limits of one document. The defaults exceed the documents of a large robot."""
 
     body: int = 16 << 20  # bytes
     elements: int = 1_000_000  # values, including those in arrays and structs
     depth: int = 100  # nested arrays and structs
-    string: int = 8 << 20  # characters of one string, bytes of one base64 value
+    string: int = 8 << 20  # characters of one string, or of the text of one base64 value
     parts: int = 100_000  # calls in one system.multicall
 
 

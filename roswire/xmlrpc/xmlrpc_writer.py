@@ -1,6 +1,6 @@
 r"""Build XML-RPC documents in the notation of Python's `xmlrpc.client`, which every ROS client reads.
 
-This module, `rosmaster` and rospy read the output back as the same value. roscpp also does, except for `\r`,
+`xmlrpc_reader`, `rosmaster` and rospy read the output back as the same value. roscpp also does, except for `\r`,
 because XmlRpc++ knows no character references.
 """
 
@@ -18,7 +18,7 @@ _MAX_WRITE_DEPTH = 200  # well below Python's own limit, far above the reader's 
 
 
 def build_call(method: str, params: Sequence[Value]) -> bytes:
-    """Raises `EncodingError` for a value that XML-RPC has no notation for."""
+    """Return a call. Raise `EncodingError` for a value that XML-RPC cannot represent."""
     out = ["<?xml version='1.0'?>\n<methodCall>\n<methodName>", _text(method), "</methodName>\n<params>\n"]
     for value in params:
         if type(value) is str:
@@ -32,7 +32,7 @@ def build_call(method: str, params: Sequence[Value]) -> bytes:
 
 
 def build_response(value: Value) -> bytes:
-    """Raises `EncodingError` for a value that XML-RPC has no notation for."""
+    """Return an answer. Raise `EncodingError` for a value that XML-RPC cannot represent."""
     out = ["<?xml version='1.0'?>\n<methodResponse>\n<params>\n<param>\n"]
     _write(value, out, 0)
     out.append("</param>\n</params>\n</methodResponse>\n")
@@ -40,7 +40,7 @@ def build_response(value: Value) -> bytes:
 
 
 def build_fault(code: int, text: str) -> bytes:
-    """Replace characters of `text` that XML has no notation for by `?`."""
+    """Return a fault. Characters of `text` that XML cannot represent become `?`."""
     out = ["<?xml version='1.0'?>\n<methodResponse>\n<fault>\n"]
     _write({"faultCode": code, "faultString": _NOT_XML.sub("?", text)}, out, 0)
     out.append("</fault>\n</methodResponse>\n")
