@@ -1,8 +1,8 @@
 """`rosrv demo`: the appliance at work, in about a minute.
 
 A lab on this machine has four hosts: the appliance, a simulated LandShark of real ROS nodes, its operator, and an
-attacker, who tries everything that ROS 1 allows any host. Scripts can rely on the exit status: 0 if the robot obeyed
-only its operator.
+attacker, who tries everything that ROS 1 allows any host to do. The exit status is 0 if the robot obeyed only its
+operator.
 """
 
 import shutil
@@ -72,7 +72,7 @@ _NODE_PACKAGES = (
 
 
 class Show:
-    """The demonstration, act by act; `results` are the results for the summary."""
+    """The demonstration, act by act. `results` collects the outcomes for the summary."""
 
     def __init__(self, stage: Stage, door: Doorway, console: Console) -> None:
         self.stage, self.door, self.console = stage, door, console
@@ -82,7 +82,6 @@ class Show:
         self.robot: list[Actor] = []
 
     def run(self) -> bool:
-        """Return whether every result was as expected."""
         self.introduce()
         self.open()
         operator = self.mission()
@@ -156,7 +155,7 @@ class Show:
         self.results.append(Result(attempt.name, attempt.succeeded, "granted by the policy"))
 
     def expect_denied(self, attack: Attack) -> None:
-        """Report the rule from the audit log."""
+        """Print an attack with the rule that denied it, from the audit log."""
         if attack.succeeded:
             self.decided("SUCCEEDED", f"{attack.name}: {attack.tried}", attack.answer)
             self.results.append(Result(f"attack: {attack.name}", good=False, remark=attack.answer))
@@ -167,19 +166,16 @@ class Show:
         self.results.append(Result(f"attack: {attack.name}", good=record is not None, remark=why))
 
     def expect_blocked(self, attack: Attack) -> None:
-        """The attack bypasses the appliance; the robot's own packet filter must block it."""
+        """Print an attack that bypasses the appliance, so that only the robot's own packet filter can block it."""
         outcome = "SUCCEEDED" if attack.succeeded else "blocked"
         self.decided(outcome, f"{attack.name}: {attack.tried}", f"rosrv protect: {attack.answer}")
         self.results.append(Result(f"attack: {attack.name}", not attack.succeeded, attack.answer))
 
     def record_of(self, attack: Attack) -> Record | None:
-        """Return the denial of an attack: a new record of its resource, or the record whose reason the answer
-        repeats.
-        """
+        """Return the denial of an attack: a new record of its resource, or the one whose reason the answer repeats."""
         before = self.last_sequence
 
         def find(found: list[Record]) -> Record | None:
-            """Choose from denials, newest first; prefer a record with a rule."""
             denials = [one for one in found if one["event"] != "denials folded"]
             self.last_sequence = max((one["sequence"] for one in denials), default=before)
             matching = [
@@ -193,7 +189,6 @@ class Show:
         return self.stage.recorded(find, "--deny", "--host", ATTACKER, "--limit", "1000")
 
     def aftermath(self, operator: Actor, before: dict[str, Any]) -> None:
-        """Every node is alive, the robot still drives, and only the operator fired."""
         self.headline("The robot is unaffected")
         after = operator.newest("position")
         dead = [actor.name for actor in [*self.robot, operator] if not actor.running]
@@ -230,7 +225,6 @@ class Show:
 
 
 def rule_of(record: Record) -> str:
-    """Return the rule with its position in the policy file; without a rule, the reason."""
     rule = record.get("rule")
     if not rule:
         return str(record.get("reason", ""))
@@ -238,7 +232,6 @@ def rule_of(record: Record) -> str:
 
 
 def require_everything() -> None:
-    """Raises `DemoError`."""
     if not has_privileges():
         raise DemoError(
             "the demonstration creates four hosts as network namespaces, which needs root: "
@@ -257,7 +250,7 @@ def require_everything() -> None:
 
 
 def demonstrate(*, hold: bool, picture: Path | None, as_json: bool, standby: bool = False) -> int:
-    """Return the exit status; draw the robot's paths into the file `picture`."""
+    """Return the exit status. Draw the robot's paths into the file `picture`."""
     console, errors = Console(stderr=as_json), Console(stderr=True)
     signal.signal(signal.SIGTERM, _interrupt)
     try:
@@ -301,7 +294,6 @@ def demonstrate(*, hold: bool, picture: Path | None, as_json: bool, standby: boo
 
 
 def _show_standby(stage: StandbyStage, console: Console, hold: bool, as_json: bool) -> int:
-    """Return the exit status."""
     show = StandbyShow(stage, console)
     good = show.run()
     _print_results(show.results, as_json)

@@ -1,6 +1,6 @@
-"""Forward a loopback port to a host of a lab that has no network link to this machine, for the demonstration's console.
+"""Forward a loopback port to a host of a lab for the demonstration's console: a lab has no link to this machine.
 
-Clients are not authenticated, because the port is on loopback and the console requires a token.
+Clients are not authenticated here, because the console requires a token.
 """
 
 import contextlib
@@ -17,7 +17,7 @@ _PIECE = 65536
 
 
 class Doorway:
-    """A port on 127.0.0.1 of this machine, as a context manager. `target` is an address on `host`."""
+    """A port on 127.0.0.1 of this machine, forwarded to `target`, an address on `host`."""
 
     def __init__(self, host: Host, target: tuple[str, int]) -> None:
         self._host, self._target = host, target

@@ -44,7 +44,7 @@ TYPES = {
 
 @dataclass(frozen=True)
 class Part:
-    """The operator's commands for some seconds; the gun is aimed at the beginning and fired in the middle."""
+    """The operator's commands for some seconds. The gun is aimed at the beginning and fired in the middle."""
 
     seconds: float
     forward: float = 0.0
@@ -72,7 +72,7 @@ MISSION = (
 
 @dataclass(frozen=True)
 class Message:
-    """A published message; `result` is passed, changed or dropped."""
+    """A published message. `result` is passed, changed or dropped."""
 
     time: int
     topic: str
@@ -82,7 +82,7 @@ class Message:
 
 @dataclass(frozen=True)
 class Shot:
-    """A pull of the trigger: its time, the gun's angle, and whether the driver got the message (`fired`)."""
+    """A pull of the trigger. `fired` is whether the driver got the message."""
 
     time: int
     tilt: float
@@ -99,13 +99,13 @@ class Drive:
     log: list[tuple[int, str]] = field(default_factory=list)
 
     def nearest(self, obstacle: physics.Obstacle) -> float:
-        """In metres; negative inside the obstacle."""
+        """Return the smallest distance from the obstacle's edge in metres, negative inside it."""
         return (
             min(math.hypot(pose.x - obstacle.x, pose.y - obstacle.y) for pose in self.poses) - obstacle.radius
         )
 
     def farthest(self) -> float:
-        """The largest distance in metres between the robot and its origin."""
+        """Return the largest distance from the origin in metres."""
         return max(math.hypot(pose.x, pose.y) for pose in self.poses)
 
 
@@ -140,7 +140,7 @@ class Simulation:
         return self.drive
 
     def _send(self, topic: str, **fields: object) -> bytes | None:
-        """Return the bytes that subscribers get, or None if the message was dropped."""
+        """Return the bytes that subscribers get, or None if a monitor dropped the message."""
         data = self._messages.encode(
             TYPES[topic],
             header__stamp__sec=self._now // 10**9,
@@ -212,7 +212,6 @@ class Simulation:
 
 
 def record(drive: Drive, path: Path) -> None:
-    """Raises `FileExistsError`."""
     if path.exists():
         raise FileExistsError(f"{path} already exists")
     store = Messages().store

@@ -6,9 +6,9 @@ with Lab("rosrv-test") as lab:
     process = robot.popen(["rosmaster", "--core"])
 ```
 
-The bridge is in a separate namespace, so nothing appears in the machine's own one, and two labs may use the same
-addresses at once. Leaving the block ends every process in the lab's namespaces. If the lab's process died before
-that, the next lab with the same prefix deletes them.
+The bridge has its own namespace, so nothing appears in the machine's, and two labs may use the same addresses at the
+same time. Leaving the block ends every process in the lab's namespaces. If the lab's own process is killed, the next
+lab with the same prefix deletes them.
 """
 
 import contextlib
@@ -37,7 +37,7 @@ T = TypeVar("T")
 
 
 class Host:
-    """A namespace with `lo` and `eth0` up."""
+    """A namespace with the interfaces `lo` and `eth0`."""
 
     def __init__(self, name: str, namespace: Namespace, port: str, addresses: tuple[str, ...]) -> None:
         self.name = name
@@ -47,19 +47,16 @@ class Host:
 
     @property
     def address(self) -> str:
-        """Without prefix length."""
         return self.interfaces[0].partition("/")[0]
 
     @property
     def address6(self) -> str:
-        """Without prefix length."""
         for text in self.interfaces:
             if ":" in text:
                 return text.partition("/")[0]
         raise NetworkError(f"the host {self.name} was given no IPv6 address")
 
     def popen(self, args: Sequence[str | os.PathLike[str]], **options: Any) -> "subprocess.Popen[Any]":
-        """The program ends with the lab at the latest."""
         return self.namespace.popen(args, **options)
 
     def run(self, function: Callable[[], T]) -> T:
@@ -67,12 +64,12 @@ class Host:
         return self.namespace.run(function)
 
     def entered(self) -> contextlib.AbstractContextManager[None]:
-        """Move the calling thread to the host for a block that does not await."""
+        """Move the calling thread to the host for a block, which must not await."""
         return self.namespace.entered()
 
 
 class Lab:
-    """The names of the lab's namespaces begin with `prefix`."""
+    """A lab whose namespaces have names that begin with `prefix`."""
 
     _numbers = itertools.count(1)
 
@@ -102,7 +99,7 @@ class Lab:
         self.close()
 
     def host(self, name: str, *addresses: str, gateway: str | None = None) -> Host:
-        """Addresses are as `10.77.0.10/24`, `fd77::10/64`."""
+        """Add a host with addresses such as `10.77.0.10/24` and `fd77::10/64`."""
         if name in self.hosts:
             raise ValueError(f"the lab has a host {name} already")
         if not addresses:
@@ -126,13 +123,12 @@ class Lab:
         interfaces.set_link(self.switch, host.port, up=True)
 
     def close(self) -> None:
-        """A second call does nothing."""
         _clear([*(host.namespace for host in self.hosts.values()), self.switch])
         self.hosts.clear()
 
 
 def clear_leftovers(prefix: str) -> list[str]:
-    """Delete the labs of this prefix whose process has ended; return the names of their namespaces."""
+    """Delete the labs of this prefix whose process has ended, and return the names of their namespaces."""
     pattern = re.compile(re.escape(prefix) + r"\.(\d+)\.\d+\.")
     left = []
     for namespace in namespaces(prefix + "."):

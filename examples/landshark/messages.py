@@ -1,4 +1,4 @@
-"""Encode and decode the LandShark's messages without ROS. Missing fields are zero; `a__b` is the field `a.b`."""
+"""Encode and decode the LandShark's messages without ROS. Missing fields are zero; `a__b` means the field `a.b`."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -52,6 +52,5 @@ class Messages:
 
 
 def long_name(kind: str) -> str:
-    """Return `package/msg/Type`."""
     package, _, name = kind.partition("/")
     return f"{package}/msg/{name}"

@@ -1,4 +1,4 @@
-"""Play the last act of `rosrv demo`: mistakes of the operator that no policy can forbid, but monitors prevent.
+"""Play an act of `rosrv demo`: the operator makes mistakes that no policy can forbid, but monitors prevent.
 
 The expected results depend on the simulated robot (`examples/landshark/nodes/physics.py`): it moves through
 obstacles, and continues for half a second after its last command.
@@ -18,11 +18,11 @@ OUTSIDE_ASIDE = ("24", "6")
 FAR_OUT = 23.0
 
 Ways = dict[str, Sequence[Sequence[float]]]
-"""The robot's path in metres, `without` monitors and `guarded` by them."""
+"""The robot's paths in metres, `without` monitors and `guarded` by them."""
 
 
 class Narrator(Protocol):
-    """The demonstration's printer, which also stores the results."""
+    """Prints the demonstration, and collects its results."""
 
     results: list[Result]
 
@@ -38,7 +38,6 @@ class Mistakes:
         self._stage, self._narrator = stage, narrator
 
     def run(self) -> Ways:
-        """Return the robot's paths without and with monitors."""
         self._narrator.headline(
             "The operator makes a mistake and fires while the gun points at the robot itself"
         )
@@ -86,7 +85,7 @@ class Mistakes:
         self._narrator.say(f"rosrv monitor enable {name}  ({self._stage.monitors / file})")
 
     def _fires(self, what: str, *, hit: bool) -> None:
-        """Pull the trigger; `hit` is whether a shot is expected."""
+        """Pull the trigger. `hit` is whether a shot is expected."""
         fired = self._stage.command("fire")
         shots = fired["shots"] - fired["before"]
         self._result(what, shots == (1 if hit else 0), "1 shot" if shots == 1 else f"{shots} shots")

@@ -1,7 +1,6 @@
-"""Draw two drives from above as an SVG: the yard, the obstacle, the robot's path, the shots, and the gun's angle over
-time.
+"""Draw drives from above as an SVG: the yard, the obstacle, the robot's path, the shots, and the gun's angle.
 
-The text has its own background, so that the picture can also be read on a dark page.
+The picture has its own background, so that it is also readable on a dark page.
 """
 
 import html
@@ -56,7 +55,7 @@ def draw_ways(
     cut: list[physics.Pose] | None = None,
     stopped: list[physics.Pose] | None = None,
 ) -> str:
-    """Also draw two drives whose link is `cut`."""
+    """Draw the paths of a robot, with `cut` and `stopped` also those of one whose link is cut."""
     parts = [
         '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 1000 640" role="img">',
         "<title>The LandShark's ways from above, without and with monitors</title>",
@@ -75,7 +74,6 @@ def draw_ways(
 
 
 def _cut(cut: list[physics.Pose], stopped: list[physics.Pose]) -> list[str]:
-    """Draw the drives to the west whose link is cut, and the fence."""
     left, top = _at(-FENCE, FENCE)
     size = 2 * FENCE * SCALE
     parts = [

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Result:
-    """A step that should succeed or fail, and its outcome."""
+    """A step and its outcome. `good` means that it succeeded or failed as expected."""
 
     what: str
     good: bool

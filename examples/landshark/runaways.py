@@ -1,4 +1,4 @@
-"""Play the act of `rosrv demo` about guards: the operator's link is cut at full speed, and the base drives on.
+"""Play an act of `rosrv demo`: the operator's link is cut at full speed, and the base keeps driving.
 
 `rosrv guard` makes three guards from presets: `deadman` stops the base, `speed` limits it, and `fence` keeps it
 inside a square.
@@ -20,13 +20,10 @@ RAN_AWAY, STOPPED = 4.0, 2.0  # metres after the cut: at least without a guard, 
 
 
 class Runaways:
-    """Cut the link without and with a guard; then drive too fast, and too far."""
-
     def __init__(self, stage: Stage, narrator: Narrator) -> None:
         self._stage, self._narrator = stage, narrator
 
     def run(self) -> Ways:
-        """Return the robot's paths after a cut, without and with guards."""
         self._narrator.headline(
             "The operator's link is cut at full speed, and the base has no timeout of its own"
         )
@@ -62,7 +59,7 @@ class Runaways:
         return {"cut": without, "stopped": guarded}
 
     def _cut(self, base: Actor) -> tuple[float, list[tuple[float, float]]]:
-        """Return how far the robot went afterwards, and its path."""
+        """Cut the link at full speed. Return the distance that the robot then drove, and its path."""
         base.expect("moved")
         plug = self._stage.cut_while_driving(TOP_SPEED)
         try:
@@ -77,7 +74,6 @@ class Runaways:
         return metres, [(0.0, 0.0), (begin["x"], begin["y"]), (end["x"], end["y"])]
 
     def _guard(self, preset: str, value: str, *further: str) -> None:
-        """The guard begins in shadow mode."""
         new = ("guard", "new", preset, COMMANDS, *further, "--shadow", value)
         self._stage.order(*new)
         self._stage.order("guard", "enforce", preset)

@@ -1,6 +1,6 @@
 """Run the actors of the demonstration: a simulated LandShark, its operator and an attacker, each on a host of a lab.
 
-The nodes know nothing of the appliance except ROS_MASTER_URI.
+The nodes know the appliance only as ROS_MASTER_URI.
 """
 
 import contextlib
@@ -39,7 +39,7 @@ Record = dict[str, Any]
 
 
 class DemoError(RuntimeError):
-    """The demonstration cannot continue; the text names what is missing, and the file to read."""
+    """The demonstration cannot continue. The text has the reason, and where possible the end of a log."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class Attack:
 
 
 class Actor:
-    """A process on a host that prints one JSON object per line; its other output goes to a file."""
+    """A process on a host that prints one JSON object per line. Its other output goes to the file `log`."""
 
     def __init__(
         self, host: Host, name: str, command: list[str], environment: dict[str, str], log: Path
@@ -77,7 +77,7 @@ class Actor:
         return self.process.poll() is None
 
     def expect(self, event: str, seconds: float = START_SECONDS) -> Event:
-        """Skip all events before this one."""
+        """Wait for an event, and skip all before it. Raise `DemoError` if the process ends or the time has passed."""
         deadline = time.monotonic() + seconds
         while True:
             try:
@@ -103,7 +103,7 @@ class Actor:
             self.process.send_signal(signal.SIGTERM)
 
     def stop(self, seconds: float = 6.0) -> None:
-        """SIGTERM, then SIGKILL."""
+        """End the process with SIGTERM, and after some seconds with SIGKILL."""
         if self.running:
             self.interrupt()
             try:
@@ -134,10 +134,10 @@ class Actor:
 
 
 class Stage:
-    """A context manager, which ends all programs."""
+    """The hosts of the demonstration and the programs on them. Leaving the block ends all programs."""
 
     def __init__(self, lab: Lab, shipped: Path, master: str = MASTER_URI) -> None:
-        """The nodes get the URI `master`."""
+        """Make the hosts. Nodes get `master` as their ROS_MASTER_URI."""
         self.master = master
         self.appliances = [APPLIANCE]
         self.shipped = shipped
@@ -157,7 +157,6 @@ class Stage:
         self.actors: list[Actor] = []
 
     def start_appliance(self) -> Event:
-        """Return the ready line, once nodes may connect."""
         return self.run_appliance(self.appliance_host, "rosrv up", self.state).expect("ready")
 
     def run_appliance(self, host: Host, name: str, state: Path) -> Actor:
@@ -179,7 +178,7 @@ class Stage:
         return self._start(host, name, command)
 
     def start_robot(self) -> list[Actor]:
-        """Five rospy nodes and, if it was compiled, one roscpp node."""
+        """Start five rospy nodes, and one roscpp node if it was compiled."""
         python = {
             "base": ["base.py"],
             "turret": ["turret.py"],
@@ -198,7 +197,7 @@ class Stage:
         ]
 
     def make_radar(self) -> bool:
-        """Compile the roscpp node; return False if there is no compiler."""
+        """Compile the roscpp node, or return False if there is no compiler."""
         # A checkout compiles it once; an installed package is never written to.
         program = (self.shipped / "build" if IS_CHECKOUT else self.directory) / "landshark_radar"
         build = self.shipped / "scripts" / "build-roscpp"
@@ -212,7 +211,6 @@ class Stage:
         return True
 
     def protect_robot(self) -> None:
-        """The nodes' own ports then answer the appliance only."""
         command = [sys.executable, "-m", "appliance.cli.main", "protect", "--apply"]
         for address in self.appliances:
             command += ["--appliance", address]
@@ -227,7 +225,7 @@ class Stage:
         return self._start(self.operator_host, "ocu", [NODE_PYTHON, str(self.nodes / "ocu.py")])
 
     def command(self, what: str, *values: str) -> Event:
-        """The control unit has ended before; return the event of `command.py`."""
+        """Run `command.py` as the operator, whose control unit must have ended, and return its event."""
         program = [NODE_PYTHON, str(self.nodes / "command.py"), what, *values]
         actor = self._start(self.operator_host, "ocu command", program)
         said = actor.expect(
@@ -238,7 +236,6 @@ class Stage:
         return said
 
     def draw(self, ways: dict[str, Sequence[Sequence[float]]], picture: Path) -> None:
-        """Ways are in metres, without and with monitors."""
         file = self.directory / "ways.json"
         file.write_text(json.dumps(ways))
         command = [sys.executable, "-m", "examples.landshark.ways", str(file), str(picture.resolve())]
@@ -254,7 +251,7 @@ class Stage:
             raise DemoError(f"the picture {picture} cannot be drawn: {done.stderr.strip()}")
 
     def console(self) -> Doorway:
-        """The console listens on loopback of the appliance's host."""
+        """Forward a port to the console, which listens on the loopback of the appliance's host."""
         return Doorway(self.appliance_host, CONSOLE)
 
     def rosrv(self, *arguments: str) -> str:
@@ -268,7 +265,6 @@ class Stage:
         return self.rosrv(*arguments, "--state", str(self.state))
 
     def start_runaway(self, heading: float) -> Actor:
-        """Replace the robot's base by one that does not stop when commands cease."""
         for base in [actor for actor in self.actors if actor.name == "landshark_base"]:
             base.stop()
             self.actors.remove(base)
@@ -276,7 +272,6 @@ class Stage:
         return self._start(self.robot_host, "landshark_base", command)
 
     def cut_while_driving(self, forward: float) -> Callable[[], None]:
-        """Cut the link at full speed; return the function that plugs it in again."""
         command = [NODE_PYTHON, str(self.nodes / "command.py"), "dash", str(forward)]
         actor = self._start(self.operator_host, "ocu command", command)
         actor.expect("dashing", COMMAND_SECONDS)
@@ -302,7 +297,7 @@ class Stage:
         return Attack(name, said["tried"], text, said["succeeded"])
 
     def audit(self, *flags: str) -> list[dict[str, Any]]:
-        """Take the flags of `rosrv audit search`."""
+        """Return the records that `rosrv audit search` finds with these flags."""
         command = [sys.executable, "-m", "appliance.cli.main", "audit", "search", *flags, "--json"]
         command += ["--state", str(self.state)]
         done = subprocess.run(command, capture_output=True, text=True, timeout=START_SECONDS, check=False)
@@ -311,14 +306,16 @@ class Stage:
         return [json.loads(line) for line in done.stdout.splitlines() if line.strip()]
 
     def recorded(self, find: Callable[[list[Record]], Record | None], *flags: str) -> Record | None:
-        """Return None after `RECORD_SECONDS`: the log may write a record shortly after the answer to its call."""
+        """Repeat a search until `find` returns a record: the log writes it shortly after the answer to the call.
+
+        Return None after `RECORD_SECONDS`.
+        """
         end = time.monotonic() + RECORD_SECONDS
         while (found := find(self.audit(*flags))) is None and time.monotonic() < end:
             pass  # a search is a process, which takes a moment
         return found
 
     def close(self) -> None:
-        """End all programs, the appliance last, and remove their files."""
         for actor in self.actors[1:]:
             actor.interrupt()  # all at once, because each takes a second to end
         for actor in reversed(self.actors):

@@ -1,4 +1,4 @@
-"""`rosrv demo --standby`: two appliances; the active one loses its power while the operator drives.
+"""`rosrv demo --standby`: two appliances, of which the active one loses its power while the operator drives.
 
 The exit status is 0 if the standby took over, no node ended, and both audit logs together prove the takeover.
 """
@@ -28,7 +28,7 @@ _PAUSE_SECONDS = 0.2
 
 
 class StandbyStage(Stage):
-    """A robot with two appliances, its operator, and the programs that keep and follow the lease."""
+    """A robot with two appliances, its operator, and the programs that grant and follow the lease."""
 
     def __init__(self, lab: Lab, shipped: Path) -> None:
         super().__init__(lab, shipped, f"http://{FIXED}:11311")
@@ -38,7 +38,7 @@ class StandbyStage(Stage):
         self.kit = self.directory / "kit"
 
     def join(self) -> None:
-        """Start witness and follower as their kits' services do."""
+        """Make the pair, and start the witness and a follower as the services of their kits do."""
         first = ["--address", APPLIANCE, "--other", OTHER, "--witness", ROBOT, "--fixed", FIXED]
         first += ["--follower", f"ocu={OPERATOR}", "--ports", "11311,19001-26000", "--output", str(self.kit)]
         self.rosrv("standby", "join", *first, "--state", str(self.state))
@@ -58,7 +58,7 @@ class StandbyStage(Stage):
             self._start(host, folder, [*program, verb, *settings])
 
     def _settings(self, folder: str) -> Path:
-        """The files lie in the demonstration's folder instead of /etc and /var."""
+        """Keep the lease's file in the demonstration's folder instead of /var, and return the settings."""
         path = self.kit / folder / "witness.json"
         settings = json.loads(path.read_text()) | {"state": str(self.directory / f"{folder}-lease")}
         path.write_text(json.dumps(settings))
@@ -77,7 +77,6 @@ class StandbyStage(Stage):
         return found
 
     def until(self, state: Path, **wanted: object) -> None:
-        """Wait for these values in `rosrv standby status`."""
         end = time.monotonic() + _SEARCH_SECONDS
         while time.monotonic() < end:
             seen = self.standby(state)
@@ -86,7 +85,6 @@ class StandbyStage(Stage):
         raise DemoError(f"rosrv standby status never had {wanted}: {self.standby(state)}")
 
     def cut_power(self, host: Host) -> None:
-        """End all processes of a host at once, and take its link down."""
         interfaces.set_link(host.namespace, INTERFACE, up=False)
         for pid in host.namespace.processes():
             with contextlib.suppress(ProcessLookupError):
@@ -99,7 +97,6 @@ class StandbyShow:
         self.results: list[Result] = []
 
     def run(self) -> bool:
-        """Return whether every result was as expected."""
         stage = self.stage
         self.headline("Two appliances become a pair: rosrv standby join")
         stage.join()

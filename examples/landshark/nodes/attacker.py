@@ -45,7 +45,6 @@ class _Transport(xmlrpc.client.Transport):
 
 
 def call(uri, method, *parameters):
-    """Return the answer, or the failure in the form of an answer."""
     try:
         with xmlrpc.client.ServerProxy(uri, transport=_Transport(), allow_none=True) as server:
             return list(getattr(server, method)(*parameters))
@@ -63,7 +62,7 @@ def look_around():
 
 
 def take_over_the_operator():
-    """ROS shuts the real node of this name down."""
+    """Register the operator's name: ROS then shuts down the real node."""
     return forge("ocu")
 
 
@@ -97,7 +96,7 @@ def forge(name):
 
 
 def replace_a_driver():
-    """The driver's name receives the operator's commands."""
+    """Subscribe under the driver's name, so that the operator's commands go to this host."""
     arguments = ("/landshark_turret", "/landshark_control/trigger", "*", MY_API)
     answer = call(MASTER, "registerSubscriber", *arguments)
     if granted(answer):  # undo the registration
@@ -106,7 +105,7 @@ def replace_a_driver():
 
 
 def watch_the_battery():
-    """Wait until the robot publishes the charge, which this host's task is to read."""
+    """Do what the policy allows: read the charge, as soon as the robot publishes it."""
     deadline, pause = time.monotonic() + ROBOT_LIMIT, threading.Event()
     while True:
         succeeded, tried, answer = subscribe(BATTERY)
@@ -160,7 +159,6 @@ def exactly(peer, size):
 
 
 def kill_a_node():
-    """Find a node's API and call its `shutdown`."""
     found = call(MASTER, "lookupNode", ME, VICTIM)
     if not granted(found):
         return False, f"lookupNode({VICTIM})", found
@@ -170,7 +168,6 @@ def kill_a_node():
 
 
 def try_every_port():
-    """Call `shutdown` on every open port, bypassing the master, and try to read the position from each."""
     host = urlsplit(MASTER).hostname
     said = []
     for port in RELAY_PORTS:
@@ -187,7 +184,6 @@ def try_every_port():
 
 
 def go_past_the_master():
-    """Call `shutdown` on the first port of the robot that answers as a node."""
     tried = f"shutdown() of a node, found by a port scan of {ROBOT}"
     ports = open_ports(ROBOT, NODE_PORTS)
     for port in ports:
@@ -199,7 +195,7 @@ def go_past_the_master():
 
 
 def open_ports(host, ports, at_once=800, seconds=0.25):
-    """Try `at_once` ports at a time."""
+    """Return the ports that accept a connection. Try `at_once` ports at a time."""
     found = []
     for start in range(0, len(ports), at_once):
         with selectors.DefaultSelector() as selector, contextlib.ExitStack() as opened:
@@ -218,7 +214,7 @@ def open_ports(host, ports, at_once=800, seconds=0.25):
 
 
 def stop_the_clock():
-    """Later nodes wait for a clock that never ticks."""
+    """Switch to simulated time: nodes that start later wait for a clock that never ticks."""
     answer = call(MASTER, "setParam", ME, "/use_sim_time", True)
     if granted(answer):
         call(MASTER, "deleteParam", ME, "/use_sim_time")

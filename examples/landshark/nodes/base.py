@@ -1,6 +1,6 @@
-"""Run /landshark_base, the motors: velocity commands in, odometry out. The robot stops when commands cease.
+"""Run /landshark_base, the motors: it takes velocity commands and publishes odometry. It stops when commands cease.
 
-With the arguments `runaway HEADING` it lacks this timeout, as many real drivers do, and reports its motion.
+With the arguments `runaway HEADING` it does not stop, like many real drivers, and reports its motion.
 """
 
 import math

@@ -3,10 +3,10 @@
     command.py drive FORWARD TURN SECONDS | dash FORWARD | reach X Y | aim PAN TILT | fire
 
 Positions are in metres, speeds in metres and radians a second, angles in radians. The program prints one JSON object:
-`drove` (the position at the end), `dashing` (the program drives on), `reached` (the way, whether the robot arrived,
-its smallest distance from the obstacle's edge, negative inside, and its largest from the origin), `aimed` (the
-angle), or `fired` (the shots so far). A message that is published once is latched for a while, as with `rostopic pub
--1`.
+`drove` (the position at the end), `dashing` (the program continues to drive), `reached` (the path, whether the robot
+arrived, its smallest distance from the obstacle's edge, negative inside, and its largest distance from the origin),
+`aimed` (the angle), or `fired` (the shots so far). A message that is published once is latched for a while, as with
+`rostopic pub -1`.
 """
 
 import math
@@ -44,7 +44,6 @@ class Display:
             self.changed.notify_all()
 
     def wait(self, condition, seconds=SECONDS):
-        """Return whether a message satisfied `condition`."""
         with self.changed:
             return self.changed.wait_for(
                 lambda: self.message is not None and condition(self.message), seconds
@@ -52,7 +51,6 @@ class Display:
 
 
 def connected(publisher):
-    """End the program if no subscriber connects."""
     rate = rospy.Rate(HERTZ)
     for _ in range(int(SECONDS * HERTZ)):
         if publisher.get_num_connections():
@@ -62,7 +60,6 @@ def connected(publisher):
 
 
 def drive(forward, turn, seconds):
-    """Return when the robot has stopped."""
     display = Display("/landshark/odom", Odometry)
     publisher = connected(rospy.Publisher("/landshark_control/base_velocity", TwistStamped, queue_size=10))
     rate = rospy.Rate(HERTZ)
@@ -78,7 +75,6 @@ def drive(forward, turn, seconds):
 
 
 def dash(forward):
-    """Drive until the program is killed."""
     display = Display("/landshark/odom", Odometry)
     publisher = connected(rospy.Publisher("/landshark_control/base_velocity", TwistStamped, queue_size=10))
     display.wait(lambda _odometry: True)
@@ -96,7 +92,7 @@ def dash(forward):
 
 
 def reach(x, y):
-    """At top speed; give up when the robot gets no nearer."""
+    """Drive to a position at top speed. Give up when the robot stops getting nearer."""
     display = Display("/landshark/odom", Odometry)
     publisher = connected(rospy.Publisher("/landshark_control/base_velocity", TwistStamped, queue_size=10))
     display.wait(lambda _odometry: True)
@@ -127,7 +123,6 @@ def reach(x, y):
 
 
 def aim(pan, tilt):
-    """Wait until the gun points there."""
     display = Display("/landshark/joint_states", JointState)
     publisher = connected(rospy.Publisher("/landshark_control/turret", JointState, queue_size=10, latch=True))
     message = JointState(name=["turret_pan", "turret_tilt"], position=[pan, tilt])

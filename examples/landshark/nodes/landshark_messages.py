@@ -1,7 +1,7 @@
 """Make the LandShark's own message type from its .msg file at run time, as `catkin_make` would at build time.
 
-LANDSHARK_MESSAGES names the folder with `landshark_msgs/PaintballTrigger.msg`; the default is `monitors/msg` of this
-checkout.
+The environment variable LANDSHARK_MESSAGES names the folder with `landshark_msgs/PaintballTrigger.msg`. The default
+is `monitors/msg` of this checkout.
 """
 
 import os

@@ -1,7 +1,7 @@
 """Run /ocu, the operator control unit: drive out, aim, fire once, then patrol until a signal.
 
-Prints one JSON object per line: `connected`, `drove` (metres), `aimed` (radians), `fired` (shots so far), `position`,
-`lost` (the robot's odometry is late), and `regained` (the seconds until it arrived again).
+It prints one JSON object per line: `connected`, `drove` (metres), `aimed` (radians), `fired` (shots so far),
+`position`, `lost` (the robot's odometry is late), and `regained` (the seconds until it arrived again).
 """
 
 import threading
@@ -48,17 +48,15 @@ class Operator:
             self.changed.notify_all()
 
     def wait(self, condition, seconds=30.0):
-        """Return whether the displays satisfied `condition`."""
         with self.changed:
             return self.changed.wait_for(lambda: rospy.is_shutdown() or condition(self.seen), seconds)
 
     def connected(self):
-        """Every control reaches a driver and every display shows something."""
         controls = (self.velocity, self.turret, self.trigger)
         return len(self.seen) == 4 and all(control.get_num_connections() for control in controls)
 
     def drive(self, forward, turn=0.0):
-        """The velocity must be repeated within half a second."""
+        """Send a velocity, which must be repeated within half a second."""
         message = TwistStamped()
         message.header.stamp = rospy.Time.now()
         message.twist.linear.x, message.twist.angular.z = forward, turn
@@ -82,7 +80,7 @@ class Operator:
                 report("lost")
 
     def x(self):
-        """Return how far east the robot is, in metres."""
+        """Return the distance to the east in metres."""
         return self.seen["/landshark/odom"].pose.pose.position.x
 
 

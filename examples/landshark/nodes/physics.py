@@ -29,8 +29,6 @@ class Pose:
 
 @dataclass(frozen=True)
 class Velocity:
-    """The base's commanded forward speed and turn rate."""
-
     forward: float = 0.0
     turn: float = 0.0
 
@@ -52,7 +50,7 @@ YARD = (Obstacle(x=8.0, y=0.5, radius=1.0),)
 
 
 def limit(value: float, low: float, high: float) -> float:
-    """For not-a-number return the middle of the limits."""
+    """Return the value within the limits, or their middle if it is not a number."""
     if math.isnan(value):
         return (low + high) / 2
     return min(max(value, low), high)
@@ -68,7 +66,6 @@ def normal_angle(angle: float) -> float:
 
 
 def possible(velocity: Velocity) -> Velocity:
-    """Return the velocity that the motors can reach for a command."""
     return Velocity(
         forward=limit(velocity.forward, -TOP_SPEED, TOP_SPEED),
         turn=limit(velocity.turn, -TOP_TURN_RATE, TOP_TURN_RATE),
@@ -95,7 +92,7 @@ def drive(pose: Pose, velocity: Velocity, seconds: float) -> Pose:
 
 
 def aim(turret: Turret, wanted: Turret, seconds: float) -> Turret:
-    """Return the turret after it moved toward the wanted angles, within its limits."""
+    """Return the turret after it has moved toward the wanted angles, within its limits."""
     reach = TURRET_SPEED * seconds
     pan, tilt = limit(wanted.pan, *PAN_LIMITS), limit(wanted.tilt, *TILT_LIMITS)
     return Turret(
@@ -105,14 +102,14 @@ def aim(turret: Turret, wanted: Turret, seconds: float) -> Turret:
 
 
 def position_on_earth(pose: Pose) -> tuple[float, float]:
-    """Latitude and longitude in degrees."""
+    """Return latitude and longitude in degrees."""
     north, east = ORIGIN
     per_degree = math.radians(1) * EARTH_RADIUS
     return north + pose.y / per_degree, east + pose.x / (per_degree * math.cos(math.radians(north)))
 
 
 def distance_along(pose: Pose, direction: float, obstacle: Obstacle) -> float:
-    """Infinite if the ray in this direction from the robot misses the obstacle."""
+    """Return the distance to the obstacle in a direction relative to the heading, or infinity if the ray misses it."""
     ray = pose.heading + direction
     to_x, to_y = obstacle.x - pose.x, obstacle.y - pose.y
     ahead = to_x * math.cos(ray) + to_y * math.sin(ray)
@@ -129,11 +126,11 @@ def distance_along(pose: Pose, direction: float, obstacle: Obstacle) -> float:
 def scan(
     pose: Pose, directions: list[float], obstacles: tuple[Obstacle, ...] = YARD, reach: float = 30.0
 ) -> list[float]:
-    """Infinite beyond the laser's range."""
+    """Return the laser's distances, which are infinite beyond its reach."""
     nearest = (min(distance_along(pose, direction, thing) for thing in obstacles) for direction in directions)
     return [distance if distance <= reach else math.inf for distance in nearest]
 
 
 def drained(charge: float, speed: float, seconds: float) -> float:
-    """Return the charge (1 is full)."""
+    """Return the charge (1 is full) after this time."""
     return max(0.0, charge - (DRAIN_IDLE + DRAIN_MOVING * abs(speed)) * seconds)

@@ -1,6 +1,6 @@
-"""Report events to the program's starter: one JSON object per line on standard output, or words for a person.
+"""Report events to the program that started a node: one JSON object per line, or words for a person.
 
-The words are for the containers of compose.yaml: LANDSHARK_REPORTS=words.
+The containers of compose.yaml set LANDSHARK_REPORTS=words.
 """
 
 import json
@@ -18,7 +18,7 @@ QUIET = ("position",)  # it comes every second
 
 
 def report(event, **fields):
-    """One write and no lock, because a signal handler may interrupt another report."""
+    """Write a line in one system call and without a lock, because a signal handler may interrupt another report."""
     if os.environ.get("LANDSHARK_REPORTS") != "words":
         line = json.dumps({"event": event, **fields}, default=str)
     elif event in QUIET:

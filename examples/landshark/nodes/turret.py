@@ -1,7 +1,6 @@
-"""Run /landshark_turret, the gun: joint commands and triggers in, joint states and the count of shots out.
+"""Run /landshark_turret, the gun: it takes joint commands and triggers, and publishes joint states and shots.
 
-The driver fires in whatever direction the gun points, even at the robot itself: preventing that is the task of a
-monitor.
+The driver fires wherever the gun points, even at the robot itself. Preventing that is the task of a monitor.
 """
 
 import threading
