@@ -1,3 +1,1 @@
-"""Build and sign (`release`) the released files: Debian packages (`deb`), the image (`image`) and an archive
-(`site`).
-"""
+"""Build the released files (`deb`, `image`, and `site` for an archive), and sign them (`release`)."""

@@ -1,7 +1,7 @@
 """Print docs/reference/audit-events.md, from the registry and from the calls that record events.
 
-The fields of `detail`, and severities that are missing in the registry, are read from these calls. Events whose names
-are computed (the log's own records, the actions of monitors) are in `ELSEWHERE`.
+These calls define the fields of `detail`, and the severities that the registry lacks. `ELSEWHERE` lists the fields of
+events whose calls do not show them, such as the log's own records and the actions of monitors.
 """
 
 import ast

@@ -31,7 +31,7 @@ class _Command(NamedTuple):
 
 
 def page() -> str:
-    """Shared options come first, then each command."""
+    """Return the page: options that many commands share, then each command."""
     found = [*_commands("rosrv", app), *_commands("rosmop", rosmop_app)]
     uses = Counter(option for one in found for option in one.options)
     shared = sorted(option for option, number in uses.items() if number >= _SHARED_BY)
@@ -68,7 +68,7 @@ def _commands(name: str, application: typer.Typer) -> Iterator[_Command]:
 
 
 def commands(words: tuple[str, ...], application: typer.Typer) -> Iterator[tuple[tuple[str, ...], Any, Any]]:
-    """Yield a program and its visible commands: the words of each, the command and its context."""
+    """Yield a program and its visible commands: the words, the command, and its context."""
     root = typer.main.get_command(application)
     yield from _below(words, root, root.make_context(words[0], [], resilient_parsing=True))
 

@@ -1,9 +1,9 @@
-"""`make package`: dist/rosrv_VERSION_ARCH.deb for Debian 12 and Ubuntu 24.04.
+"""`make package`: build dist/rosrv_VERSION_ARCH.deb for Debian 12 and Ubuntu 24.04.
 
     python -m distribution.deb amd64 arm64
 
-All times are that of the newest commit, so two builds of one commit are equal, byte by byte. DEBFULLNAME and DEBEMAIL
-name the maintainer, as for Debian's own tools.
+All files have the time of the newest commit, so two builds of one commit are equal byte by byte. DEBFULLNAME and
+DEBEMAIL name the maintainer, as for Debian's own tools.
 """
 
 import os
@@ -32,7 +32,7 @@ COMPLETIONS = {
     "zsh": "usr/share/zsh/vendor-completions/_rosrv",
     "fish": "usr/share/fish/vendor_completions.d/rosrv.fish",
 }
-"""Where each shell looks for completions of a package."""
+"""The files in which each shell looks for the completions of a package."""
 _NO_ADDRESS = "maintainers@localhost"
 _LAUNCHER = """\
 #!/usr/lib/rosrv/bin/python -P
@@ -48,7 +48,7 @@ main()
 
 
 def build(architecture: Architecture, *, moment: int) -> Path:
-    """All times are at `moment` (seconds since the epoch)."""
+    """Build the package. All its files get the time `moment` (seconds since the epoch)."""
     work = ROOT / "build/package" / architecture.debian
     shutil.rmtree(work, ignore_errors=True)
     source = work / "source"
@@ -76,7 +76,6 @@ def build(architecture: Architecture, *, moment: int) -> Path:
 
 
 def _gather(source: Path, architecture: Architecture, work: Path, moment: int) -> None:
-    """Copy all files of the package to `source/root`."""
     root = source / "root"
     library = root / LIBRARY
     make_environment(library, architecture, work)
@@ -126,7 +125,7 @@ def _gather(source: Path, architecture: Architecture, work: Path, moment: int) -
 
 
 def _make_virtual(library: Path) -> None:
-    """The environment is for Debian's interpreter, any of `INTERPRETERS`."""
+    """Make `library` a virtual environment of Debian's interpreter, which may be any of `INTERPRETERS`."""
     (library / "bin").mkdir()
     (library / "bin/python").symlink_to("/usr/bin/python3")
     (library / "pyvenv.cfg").write_text("home = /usr/bin\ninclude-system-site-packages = false\n")
@@ -173,7 +172,6 @@ def _missing_packages(architectures: list[str]) -> list[str]:
 
 
 def main(arguments: list[str]) -> int:
-    """Return exit status 1 with a message on failure."""
     unknown = [name for name in arguments if name not in ARCHITECTURES]
     if unknown or not arguments:
         sys.stderr.write(f"package: give architectures of {', '.join(ARCHITECTURES)}, not {unknown}\n")

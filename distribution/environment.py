@@ -4,8 +4,8 @@
     lib/python3.12/site-packages
     common                         files for all: each `site-packages` has a `common.pth` with its path
 
-The wheels are those of requirements.lock, by hash. None of their code runs here. python-iptables comes as source; its
-one C file needs only libc, and is compiled here.
+The wheels are those of requirements.lock, verified by hash. None of their code runs here. python-iptables has no
+wheel; its one C file needs only libc, and is compiled here.
 """
 
 import filecmp
@@ -26,14 +26,14 @@ _SOURCE_ONLY = "python-iptables"
 
 @dataclass(frozen=True)
 class Architecture:
-    """A Debian architecture with its names."""
+    """A Debian architecture and its GNU triplet."""
 
     debian: str
     triplet: str
 
     @property
     def machine(self) -> str:
-        """Return the architecture's name in wheels and the kernel."""
+        """The name of the architecture in wheels and in the kernel."""
         return self.triplet.partition("-")[0]
 
 
@@ -44,7 +44,7 @@ ARCHITECTURES = {
 
 
 def make_environment(target: Path, architecture: Architecture, work: Path) -> None:
-    """The folder `target` must be new. Raises `subprocess.CalledProcessError`, `ValueError`."""
+    """Make the environment in the new folder `target`. Raise `subprocess.CalledProcessError` or `ValueError`."""
     wheels, source = _split_lock((ROOT / "requirements.lock").read_text(), work)
     trees = [target / f"lib/python{version}/site-packages" for version in INTERPRETERS]
     for version, tree in zip(INTERPRETERS, trees, strict=True):
@@ -59,7 +59,7 @@ def make_environment(target: Path, architecture: Architecture, work: Path) -> No
 
 
 def _split_lock(lock: str, work: Path) -> tuple[Path, Path]:
-    """Packages with wheels come first, then packages as source."""
+    """Return the lock of the packages with wheels, and that of the package that comes as source."""
     entries = re.split(r"\n(?=\S)", lock)
     own = [entry for entry in entries if entry.startswith(f"{_SOURCE_ONLY}==")]
     if len(own) != 1:
@@ -121,7 +121,7 @@ _TESTS = ("tests", "test_data")
 
 
 def _leave_out(tree: Path) -> None:
-    """Remove programs, tests and data of tests of the packages."""
+    """Remove files that the installed program does not need."""
     shutil.rmtree(tree / "bin", ignore_errors=True)
     for tests in [path for path in tree.rglob("*") if path.name in _TESTS and path.is_dir()]:
         shutil.rmtree(tests, ignore_errors=True)

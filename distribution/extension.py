@@ -3,9 +3,9 @@
     python distribution/extension.py               # appliance/relay/transport/pump.abi3.so, for this machine
     python distribution/extension.py --sanitized   # build/extension/sanitized/pump.abi3.so, for the fuzzers
 
-Every build uses this file. It needs gcc, the headers of libc and Python, and the locked Cython, and does nothing if
-they and the source are unchanged. The module uses only the stable interface of Python 3.11, so it serves all later
-versions.
+Every build uses this file. It needs gcc, the headers of libc and Python, and the locked Cython. It does nothing if
+they and the source are unchanged. The module uses only the stable interface of Python 3.11, so it also runs with
+later versions.
 """
 
 import fcntl
@@ -46,13 +46,13 @@ _CHECKED = (
 
 
 class ExtensionError(Exception):
-    """The module cannot be built: the text has the reason and the remedy."""
+    """The module cannot be built. The text has the reason and the remedy."""
 
 
 def build(variant: str = _NATIVE) -> Path:
-    """For an architecture (`aarch64-linux-gnu`), or `SANITIZED` for this machine.
+    """Return the module, compiled if it is not up to date. `variant` is a triplet or `SANITIZED`.
 
-    Raises `ExtensionError`. Safe to run twice at once.
+    Raise `ExtensionError`. A lock makes simultaneous calls safe.
     """
     folder = ROOT / "build/extension" / variant
     folder.mkdir(parents=True, exist_ok=True)
@@ -68,7 +68,7 @@ def build(variant: str = _NATIVE) -> Path:
 
 
 def install() -> bool:
-    """Put the module beside its source; return whether it changed."""
+    """Copy the module beside its source, and return whether it has changed."""
     made = build()
     if IN_PLACE.exists() and filecmp.cmp(made, IN_PLACE, shallow=False):
         return False
@@ -118,9 +118,10 @@ def _compile(variant: str, folder: Path, made: Path) -> None:
 
 
 def _foreign_headers(folder: Path, triplet: str) -> str:
-    """Provide the one header of Python that Debian installs by architecture, and return the option for it.
+    """Return the option that lets a compiler for another architecture find this machine's `pyconfig.h`.
 
-    The files of amd64 and arm64 differ in four lines, which no header of the stable interface reads.
+    Debian installs only this header of Python by architecture. The files differ in four lines, which the stable
+    interface does not use.
     """
     place = folder / "include" / triplet
     place.mkdir(parents=True, exist_ok=True)
@@ -139,7 +140,6 @@ def _run(command: list[str]) -> None:
 
 
 def main(arguments: list[str]) -> int:
-    """Return exit status 1 with a message on failure."""
     if arguments not in ([], [f"--{SANITIZED}"]):
         sys.stderr.write(f"extension: the only option is --{SANITIZED}, not {' '.join(arguments)}\n")
         return 2

@@ -1,10 +1,10 @@
-"""`make image`: dist/rosrv-image_VERSION_ARCH.tar, for `docker load` and all OCI tools.
+"""`make image`: build dist/rosrv-image_VERSION_ARCH.tar, for `docker load` and all OCI tools.
 
     python -m distribution.image [OPTIONS OF docker build …]
     python -m distribution.image lock BASE [OPTIONS …]     new image-packages.lock from Debian's present packages
 
-The engine's result is rewritten: no time in it is later than the newest commit, so that two builds of one commit can
-be equal. One layer is added, with the list of parts (`sbom`) and the origin of the build.
+The engine's result is rewritten so that no time in it is later than the newest commit: two builds of one commit can
+be equal. An additional layer has the list of parts (`sbom`) and the origin of the build.
 """
 
 import hashlib
@@ -35,7 +35,7 @@ _HEAD = (
 
 @dataclass(frozen=True)
 class Blob:
-    """A part of the image, named by its digest; `file` holds it."""
+    """A part of the image in `file`, named by its digest."""
 
     file: Path
     digest: str
@@ -46,9 +46,9 @@ class Blob:
 
 
 def build(options: list[str], *, moment: int) -> tuple[Path, Path]:
-    """Times are up to `moment` (seconds since the epoch); return the paths of image and list.
+    """Return the paths of the image and its list of parts. No time in them is later than `moment` (seconds).
 
-    Raises `subprocess.CalledProcessError`.
+    Raise `subprocess.CalledProcessError`.
     """
     # Without a cache, because older parts would keep their own times.
     pins = " ".join(line for line in LOCK.read_text().splitlines() if not line.startswith("#"))
@@ -66,7 +66,7 @@ def build(options: list[str], *, moment: int) -> tuple[Path, Path]:
 
 
 def lock(base: str, build_options: list[str]) -> None:
-    """List the packages of the image that are not in its base image."""
+    """Write the packages that the image has in addition to those of its base image to the lock file."""
     options = ["--quiet", "--target", "appliance", str(ROOT)]
     listed = "dpkg-query --show --showformat '${Package}=${Version}\\n'"
     before, after = (
@@ -103,7 +103,7 @@ def _rewrite(saved: Path, work: Path, moment: int) -> tuple[Path, Path]:
 def _kept(
     members: tarfile.TarFile, tree: ImageFiles, moment: int
 ) -> Iterator[tuple[tarfile.TarInfo, IO[bytes] | None]]:
-    """Yield the entries of a layer, without values that differ between builds. Add each entry to `tree`."""
+    """Yield the entries of a layer without values that differ between builds, and add each to `tree`."""
     for member in members:
         member.mtime = min(int(member.mtime), moment)
         member.pax_headers = {
@@ -145,7 +145,7 @@ def _blob(path: Path) -> Blob:
 
 
 def _settled(config: dict[str, Any], layers: list[Blob], moment: int) -> dict[str, Any]:
-    """Leave out values that the building engine set."""
+    """Return the image's configuration without the values that depend on the building engine."""
     created = datetime.fromtimestamp(moment, UTC).isoformat().replace("+00:00", "Z")
     history = [{**step, "created": created} for step in config["history"]]
     history.append(
@@ -173,7 +173,7 @@ def _settled(config: dict[str, Any], layers: list[Blob], moment: int) -> dict[st
 
 
 def _write_oci(image: Path, config: dict[str, Any], layers: list[Blob], moment: int) -> None:
-    """Include the manifest.json for `docker load`."""
+    """Write the image as an OCI layout, with the manifest.json that `docker load` reads."""
     folder = layers[0].file.parent
 
     def document(name: str, content: Any) -> Blob:
@@ -225,7 +225,7 @@ def _docker(*arguments: str) -> str:
 
 
 def attempt(options: list[str]) -> tuple[Path, ...]:
-    """Return an empty tuple if the engine fails."""
+    """Build the image and print its files, or print the error and return an empty tuple."""
     try:
         made = build(options, moment=time_of_commit())
     except FileNotFoundError:
@@ -240,7 +240,6 @@ def attempt(options: list[str]) -> tuple[Path, ...]:
 
 
 def main(arguments: list[str]) -> int:
-    """Return the exit status."""
     if arguments[:1] == ["lock"]:
         lock(arguments[1], arguments[2:])
         return 0

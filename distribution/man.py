@@ -1,6 +1,8 @@
-"""Write the man pages of `rosrv` from its own help: rosrv(1), and a page for each verb.
+"""Write the man pages of `rosrv` from its own help: rosrv(1), and a page for each command.
 
-python -m distribution.man DIRECTORY DATE     (DATE as 2026-11-01: two builds write the same)
+    python -m distribution.man DIRECTORY DATE
+
+DATE has the form 2026-11-01. It is an argument so that two builds write the same pages.
 """
 
 import re

@@ -4,8 +4,8 @@
     SHA256SUMS        of every file, as `sha256sum --check` reads them
     SHA256SUMS.sig    ECDSA P-256 over SHA256SUMS, as `cosign verify-blob` and `openssl dgst` check it
 
-The key belongs to the person who releases (`openssl ecparam -name prime256v1 -genkey -noout`). The target builds
-everything again before it signs, so that all files are of one commit.
+The person who releases keeps the key (`openssl ecparam -name prime256v1 -genkey -noout`). The target first builds
+everything again, so that all signed files are of one commit.
 """
 
 import base64
@@ -34,7 +34,7 @@ _MATERIALS = (
 
 
 def release(folder: Path, key: Path) -> None:
-    """Raises `ValueError` for an invalid key or an empty folder."""
+    """Sign the files in a folder. Raise `ValueError` for an unsuitable key or an empty folder."""
     private = load_pem_private_key(key.read_bytes(), password=None)
     if not isinstance(private, ec.EllipticCurvePrivateKey) or private.curve.name != "secp256r1":
         raise ValueError(f"{key} is not a private key on the curve P-256")
@@ -81,7 +81,6 @@ def _provenance(files: dict[str, str]) -> dict[str, object]:
 
 
 def main(arguments: list[str]) -> int:
-    """Return exit status 1 with a message on failure, 2 without a key."""
     if len(arguments) != 1 or not arguments[0]:
         sys.stderr.write("release: give the file of the private key: make release KEY=FILE\n")
         return 2

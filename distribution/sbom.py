@@ -1,4 +1,4 @@
-"""List the parts of the image as CycloneDX: packages of Debian, Python and the console, with their licences."""
+"""List the parts of the image as CycloneDX: Debian, Python and console packages, with their licences."""
 
 import json
 import posixpath
@@ -27,19 +27,19 @@ _READ = (_DPKG, "usr/share/doc/*/copyright", f"{_PYTHON}*.dist-info/METADATA", _
 
 
 class ImageFiles:
-    """The files of an image, layer after layer, with the texts that name its parts."""
+    """The files of an image that name its parts and their licences, collected layer by layer."""
 
     def __init__(self) -> None:
         self.texts: dict[str, str] = {}
         self._links: dict[str, str] = {}
 
     def wants(self, name: str) -> bool:
-        """Whether `add` needs the content of this file."""
+        """Return whether `add` needs the content of this file."""
         name = name.removeprefix("./")
         return any(fnmatchcase(name, pattern) for pattern in _READ)
 
     def add(self, name: str, data: bytes, *, link: str = "") -> None:
-        """`link` is the target of a symbolic link."""
+        """Add an entry of a layer. `link` is the target of a symbolic link."""
         name = name.removeprefix("./")
         folder, _, last = name.rpartition("/")
         if last.startswith(".wh."):
@@ -53,17 +53,17 @@ class ImageFiles:
             self._links[name] = posixpath.normpath(posixpath.join(folder, link))
 
     def copyright(self, package: str) -> str:
-        """Return an empty string if a Debian package has no copyright file."""
+        """Return the copyright file of a Debian package, or ""."""
         folder = f"usr/share/doc/{package}"
         return self.texts.get(f"{self._links.get(folder, folder)}/copyright", "")
 
     def matching(self, pattern: str) -> Iterator[str]:
-        """In order of their names."""
+        """Return the texts of the matching files, in the order of their names."""
         return (self.texts[name] for name in sorted(self.texts) if fnmatchcase(name, pattern))
 
 
 def make_sbom(tree: ImageFiles, *, architecture: str, moment: int) -> str:
-    """Equal trees give equal JSON. `moment` is in seconds since the epoch."""
+    """Return the list as JSON, which is equal for equal trees. `moment` is in seconds since the epoch."""
     itself = Component(
         name="rosrv/appliance", version=__version__, type=ComponentType.CONTAINER, bom_ref="rosrv/appliance",
         licenses=_licences(["Apache-2.0"]),
@@ -89,7 +89,7 @@ def _part(
 
 
 def _licences(names: Iterable[str]) -> list[License]:
-    """Return one expression, or a list of single licences."""
+    """Return one licence expression, or a list of single licences."""
     factory = LicenseFactory()
     made = [factory.make_from_string(name) for name in sorted(set(names))]
     return made if len(made) == 1 else [factory.make_with_name(name) for name in sorted(set(names))]

@@ -38,7 +38,6 @@ _TYPES = {
 
 
 def page() -> str:
-    """Keys outside sections come first, then each section."""
     schema = TypeAdapter(Settings).json_schema()
     sections: list[tuple[str, dict[str, Any]]] = []
     top = _rows(schema, schema["$defs"], "", sections)

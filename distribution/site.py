@@ -1,9 +1,9 @@
-"""`make site`: dist/rosrv-site_VERSION_ARCH.tar, with everything that a site without a network needs (docs/install.md).
+"""`make site`: build dist/rosrv-site_VERSION_ARCH.tar, which has all that a site without a network needs.
 
     python -m distribution.site [OPTIONS OF docker build …]
 
-The archive has the image with its list of parts, compose files, policies, monitors, pages, and the checksums of all
-files.
+The archive has the image with its list of parts, the files in `BESIDE`, and checksums of everything. Its use is in
+docs/install.md.
 """
 
 import hashlib
@@ -20,7 +20,6 @@ BESIDE = ("compose.yaml", "compose.host.yaml", "LICENSE", "docs", "ipsec", "moni
 
 
 def pack(parts: tuple[Path, ...], *, moment: int) -> Path:
-    """Include `BESIDE`."""
     files = {part.name: part for part in parts}
     for name in BESIDE:
         found = [path for path in (ROOT / name).rglob("*") if path.is_file()] or [ROOT / name]
@@ -43,7 +42,6 @@ def pack(parts: tuple[Path, ...], *, moment: int) -> Path:
 
 
 def main(arguments: list[str]) -> int:
-    """Return exit status 1 if the engine fails."""
     made = image.attempt(arguments)
     if made:
         sys.stdout.write(f"{pack(made, moment=time_of_commit()).relative_to(ROOT)}\n")

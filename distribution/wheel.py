@@ -1,4 +1,4 @@
-"""Hatch's hook for `make wheel`: build the compiled module, and name the machines that the wheel is for."""
+"""Hatch's hook for `make wheel`: build the compiled module, and tag the wheel with the machines that can use it."""
 
 import platform
 import subprocess
@@ -12,7 +12,7 @@ _MODULE = "appliance/relay/transport/pump.abi3.so"
 
 
 class ExtensionHook(BuildHookInterface[Any]):
-    """Runs `distribution/extension.py`; the wheel is for this architecture and this version of glibc or newer."""
+    """Runs `distribution/extension.py`. The wheel is for this architecture, and for this glibc or a newer one."""
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:  # noqa: ARG002  hatch passes both
         subprocess.run([sys.executable, str(Path(self.root, "distribution/extension.py"))], check=True)
