@@ -1,10 +1,9 @@
-"""The robot's delays under attack: `python -m benchmarks.attacks [--only loop,flood] [--busy 4] [--seconds 10]`.
+"""Measure a robot's delays under attack: `python -m benchmarks.attacks [--only loop,flood] [--busy N] [--seconds S]`.
 
-The robot sends an unmonitored topic at 100 Hz, and makes 20 calls a second on new connections and 20 on a kept
-connection. Guests, and hosts that no rule names, attack: one attack after the other, then in combinations. Each row
-has the delays in milliseconds, lost messages, unanswered calls and restarted relays; `quiet` is without an attack.
-`--busy N` adds N processes that only compute. The probes run at real-time priority, so that their own scheduling adds
-nothing; this needs root.
+The robot publishes a topic without a monitor at 100 Hz, and makes 20 calls a second on new connections and 20 on a
+kept one. Guests, and hosts that no rule names, run one attack after the other, then combinations. Rows have the
+delays in milliseconds, the lost messages, the unanswered calls and the restarted relays. `--busy N` adds N processes
+that only compute. The probes run at real-time priority, which requires root.
 """
 
 import argparse
@@ -95,7 +94,6 @@ def header(**fields: str) -> bytes:
 
 
 def receive(sock: socket.socket, size: int) -> bytes:
-    """Raises `ConnectionError` at the end of the stream."""
     data = bytearray()
     while len(data) < size:
         piece = sock.recv(size - len(data))
@@ -234,7 +232,6 @@ DEFINITIONS = {
 
 
 def call(address: str, method: str, *params: Any, uri: str = MASTER) -> Any:
-    """Each call has a new connection, and is repeated if an attack interferes."""
     place = uri.removeprefix("http://").rstrip("/")
     host, _, port = place.rpartition(":")
     tries = 0
@@ -273,7 +270,7 @@ def subscribe(nodes: Nodes, address: str, node: str, topic: str) -> list[socket.
 
 
 def probe_messages(seconds: float, robot: Host, operator: Host, answers: Connection, begin: Event) -> None:
-    """Each time that `begin` is set, it sends for `seconds`."""
+    """Publish for `seconds` whenever `begin` is set, and send the delays and the losses."""
     realtime()
     with robot.entered():
         nodes = Nodes()
@@ -328,7 +325,10 @@ def probe_messages(seconds: float, robot: Host, operator: Host, answers: Connect
 
 
 def probe_calls(seconds: float, robot: Host, keep: bool, answers: Connection, begin: Event) -> None:
-    """20 calls a second, on one connection if `keep` is set. A round is cut off at three times its length."""
+    """Make 20 calls a second whenever `begin` is set, on one connection if `keep` is set.
+
+    A round ends after three times its length, and its remaining calls count as errors.
+    """
     realtime()
     body = xmlrpc.client.dumps(("/looker", "/rosdistro"), "getParam").encode()
     with robot.entered():
@@ -366,7 +366,6 @@ def probe_calls(seconds: float, robot: Host, keep: bool, answers: Connection, be
 
 
 def realtime() -> None:
-    """The priority is above everything that the process measures."""
     os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(10))
 
 
@@ -374,8 +373,6 @@ def realtime() -> None:
 
 
 class Pipes:
-    """Sends as fast as the receiver reads, or at a total rate."""
-
     def __init__(self, socks: Sequence[socket.socket]) -> None:
         self._rest: dict[socket.socket, memoryview] = {}
         self.socks = list(socks)
@@ -406,7 +403,6 @@ class Pipes:
 
 
 def published(nodes: Nodes, addresses: Sequence[str], topic: str, *, listen: bool = False) -> Pipes:
-    """With `listen`, each address also subscribes."""
     for number, address in enumerate(addresses):
         nodes.publish(address, f"/guest/n{number}_{topic.rpartition('/')[2]}", topic, TYPES[topic])
     if listen:
@@ -423,14 +419,14 @@ def _drain(sock: socket.socket) -> None:
 
 
 def loop(addresses: Sequence[str], go: Callable[[], None]) -> None:
-    """0.8 MB/s on the guest's own topic, whose monitor loops over a string."""
+    """Send 0.8 MB/s on a guest's own topic, whose monitor loops over a string."""
     pipes = published(Nodes(), addresses, "/guest/loop")
     go()
     pipes.at(8 / len(addresses), frame(text(b"y" * 100_000)))
 
 
 def scans(addresses: Sequence[str], go: Callable[[], None]) -> None:
-    """200,000 ranges for the shipped obstacle monitor, two a second."""
+    """Send two scans of 200,000 ranges a second to the shipped obstacle monitor."""
     pipes = published(Nodes(), addresses, "/landshark/scan")
     head = struct.pack("<III", 1, 0, 0) + text(b"") + struct.pack("<7f", 0, 0, 0, 0, 0, 0, 0)
     go()
@@ -441,7 +437,7 @@ def scans(addresses: Sequence[str], go: Callable[[], None]) -> None:
 
 
 def joints(addresses: Sequence[str], go: Callable[[], None]) -> None:
-    """A field behind a million empty strings, 4 MB, two a second."""
+    """Send two messages a second in which a million empty strings (4 MB) precede the field that a monitor reads."""
     pipes = published(Nodes(), addresses, "/guest/joints")
     body = struct.pack("<III", 1, 0, 0) + text(b"") + struct.pack("<I", 1_000_000) + bytes(4_000_000)
     go()
@@ -449,7 +445,7 @@ def joints(addresses: Sequence[str], go: Callable[[], None]) -> None:
 
 
 def six_joints(addresses: Sequence[str], go: Callable[[], None]) -> None:
-    """The messages of `joints` from six publishers at once, as fast as they are read."""
+    """Send the messages of `joints` from six publishers at once, as fast as they are read."""
     nodes = Nodes()
     for number in range(6):
         for index, address in enumerate(addresses[: max(1, len(addresses) // 6)]):
@@ -461,7 +457,6 @@ def six_joints(addresses: Sequence[str], go: Callable[[], None]) -> None:
 
 
 def slices(addresses: Sequence[str], go: Callable[[], None]) -> None:
-    """20,000 slices, then empty messages that concern all of them."""
     nodes = Nodes()
     make = published(nodes, addresses, "/guest/make")
     touch = published(nodes, addresses, "/guest/touch")
@@ -475,7 +470,6 @@ def slices(addresses: Sequence[str], go: Callable[[], None]) -> None:
 
 
 def flood(addresses: Sequence[str], go: Callable[[], None]) -> None:
-    """8 bytes, without a monitor, as fast as they are taken."""
     pipes = published(Nodes(), addresses, "/guest/flood", listen=True)
     go()
     while True:
@@ -484,7 +478,6 @@ def flood(addresses: Sequence[str], go: Callable[[], None]) -> None:
 
 
 def kept(addresses: Sequence[str], go: Callable[[], None]) -> None:
-    """500 connections, each with one small call after the other."""
     body = xmlrpc.client.dumps(("/guest/looker", "/rosdistro"), "getParam").encode()
     request = b"POST /RPC2 HTTP/1.1\r\nHost: x\r\nContent-Length: %d\r\n\r\n%b" % (len(body), body)
     selector = selectors.DefaultSelector()
@@ -511,7 +504,7 @@ def kept(addresses: Sequence[str], go: Callable[[], None]) -> None:
 
 
 def multicalls(addresses: Sequence[str], go: Callable[[], None]) -> None:
-    """Multicalls of 9,000 reads on 16 connections; 60 connections a second from an unknown host."""
+    """Send multicalls of 9,000 reads on 16 connections, while an unknown host opens 60 connections a second."""
     part = {"methodName": "getParam", "params": ["/guest/looker", "/rosdistro"]}
     body = xmlrpc.client.dumps(([part] * 9000,), "system.multicall").encode()
 
@@ -537,7 +530,6 @@ def multicalls(addresses: Sequence[str], go: Callable[[], None]) -> None:
 
 
 def service(addresses: Sequence[str], go: Callable[[], None]) -> None:
-    """100 kB for a monitor that loops over them, ten a second."""
     place = call(addresses[0], "lookupService", "/guest/asker", "/guest/service")[2].removeprefix("rosrpc://")
     host, _, port = place.rstrip("/").rpartition(":")
     socks = []
@@ -553,7 +545,6 @@ def service(addresses: Sequence[str], go: Callable[[], None]) -> None:
 
 
 def connections(addresses: Sequence[str], go: Callable[[], None]) -> None:
-    """To RVMaster and to a port of the relay, as fast as possible."""
     code, _, uri = call(addresses[0], "lookupNode", "/guest/looker", "/probe_source")
     assert code == 1, uri
     place = (APPLIANCE, int(uri.rstrip("/").rpartition(":")[2]))
@@ -584,7 +575,7 @@ ATTACKS: dict[str, tuple[Callable[..., None], ...]] = {
 
 
 def attack(crowd: Host, function: Callable[..., None], addresses: Sequence[str]) -> tuple[Any, Event]:
-    """The event is set when the attack has begun."""
+    """Start an attack, and return its process and an event that is set when it is under way."""
     under_way = CONTEXT.Event()
 
     def run() -> None:

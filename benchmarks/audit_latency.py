@@ -1,10 +1,8 @@
 """The cost of the audit log to a caller of RVMaster: python -m benchmarks.audit_latency [--seconds 2] [--rounds 3]
 
-Appliances take turns: `batched` (the default), `strict` (on disk before the answer), and `batched` with forwarding to
-a syslog receiver that takes everything. Each caller makes one call after the other (`hasParam`) on its own
-connection.
-
-Cells are medians of the rounds, in microseconds; CPU is of control, a call.
+Three appliances take turns: `batched` (the default), `strict` (on disk before the answer), and `batched` with
+forwarding to a syslog receiver that takes everything. Each caller makes one call (`hasParam`) after the other on its
+own connection. Cells are medians of the rounds in microseconds; CPU is control's processor time for one call.
 """
 
 import argparse
@@ -84,7 +82,7 @@ def _length(answer: bytes) -> int:
 
 
 def measure(one: Running, clients: int, seconds: float) -> tuple[float, float, float, float]:
-    """Return median and 99th percentile in microseconds, calls a second, and CPU of control per call."""
+    """Return the median and 99th percentile in microseconds, the calls a second, and control's CPU time of a call."""
     taken: list[list[float]] = [[] for _ in range(clients)]
     threads = [threading.Thread(target=calls, args=(one.port, seconds, mine)) for mine in taken]
     before = one.cpu()

@@ -1,4 +1,4 @@
-"""The speed of writing, proving and finding audit records: python -m benchmarks.audit_records [RECORDS]
+"""Measure how fast audit records are written, proven and found: python -m benchmarks.audit_records [RECORDS]
 
 Searches are over RECORDS (by default a million) records. All files are in one directory (TMPDIR) on one disk.
 """
@@ -34,7 +34,7 @@ def row(name: str, value: str) -> None:
 
 
 def record(log: AuditLog, number: int) -> AuditRecord:
-    """One in ten thousand is special, so that selective searches find something."""
+    """Return a record. One in ten thousand is special, so that selective searches find something."""
     special = number % 10_000 == 9_999
     return AuditRecord(
         id=log.ids.next(),
@@ -55,7 +55,6 @@ def record(log: AuditLog, number: int) -> AuditRecord:
 
 
 def open_log(directory: Path, name: str, durability: str) -> AuditLog:
-    """Without folding, because writing is measured."""
     return AuditLog(
         directory / name / "audit.db",
         durability="strict" if durability == "strict" else "batched",
@@ -94,7 +93,6 @@ async def _clients(log: AuditLog, clients: int, each: int) -> float:
 
 
 def measure_strict(directory: Path) -> None:
-    """Each client waits for its record before it sends the next one."""
     for clients in (1, 10, 100, 1000):
         log = open_log(directory, f"strict{clients}", "strict")
         rate = asyncio.run(_clients(log, clients, max(20, 10_000 // clients)))
@@ -103,7 +101,7 @@ def measure_strict(directory: Path) -> None:
 
 
 async def _paced(log: AuditLog, rate: int, seconds: float) -> tuple[float, float]:
-    """Return the delay of the loop's other work (median, 99.9 %) in ms."""
+    """Record at a rate from an event loop, and return the delay of its other work (median and 99.9 %) in ms."""
     late: list[float] = []
 
     async def other_work() -> None:
@@ -137,7 +135,7 @@ def measure_loop(directory: Path) -> None:
 
 
 def measure_busy(directory: Path) -> None:
-    """The thread never releases the interpreter lock voluntarily."""
+    """Record beside a thread that never releases the interpreter lock voluntarily."""
     log = open_log(directory, "busy", "batched")
     records = [record(log, number) for number in range(50_000)]
     stop = threading.Event()

@@ -1,13 +1,11 @@
 """The cost of a message as users pay it: `python -m benchmarks.cold [--busy]` (under two minutes).
 
-On a robot most messages come alone, 20 to 1,000 times a second, and find the caches cold. The relay is that of `rosrv
-up`, without a monitor and with one (two fields read, one written, one FSM step). Beside it, in turns: nothing,
-`copying_relay.c` with epoll, and five lines of Python. Cells are medians of the rounds; in parentheses are the
-median, the least and the greatest ratio to the C relay of the same round.
-
-*paced100*, *paced1000* (or any other number): messages a second, with real-time priority of the load if permitted.
-*window*: 64 messages on their way. `--busy` adds programs that use half of each core and walk through their memory.
-Processor time is that of the process in the middle, all threads. Needs g++, rosmaster and chrt.
+The relay of `rosrv up`, without a monitor and with one (two fields read, one written, one FSM step), takes turns with
+a direct connection, `copying_relay.c` with epoll, and five lines of Python. Cells are medians of the rounds; in
+parentheses are the median, the least and the greatest ratio to the C relay in the same round. *paced100* and
+*paced1000* are messages a second, with real-time priority for the load if permitted; *window* keeps 64 messages on
+their way. `--busy` adds programs that use half of each core and walk through their memory. The processor time is that
+of the process in the middle. Needs g++, rosmaster and chrt.
 """
 
 import argparse
@@ -57,7 +55,7 @@ while True:
 
 
 class DeployedRelay:
-    """The load's nodes register again for each run."""
+    """The relay of a running appliance. The load's nodes register again for each run."""
 
     def __init__(self, name: str, *specifications: str) -> None:
         self.name = name
@@ -120,7 +118,6 @@ def other_programs(number: int) -> Iterator[None]:
 
 
 def realtime() -> tuple[str, ...]:
-    """Empty if real-time priority is not permitted."""
     permitted = subprocess.run([*REALTIME, "true"], check=False, stderr=subprocess.DEVNULL).returncode == 0
     return REALTIME if permitted else ()
 

@@ -1,9 +1,8 @@
-"""The time until nodes may connect after `docker compose up`, the time of `stop`, and the size of the image.
+"""Measure the time from `docker compose up` until nodes may connect, the time of `stop`, and the image's size.
 
     python -m benchmarks.compose_start [RUNS]
 
-Needs root and an otherwise idle machine. The first start makes the volume, the keys and the log; later starts find
-them.
+Needs root and an otherwise idle machine. Only the first start makes the volume, the keys and the log.
 """
 
 import statistics

@@ -1,8 +1,8 @@
 """RVMaster beside plain `rosmaster`: `python -m benchmarks.control_plane [--seconds 2] [--rounds 3] [--only CALL]`.
 
-Both run at once and take turns at every load, the appliance as `rosrv up` runs it. Cells are medians of the rounds;
-the ratio is the median of the rounds' ratios, `added` the difference of the medians of the delay of one call.
-Processor time is that of the plain master, and of RVMaster with the one it hides.
+Both run at the same time, the appliance as `rosrv up` starts it, and take turns at every load. Cells are medians of
+the rounds. `ratio` is the median of the rounds' ratios, and `added` the difference between the median delays of a
+call. RVMaster's processor time includes that of the master that it hides.
 """
 
 import argparse
@@ -91,7 +91,7 @@ def furnish(port: int) -> None:
 
 
 class Client:
-    """`delays` are seconds per call, `answer` is the last body."""
+    """A caller that makes the `wanted` calls in turn. `delays` has the seconds of each call, `answer` the last body."""
 
     def __init__(self, port: int, wanted: list[bytes], keep: bool, host: str = "127.0.0.1") -> None:
         self.delays: list[float] = []
@@ -112,7 +112,6 @@ class Client:
         return self.sock
 
     def receive(self) -> bool:
-        """Return whether the answer is complete. Raises `ConnectionError` for a refusal."""
         assert self.sock is not None
         piece = self.sock.recv(1 << 20)
         self._buffer += piece
@@ -135,7 +134,6 @@ class Client:
 
 
 def load(port: int, operation: str, clients: int, keep: bool, seconds: float) -> tuple[float, float]:
-    """Return calls per second and the median delay of a call in microseconds."""
     # Each client is a separate host: a long load of one host would exceed its quota of the audit log and be delayed.
     group = [
         Client(port, requests(operation, one, keep), keep, f"127.0.0.{one + 1}") for one in range(clients)
@@ -210,7 +208,7 @@ class Master(NamedTuple):
     pids: list[int]
 
     def under(self, operation: str, clients: int, keep: bool, seconds: float) -> tuple[float, float, float]:
-        """Return calls per second, and median delay and processor time of a call in microseconds."""
+        """Return calls per second, and the median delay and the processor time of a call in microseconds."""
         before = processor_seconds(self.pids)
         began = time.perf_counter()
         rate, delay = load(self.port, operation, clients, keep, seconds)

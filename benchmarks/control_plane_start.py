@@ -1,13 +1,13 @@
 """A robot that starts, beside plain `rosmaster`: `python -m benchmarks.control_plane_start [--rounds 5]`.
 
-Both masters are new in each round and take turns.
+In each round, both masters are new and take turns.
 
 - `parameters`: roslaunch clears a namespace and sets 4,000 parameters below it, in one multicall.
 - `nodes`: 100 nodes at once publish ten topics each and subscribe to ten of the next one, each over a kept connection
-  as with roscpp. It is over when every call is answered and every subscriber knows its publishers.
+  as with roscpp. The start is over when every call is answered and every subscriber knows its publishers.
 
-Figures are medians of the rounds: seconds until it is over, and seconds of processor time (of RVMaster with the
-master that it hides). A ratio above 1 means that RVMaster is slower.
+The table has medians of the rounds: the seconds until the start is over, and the processor time in seconds, which for
+RVMaster includes the master that it hides. A ratio above 1 means that RVMaster is slower.
 """
 
 import argparse
@@ -55,8 +55,6 @@ def parameters(port: int) -> float:
 
 
 class Node:
-    """Makes one call after the other; its port receives lists of publishers."""
-
     def __init__(self, master: int, number: int) -> None:
         self.listening = socket.create_server(("127.0.0.1", 0), backlog=64)
         me, following = f"/start/node_{number}", (number + 1) % NODES
@@ -95,7 +93,6 @@ class Told:
         self._buffer = b""
 
     def receive(self) -> bool:
-        """Acknowledge complete calls; return whether the connection stays open."""
         piece = self.sock.recv(1 << 16)
         self._buffer += piece
         head, mark, body = self._buffer.partition(b"\r\n\r\n")

@@ -1,14 +1,13 @@
 """Parametric specifications beside DejaVu's, on the traces of its own tests: `python -m benchmarks.dejavu CHECKOUT`.
 
-CHECKOUT is DejaVu's repository (github.com/havelund/dejavu): its tests name the events of each trace at which a
-property fails, those of the traces that it was entered with at the CRV benchmark challenge of 2018 among them. For
-each, the specifications here must report the same events; otherwise the exit status is 1. The time is that of one
-event, all specifications together, in microseconds of processor time. A trace that is not in the checkout is reported
-and skipped.
+CHECKOUT is DejaVu's repository (github.com/havelund/dejavu). Its tests state the events of each trace at which a
+property fails; some of the traces are from the CRV benchmark challenge of 2018. The specifications here must report
+the same events; otherwise the exit status is 1. The time of an event is that of all specifications together, in
+microseconds of processor time. A trace that is not in the checkout is reported and skipped.
 
-DejaVu quantifies over all values; a slice has one binding. So a formula over two parameters that is the conjunction
-of formulas over one is two specifications here (every user with every file would be a slice each), and `exists` over
-what no event binds together is not among the properties.
+DejaVu quantifies over all values, whereas a slice has one binding. So a formula over two parameters that is a
+conjunction of formulas over one is split into two specifications here (otherwise each user with each file would be a
+slice). Properties with `exists` over values that no event binds together are not among the cases.
 """
 
 import csv
@@ -29,7 +28,7 @@ _FIELDS = ("key", "value")
 
 
 def specification(name: str, events: Mapping[str, Sequence[str]], over: Sequence[str], formula: str) -> str:
-    """`events` has the names of each event's values, `over` the parameters."""
+    """Return a specification. `events` has the names of each event's values, `over` the parameters."""
     lines = [
         f"event {event}({', '.join(f'std::string {one}' for one in values if one in over)}) /{event} "
         f"diagnostic_msgs/KeyValue "
@@ -50,7 +49,7 @@ def of(events: Mapping[str, Sequence[str]], *properties: tuple[Sequence[str], st
 
 @dataclass(frozen=True)
 class Case:
-    """`fails` has the events at which DejaVu reports a failure, counted from 1."""
+    """A trace and its specifications. `fails` has the events at which DejaVu reports a failure, counted from 1."""
 
     trace: str
     specifications: tuple[str, ...]
@@ -100,7 +99,7 @@ CASES = (
 
 
 def messages(trace: Path) -> list[tuple[str, bytes]]:
-    """A `diagnostic_msgs/KeyValue` has the first two values; no property uses a third."""
+    """Return the events as `diagnostic_msgs/KeyValue`, which have two values: no property uses a third."""
     found = []
     with trace.open(newline="") as rows:
         for name, *values in (row for row in csv.reader(rows) if row):

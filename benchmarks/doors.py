@@ -1,18 +1,19 @@
 """A door beside rosbridge_suite and foxglove_bridge: `python -m benchmarks.doors [--rounds 3]`.
 
-A roscpp node publishes texts, and WebSocket clients on another host of a lab count the frames that they receive. The
-ways take turns. Each is measured with 200 bytes and with 1 MB, as large as a frame of a camera: *paced* with one client
-and a fixed rate (the delay from `publish` to the client, and the processor time for each message), and *most*, with one
-client and with several of the same topic, as a door has dashboards: the most frames a second that all received, with
-growing rates of the publisher. *Most* also shows the processor time of each process, so a publisher or a client that is
-the limit is seen: all of them share the cores. The path of a door has two processes, the relay and the door. A door has
-a lower priority than the robot (nice 10), as on a robot; `--same-priority` gives both 0.
+A roscpp node publishes strings, and WebSocket clients on another host of a lab count the frames that they receive.
+The servers take turns, with messages of 200 bytes and of 1 MB, the size of a camera's frame:
 
-*Flooded*: a client sends messages to the door as fast as it can, while a node of the robot listens to another. The
-client has the least priority, because a flood comes from another machine.
+- *paced*: one client and a fixed rate; the delay from `publish` to the client, and the processor time of a message.
+- *most*: one client, then several of the same topic, as dashboards are; the most frames a second that all received
+  while the publisher's rate grows. The processor time of each process shows whether the publisher or a client is the
+  limit, as all of them share the cores.
+- *flooded*: a client sends messages to the door as fast as it can, while a node of the robot listens to another one.
+  The client has the lowest priority, because a real flood comes from another machine.
 
-Neither peer is a Debian package. Give programs that start them, with `--rosbridge` (rosbridge_websocket.py of the
-branch ros1) and `--foxglove-bridge`; without one, its rows are left out.
+The path through a door has two processes, the relay and the door. A door has a lower priority than the robot (nice
+10), as on a robot, unless `--same-priority` is given. Neither peer is a Debian package: `--rosbridge`
+(rosbridge_websocket.py of the branch ros1) and `--foxglove-bridge` name programs that start them. Without an option,
+its rows are left out.
 """
 
 import argparse
@@ -46,7 +47,7 @@ from tests.support.waiting import eventually
 _BENCHMARKS = ROOT / "build" / "benchmarks"
 _LOAD, _ROBOT = _BENCHMARKS / "door_load", _BENCHMARKS / "recorder_load"
 _SIZES = {200: (100, (8_000, 32_000, 64_000)), 1_000_000: (20, (100, 400, 1_600))}
-"""The size of a message: the rate of *paced*, and the rates of *most*."""
+"""The rate of *paced* and the rates of *most*, by the size of a message."""
 _RECEIVED_BYTES = 1 << 18
 _STAMP = re.compile(rb"t=([0-9a-f]{16})")
 _HEAD_BYTES = 400
@@ -55,7 +56,7 @@ _CLIENTS = 20
 
 
 class Viewer:
-    """It only finds the frames; a library would be slower than some of the servers."""
+    """A WebSocket client that only finds the frames. A library would be slower than some of the servers."""
 
     def __init__(self, address: str, port: int, subprotocol: str = "") -> None:
         self.socket = socket.create_connection((address, port), timeout=20)
@@ -93,7 +94,6 @@ class Viewer:
             yield opcode, found
 
     def rest(self) -> bytes:
-        """The bytes that have come, and that `frames` did not take."""
         return bytes(self._data)
 
     def _receive(self) -> None:
@@ -104,7 +104,7 @@ class Viewer:
 
 
 class FrameCounter:
-    """Counts the frames in what a connection receives, at a fraction of the server's work for them."""
+    """Counts the frames that a connection receives, at a fraction of the server's cost."""
 
     def __init__(self) -> None:
         self.frames = 0
@@ -157,19 +157,18 @@ class Way(NamedTuple):
 
 @dataclass
 class System:
-    """`session` is that of the robot's nodes behind the server."""
+    """A server of clients. `session` has the robot's nodes behind it."""
 
     session: RosSession
     address: str
     port: int
     pids: Callable[[], Sequence[int]]
-    """The processes on the path of a message; the last one serves the clients."""
+    """The processes on the path of a message. The last one serves the clients."""
     stop: Callable[[], object] = lambda: None
-    """A peer may not end on SIGINT."""
 
 
 class Heard(NamedTuple):
-    """Frames a second, the median and 99th percentile of the delay, and processor time."""
+    """The frames a second, the median and 99th percentile of their delay, and the processor time of each."""
 
     rate: float
     p50_us: float
@@ -178,7 +177,7 @@ class Heard(NamedTuple):
 
 
 class Carried(NamedTuple):
-    """The frames a second of all clients, and the processor time of each process for one of them, in microseconds."""
+    """The frames a second to all clients, and the microseconds that each process spends on one of them."""
 
     rate: float
     publisher_us: float
@@ -188,7 +187,6 @@ class Carried(NamedTuple):
 
 
 def carried(way: Way, operator: Host, size: int, hertz: int, *, clients: int, seconds: float) -> Carried:
-    """Counts what clients of one topic receive at this rate of the publisher."""
     talker = way.system.session.start([str(_LOAD), str(size), str(hertz)], label="talker")
     try:
         talker.wait_for(event="ready")
@@ -268,7 +266,7 @@ def _count(way: Way, seconds: float) -> Heard:
 
 
 def processor_seconds(pid: int) -> float:
-    """`/proc/PID/stat` would have it in steps of 10 ms."""
+    """Return the processor time of a process, which `/proc/PID/stat` has only in steps of 10 ms."""
     tasks = Path(f"/proc/{pid}/task").iterdir()
     return sum(int((task / "schedstat").read_text().split()[0]) for task in tasks) / 1e9
 
@@ -279,7 +277,7 @@ def private_kb(pid: int) -> int:
 
 
 def memory(way: Way, operator: Host) -> tuple[float, float]:
-    """Return the server's memory in MB, and the part of each idle subscriber in kB."""
+    """Return the server's memory in MB, and the memory of each idle client in kB."""
     pid = way.system.pids()[-1]
     first = operator.run(way.open)
     threading.Event().wait(1)
@@ -306,7 +304,7 @@ def robot_p50(way: Way, folder: Path, seconds: float) -> float:
 
 @contextmanager
 def flood(way: Way, operator: Host) -> Iterator[list[int]]:
-    """Yield the number of messages at the end."""
+    """Flood the server during the block. The yielded list has the number of messages at its end."""
     over, sent = threading.Event(), [0]
 
     def work() -> None:

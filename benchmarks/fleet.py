@@ -3,8 +3,8 @@
     python -m benchmarks.fleet                                  # 1,000 appliances, 10,000,000 rows: 16 minutes
     python -m benchmarks.fleet --robots 50 --rows 100000 --seconds 20
 
-The collector is the program that a site runs, with a private PostgreSQL 15. The appliances use their own log and both
-clients (`benchmarks/fleet_robots.py`). All share this machine's processors, the appliances with niceness 10. The parts:
+The collector is the released program, with a private PostgreSQL 15. The appliances use their own log and both clients
+(`benchmarks/fleet_robots.py`). All share this machine's processors, the appliances with niceness 10. The parts:
 
 1. All appliances connect and push at the same time, as after a power failure of the site.
 2. They record and push at `--rate` records a second together, while an operator searches many rows.

@@ -1,6 +1,6 @@
-"""Simulated appliances for `benchmarks.fleet`: the appliance's own log, signatures and both clients of the collector.
+"""Simulate appliances for `benchmarks.fleet`, with the real log, signatures and both clients of the collector.
 
-They differ from an appliance in two things: decisions are generated, and a function replaces control's gate.
+They differ from appliances in two ways: decisions are generated, and a function replaces control's gate.
 """
 
 import logging
@@ -26,7 +26,7 @@ from tests.support.bundle_site import GROUP, SITE
 from tests.system.fleet.fleet_site import FleetRobot, FleetSite
 
 BAD = "# refused by the gate\n"
-"""Simulated appliances refuse a bundle with this text in its policy."""
+"""Simulated appliances refuse a bundle whose policy contains this text."""
 
 _NICENESS = 10  # real robots take no processor time from the collector
 _POLL_SECONDS = 300.0
@@ -35,7 +35,7 @@ _FORK = multiprocessing.get_context("fork")  # a process gets the site as it is
 
 @dataclass(frozen=True)
 class SimulatedLoad:
-    """Each appliance records `records` decisions every `seconds`, and seals them."""
+    """The load of each appliance: it records `records` decisions every `seconds`, and seals them."""
 
     records: int
     seconds: float
@@ -52,8 +52,6 @@ def enrol(site: FleetSite, names: Sequence[str]) -> None:
 
 
 class SimulatedRobots:
-    """Appliances in several processes: `begin` lets all of them push at the same time; `end` returns their lags."""
-
     def __init__(self, site: FleetSite, names: Sequence[str], processes: int, load: SimulatedLoad) -> None:
         self._begin, self._end = _FORK.Event(), _FORK.Event()
         self._results = _FORK.SimpleQueue()
@@ -64,7 +62,6 @@ class SimulatedRobots:
         ]
 
     def start(self) -> None:
-        """Return when every appliance has sealed its first records and waits."""
         for process in self._processes:
             process.start()
         for _process in self._processes:
@@ -74,7 +71,7 @@ class SimulatedRobots:
         self._begin.set()
 
     def end(self) -> list[float]:
-        """Push what is sealed; return the seconds from each record to its receipt."""
+        """Push the rest, and return the seconds from each seal to its receipt."""
         self._end.set()
         lags = [lag for _process in self._processes for lag in self._results.get()]
         for process in self._processes:
@@ -116,7 +113,6 @@ class _Appliance:
         self._bundles = self._poll_loop(robot.site, f"https://127.0.0.1:{robot.site.port}")
 
     def work(self, ended: Callable[[], bool]) -> None:
-        """After `ended`, the rest is pushed."""
         self._bundles.start()
         pusher, pause = self.robot.pusher(), threading.Event()
         sealed = time.monotonic()

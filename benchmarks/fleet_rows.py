@@ -1,4 +1,4 @@
-"""Many rows of an index, as a fleet of a thousand robots writes them in twenty days, and searches over them."""
+"""Fill an index with the rows that a thousand robots write in twenty days, and define searches over them."""
 
 import random
 import re

@@ -1,7 +1,7 @@
-"""Seconds without messages after a relay's death and a restart: python -m benchmarks.gaps [--deaths 20] [--restarts 5]
+"""Seconds without messages after a relay's death and a restart: python -m benchmarks.gaps [--deaths D] [--restarts R]
 
 One rospy node publishes 100 messages a second to another. The relay of `rosrv up` is killed (SIGKILL) again and
-again, then the whole appliance is restarted; the longest time between two messages around each counts.
+again, then the whole appliance is restarted. Each time, the longest gap between two messages counts.
 """
 
 import argparse

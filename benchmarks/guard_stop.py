@@ -1,8 +1,7 @@
 """Time until the guard `deadman` stops a base whose operator falls silent: python -m benchmarks.guard_stop [--busy]
 
 A rospy node commands full speed 50 times a second, and falls silent. The time is from its last call of `publish`
-until the base's callback for the stop, less the guard's `silent`. With `--busy`, one program keeps a core busy all
-the time.
+until the base's callback for the stop, minus the guard's `silent`. With `--busy`, another program keeps a core busy.
 """
 
 import argparse
@@ -18,11 +17,11 @@ from tests.support.appliance import Appliance
 from tests.support.nodes import PYTHON, RosSession
 
 ALLOWED = 20.0
-"""Milliseconds by which a stop may be late."""
+"""The milliseconds by which a stop may be late."""
 
 
 def lateness(trials: int, silent: float) -> list[float | None]:
-    """In milliseconds, for each cut; None without a stop."""
+    """Return the milliseconds by which each stop was late, or None without a stop."""
     text = text_of(Guard("deadman", PRESETS["deadman"], values={"silent": f"{silent:g}"}))
     with (
         Appliance(monitors={"deadman": text}) as appliance,

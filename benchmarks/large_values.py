@@ -42,7 +42,7 @@ class Caller:
 
 
 def delays(port: int, seconds: float, large: bytes | None) -> tuple[list[float], int]:
-    """In milliseconds, while the guest repeatedly sends `large`; also the number of the guest's calls."""
+    """Return the milliseconds of a robot's calls while a guest sends `large`, and the number of times it did."""
     stop, sent = threading.Event(), [0]
 
     def flood() -> None:

@@ -1,23 +1,23 @@
 """Launch a robot beside plain `rosmaster`: python -m benchmarks.launch [--nodes 40] [--rounds 8] [--rospy] [--busy]
 
-`roslaunch` starts nodes; each reads 20 private parameters, publishes five topics, subscribes to five of the next node,
-and is up when all five bring messages. Both masters are new in each round and take turns: `rosmaster` with `rosout`,
-and the appliance that `rosrv up` has started. Measured are
+`roslaunch` starts nodes. Each reads 20 private parameters, publishes five topics, subscribes to five of the next
+node, and is up when all five bring messages. Both masters are new in each round and take turns: `rosmaster` with
+`rosout`, and a running appliance. The rows are
 
 - the time until the last node is up, and the processor time of the master's processes until then;
-- the delays of a `getParam` and of a `registerPublisher` that another client makes, each over a new connection, every
-  20 ms during the start;
+- the delays of `getParam` and `registerPublisher` calls that another client makes on new connections, every 20 ms
+  during the start;
 - the time until a killed node works again, and the time of three tools.
 
-Figures are medians of the rounds; a ratio is the median of the rounds' ratios, above 1 where the appliance is slower.
+Figures are medians of the rounds. A ratio is the median of the rounds' ratios, above 1 where the appliance is slower.
 With `--busy`, a program for each processor works half of the time.
 
-The last lines are findings: the rows whose ratio is in every round more than 20 % above, or in every round more than
-20 % below, the ratio of the same robot in `benchmarks/RESULTS.md`. If the true median is within the 20 %, a round is on
-the far side of either limit with a chance of at most one half. So chance makes a row a finding in at most one of 128
+The last lines are findings: rows whose ratio is more than 20 % above, or more than 20 % below, the ratio of the same
+robot in `benchmarks/RESULTS.md`, in every round and always on the same side. If the true median is within the 20 %, a
+round is beyond a limit with a probability of at most one half. So chance makes a row a finding in at most one of 128
 measurements of eight rounds.
 
-Needs root, and runs in a process namespace of its own: the kernel ends all that it started with it, however it ends.
+Needs root. The benchmark runs in its own process namespace, so that the kernel ends everything with it.
 """
 
 import argparse
@@ -77,7 +77,7 @@ class Reports:
         self.port = int(self._socket.getsockname()[1])
 
     def wait(self, numbers: set[int]) -> float:
-        """Return the time (monotonic) at which the last of these nodes is up. Raises `TimeoutError`."""
+        """Return the time (monotonic) at which the last of these nodes was up. Raise `TimeoutError`."""
         last, deadline = 0.0, time.monotonic() + LIMIT
         while numbers:
             self._socket.settimeout(max(0.001, deadline - time.monotonic()))
@@ -94,8 +94,6 @@ class Reports:
 
 
 class OtherClient:
-    """Each call has a new connection."""
-
     def __init__(self, uri: str) -> None:
         self.delays: dict[str, list[float]] = {"getParam": [], "registerPublisher": []}
         self._uri = uri
@@ -167,7 +165,7 @@ def package(folder: Path, nodes: int, port: int, *, rospy: bool) -> Path:
 
 
 def start(session: RosSession, masters: list[int], nodes: int, *, rospy: bool) -> Start:
-    """`masters` are the processes of the master; their descendants count too."""
+    """Measure a start. `masters` are the processes of the master, whose descendants count as well."""
     reports, measured = Reports(), Start()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -201,7 +199,7 @@ def _used(masters: list[int]) -> dict[int, float]:
 
 
 def killed(session: RosSession, folder: Path, reports: Reports, nodes: int, path: dict[str, str]) -> float:
-    """Returns the seconds until the first node is up again."""
+    """Kill the first node, and return the seconds until it is up again."""
     [found] = [
         int(entry.name)
         for entry in Path("/proc").iterdir()
@@ -243,7 +241,7 @@ def deployed() -> Iterator[tuple[RosSession, list[int]]]:
 
 
 def table_ratios(text: str, robot: str) -> dict[str, float]:
-    """Return the ratio of each row in the column of this robot; {} without a column."""
+    """Return the ratio of each row in the column of this robot, or {} without a column."""
     tables = [part.splitlines() for part in text.split("\n\n") if f"| {robot}, load" in part]
     if not tables:
         return {}
@@ -256,7 +254,7 @@ def table_ratios(text: str, robot: str) -> dict[str, float]:
 
 
 def findings(measured: Mapping[str, Sequence[float]], table: Mapping[str, float]) -> list[str]:
-    """Return the rows whose ratio is outside of the table's 20 % on the same side in every round."""
+    """Return the rows whose ratio is beyond the table's 20 % on the same side in every round."""
     found = []
     for what, ratios in measured.items():
         known = table[what]
@@ -307,7 +305,6 @@ def main() -> int:
 
 
 def _contained(arguments: list[str]) -> int:
-    """Run this program again as the first process of a namespace, which ends with this process."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         Path(folder).chmod(0o755)  # the appliance's processes run as other users

@@ -3,8 +3,8 @@
     python -m benchmarks.learning [--drives 240] [--faults 100] [--seed 1]
 
 Every drive is another random mission of half a minute, with late receptions and noise. An alarm in the second half is
-a false one. Each fault is put into a drive of the second half, on a random topic, field and time. It is flagged if,
-from its beginning on, there is an alarm that the same drive does not have without it.
+a false alarm. Each fault changes a drive of the second half, and is flagged if it causes an alarm that the same drive
+does not have without it.
 """
 
 import argparse
@@ -111,7 +111,7 @@ def altered(topic: str, data: bytes, change: Callable[[Any], None]) -> bytes:
 
 
 def get(fields: Any, path: str) -> Any:
-    """For `a#1` the element, for `a#` the whole array."""
+    """Return the field at a path; `a#1` is an element of an array."""
     path, _, element = path.partition("#")
     for step in path.split("."):
         fields = getattr(fields, step)
@@ -175,7 +175,7 @@ class Seeding:
         return get(MESSAGES.decode(TYPES[topic], data), path)
 
     def span(self, topic: str, path: str) -> float:
-        """The span of a constant is 1."""
+        """Return the span of a field's values, or 1 for a constant."""
         values = [
             float(self.value(place, path)) for place, row in enumerate(self.drive.rows) if row[0] == topic
         ]
@@ -266,7 +266,7 @@ KINDS: Mapping[str, Callable[[Seeding], list[Row]]] = {
 
 
 def seeded(kind: str, drives: Sequence[Drive], chance: random.Random) -> tuple[Drive, int, list[Row], str]:
-    """Return a drive, its fault's time, its messages with the fault, and the fault's description."""
+    """Return a drive, the time of its fault, its messages with the fault, and the fault's description."""
     while True:
         drive_ = chance.choice(drives)
         time = drive_.began + int((drive_.ended - drive_.began) * chance.uniform(0.2, 0.6))
@@ -280,7 +280,7 @@ def seeded(kind: str, drives: Sequence[Drive], chance: random.Random) -> tuple[D
 
 
 def alarms(learnt: LearningResult, rows: Sequence[Row]) -> list[tuple[int, str, str]]:
-    """Time, specification and text of every warning."""
+    """Return the time, specification and text of every warning."""
     monitors = MonitorSet.of(compiled_from({"learnt.rv": learnt.text}, KNOWN))
     monitors.start(rows[0][1], frozenset(TYPES))
     found = []

@@ -2,11 +2,9 @@
 
     python -m benchmarks.logic_steps [--long EVENTS] [--beside]
 
-The cost must not grow with the trace or with a time bound. The loop around the step is subtracted. For tables, the
-cost of looking them up inline is shown as well.
-
-`--beside` measures formulas of `mtl` about the past beside reelay and rtamt, in this process: one event for each unit
-of time.
+The cost must not grow with the trace or with a time bound. The loop around the step is subtracted. For logics with
+tables, the last column is the cost of looking them up inline. `--beside` compares `mtl` formulas about the past with
+reelay and rtamt in this process, with one event for each unit of time.
 """
 
 import argparse
@@ -57,11 +55,11 @@ BESIDE = (
     ("historically[0,50ns] (c => once[0,100ns] a)", "(historically[0:50] ({c} -> once[0:100] {a}))",
      "(historically[0:50] ((c >= 0) implies (once[0:100] (a >= 0))))"),
 )  # fmt: skip
-"""The same formula in reelay and in rtamt follows."""
+"""Each formula in this language, in reelay's and in rtamt's."""
 
 
 def trace(kind: str, length: int) -> list[int]:
-    """Random, balanced pairs of depth up to two, or all openings before all closings."""
+    """Return random events, pairs that nest at most two deep, or all openings before all closings."""
     if kind == "pairs":
         return [0, 0, 1, 1, 0, 1] * (length // 6)
     if kind == "nested":
@@ -70,7 +68,7 @@ def trace(kind: str, length: int) -> list[int]:
 
 
 def per_step(run: Run, events: Sequence[int]) -> float:
-    """Nanoseconds; events are one millisecond apart."""
+    """Return the nanoseconds of a step, with events one millisecond apart."""
     step = run.step
     times = range(0, len(events) * MS, MS)
     gc.collect()
@@ -102,7 +100,7 @@ def inline_step(compiled: CompiledProperty, events: Sequence[int]) -> float | No
 
 
 def others(for_reelay: str, for_rtamt: str, events: Sequence[int]) -> tuple[Callable[[int], bool], ...]:
-    """Each step returns whether the formula holds at an event."""
+    """Return the steps of reelay and rtamt. Each returns whether the formula holds at an event."""
     other: Any = reelay.discrete_timed_monitor(pattern=for_reelay, semantics="boolean", condense=False)
     third = rtamt.StlDiscreteTimeSpecification()
     for name in (*EVENTS, "out"):
@@ -118,7 +116,6 @@ def others(for_reelay: str, for_rtamt: str, events: Sequence[int]) -> tuple[Call
 
 
 def beside(events: Sequence[int]) -> None:
-    """Raises `SystemExit` if a verdict differs."""
     print(f"{'here':>8} {'reelay':>8} {'rtamt':>8}  ns/step, {len(events)} events")
     for formula, for_reelay, for_rtamt in BESIDE:
         compiled = compile_property("mtl", formula, EVENTS, Position("benchmark", 1, 1))

@@ -1,7 +1,7 @@
 """The cost of monitors for one message: `python benchmarks/monitor_messages.py`.
 
-The reference specification reads two fields, writes one, and steps one state machine. Times are processor time in
-microseconds for each message, as the median of the rounds.
+The reference specification reads two fields, writes one, and steps one state machine. Each time is the median of the
+rounds, in microseconds of processor time for one message.
 """
 
 import statistics
@@ -63,7 +63,6 @@ OTHERS = "".join(
 
 
 def command(frame: bytes = b"base_link") -> bytes:
-    """`geometry_msgs/TwistStamped`, 80 bytes and the frame's name."""
     return struct.pack(f"<IIII{len(frame)}s6d", 1, 2, 3, len(frame), frame, 2.0, 0, 0, 0, 0, 0.5)
 
 
@@ -97,7 +96,7 @@ def with_module(text: str) -> MonitorSet:
 
 
 def batched(messages: int, body: bytes, text: str = REFERENCE, topic: str = "/cmd") -> float:
-    """The first round, which allocates the buffers, does not count."""
+    """Return the microseconds of a message in batches. The first message, for the buffers, is not measured."""
     loaded = with_module(text)
     loaded.process(topic, bytearray(body), 1)
     lane, area = loaded.lane(topic), loaded.area

@@ -1,14 +1,18 @@
 """The cost of a monitor: `python -m benchmarks.monitors` (two or three minutes; the long run: `--all`).
 
-One publisher, one subscriber, one topic, loopback; the load is `relay_load.cpp`. In the middle, in turns: nothing;
-`copying_relay.c`; this relay without a monitor, with one on the topic (two fields read, one written, one FSM step),
-with 10 and with 50 more on other topics; `topic_tools relay`; a typed rospy relay that does the monitor's work. Cells
-are medians of the rounds; ratios are to the C relay, of one round each.
+One publisher, one subscriber and one topic use the loopback; `relay_load.cpp` is the load. The middle is, in turns: a
+direct connection; `copying_relay.c`; this relay without a monitor, with one on the topic (two fields read, one
+written, one FSM step), and with 10 and 50 more on other topics; `topic_tools relay`; a typed rospy relay that does
+the monitor's work. Cells are medians of the rounds; ratios are to the C relay in the same round.
 
-*window*: 64 messages on their way; *flat*: as fast as it goes, with the loss; *paced*: 1,000 a second, the delay;
-*topics*: 1, 8 and more topics at 1,000 a second each, each with a monitor; *memory*: that of the relay while a flat
-run of `--minutes` lasts. `--relays` leaves out the slowest peers; `--kinds` has monitors of one kind each instead
-(`KINDS`). Needs g++, rosmaster, topic_tools and rospy.
+- *window*: 64 messages are on their way.
+- *flat*: messages are sent as fast as possible; the loss is shown.
+- *paced*: 1,000 messages are sent a second; the delay is shown.
+- *topics*: 1, 8 and more topics have 1,000 messages a second and a monitor each.
+- *memory*: the relay's memory during a flat run of `--minutes`.
+
+`--relays` leaves out the slowest peers; `--kinds` measures monitors of one kind each instead (`KINDS`). Needs g++,
+rosmaster, topic_tools and rospy.
 """
 
 import argparse
@@ -58,7 +62,7 @@ KINDS = {
 }
 TEXT = "uint64 number\nint64 sent\nfloat64 value\nstring data\n"
 TEXT_MD5SUM = Definitions.from_files({f"{TYPE}.msg": TEXT}).md5sum(TYPE)
-"""The type on the wire, with a string in place of its bytes."""
+"""The md5sum of the message type with a string in place of its bytes."""
 TOPICS = (1, 8)
 MORE_TOPICS = (1, 8, 20, 50, 100)
 SIZES = (32, 200, 4096, 65536, 1048576, 4194304)
@@ -69,7 +73,7 @@ Results = dict[tuple[str, int, str], list[Result]]
 
 class MinimalRelay:
     def __init__(self, name: str, *command: str) -> None:
-        """`command` is called with the publisher's port, and prints the port for the subscriber."""
+        """Run `command` with the publisher's port as argument. It prints the port for the subscriber."""
         self.name = name
         self._command = command
         self.pid: int | None = None
@@ -91,7 +95,7 @@ class MinimalRelay:
 
 
 class CopyingRelay(MinimalRelay):
-    """With `epoll` it waits for data like a relay with many connections."""
+    """`copying_relay.c`. With `epoll`, it waits for data like a relay with many connections."""
 
     def __init__(self, *, epoll: bool = False) -> None:
         source = HERE / "copying_relay.c"
@@ -133,9 +137,9 @@ def of_kind(name: str) -> Relay:
 
 
 def topics_at_once(number: int, seconds: float) -> tuple[float, float, float]:
-    """1,000 messages of 200 bytes a second on each topic, which has a monitor.
+    """Send 1,000 messages of 200 bytes a second on each topic, which has a monitor.
 
-    Return the median and the largest of the topics' p50 (microseconds), and the part of a core that the relay uses.
+    Return the median and the largest of the topics' p50 (microseconds), and the relay's share of a core.
     """
     relay = Relay("topics")
     names = [f"/load{one}" for one in range(number)]

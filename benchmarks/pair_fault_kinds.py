@@ -1,4 +1,4 @@
-"""The faults that `benchmarks.pair_faults` draws from: each edge, process, disk and order of a pair of appliances."""
+"""Define the faults from which `benchmarks.pair_faults` draws."""
 
 import contextlib
 import os
@@ -22,16 +22,15 @@ _ROLES = ("control", "relay", "rosmaster", "signer", "lease", "api", "recorder",
 _STANDBY_ROLES = ("control", "lease", "signer", "relay", "supervisor")
 _PROMOTE_SECONDS = 30.0
 Said = list[str]
-"""Answers to orders of operators during a fault."""
 
 
 @dataclass(frozen=True)
 class Fault:
-    """A fault of a site with `active` and `passive`, which `make(site, active, passive, said)` holds for its block.
+    """A fault, which `make(site, active, passive, said)` causes during its block for `least` to `most` seconds.
 
-    It lasts `least` to `most` seconds. `cut_off`: no appliance could serve during it, so times count from its end.
-    `goes_on`: the active appliance goes on without the standby, so a call waits once for up to 0.8 s.
-    `interrupts`: the network loses packets, and TCP repeats them at intervals that grow with the interruption.
+    With `cut_off`, no appliance can serve during the fault, so times count from its end. With `goes_on`, the active
+    appliance continues without the standby, and a call waits once for up to 0.8 s. With `interrupts`, the network
+    loses packets, which TCP repeats at growing intervals.
     """
 
     name: str
@@ -143,7 +142,7 @@ def _promoted(
     on: str,
     during: Callable[..., contextlib.AbstractContextManager[object]] | None = None,
 ) -> Iterator[None]:
-    """The order comes half a second after `during` has begun; `on` is `active`, `standby` or `both`."""
+    """Order a takeover half a second after `during` has begun; `on` is `active`, `standby` or `both`."""
     names = {"active": [active], "standby": [passive], "both": [active, passive]}[on]
     with during(site, active, passive, said) if during is not None else contextlib.nullcontext():
         _NEVER.wait(0.5 if during is not None else 0)
@@ -219,7 +218,7 @@ KINDS = tuple(_kinds())
 
 
 def drawn(number: int, seed: int) -> list[tuple[Fault, float]]:
-    """Every kind once, in random order, then every kind again; with seconds."""
+    """Return faults with their seconds: every kind once in random order, then every kind again."""
     chance, found = random.Random(seed), list[tuple[Fault, float]]()
     while len(found) < number:
         found += [(one, chance.uniform(one.least, one.most)) for one in chance.sample(KINDS, len(KINDS))]

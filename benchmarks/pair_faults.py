@@ -2,14 +2,14 @@
 
     python -m benchmarks.pair_faults --faults 150 --seed 1 [--load 0] [--only TEXT] [--results FILE]
 
-The list of faults follows from the seed alone. With `--results`, a further run with the same file continues after the
-last fault.
+The seed determines the list of faults. With `--results`, another run with the same file continues after the last
+fault.
 
-Columns: the longest time in seconds without an answer of the Master API, a message, and an answer of a service (from
-the end of the fault if no appliance could serve before); subscriptions that were not back 20 s after the fault; the
-holder of the lease before and after; how `standby status` judged the pair near the end of the fault, and the seconds
-of the answer; `two`: the changes of the answering appliance, as an unfenced outsider sees it, that no grant of the
-witness explains. A broken promise is in the last column, and the exit status is then 1.
+The columns are: the longest time in seconds without an answer of the Master API, a message, and an answer of a
+service (from the end of the fault if no appliance could serve before); the subscriptions that were not back 20 s
+after the fault; the holder of the lease before and after; the answer of `standby status` near the end of the fault,
+and the seconds until it came; `two`, the changes of the answering appliance that no grant of the witness explains, as
+an unfenced outsider sees them. The last column has broken promises, and with one the exit status is 1.
 """
 
 import argparse
@@ -109,7 +109,6 @@ def answered_by_two(events: list[dict[str, object]], grants: int) -> int:
 def suffer(
     site: StandbySite, robot: StandbyRobot, probe: Process, row: Noticed, fault: Fault
 ) -> list[Process]:
-    """Return the listeners whose subscriptions are lost."""
     active, passive = site.pair()
     epoch, mark = site.lease.read().epoch, probe.mark()
     with Watch(robot) as watch:
@@ -187,7 +186,7 @@ def running_site() -> Iterator[tuple[StandbySite, Process]]:
 
 
 def until_whole(site: StandbySite, robot: StandbyRobot) -> None:
-    """Nothing is lost, the robot admits the holder alone, and both appliances report no trouble."""
+    """Wait until the robot admits only the holder, and both appliances report no trouble and no lost change."""
     robot.lost_nothing()
     eventually(lambda: robot.admitted() == {ADDRESSES[site.holder()]}, site.story)
     wanted = standby_requests.StandbyWanted()
@@ -198,7 +197,7 @@ def until_whole(site: StandbySite, robot: StandbyRobot) -> None:
 def one(
     site: StandbySite, robot: StandbyRobot, probe: Process, row: Noticed, fault: Fault, *, limit: float
 ) -> None:
-    """A row with a broken promise has the output of all programs as its `story`."""
+    """Measure and judge a fault. A row with a broken promise gets the output of all programs as its `story`."""
     try:
         _start_again(robot, suffer(site, robot, probe, row, fault))
         judge(row, fault, limit)
@@ -211,7 +210,7 @@ def one(
 
 
 def run(faults: Sequence[tuple[Fault, float]], *, done: int, load: int, limit: float) -> Iterator[Noticed]:
-    """Skips the first `done` faults; a site that did not recover is made again."""
+    """Yield a row for each fault after the first `done`. A site that did not recover is made again."""
     while done < len(faults):
         with running_site() as (site, probe), StandbyRobot(site, rate=_RATE) as robot, busy(load):
             for fault, seconds in faults[done:]:

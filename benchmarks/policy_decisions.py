@@ -1,9 +1,8 @@
 """Decisions per second against the number of rules: `python benchmarks/policy_decisions.py`.
 
-Each policy has as many rules as the row says (seven of ten exact names, three of ten patterns) and a group
-for each ten rules, every group with an address, a network and another group. *Warm*: requests that were
-asked before, as most are on a robot. *Cold*: names never seen before, so that nothing is remembered. The
-ratio is to 10 rules: it should stay near 1. Times are the median of the rounds.
+Seven of ten rules have exact names, and three have patterns. Each ten rules have a group, which has an address, a
+network and another group. *Warm*: the requests were asked before, as most are on a robot. *Cold*: the names are new,
+so nothing is remembered. The ratio is to 10 rules, and should stay near 1. Times are medians of the rounds.
 """
 
 import argparse

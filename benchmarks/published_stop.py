@@ -1,9 +1,9 @@
 """Time until a stop that a monitor publishes is sent: python -m benchmarks.published_stop [--deployed] [--stops 400]
 
 The time is from the arrival of a scan with a near obstacle at the monitors until the relay has the zero velocity to
-send, without sockets. With `--deployed`, it is from one rospy node's call of `publish` to another's callback, at an
-appliance that `rosrv up` has started; changed commands take turns with the stops. The nodes have real-time priority
-if that is permitted. With `--busy` as well, two programs for each core keep it busy.
+send, without sockets. With `--deployed`, it is from one rospy node's `publish` to another's callback at a running
+appliance, and changed commands take turns with the stops; the nodes have real-time priority if permitted. With
+`--busy`, two programs for each core keep it busy.
 """
 
 import argparse
@@ -35,7 +35,6 @@ NEAR = message("sensor_msgs/LaserScan", ranges=[0.1] * 40)
 
 
 def alone(stops: int) -> dict[str, list[float]]:
-    """In milliseconds; no sockets are used."""
     sent: list[int] = []
     monitors = QuietMonitors(lambda _topic, _data: sent.append(time.perf_counter_ns()))
     monitors.load(STOP)

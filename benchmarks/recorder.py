@@ -1,13 +1,12 @@
 """The flight recorder beside `rosbag record` and `rosbag_snapshot`: `python -m benchmarks.recorder [--seconds 15]`.
 
-One node talks on fifty topics (20 MB/s in all) or on five (0.1 MB/s), one listens. The systems take turns: a plain
-master; the same with `rosbag record -a`; with the node `snapshot` (not a Debian package: the program given by
-`--snapshot`, in PATH or below /opt/ros); the appliance without and with the recorder.
-
-Measured: messages, those missing between the first and the last of a topic, the seconds from the end of the recorded
-time until the file is complete, the median delay, and processor time in percent of a core. *killed*: relay, control
-and recorder get SIGKILL together. There, a message is missing if the subscriber received it in the recorded time, and
-the recording does not have it.
+One node talks on fifty topics (20 MB/s in total) or on five (0.1 MB/s), and another listens. The systems take turns:
+a plain master; the same with `rosbag record -a`; the same with the node `snapshot` (the program given by
+`--snapshot`, in PATH or below /opt/ros); the appliance without and with the recorder. The columns are messages, those
+missing between the first and the last of a topic, the seconds from the end of the recorded time until the file is
+complete, processor time in percent of a core, and the median delay. In the row *killed*, relay, control and recorder
+get SIGKILL together, and a message that the subscriber received in the recorded time is missing if the recording
+lacks it.
 """
 
 import argparse
@@ -55,7 +54,7 @@ class Bag(NamedTuple):
 
 @dataclass
 class Result:
-    """`cpu` is percent of a core by process name."""
+    """A run. `cpu` has the percentage of a core by the name of the process."""
 
     p50: float
     bag: Bag | None = None
@@ -63,7 +62,7 @@ class Result:
 
 
 class Load:
-    """Two connected nodes; the listener writes its received messages to a file in `folder`."""
+    """Two connected nodes. The listener writes the messages that it receives to a file in `folder`."""
 
     def __init__(self, session: RosSession, folder: Path, topics: int, size: int, hertz: int) -> None:
         self._heard = folder / "heard"
@@ -91,7 +90,7 @@ class Load:
         return float(heard["p50_us"])
 
     def heard(self, began: int, ended: int) -> dict[str, set[int]]:
-        """By topic, from `began` to `ended` (ns).
+        """Return the numbers of the messages received from `began` to `ended` (ns), by topic.
 
         The first second is left out, because its messages may have been published before.
         """
@@ -110,9 +109,7 @@ def measured(pids: Mapping[str, int], seconds: float, into: dict[str, float]) ->
 
 
 def counted(path: Path, closed: float, heard: dict[str, set[int]] | None = None) -> Bag:
-    """Count messages, and those missing between the first and the last of a topic; with `heard`, also those that the
-    bag lacks.
-    """
+    """Count a bag's messages and its missing ones: gaps of a topic's numbers, or with `heard` those that it lacks."""
     numbers: dict[str, set[int]] = {}
     with Reader(path) as reader:
         for connection, _time, data in reader.messages():
@@ -134,7 +131,7 @@ def snapshot_program() -> Path | None:
 def at_plain_master(
     folder: Path, load: tuple[int, int, int], seconds: float, recorder: str, snapshot: Path | None
 ) -> Result:
-    """`recorder` is "" (none), `rosbag`, or `snapshot`, the node of rosbag_snapshot."""
+    """Measure at a plain master. `recorder` is "", `rosbag`, or `snapshot` for the node of rosbag_snapshot."""
     with PlainMaster(folder) as master, RosSession(master.master_uri, folder) as session:
         running = Load(session, folder, *load)
         if not recorder:
@@ -164,7 +161,6 @@ def at_plain_master(
 def at_appliance(
     folder: Path, load: tuple[int, int, int], seconds: float, *, recorder: bool, kills: bool = False
 ) -> Result:
-    """With `kills`, the appliance's processes are killed during the load."""
     configuration = folder / "appliance.yaml"
     configuration.write_text(_CONFIGURATION.format(enabled=str(recorder).lower(), seconds=seconds))
     options = ("--config", str(configuration))

@@ -2,9 +2,9 @@
 
     python -m benchmarks.recordings
 
-Each pair runs both numbers of workers, in alternating order, on the same recordings; the efficiency of a pair is the
-ratio of their throughputs divided by the number of workers. Two commands with half of the recordings each, at the same
-time and without a pool, show the efficiency that the machine allows. Processor time does not depend on other programs.
+Each pair runs both numbers of workers, in alternating order, on the same recordings. Its efficiency is the ratio of
+their throughputs divided by the number of workers. Two commands with half of the recordings each, at the same time
+and without a pool, show the efficiency that the machine allows. Processor time does not depend on other programs.
 """
 
 import argparse
@@ -43,7 +43,6 @@ app()
 
 
 def make(path: Path, seed: int, seconds: int, payload: int) -> None:
-    """50 commands and 50 strings each second."""
     known, chance = standard_definitions(), random.Random(seed)
     with Writer(path) as writer:
         rows = [
@@ -64,7 +63,7 @@ def processor_time() -> float:
 
 
 def run(folder: Path, recordings: str, workers: int) -> tuple[float, int]:
-    """Return seconds, and the largest memory of the first process in bytes."""
+    """Return the seconds, and the largest memory of the first process in bytes."""
     command = [
         sys.executable,
         "-c",

@@ -1,9 +1,9 @@
 """The relay beside `topic_tools relay` and nothing at all: `python -m benchmarks.relay_throughput`.
 
-One publisher, one subscriber, one topic, loopback; the load is `relay_load.cpp`. *window*: 64 messages on their way;
-*flat*: as fast as it goes, with the loss; *paced*: 1,000 messages a second, with the delay. Systems take turns; cells
-are medians of the rounds and ratios are to `topic_tools`, of one round each. *recorded* is the relay with a flight
-recorder's memory of 64 MiB.
+`relay_load.cpp` is the load, on one topic over the loopback. *window* keeps 64 messages on their way, *flat* sends as
+fast as possible and shows the loss, *paced* sends 1,000 messages a second and shows the delay. Systems take turns.
+Cells are medians of the rounds, and ratios are to `topic_tools` in the same round. *recorded* is the relay with a
+flight recorder's memory of 64 MiB.
 """
 
 import argparse
@@ -45,7 +45,7 @@ TYPE = "relay_load/Sample"
 
 @dataclass
 class Result:
-    """Messages a second, lost fraction and number, delays in microseconds, the relay's CPU time a message."""
+    """Messages a second, lost ones (fraction and number), delays and the middle's CPU a message (microseconds)."""
 
     rate: float
     loss: float
@@ -65,7 +65,6 @@ def compiled() -> Path:
 
 
 def cpu_seconds(pid: int | None) -> float:
-    """User and system time so far."""
     if pid is None:
         return 0.0
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
@@ -75,7 +74,7 @@ def cpu_seconds(pid: int | None) -> float:
 def run(
     mode: str, size: int, seconds: float, system: "System", *md5sum: str, prefix: Sequence[str] = ()
 ) -> Result:
-    """`prefix` begins the load's command; `md5sum` replaces the md5sum of the message type.
+    """Run the load once. `prefix` begins its command; `md5sum` replaces the md5sum of the message type.
 
     Sessions share the cores equally (`sched_autogroup_enabled`), so the load has its own, like a node of roslaunch.
     """
@@ -108,7 +107,7 @@ class System(Protocol):
     pid: int | None
 
     def target(self, publisher: int) -> tuple[int, str]:
-        """Return port and topic for the subscriber."""
+        """Return the port and topic for the subscriber."""
 
     def close(self) -> None: ...
 
@@ -124,7 +123,7 @@ class Direct:
 
 
 class Relay:
-    """This project's relay process; its control knows one topic in each run."""
+    """This project's relay process, with this benchmark as its control."""
 
     def __init__(self, name: str = "relay", *, recorded: bool = False) -> None:
         self.name = name
@@ -148,7 +147,6 @@ class Relay:
         return self.place(publisher, "/load")
 
     def place(self, publisher: int, topic: str) -> tuple[int, str]:
-        """Make a new incarnation that publishes this topic; return port and topic for its subscriber."""
         key = str(len(self._publishers) + 1)
         self._publishers[key] = publisher
         with socket.create_server((LOOPBACK, 0)) as listening:
@@ -170,8 +168,6 @@ class Relay:
 
 
 class LoadApi:
-    """`publisher` is the port of this run's publisher."""
-
     def __init__(self) -> None:
         self.publisher = 0
         self._server = SimpleXMLRPCServer((LOOPBACK, 0), logRequests=False)
@@ -190,7 +186,7 @@ class LoadApi:
 
 
 class RosRelay:
-    """The node is started again for each run."""
+    """A relay that is a ROS node, behind a plain master. The node is started again for each run."""
 
     def __init__(self, name: str = "topic_tools", command: Sequence[str] = (TOPIC_TOOLS,)) -> None:
         self.name = name
@@ -211,7 +207,6 @@ class RosRelay:
         self.pid: int | None = None
 
     def target(self, publisher: int) -> tuple[int, str]:
-        """Find the port that the relay publishes on."""
         self.stop_relay()
         self._api.publisher = publisher
         self._runs += 1

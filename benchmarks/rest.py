@@ -1,10 +1,8 @@
 """REST beside a bare FastAPI route on uvicorn: `python -m benchmarks.rest [--seconds 2] [--rounds 3]`.
 
-Both run at once and take turns at every load. Requests a second are medians of the rounds, the ratio is the median of
-the rounds' ratios; the CPU time of a request is that of the api and of control together.
-
-Then: what REST at full load does to the delay of a call of RVMaster, beside the same call in a quiet second of the
-same round.
+Both run at the same time and take turns at every load. Requests a second are medians of the rounds, and ratios
+medians of the rounds' ratios. The CPU time of a request includes the api and control. A second table has the delay of
+a call of RVMaster while REST is at full load, and in a quiet second of the same round.
 """
 
 import argparse
@@ -68,7 +66,6 @@ class Client:
         self.sock.sendall(self.data)
 
     def receive(self) -> bool:
-        """Return whether the answer is complete."""
         piece = self.sock.recv(1 << 20)
         if not piece:
             raise RuntimeError(f"the server closed the connection: {self.got[:300]!r}")
@@ -83,7 +80,6 @@ class Client:
 
 
 def load(port: int, path: str, token: str, clients: int, seconds: float) -> float:
-    """Requests a second in a closed loop."""
     head = f"GET {path} HTTP/1.1\r\nHost: 127.0.0.1\r\nAuthorization: Bearer {token}\r\n\r\n".encode()
     everybody = {one.sock.fileno(): one for one in (Client(port, head) for _ in range(clients))}
     poll = select.epoll()
@@ -152,7 +148,7 @@ class Appliance:
         return found
 
     def delays(self, seconds: float) -> list[float]:
-        """Seconds of calls of getSystemState, one after the other."""
+        """Return the seconds of getSystemState calls, one after the other."""
         found = []
         with xmlrpc.client.ServerProxy(self.master) as master:
             end = time.perf_counter() + seconds

@@ -1,12 +1,12 @@
 """`ere` and `ltl` beside RV-Monitor: `python -m benchmarks.rv_monitor CHECKOUT JAVACC [FORMULAS] [--seed SEED]`.
 
-CHECKOUT is RV-Monitor's repository (github.com/runtimeverification/rv-monitor), JAVACC the archive of JavaCC (Debian's
-package `javacc`: /usr/share/java/javacc.jar); `javac` and `java` are on the path. Its plugins are compiled as they
-are, without what reads and writes XML, and make automata of random expressions and formulas, some with `(*)`, `<*>`
-and `S` about the past. On random traces both sides must report `match` and `violation` at the same events. RV-Monitor
-may report `fail` and `violation` later, because it does not always detect that no continuation matches. Where it is
-later for an `ltl` formula, the definition must give `violation` at the earlier event. The exit status is 1 if they
-differ.
+CHECKOUT is RV-Monitor's repository (github.com/runtimeverification/rv-monitor), JAVACC the archive of JavaCC
+(Debian's package `javacc`: /usr/share/java/javacc.jar); `javac` and `java` are on the path. Its plugins, compiled
+without the parts that read and write XML, make automata of random expressions and formulas, some with `(*)`, `<*>`
+and `S` about the past. On random traces, both sides must report `match` and `violation` at the same events; otherwise
+the exit status is 1. RV-Monitor may report `fail` and `violation` later, because it does not always detect that no
+continuation matches. Where it is later for an `ltl` formula, the definition must give `violation` at the earlier
+event.
 """
 
 import argparse
@@ -71,7 +71,7 @@ public class Made { public static String of(String text) {
 
 
 class Formula(NamedTuple):
-    """The text has all parentheses."""
+    """A random formula as a tree, and as text with all parentheses."""
 
     logic: str
     events: Sequence[str]
@@ -104,7 +104,7 @@ def drawn(random: Random, count: int) -> Iterator[Formula]:
 
 
 def automata(checkout: Path, javacc: Path, formulas: Sequence[Formula]) -> list[str]:
-    """Empty if RV-Monitor cannot make the automaton."""
+    """Return RV-Monitor's automata, with "" for a formula from which it cannot make one."""
     with tempfile.TemporaryDirectory() as made:
         sources, classes = Path(made) / "sources", Path(made) / "classes"
         for logic in ("ere", "ltl"):
@@ -129,7 +129,7 @@ def _run(command: list[str], given: str = "") -> str:
 
 
 def theirs(automaton: str, logic: str, trace: Sequence[str]) -> list[tuple[bool, bool]]:
-    """After each event: whether the automaton matches, and whether no continuation can match."""
+    """Return, after each event, whether the automaton matches and whether no continuation can match."""
     states: dict[str, dict[str, str]] = {}
     for name, body in re.findall(r"(\w+) ?\[([^\]]*)\]", automaton):
         states[name] = dict(re.findall(r"(\w+) -> (\w+)", body))

@@ -1,6 +1,6 @@
 """The cost of slices: `python -m benchmarks.slices`.
 
-Times are microseconds of processor time, the minimum of the rounds; 10,000 live slices are visited in turn.
+Times are the minimum of the rounds in microseconds of processor time. The 10,000 live slices are visited in turn.
 """
 
 import struct
@@ -41,7 +41,6 @@ WITHIN = SPECIFICATION % (
 
 
 def ids(count: int) -> list[bytes]:
-    """In the form of actionlib's ids."""
     made = (b"/planner-%d-%d.%09d" % (number, 1_700_000_000 + number, number) for number in range(count))
     return [struct.pack("<I", len(one)) + one for one in made]
 

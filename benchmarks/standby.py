@@ -4,11 +4,11 @@
     python -m benchmarks.standby switchovers [--cuts 10] [--load 0] [--monitors FOLDER]
     python -m benchmarks.standby registrations [--rounds 40] [--load 0]
 
-`cuts`: the power of the active appliance is cut at a random time. `switchovers`: an operator orders the standby to
-take over. The table has the longest time without a message, an answer of a service, and an answer of the Master API,
-of which 20 ms are usual. The program fails if a node has ended or an answered change is missing. `registrations`: one
-node registers and unregisters a topic behind one appliance and behind two, in turns; ratios are of medians. `--load`
-starts processes that keep the cores busy.
+`cuts` cuts the power of the active appliance at a random time. `switchovers` orders the standby to take over. The
+table has the longest time without a message, an answer of a service, and an answer of the Master API; 20 ms are
+usual. The program fails if a node has ended or an answered change is missing. `registrations` lets one node register
+and unregister a topic behind one appliance and behind two, in turns; ratios are of medians. `--load` starts processes
+that keep the cores busy.
 """
 
 import argparse
@@ -54,7 +54,7 @@ class Successes:
             self._new.notify_all()
 
     def until_after(self, moment: float, seconds: float = _SECONDS) -> float:
-        """Raises `TimeoutError`."""
+        """Return the time of the first success after `moment`, or raise `TimeoutError`."""
         with self._new:
             if not self._new.wait_for(lambda: self.times[-1] > moment, seconds):
                 raise TimeoutError(f"nothing worked for {seconds:g} s")
@@ -65,8 +65,6 @@ class Successes:
 
 
 class Watch:
-    """Watches topics, services and the Master API while the block runs."""
-
     def __init__(self, robot: StandbyRobot) -> None:
         self._robot = robot
         self._ended = threading.Event()
@@ -177,7 +175,7 @@ def print_pauses(pauses: dict[str, list[float]], title: str) -> None:
 
 
 def one_takeover(site: StandbySite, robot: StandbyRobot, *, planned: bool) -> dict[str, float]:
-    """Return the longest pause of everything; then both appliances are in sync again."""
+    """Return the longest pause of each thing, once both appliances are in sync again."""
     active, passive = site.pair()
     with Watch(robot) as watch:
         if planned:
@@ -237,7 +235,6 @@ def _behind(*, pair: bool) -> Iterator[Callable[[], list[float]]]:
 
 
 def _registered(master: str) -> list[float]:
-    """The seconds of each call."""
     times = []
     with xmlrpc.client.ServerProxy(master) as proxy:
         proxy.getPid("/bench")

@@ -12,9 +12,9 @@
 | `standby` | no packet passes between the standby and the robot, for 2 to 8 s |
 | `robot` | the witness ends, and its boot rules shut out both appliances, for 0.5 to 4 s |
 
-For `stalls` and `link` the table shows the longest time without a message, an answer of a service, and an answer of the
-Master API; for the others the time from the end of the fault. A subscription that gets no message for 20 s after the
-fault is lost: the program counts it, and starts its node again.
+The table shows the longest time without a message, an answer of a service, and an answer of the Master API, or for
+`interruptions`, `follower` and `robot` the time from the end of the fault. A subscription that gets no message for 20
+s after the fault is lost: the program counts it, and starts its node again.
 """
 
 import argparse
@@ -106,7 +106,6 @@ FAULTS: dict[str, tuple[Fault, float, float, bool]] = {
 
 
 def faults(kind: str, number: int, load: int = 0, seed: int = 1) -> int:
-    """Return the number of lost subscriptions."""
     make, least, most, after = FAULTS[kind]
     chance, pauses, lost = random.Random(seed), dict[str, list[float]](), 0
     with (
@@ -159,9 +158,9 @@ def _one(
     after: bool,
     in_sync: int,
 ) -> tuple[dict[str, float], int]:
-    """Returns the times without service, and the number of lost subscriptions.
+    """Return the times without service, and the number of lost subscriptions.
 
-    `in_sync`: the number of appliances in sync some time after the fault.
+    `in_sync` is the number of appliances that are in sync some time after the fault.
     """
     lost: list[Process] = []
     with Watch(robot) as watch:

@@ -1,12 +1,12 @@
 """Time saved by the log in front of the database: python -m benchmarks.state_writes [--rate 500] [--seconds 10]
 
-Nodes register at a rate; each registration must survive the death of control before it is answered. Every second
+Nodes register at a rate, and each registration must survive the death of control before it is answered. Every second,
 another thread saves the tree of parameters. The table shows how long one registration blocks the answering thread, in
 microseconds:
 
-- `ahead`: as the program does it, a line in `state.ahead` and a statement in the queue of the writer's thread.
+- `ahead`: the program's way, a line in `state.ahead` and a statement in the queue of the writer's thread.
 - `commit`: the answering thread commits the statement to SQLite's own log (WAL, `synchronous=NORMAL`). It waits while
-  the other thread writes the tree, and when it is its turn to bring SQLite's log into the database.
+  the other thread writes the tree, and whenever it has to move SQLite's log into the database.
 """
 
 import argparse
@@ -27,7 +27,6 @@ Keep = Callable[[RegistrationRow], None]
 
 
 def main() -> None:
-    """Trees of parameters are those of small and large robots."""
     arguments = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     arguments.add_argument("--rate", type=int, default=500, help="registrations a second")
     arguments.add_argument("--seconds", type=float, default=10)

@@ -1,5 +1,3 @@
-"""Receive and count all syslog messages, to measure the sender."""
-
 import contextlib
 import socket
 import threading
@@ -7,7 +5,7 @@ from typing import Self
 
 
 class Sink:
-    """`messages` counts octet-counted messages of RFC 5424."""
+    """A receiver on loopback. `messages` counts octet-counted messages of RFC 5424."""
 
     def __init__(self) -> None:
         self.messages = 0

@@ -1,10 +1,10 @@
 """The thesis's experiments (chapter 5, RQ2), with real nodes: `python -m benchmarks.thesis_experiments`.
 
-Two rospy nodes, ten messages a second: behind a plain `rosmaster`, behind the appliance without a monitor, and with
-one on each topic. Experiment 1 and 2: one topic, 10 s and 10 minutes; 3: both nodes publish and subscribe, 10 s and
-10 minutes; 4: the monitor publishes a message for each that it sees, 1 minute. Durations are multiplied by --scale
-(default 0.02, no run below 5 s; `--scale 1` is the thesis's own, about an hour). `lost` are messages missing after
-the first one was received, because the first ones are published before the nodes have found each other.
+Two rospy nodes exchange ten messages a second: behind a plain `rosmaster`, behind the appliance without a monitor,
+and with one on each topic. Experiments 1 and 2 have one topic, for 10 s and 10 minutes. In experiment 3 both nodes
+publish and subscribe, for the same times. In experiment 4 the monitor publishes a message for each that it sees, for
+1 minute. `--scale` multiplies the times (by default 0.02, at least 5 s). `lost` messages are missing after the first
+received one, because earlier ones are published before the nodes have found each other.
 """
 
 import argparse
@@ -36,7 +36,7 @@ EXTRA = "copy = MESSAGE; PUBLISH(/extra, std_msgs/String, copy);"
 
 @dataclass(frozen=True)
 class Experiment:
-    """`nodes` are the roles of both nodes, `extra` is an additional action of the monitor."""
+    """An experiment. `nodes` are the roles of both nodes; `extra` is an additional action of the monitor."""
 
     name: str
     seconds: float
@@ -90,7 +90,6 @@ def measure(master_uri: str, home: Path, experiment: Experiment, seconds: float)
 
 
 def counted(node: Process, seconds: float) -> dict[str, int]:
-    """The node prints them at its end."""
     event = node.wait_for(event="counted", timeout=seconds + 60)
     return {name: int(event[name]) for name in ("sent", "received", "lost")}
 

@@ -1,7 +1,8 @@
 """Stock tools that query everything, compared with a plain master: `python -m benchmarks.tools [--rounds 3]`.
 
-`rosbag record -a` records a robot with a hundred topics. Two times are measured: from the first topic's first message
-in the bag to the last topic's, and from the start of the tool. Then `rosgraph`'s library queries the whole graph.
+`rosbag record -a` records a robot with a hundred topics. The time until the last topic's first message is in the bag
+is measured twice: from the first topic's first message, and from the start of the tool. Then `rosgraph`'s library
+queries the whole graph.
 """
 
 import argparse
@@ -40,8 +41,6 @@ print(time.monotonic() - began)
 
 
 class Robot:
-    """Ten nodes with ten topics each, behind one master."""
-
     def __init__(self, session: RosSession) -> None:
         self.session = session
         subprocess.run([str(ROOT / "scripts" / "build-roscpp"), str(_SOURCE), str(_PROGRAM)], check=True)
@@ -53,7 +52,7 @@ class Robot:
             node.wait_for(event="ready")
 
     def record(self, bag: Path) -> tuple[float, float, float]:
-        """Return the two times in seconds, and the number of missing topics."""
+        """Return both times in seconds, and the number of missing topics."""
         began = time.time()
         self.session.run(
             "rosbag", "record", "-a", "-O", str(bag), f"--duration={_RECORDED_SECONDS}", timeout=60

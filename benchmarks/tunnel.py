@@ -1,13 +1,11 @@
 """A tunnel beside the clear path, in one run: `python -m benchmarks.tunnel [--seconds 5] [--rounds 3] [--machine]`.
 
-The same host, once by its virtual address through its tunnel and once by its own in clear text, publishes to the
-robot (rospy at both ends, through the relay) and calls RVMaster. They take turns; cells are medians of the rounds,
-ratios are medians of the rounds' ratios. Then: the time from `host add` to the first message through the tunnel.
+The same host publishes to the robot (rospy at both ends, through the relay) and calls RVMaster, in turns through its
+tunnel and in clear text from its own address. Cells are medians of the rounds, ratios medians of the rounds' ratios.
+Then the time from `host add` to the first message through the tunnel is measured.
 
-ESP runs where this machine has it; `--machine` runs all of it in the tests' virtual machine, whose kernel has ESP
-(without KVM every figure there is some ten times slower).
-
-Needs root.
+ESP runs where this machine supports it. `--machine` runs everything in the tests' virtual machine, whose kernel has
+ESP; without KVM, all figures there are about ten times slower. Needs root.
 """
 
 import argparse
@@ -57,7 +55,7 @@ class Measure:
 
 
 class Bench:
-    """The trusted host is behind its tunnel and, at its own address, in clear text."""
+    """The trusted host, both behind its tunnel and at its own address in clear text."""
 
     def __init__(self, site: TunnelSite, joined: JoinedHost, seconds: float) -> None:
         self.site, self.joined, self.seconds = site, joined, seconds
@@ -94,7 +92,6 @@ class Bench:
         return counted["received"] / counted["seconds"], statistics.median(counted["delays"])
 
     def _calls(self, path: Way) -> float:
-        """A second, over one kept connection."""
         body = xmlrpc.client.dumps(("/bench",), "getSystemState").encode()
 
         def work() -> float:

@@ -1,7 +1,7 @@
-"""Five lines of Python between two connections, without reading the messages: `copying_relay.py PORT`.
+"""Relay one connection with five lines of Python that never parse a message: `copying_relay.py PORT`.
 
-As `copying_relay.c`, it prints its port, takes one subscriber, connects to the publisher at PORT, and passes on both
-connection headers before the messages.
+Like `copying_relay.c`, it prints its port, takes one subscriber, connects to the publisher at PORT, and passes on
+both connection headers before the messages.
 """
 
 import select

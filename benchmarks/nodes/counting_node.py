@@ -1,8 +1,8 @@
 """The thesis's node: publish ten times a second, and count sent and received messages (run by Debian's Python).
 
-`counting_node.py SECONDS [publish:=TOPIC] [subscribe:=TOPIC]` publishes from its start on, even without a subscriber,
-as the thesis's node did. It ends a second after the last message and prints `{"event": "counted", "sent": …,
-"received": …, "lost": …}`: lost messages are those missing between the first and the last received message.
+`counting_node.py SECONDS [publish:=TOPIC] [subscribe:=TOPIC]` publishes from its start, even without a subscriber, as
+the thesis's node did. A second after the last message it prints `{"event": "counted", "sent": …, "received": …,
+"lost": …}`. Lost messages are those missing between the first and the last received one.
 """
 
 import json

@@ -1,8 +1,8 @@
-"""Cut an operator's commands at full speed, with two rospy nodes (run by Debian's Python): `cut_node.py COUNT SILENT`.
+"""Cut an operator's commands at full speed, with two nodes of Debian's rospy: `cut_node.py COUNT SILENT`.
 
-One node commands full speed on `/cmd_vel`, 50 times a second, and then falls silent without a closed connection.
-Print `{"event": "measured", "late": [...]}`: milliseconds from the call of `publish` of the last command until the
-base's callback for the stop, less SILENT (seconds).
+One node commands full speed on `/cmd_vel` 50 times a second, then falls silent without closing its connection. The
+program prints `{"event": "measured", "late": [...]}`: milliseconds from the `publish` of the last command until the
+base's callback for the stop, minus SILENT (seconds).
 """
 
 import json
@@ -40,7 +40,6 @@ def next_of(arrivals, speed):
 
 
 def cut(publisher, arrivals, number, silent, pause):
-    """Return the milliseconds by which the stop is late, or None without a stop."""
     command = Twist()
     command.linear.x = 1.0 + number
     for place in range(COMMANDS):

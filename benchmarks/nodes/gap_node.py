@@ -1,6 +1,6 @@
 """Report the gaps of a topic (run by Debian's Python): gap_node.py TOPIC.
 
-Print `{"event": "first"}` at the first message, and `{"event": "gap", "began": …, "ended": …}` (seconds of the
+It prints `{"event": "first"}` at the first message, and `{"event": "gap", "began": …, "ended": …}` (seconds of the
 monotonic clock) whenever two messages are more than 50 ms apart.
 """
 

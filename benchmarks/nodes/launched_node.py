@@ -1,5 +1,5 @@
 #!/usr/bin/python3
-"""A rospy node of a robot that starts, as launched_node.cpp: launched_node.py NUMBER NODES PORT."""
+"""A rospy node of a robot that starts, like launched_node.cpp: launched_node.py NUMBER NODES PORT."""
 
 import socket
 import sys

@@ -1,8 +1,9 @@
 """Publish messages with timestamps, or report their arrival (run by Debian's Python, with rospy).
 
-`stamping_node.py publish TOPIC BYTES HZ SECONDS` (HZ 0: as fast as the connection takes them) ends after SECONDS;
-`stamping_node.py subscribe TOPIC` prints for each line on its input a line `{"event": "counted", "received": N,
-"seconds": S, "delays": [µs, …]}` about the messages since the last line. The clock is the machine's (CLOCK_MONOTONIC).
+`stamping_node.py publish TOPIC BYTES HZ SECONDS` ends after SECONDS; with HZ 0 it publishes as fast as the connection
+takes messages. `stamping_node.py subscribe TOPIC` answers each line of its input with a line `{"event": "counted",
+"received": N, "seconds": S, "delays": [µs, …]}` about the messages since the last one. The clock is CLOCK_MONOTONIC,
+which both processes share.
 """
 
 import json

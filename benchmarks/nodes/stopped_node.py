@@ -1,8 +1,8 @@
 """Measure how late commands and stops arrive, with two rospy nodes (run by Debian's Python): `stopped_node.py COUNT`.
 
 One node publishes in turns a command (`/drive`), which a monitor changes, and a scan (`/scan`), for which a monitor
-publishes a stop (`/cmd_vel`). The other node receives both, because a node's messages to itself do not leave its
-process. Print `{"event": "measured", "changed": [...], "stopped": [...]}`: milliseconds from `publish` until the
+publishes a stop (`/cmd_vel`). The other receives both, because a node's messages to itself never leave its process.
+The program prints `{"event": "measured", "changed": [...], "stopped": [...]}`: milliseconds from `publish` until the
 callback.
 """
 
@@ -37,7 +37,6 @@ def receive(arrivals):
 
 
 def measure(publisher, message, arrivals, patience=LIMIT):
-    """Returns the milliseconds until the command arrives, or None."""
     began = time.monotonic()
     publisher.publish(message)
     if not select.select([arrivals], [], [], patience)[0]:
