@@ -19,13 +19,13 @@ _NIGHTLY = ("tests/integration/", "tests/system/", "tests/package/", "tests/proo
 
 
 def pytest_configure() -> None:
-    """Begin to see what depends on chance."""
+    """Watch for all that depends on chance, before a test module can import a function that is replaced."""
     WATCH.install()
 
 
 @pytest.hookimpl(tryfirst=True)  # before -m selects by marker
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark tests with real nodes as nightly, and count the real ones."""
+    """Mark tests with real nodes as nightly, and limit the number of cases marked `real`."""
     real = [item for item in items if item.get_closest_marker("real")]
     if len(real) > _MOST_REAL:
         raise pytest.UsageError(f"{len(real)} cases are marked `real`; the gate runs at most {_MOST_REAL}")
@@ -46,7 +46,7 @@ def _watched(item: pytest.Item) -> Generator[None, Any, Any]:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol() -> Generator[None, Any, Any]:
-    """Restore logging after each test: a command that ran in it logs to its captured output, which is closed then."""
+    """Restore logging after each test: a command that it ran logs to its captured output, which is closed."""
     before, handlers = structlog.get_config(), logging.root.handlers.copy()
     result = yield
     structlog.configure(**before)
@@ -56,7 +56,7 @@ def pytest_runtest_protocol() -> Generator[None, Any, Any]:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_setup(item: pytest.Item) -> Generator[None, Any, Any]:
-    """Begin the test's own time, and forbid what chance can decide in its fixtures."""
+    """Give the test its own virtual time, and forbid its fixtures to depend on chance."""
     if not may_depend_on_chance(item):
         item.stash[_TIME] = contextlib.ExitStack()
         item.stash[_TIME].enter_context(clock.using(VirtualClock(wall=_WALL)))
@@ -65,13 +65,11 @@ def pytest_runtest_setup(item: pytest.Item) -> Generator[None, Any, Any]:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_call(item: pytest.Item) -> Generator[None, Any, Any]:
-    """Forbid what chance can decide in a test."""
     return (yield from _watched(item))
 
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_teardown(item: pytest.Item) -> Generator[None, Any, Any]:
-    """Forbid what chance can decide at the end of a test, and end its time."""
     try:
         return (yield from _watched(item))
     finally:

@@ -65,7 +65,7 @@ def masters(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Masters]:
 
 @pytest.fixture
 def appliance(masters: Masters) -> Iterator[Appliance]:
-    """The worker's appliance on the loopback, with an open policy and REST; the test must leave it as it was."""
+    """Yield the worker's appliance on the loopback, with an open policy and REST. The test must leave it as it was."""
     with masters.lend("appliance", "loopback") as site:
         site.appliance.ignore_earlier_records()
         yield site.appliance
@@ -98,10 +98,10 @@ def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestR
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Give each worker of pytest-xdist a loopback of its own, as root, and let programs hear SIGINT.
+    """Let programs hear SIGINT, and as root give each worker of pytest-xdist its own loopback.
 
     A script's background process ignores SIGINT, and so does every program that it starts: a test that interrupts it
-    would wait until the time limit. The port of a killed node could go to the next node on a common loopback, which
+    would wait until the time limit. On a common loopback, the port of a killed node could go to the next node, which
     would answer for it.
     """
     # The collected tests stay in memory: the garbage collector would scan their millions of objects again and again.

@@ -1,11 +1,10 @@
 """Change the kernel in small wrong ways, and list the changes that no test of the gate finds: `make mutants N=200`.
 
-Every module is loaded with all its mutants inside, each switched by a number. A first run records which tests reach
-which mutant; then a fork runs only those tests with the mutant on, until one fails. `--all` also runs tests outside
-the gate. `--module master` changes the modules whose path contains `master` instead of the kernel. A seed chooses the
-same mutants whatever the tests reach, so that two states of the tests can be compared.
-
-Changes without an effect are left out: None instead of False, another step of a version, a `zip` that is not strict.
+Every module is loaded with all its mutants inside, each switched on by a number. A first run records which tests
+reach which mutant; then a fork for each mutant runs only those tests, until one fails. `--all` adds tests outside the
+gate; `--module master` changes the modules whose path contains `master` instead of the kernel. A seed chooses the
+same mutants whatever the tests reach, so that two states of the tests can be compared. Changes without an effect are
+left out: None instead of False, another step of a version, a `zip` that is not strict.
 """
 
 import argparse
@@ -250,7 +249,7 @@ def _say(line: str) -> None:
 
 
 def main() -> int:
-    """Return 0: survivors are for people to judge."""
+    """Return 0: people judge the survivors."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--number", type=int, default=200)
     parser.add_argument("--seed", type=int, default=1)

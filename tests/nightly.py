@@ -1,10 +1,10 @@
 """Run all tests and report each: `make nightly`, or the tests of one lane, `make nightly LANE=standby`.
 
-It never stops at a failure. `build/nightly/results.json` has passes, failures and seconds of each test, and commit,
-start, end and load average of each run. Runs of the same commit add up. A change of more than 20 % of a robot's start
-(`benchmarks/launch.py`) against the table in `benchmarks/RESULTS.md` is a finding, for people to look at.
-
-The exit status is 1 if a test failed that `tests/unsteady.txt` does not list, or if the robot did not start.
+It never stops at a failure. `build/nightly/results.json` has passes, failures and seconds of each test, and the
+commit, start, end and load average of each run. Runs of the same commit add up. If a robot's start
+(`benchmarks/launch.py`) differs by more than 20 % from the table in `benchmarks/RESULTS.md`, that is a finding for
+people to look at. The exit status is 1 if a test failed that `tests/unsteady.txt` does not list, or if the robot did
+not start.
 """
 
 import argparse
@@ -42,12 +42,12 @@ LANES = {
     "recorder": ("recorder", "evidence", "recording"),
     "language": ("rosmop/", "tests/proofs/", "monitor", "specification", "compiler"),
 }
-"""Parts of a file's path; the first lane that has one counts. All other files are in `core`."""
+"""Words of each lane. A file is in the first lane with a word that its path contains, and otherwise in `core`."""
 
 
 @dataclass(frozen=True)
 class Stage:
-    """Tests run side by side on `workers` of pytest-xdist, or one after the other."""
+    """Tests that run side by side on `workers` of pytest-xdist, or one after the other."""
 
     name: str
     folders: tuple[str, ...]
@@ -100,7 +100,7 @@ exec "$@"
 
 
 def open_folders_above(checkout: Path) -> None:
-    """Start this program again where other users can reach the checkout, if they cannot reach it here."""
+    """Start this program again in a mount namespace where other users can reach the checkout, unless they can here."""
     closed = [
         str(folder) for folder in reversed(checkout.parents) if not folder.stat().st_mode & stat.S_IXOTH
     ]
@@ -128,7 +128,6 @@ def files_of_stages() -> dict[str, list[str]]:
 
 
 def outcomes_of(report: Path) -> Iterator[tuple[str, str, float]]:
-    """Yield id, outcome (passed, failed, skipped) and seconds of each test, from a JUnit report of pytest."""
     for case in xml.etree.ElementTree.parse(report).iter("testcase"):  # noqa: S314  written by pytest
         kinds = {child.tag for child in case}
         outcome = "failed" if kinds & {"failure", "error"} else "skipped" if "skipped" in kinds else "passed"
@@ -136,7 +135,7 @@ def outcomes_of(report: Path) -> Iterator[tuple[str, str, float]]:
 
 
 def unsteady() -> set[str]:
-    """Each line of the file has the id, a date and the reason."""
+    """Return the ids in the file, in which each line has an id, a date and the reason."""
     lines = UNSTEADY.read_text(encoding="utf-8").splitlines()
     return {line.split()[0] for line in lines if line and not line.startswith("#")}
 
@@ -165,7 +164,6 @@ def run_stage(stage: Stage, files: list[str]) -> tuple[list[tuple[str, str, floa
 
 
 def measure_start() -> tuple[list[str], str]:
-    """Return the findings, and what went wrong."""
     command = [sys.executable, "-m", "benchmarks.launch"]
     with START.open("wb") as log:
         try:

@@ -1,6 +1,6 @@
 """Run a test many times beside busy loops: `make steady TEST=path N=50`.
 
-Prints the number of failures, and the largest chance of failure that this number is compatible with (95 % confidence).
+It prints the number of failures, and the largest probability of failure that is compatible with it (95 % confidence).
 """
 
 import argparse
@@ -14,7 +14,7 @@ from tests.support.sources import ROOT
 
 
 def largest_chance(failures: int, runs: int, confidence: float = 0.95) -> float:
-    """Clopper and Pearson's upper bound; about 3/n without a failure."""
+    """Return Clopper and Pearson's upper bound, which is about 3/n without a failure."""
     low, high = failures / runs, 1.0
     for _ in range(60):
         middle = (low + high) / 2

@@ -1,6 +1,6 @@
 """The thesis's attacks on the LandShark (its research question 3), with real nodes on two machines.
 
-Only the first machine may publish the topic, and the second one may not end a node of the first.
+Only the first machine may publish the topic, and the second must not end a node of the first.
 """
 
 from collections.abc import Iterator

@@ -1,7 +1,7 @@
 """The appliance is upgraded in place: it starts on the state of version 0.2.0.
 
-`state-0.2.0.sql` has a publisher, a subscriber, a service and its client, a policy and a specification loaded by an
-operator, and two tokens, one of them revoked.
+`state-0.2.0.sql` has a publisher, a subscriber, a service and its client, a policy and a specification that an
+operator loaded, and two tokens, one of them revoked.
 """
 
 import hashlib

@@ -75,8 +75,9 @@ def clean_machine(
     more: tuple[str, ...] = (),
     name: str = "clean",
 ) -> Machine:
-    """Not started; its folder contains `files` under these names. A machine with `more` Debian packages has its own
-    `name`.
+    """Return a machine that is not started, whose folder contains `files` under these names.
+
+    A machine with `more` Debian packages has its own `name`.
     """
     depends = subprocess.run(
         ["dpkg-deb", "--field", str(package), "Depends"], capture_output=True, text=True, check=True

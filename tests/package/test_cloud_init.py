@@ -1,4 +1,4 @@
-"""The example of docs/install.md; its web server and vehicle are in the same machine, which has no network card."""
+"""The example of docs/install.md. Its web server and its vehicle are in one machine, which has no network card."""
 
 import hashlib
 import json

@@ -193,7 +193,7 @@ def test_the_archive_protects_a_robot(unpacked: Path, tmp_path: Path) -> None:
 
 
 def test_two_builds_are_the_same(engine: Engine, unpacked: Path, tmp_path: Path) -> None:
-    """Two days later, from nothing, in another folder, with files readable for their owner only."""
+    """The second build is two days later, without a cache, in another folder, with private files."""
     engine.go_ahead(LATER)
     folder = elsewhere(tmp_path / "elsewhere")
     second = build_later("distribution.image", *OPTIONS, folder=folder, DOCKER_HOST=engine.address)

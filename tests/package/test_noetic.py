@@ -1,4 +1,4 @@
-"""Robot and laptop of Noetic's generation beside the appliance in its container: docs/install.md.
+"""A robot and a laptop of Noetic's generation beside the appliance in its container: docs/install.md.
 
 Debian's archive does not have Ubuntu. Debian 11 is as old: ROS 1.15, Python 3.9, OpenSSL 1.1.1, nftables 0.9,
 strongSwan 5.9.

@@ -1,6 +1,6 @@
 """Faults in the code generator for events are found: each instruction of four events is mutated in every way.
 
-Mutations: operand, constant, operation, comparison, sign, width, offset; a check is omitted or inverted.
+A mutation changes an operand, constant, operation, comparison, sign, width or offset, or omits or inverts a check.
 """
 
 from collections import Counter
@@ -21,13 +21,13 @@ UNDECIDED = {
         ("offset", "uses a constant string or array, or one that is kept"): 4
     },
 }
-"""The number of mutants that are rejected without z3, by the kind of the fault and the answer. None passes as equal."""
+"""The number of mutants that are rejected without z3, by the kind of the fault and the answer."""
 
 
 @pytest.mark.timeout(1200)  # beside other work, the slowest takes more than the usual five minutes
 @pytest.mark.parametrize("text", FAULTY)
 def test_every_fault_is_found_or_none(text: str) -> None:
-    """z3 decides all except those of `UNDECIDED`: a mutant differs for some message, or is proved equivalent.
+    """z3 decides all mutants except those in `UNDECIDED`: each differs for some message, or is proved equivalent.
 
     Mutants that leave more messages to Python count as equivalent, and so do mutants of unreachable or redundant
     code.

@@ -1,6 +1,6 @@
 """Check the model of the insertion (`proofs/insertion.pml`) exhaustively.
 
-Bounds that take longer are in `test_insertion_at_large.py`, wrong programs in `test_insertion_mutants.py`.
+Larger bounds are in `test_insertion_at_large.py`, wrong programs in `test_insertion_mutants.py`.
 """
 
 from pathlib import Path

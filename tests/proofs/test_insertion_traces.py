@@ -1,8 +1,7 @@
 """A trace of the running appliance is an execution of the model (`proofs/insertion.pml`); a tampered one is not.
 
-A monitor that stamps its revision on its messages is replaced and removed, the relay is killed, the policy revokes
-the subscription and grants it again. After each change the trace has a message that was sent once the change had been
-answered.
+A monitor that stamps its revision on its messages is replaced and removed, the relay is killed, and the policy
+revokes the subscription and grants it again. After the answer to each change, one more message is sent.
 """
 
 import re

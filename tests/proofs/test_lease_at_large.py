@@ -1,4 +1,4 @@
-"""These bounds take minutes, with `make prove` only."""
+"""Check the lease with larger bounds, which take minutes."""
 
 from pathlib import Path
 

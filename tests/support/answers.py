@@ -1,4 +1,4 @@
-"""Build answers of the appliance: fields that a test does not set are empty, zero or None."""
+"""Build answers of the appliance. Fields that a test does not set are empty, zero or None."""
 
 import types
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin

@@ -33,7 +33,7 @@ default = *
 """
 
 _FLAGS = {"event": "--event", "host": "--host"}
-"""Fields whose search is quicker than reading every record."""
+"""The fields whose search is faster than reading every record."""
 
 
 class Appliance:
@@ -49,9 +49,10 @@ class Appliance:
         json: bool = True,
         relays: int = 1,
     ) -> None:
-        """With `json=False` the output is for a person. `settings` is the text of appliance.yaml.
+        """Write the configuration. With `json=False` the output is for a person.
 
-        `relays` is the number of relay processes, the same on every machine.
+        `settings` is the text of appliance.yaml. `relays` is the number of relay processes, the same on every
+        machine.
         """
         self.relays = relays
         self.host: Host = host or ThisMachine()
@@ -120,7 +121,6 @@ class Appliance:
     def rosrv(
         self, *arguments: str, check: bool = True, state: bool = True
     ) -> subprocess.CompletedProcess[str]:
-        """With `check`, raises `NoAnswerError` if it fails."""
         done = rosrv(*arguments, *(["--state", str(self.state)] if state else []))
         if check and done.returncode:
             raise NoAnswerError(
@@ -148,7 +148,6 @@ class Appliance:
         return self.row("status")
 
     def audit(self, *flags: str, **fields: Any) -> list[dict[str, Any]]:
-        """Without `--limit`, all records count, not only the newest."""
         whole = () if "--limit" in flags else ("--limit", "10000")
         named = [f"{flag}={fields[name]}" for name, flag in _FLAGS.items() if fields.get(name)]
         lines = self.rosrv("audit", "search", *named, *flags, *whole, "--json").stdout.splitlines()
@@ -166,7 +165,7 @@ class Appliance:
         )
 
     def recorded(self, *flags: str, count: int = 1, **fields: Any) -> list[dict[str, Any]]:
-        """Writing takes a moment, and reports of a relay a little longer."""
+        """Wait for `count` matching records, which are written shortly after the event."""
 
         def found() -> list[dict[str, Any]] | None:
             records = self.audit(*flags, **fields)
@@ -193,7 +192,7 @@ class Appliance:
         return client
 
     def processes(self) -> dict[str, dict[str, Any]]:
-        """Wait until every process has reported its sandbox."""
+        """Wait until every process has reported its sandbox, and return the processes by role."""
 
         def told() -> dict[str, dict[str, Any]] | None:
             rows = self.status()["processes"]

@@ -38,9 +38,9 @@ def decision(log: AuditLog, number: int = 0, **changes: Any) -> AuditRecord:
 
 
 def settle(log: AuditLog, seconds: float = 0.0) -> str | None:
-    """Return the reason if the records cannot be written.
+    """Wait until all records are on the disk, or return the reason if they cannot be written.
 
-    Virtual time passes for some `seconds`: a log that could not be written tries again after half a second.
+    For some `seconds`, virtual time passes: a log that failed to write tries again after half a second.
     """
 
     async def settled() -> str | None:

@@ -1,8 +1,8 @@
-"""An event loop with virtual time, so that a test waits for nothing and runs the same way each time.
+"""An event loop with virtual time, so that a test never waits and runs the same way each time.
 
-When nothing is ready, the clock jumps to the next timer. Without a timer, `DeadlockError` names the waiting tasks. A
-function passed to `to_thread` runs in the loop. Sockets, signals, programs and calls from other threads raise
-`RealLoopError`.
+When no callback is ready, the clock jumps to the next timer. Without a timer, `DeadlockError` names the waiting
+tasks. A function passed to `to_thread` runs in the loop. Sockets, signals, programs and calls from other threads
+raise `RealLoopError`.
 """
 
 import asyncio
@@ -31,7 +31,7 @@ class RealLoopError(Exception):
 
 
 class AutojumpLoop(asyncio.BaseEventLoop):
-    """Use it inside `clock.using(machine)`, as `autojump` does."""
+    """The loop. It must be used inside `clock.using(machine)`, as `autojump` does."""
 
     _thread_id: int | None  # of the thread that runs the loop
 
@@ -74,7 +74,7 @@ class AutojumpLoop(asyncio.BaseEventLoop):
     def run_in_executor(
         self, _executor: object, func: Callable[[*_Arguments], _Result], *args: *_Arguments
     ) -> asyncio.Future[_Result]:
-        """As in a thread, the function finds no running loop."""
+        """Run the function in the loop. As in a thread, it finds no running loop."""
         future: asyncio.Future[_Result] = self.create_future()
         self.call_soon(self._run_inline, future, func, args)
         return future
@@ -131,7 +131,7 @@ def _place(coroutine: Any) -> str:
 
 @contextlib.contextmanager
 def autojump(machine: VirtualClock | None = None) -> Iterator[Callable[[], AutojumpLoop]]:
-    """Yield a maker of loops; `machine` is the clock of the block, or the test's own."""
+    """Yield a factory of loops. `machine` becomes the clock of the block; the default is the test's own."""
     present = clock.source()
     machine = machine or (present if isinstance(present, VirtualClock) else VirtualClock())
     with clock.using(machine):

@@ -1,4 +1,4 @@
-"""Run a fleet's bundles: an operator's repository, and a collector that can lie about everything it serves (`lies`)."""
+"""Run a fleet's bundles: an operator's repository, and a collector that can lie about everything that it serves."""
 
 import datetime
 import http.server

@@ -1,9 +1,9 @@
-"""Print the files that one registerPublisher enters in control, in the order of the first entry, one a line.
-
-A control with a real rosmaster runs in a thread of this program, which profiles all its threads. A file counts if
-each of some calls enters it, and not in work that goes on without calls (`run_always`).
+"""Print the files that one registerPublisher enters in control, one a line, in the order of the first entry.
 
     python -m tests.support.call_path FOLDER    # with a network that is only a loopback
+
+A control with a real rosmaster runs in a thread of this program, which profiles all its threads. A file is listed if
+each of `_CALLS` calls enters it. Work that goes on without calls (`run_always`) does not count.
 """
 
 import http.client

@@ -1,4 +1,4 @@
-"""Canaille, a provider of single sign-on that is not ours, whose dependencies have a lock of their own."""
+"""Run Canaille, an independent provider of single sign-on, whose dependencies have their own lock."""
 
 import json
 import os

@@ -1,5 +1,3 @@
-"""Run `rosrv` within the process of a test, without a new Python for each verb."""
-
 import contextlib
 import io
 import os

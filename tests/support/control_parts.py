@@ -1,6 +1,6 @@
 """Connect registry, graph, revocation, liveness and reconcile loop as control connects them.
 
-Models of everything else remember their calls and give the answers that a test sets.
+Models of everything else record their calls, and give the answers that a test sets.
 """
 
 import asyncio
@@ -362,7 +362,7 @@ class Addresses:
 
 
 class ControlParts:
-    """`reload(text)` puts another policy in force, `settle()` waits for its consequences."""
+    """The connected parts. `reload(text)` puts another policy in force, and `settle()` waits for its consequences."""
 
     def __init__(self, *, silent: float = 0.0) -> None:
         self._not_ours = asyncio.all_tasks()  # the test's own
@@ -495,7 +495,7 @@ class ControlParts:
         target: Incarnation | None = None,
         own: bool = False,
     ) -> Value:
-        """`own` is the appliance's node; `target` is a node instead of RVMaster."""
+        """Make a call: of RVMaster, of the node `target`, or by the appliance's own node (`own`)."""
         peer = Peer(ipaddress.ip_address(host), host, "10.0.0.1")
         serve = self._serving(own=own, target=target) if own or target is not None else self._serve
         return parse_response(await serve(HttpRequest(peer, "/", build_call(method, params), 0)))

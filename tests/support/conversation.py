@@ -30,9 +30,9 @@ Events:
 Effects follow, one per line. First come the answers of calls: a denial as `deny CATEGORY RESOURCE: reason`, with the
 reason in the record below it if no rule decides and the caller gets less, another failure as `refused: reason`, an
 error of the caller as `error: reason`, the answer to a question as `answer: value`. Then come `record malformed`,
-`record limit exceeded` and `record would deny`, the effects in the order in which they are carried out, and last the
-denied resources that a caller or node does not get, as `withhold`. Nodes are written by name (a second incarnation as
-`/talker:2`), also for the URIs of their proxy endpoints; `/talker itself` is the node's own URI. Effects that only
+`record limit exceeded` and `record would deny`, the effects in the order in which they are carried out, and last, as
+`withhold`, the denied resources that a caller or node does not get. Nodes are written by name (a second incarnation
+as `/talker:2`), even for the URIs of their proxy endpoints; `/talker itself` is the node's own URI. Effects that only
 store state for a restart of control are left out. No socket is opened and no name is random, so a formal model of
 RVMaster can be compared with the text.
 

@@ -1,7 +1,7 @@
 """Make a small Debian with debootstrap, as the base of the tests' containers and virtual machines.
 
-The first call for a suite and package list takes a minute or two; its result is kept in `CACHE`. The tree can fetch
-more packages with this machine's sources, proxy, certificate authorities and pip settings.
+Its result is kept in `CACHE` for each suite and package list. The tree can fetch more packages with this machine's
+sources, proxy, certificate authorities and pip settings.
 """
 
 import fcntl
@@ -57,7 +57,10 @@ class MachineSettings:
 
 
 def make_base(directory: Path, packages: Sequence[str] = (), *, suite: str = SUITE) -> Path:
-    """The caller may change `directory`. Needs root and debootstrap. Raises `DebianBaseError`."""
+    """Unpack a Debian into `directory`, which the caller may change. Raise `DebianBaseError`.
+
+    Needs root and debootstrap.
+    """
     archive = base_archive(packages, suite=suite)
     directory.mkdir(parents=True, exist_ok=True)
     _unpack(archive, directory)

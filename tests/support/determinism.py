@@ -1,7 +1,7 @@
-"""Keep a test from what chance can decide: threads, processes, sockets, pauses and real clocks.
+"""Keep a test from everything that chance can decide: threads, processes, sockets, pauses and real clocks.
 
-An audit hook of Python sees processes and sockets, also in libraries. The rest has no hook in Python 3.11, so
-functions are replaced; of the reads of a clock, only those by our own code count.
+An audit hook of Python sees processes and sockets, even in libraries. The rest has no hook in Python 3.11, so
+functions are replaced. Only our own code's reads of a clock count.
 """
 
 import functools
@@ -35,7 +35,7 @@ class ChanceError(RuntimeError):
 
 
 class Watch:
-    """There is one, because an audit hook cannot be removed."""
+    """Records and forbids such events while a test is watched. There is one, as an audit hook cannot be removed."""
 
     def __init__(self) -> None:
         self._watched = False
@@ -106,6 +106,6 @@ def callers(depth: int) -> Iterator[str]:
 
 
 def _is_harmless(event: str) -> bool:
-    """A loop makes sockets by which threads wake it, and urllib3 looks for IPv6 when loaded."""
+    """Allow the sockets with which threads wake a loop, and the one with which urllib3 tests for IPv6."""
     makers = {"asyncio.selector_events", "urllib3.util.connection"}
     return event == "socket.__new__" and not makers.isdisjoint(itertools.islice(callers(2), 5))

@@ -1,7 +1,7 @@
-"""Run a Docker engine for the tests only, independent of other engines on the machine.
+"""Run a Docker engine for the tests only, on a host of the lab, whose namespace has its bridges and rules.
 
-The engine runs on a host of the lab, whose namespace has its bridges and rules. Images are built earlier, by an
-engine in this machine's own network that does not change it. Both use the same data in the cache of this machine.
+Images are built earlier, by an engine in this machine's network that leaves the network as it is. Both use the same
+data in this machine's cache.
 """
 
 import contextlib
@@ -54,7 +54,7 @@ class DockerError(AssertionError):
 
 
 class Engine:
-    """With `builds`, it only builds images. With `clock`, the time of its containers can be changed (`go_ahead`)."""
+    """A Docker engine. With `builds` it only builds images. With `clock` a test can change its containers' time."""
 
     def __init__(
         self, host: Host | None = None, *, builds: bool = False, clock: bool = False, data: Path = DATA

@@ -24,7 +24,7 @@ class ByHand(InCaller):
             self._wanted = True
 
     def hurry(self) -> None:
-        """A call during a turn, also in another thread, has the due turns called after it."""
+        """Take the turns that are due. A call during a turn, even from another thread, causes another turn."""
         self._wanted = True
         while self._wanted and self._turning.acquire(blocking=False):
             try:

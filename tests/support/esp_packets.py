@@ -11,7 +11,7 @@ _IPV4 = 4
 
 @dataclass(frozen=True)
 class EspKeys:
-    """`key` is the cipher's key and, in its last four bytes, the salt (RFC 4106)."""
+    """The keys of one direction. `key` is the cipher's key and, in its last four bytes, the salt (RFC 4106)."""
 
     spi: int
     key: bytes

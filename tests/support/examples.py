@@ -1,4 +1,4 @@
-"""A sixth of a property's examples run each time, all in `make nightly`.
+"""Run a sixth of a property's examples each time, and all in `make nightly`.
 
 With `CI=true` Hypothesis derives the seed from the test; otherwise each run has a new seed.
 """

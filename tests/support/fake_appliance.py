@@ -33,7 +33,7 @@ Answer = Callable[[dict[str, Any]], AdminAnswer[Any]]
 class FakeAppliance:
     def __init__(self, context: ssl.SSLContext | None = None) -> None:
         self.requests: list[str] = []
-        """The JSON of the admin socket; method, path and body of REST."""
+        """The JSON of requests at the admin socket, and the method, path and body of those over REST."""
         self.status, self.headers, self.body = 200, dict[str, str](), b"{}"
         self._answers: dict[str, Answer] = {}
         self._context = context
@@ -138,7 +138,7 @@ def _unknown(request: dict[str, Any]) -> AdminAnswer[Any]:
 
 
 def _proven(method: str, path: str, headers: dict[str, str], body: bytes) -> str:
-    """Return how a request shows its token, which it must never send itself."""
+    """Return how a request proves its token, which it must never send itself."""
     if headers.get("Authorization") != f"Bearer {reading_key(TOKEN)}":
         return f" (Authorization: {headers.get('Authorization')})"
     if (proof := headers.get("ROSRV-Proof")) is None:

@@ -1,4 +1,4 @@
-"""A robot and its operator talk, a rogue host attacks, a test reads the audit log."""
+"""A field where a robot and its operator talk, a rogue host attacks, and a test reads the audit log."""
 
 import contextlib
 import http.client
@@ -18,8 +18,8 @@ from tests.support.processes import LIMIT, Event, Process, ThisMachine
 
 
 class Field:
-    """Hosts: `robot` 10.77.0.10 (talker `/voice`), `ocu` 10.77.0.20 (listener `/ear`), `attacker` 10.77.0.66,
-    `unknown_host` 10.77.0.99, which no rule names; the appliance is 10.77.0.2.
+    """The hosts `robot` 10.77.0.10 (talker `/voice`), `ocu` 10.77.0.20 (listener `/ear`), `attacker` 10.77.0.66, and
+    `unknown_host` 10.77.0.99, which no rule names. The appliance is 10.77.0.2.
     """
 
     api = "http://10.77.0.66:40404/"  # nothing listens there unless a test does

@@ -1,4 +1,4 @@
-"""Write the first packets of TCP connections with any source by hand, and read those that arrive."""
+"""Send the first packets of TCP connections from any source address, and receive those that arrive."""
 
 import ipaddress
 import socket

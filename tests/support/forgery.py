@@ -17,7 +17,7 @@ _EVENT, _DETAIL = _FIELDS.index("event"), _FIELDS.index("detail")
 
 
 def write_anew(path: Path, key: Ed25519PrivateKey, signer: Path, change: str) -> None:
-    """As root can: with all hashes, checkpoints, signatures and the signer's memory."""
+    """Rewrite a log as root can: with all hashes, checkpoints, signatures and the signer's memory."""
     with closing(sqlite3.connect(path)) as connection:
         connection.execute(change)
         rows = connection.execute(f"SELECT {COLUMNS} FROM record ORDER BY sequence").fetchall()

@@ -1,6 +1,6 @@
 """Fork nodes and tools of Debian's Python from a process with rospy loaded, which is the slow part of a start.
 
-A fork has its own session and the host's network namespace, and differs from a new process only in that the modules
+A fork has its own session and the host's network namespace. It differs from a new process only in that the modules
 are already in memory. roslaunch starts its nodes itself.
 """
 

@@ -1,8 +1,8 @@
-"""Open a connection to a master, and ask for its process over it once a line comes in.
+"""Open a connection to a master, and call getPid over it after an input line.
 
-python -m tests.support.held_connection MASTER OWN-ADDRESS
+    python -m tests.support.held_connection MASTER OWN-ADDRESS
 
-Prints one event per line: `opened`, then `answered`, or `closed` if the connection ends first.
+It prints one event per line: `opened`, then `answered`, or `closed` if the connection ends first.
 """
 
 import contextlib

@@ -1,5 +1,3 @@
-"""Check at the end that the server keeps no state of a client."""
-
 import asyncio
 import contextlib
 import time

@@ -11,9 +11,9 @@ def idle(part: type[T]) -> T:
 
 
 def idle_class(part: type[object]) -> Any:
-    """The class has the public methods of `part`, which do nothing, and reject arguments that `part`'s reject.
+    """Return a class with the public methods of `part`, which only check their arguments against the signature.
 
-    So a renaming in the product fails in its tests. An object of it has no attributes.
+    So a renaming in the product fails in its tests. An object of the class has no attributes.
     """
     methods = {
         name: _idle(method)

@@ -9,7 +9,7 @@ Lie = Callable[["Visitor"], None]
 
 
 class Visitor:
-    """The methods raise `OSError` after the client has closed the connection."""
+    """A client's connection. The methods raise `OSError` after the client has closed it."""
 
     def __init__(self, stream: socket.socket, ending: threading.Event) -> None:
         self.stream = stream

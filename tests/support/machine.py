@@ -1,7 +1,7 @@
 """Run parts of the tests in a virtual machine (QEMU) with Debian's cloud kernel, which ends with this process.
 
-It has no network card. KVM is used where a trial shows that it runs a guest; otherwise QEMU emulates every
-instruction (TCG), which is five to twenty times slower.
+It has no network card. KVM is used if a trial shows that it runs a guest; otherwise QEMU emulates every instruction
+(TCG), which is five to twenty times slower.
 """
 
 import contextlib
@@ -51,10 +51,10 @@ class Done:
 
 
 class Machine:
-    """`directory` keeps its sockets and the text of its console. `disk` is written to; without it the machine has a
-    snapshot.
+    """A virtual machine. `directory` has its sockets and the output of its console.
 
-    `freight` writes the archive that the agent unpacks before it takes orders; the default is the checkout.
+    It writes to `disk`, or without one works on a snapshot. `freight` writes the archive that the agent unpacks
+    before it takes orders; the default is the checkout.
     """
 
     def __init__(
@@ -123,7 +123,7 @@ class Machine:
         return done
 
     def stop(self) -> bool:
-        """Shut down as with the power button; return True if that worked. A machine that does not end is killed."""
+        """Shut down as with the power button, or kill the machine if it does not end. Return True if it shut down."""
         process, self._process = self._process, None
         if process is None:
             return True
@@ -216,7 +216,7 @@ class Machine:
 
 @cache
 def accelerator(program: str, kernel: Kernel) -> str:
-    """A device file alone proves nothing, so a kernel must print its first line with `kvm`."""
+    """Return `kvm` if a kernel prints its first line with it, otherwise `tcg`: a device file alone proves nothing."""
     if not KVM.exists():
         return "tcg"
     arguments = [*_hardware("kvm"), "-m", "256", "-kernel", str(kernel.image), "-serial", "stdio"]

@@ -1,8 +1,8 @@
 """Run in the virtual machine of the tests: take one order per line from a virtio port, and answer with its outcome.
 
-An order is `{"number", "argv", "seconds"}`; its answer `{"number", "status", "output"}`, both JSON. `{"ready": true}`
-is sent once the checkout (a tar archive on the second disk) is unpacked. Standard library only: the project is not
-there at the start.
+An order is `{"number", "argv", "seconds"}`, its answer `{"number", "status", "output"}`, both JSON. `{"ready": true}`
+is sent once the checkout (a tar archive on the second disk) is unpacked. The program uses only the standard library,
+because the project is not there at the start.
 """
 
 import json

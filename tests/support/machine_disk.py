@@ -1,7 +1,7 @@
-"""Debian, its cloud kernel's modules, the project's environment, and the agent of the virtual machine.
+"""Make the disk of the virtual machine: Debian, its cloud kernel's modules, the project's environment, and the agent.
 
-The image is under `build/machine/`, named by a key of its inputs, and never changed: a machine works on a snapshot.
-The checkout is on a second disk that is made for each start (`checkout_archive`).
+An image is named by a hash of its inputs and never changes: a machine works on a snapshot. The checkout is on a
+second disk, which is made for each start.
 """
 
 import hashlib
@@ -178,7 +178,7 @@ def _too_large(_folder: str, names: list[str]) -> Iterable[str]:
 
 
 def _compile(folder: Path, *, as_if_in: Path) -> None:
-    """The machine would need ten times as long, in every process."""
+    """Compile Python files here: the machine would need ten times as long, in every process."""
     command = [str(ROOT / ".venv/bin/python"), "-m", "compileall", "-q", "-j", "2"]
     done = subprocess.run(
         [*command, "-s", str(folder), "-p", str(as_if_in), str(folder)], capture_output=True, check=False

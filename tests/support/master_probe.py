@@ -2,7 +2,7 @@
 
     master_probe.py NAME=URI...
 
-Event `answered` has the name; refused and late calls are left out.
+The event `answered` has the name. Refused and late calls are not reported.
 """
 
 import http.client

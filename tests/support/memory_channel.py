@@ -10,7 +10,7 @@ from appliance.channel.messages import Message
 
 
 class MemoryChannel(Channel):
-    """The `peer` gets each message in a later turn of the loop, as over a socket."""
+    """A channel in memory. As over a socket, the `peer` gets each message in a later turn of the loop."""
 
     def __init__(self, union: Any) -> None:
         self._encode = msgspec.msgpack.Encoder().encode

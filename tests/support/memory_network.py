@@ -1,4 +1,4 @@
-"""A network in memory for nodes in virtual time: connections between addresses, in order, with bounded buffers."""
+"""A network in memory for nodes in virtual time, whose connections keep the order and have bounded buffers."""
 
 import asyncio
 from dataclasses import dataclass, field

@@ -87,15 +87,15 @@ class RosSession:
         return self.node(client, "talker", topic, *options, name=name)
 
     def listener(self, client: Client, topic: str, *options: str, name: str | None = None) -> Process:
-        """Event `received` with `data` and `publisher`."""
+        """Subscribe to a std_msgs/String. The event `received` has `data` and `publisher`."""
         return self.node(client, "listener", topic, *options, name=name)
 
     def service_server(self, client: Client, service: str, name: str | None = None) -> Process:
-        """Offer a std_srvs/SetBool that answers with the negation; event `called`."""
+        """Offer a std_srvs/SetBool that answers with the negation. The event is `called`."""
         return self.node(client, "service_server", service, name=name)
 
     def service_client(self, client: Client, service: str, *options: str, name: str | None = None) -> Process:
-        """Call a std_srvs/SetBool for each line `true` or `false` on the input; `answered` or `failed`."""
+        """Call a std_srvs/SetBool for each input line `true` or `false`. The events are `answered` and `failed`."""
         return self.node(client, "service_client", service, *options, name=name)
 
     def parameters(self, client: Client, *options: str, name: str | None = None) -> Process:

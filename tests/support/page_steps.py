@@ -1,4 +1,4 @@
-"""Each block of a page is marked with its machine, and the block after it has the output.
+"""Read the steps of a page: a block is marked with its machine, and the block after it has the expected output.
 
     <!-- on: robot, stays -->
 

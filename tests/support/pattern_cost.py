@@ -1,7 +1,7 @@
 """Bound the steps of a regular expression by its construction, without running it.
 
-Python's matcher returns to each repeat and branch to try its other ways, and holds the interpreter for it. A
-possessive repeat (`*+`, `++`) of one set of characters has one way: it only scans the input.
+Python's matcher returns to each repeat and branch to try its other alternatives, and holds the interpreter lock in
+that time. A possessive repeat (`*+`, `++`) of one set of characters has one alternative, so it only scans the input.
 """
 
 import math
@@ -16,8 +16,9 @@ _LOOPS = {op.MAX_REPEAT, op.MIN_REPEAT, op.POSSESSIVE_REPEAT}
 
 
 def steps(pattern: str | bytes, flags: int, size: int, *, anywhere: bool) -> float:
-    """`anywhere`: each position is an attempt. In an attempt that can fail after a scan, the scan counts with its
-    length.
+    """Return a bound of the steps for an input of `size`. With `anywhere`, each position is an attempt.
+
+    In an attempt that can fail after a scan, the scan counts with its length.
     """
     text = pattern.decode("latin-1") if isinstance(pattern, bytes) else pattern
     tree = list(_parser.parse(text, 0 if isinstance(pattern, bytes) else flags))

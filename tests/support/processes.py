@@ -1,4 +1,4 @@
-"""Programs of the tests print one JSON object per line; a test waits for the line it needs, with a limit.
+"""Run programs that print one JSON object per line. A test waits for the line that it needs, with a limit.
 
 Other lines (stock tools, warnings) are kept as `{"text": line}`. A failure shows the whole output.
 """
@@ -33,7 +33,7 @@ class ThisMachine:
 
 
 def runs(pid: int | str) -> bool:
-    """A process that has ended and waits for its parent does not run."""
+    """Return whether a process runs. One that has ended but was not yet reaped does not run."""
     try:
         return Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()[0] != "Z"
     except (FileNotFoundError, ProcessLookupError):  # the second if it is reaped while it is read
@@ -180,7 +180,7 @@ class Process:
         self._asked = True
 
     def stop(self, *, with_signal: int = signal.SIGINT, timeout: float = 20) -> int:
-        """SIGABRT (a Python program then prints its stack) and SIGKILL to the session follow the signal."""
+        """Send the signal, and if the program does not end SIGABRT (a Python program prints its stack) and SIGKILL."""
         if not self._asked:
             self.interrupt(with_signal)
         if self.running:

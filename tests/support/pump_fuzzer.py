@@ -3,8 +3,8 @@
     .venv/bin/python -m tests.support.pump_fuzzer SEED BYTES    # builds it, and prints the number of each action
 
 A seed determines the actions: mutated frames over real sockets, descriptors that close at any time, subscribers that
-never read, a scratch area that is replaced and freed, a module that answers nonsense. The first error in memory ends
-the process.
+never read, a scratch area that is replaced and freed, a module that answers nonsense. The first memory error ends the
+process.
 """
 
 import contextlib

@@ -166,9 +166,7 @@ class RelayProcess:
         return link
 
     def ping(self, number: int) -> None:
-        """Wait for two turns of the relay's main loop: in the first it may only accept a link, without reading from
-        it.
-        """
+        """Wait for two turns of the relay's main loop: in the first it may accept a link without reading it."""
         for answer in (Pong(number), Pong(number + 1_000_000)):
             after = len(self.lifeline.messages)
             self.lifeline.send(Ping(answer.number))
@@ -366,7 +364,6 @@ def call(uri: str, method: str, *arguments: Any) -> Any:
 
 
 def free_port() -> int:
-    """Only for programs that do not accept port 0 (rosmaster)."""
     with socket.create_server((LOOPBACK, 0)) as sock:
         return int(sock.getsockname()[1])
 

@@ -1,4 +1,4 @@
-"""A missing requirement skips the test on a laptop and fails it in CI, so that no test quietly stops running."""
+"""Skip a test with a missing requirement on a laptop, and fail it in CI, so that no test silently stops running."""
 
 import os
 import shutil

@@ -29,10 +29,10 @@ class Answer:
 
 
 class Rest:
-    """Make requests, each on a connection of its own.
+    """Makes requests, each on a new connection.
 
-    After a 429 the request is repeated when the server allows it: requests of other tests to a shared appliance must
-    not fail this test. A test of the 429 uses `impatient()`.
+    After a 429, it repeats the request when the server allows it, because requests of other tests to a shared
+    appliance must not fail this test. `impatient()` does not wait.
     """
 
     def __init__(
@@ -100,7 +100,7 @@ class Rest:
         )
 
     def post(self, path: str, body: Any = None, *, match: str | None = None) -> Answer:
-        """A string is text/plain, anything else JSON; `match` is If-Match."""
+        """Send a string as text/plain, anything else as JSON. `match` is the header If-Match."""
         headers = {} if match is None else {"If-Match": match}
         if isinstance(body, str):
             return self.request("POST", path, body.encode(), headers | {"Content-Type": "text/plain"})
@@ -108,9 +108,9 @@ class Rest:
         return self.request("POST", path, None if body is None else json.dumps(body).encode(), headers)
 
     def events(self, path: str, timeout: float = 30, **headers: str) -> Generator[dict[str, str], None, None]:
-        """The first event, `{}`, reports that the stream is open.
+        """Yield events, after `{}` for the open stream. Wait for each at most `timeout` seconds.
 
-        Each is waited for at most `timeout` seconds: the appliance's pings keep a stream open, but not a test.
+        The appliance's pings keep a stream open, but must not keep a test waiting.
         """
         given = {name.replace("_", "-"): text for name, text in headers.items()}
         with self._asked("GET", path, None, given, timeout) as response:

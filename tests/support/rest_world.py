@@ -1,6 +1,6 @@
-"""REST in one process: the api's real gate, routes and link, and control's real link, authentication and dispatch.
+"""Run REST in one process: the api's gate, routes and link, and control's link, authentication and dispatch.
 
-Only the parts of control that answer requests are models.
+All of these are the product's own. Only the parts of control that answer requests are models.
 """
 
 import asyncio
@@ -175,7 +175,7 @@ class RestWorld:
         self, method: str, target: str, body: Any = None, role: str | None = "admin", tag: str | None = None,
         *, kind: str = "text/plain",
     ) -> httpx.Response:  # fmt: skip
-        """Without a role, there is no token. A text or bytes has the content type `kind`; any other body is JSON."""
+        """Return the response. Without a role, there is no token. Strings and bytes have the content type `kind`."""
         headers = {} if role is None else {"Authorization": f"Bearer {self.tokens.texts[role]}"}
         headers |= {} if tag is None else {"If-Match": tag}
         given: dict[str, Any] = {"json": body}

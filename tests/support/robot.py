@@ -1,7 +1,7 @@
 """Run a robot of a hundred nodes and two hundred topics.
 
-The nodes of one machine share one API and one listener, on addresses of the loopback (127.0.0.11 and on), so that the
-appliance sees as many hosts as the robot has machines.
+The nodes of one machine share an API and a listener, on an address of the loopback (from 127.0.0.11), so that the
+appliance sees a host for each machine of the robot.
 """
 
 import contextlib

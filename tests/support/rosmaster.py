@@ -46,7 +46,7 @@ class PlainMaster:
 
 
 def master_at(uri: str) -> Any:
-    """The type stubs of `xmlrpc.client` lack answers that are lists."""
+    """Return a proxy without types, because the type stubs of `xmlrpc.client` lack answers that are lists."""
     return xmlrpc.client.ServerProxy(uri, allow_none=True)
 
 
@@ -89,7 +89,7 @@ def _await(attempt: Callable[[], object], complaint: str, process: Process | Non
 
 
 def free_port() -> int:
-    """The kernel does not hand it out again soon."""
+    """Return a port that was just free, for programs that do not accept port 0. The kernel does not reuse it soon."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])

@@ -1,7 +1,7 @@
 """A host of the lab that runs a kit's own scripts, as root on a Debian machine without systemd would.
 
 It has its own network (the lab's namespace) and, in a mount namespace, its own `/etc` and `/run`. With `root` it also
-has that system's programs.
+has the programs of that system.
 """
 
 import contextlib

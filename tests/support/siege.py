@@ -1,6 +1,6 @@
 """Run a robot at work while two hundred addresses try to exhaust every resource.
 
-The appliance is 10.77.0.2, the robot 10.77.0.10, its operator 10.77.0.20. A crowd has a hundred guest addresses,
+The appliance is 10.77.0.2, the robot 10.77.0.10, its operator 10.77.0.20. The crowd has a hundred guest addresses,
 which may do anything below `/guest`, and a hundred unknown hosts, which no rule names.
 """
 

@@ -1,7 +1,7 @@
-"""Masters that the tests of a worker share: each is lent to one test at a time, which must leave it as it was.
+"""Masters that the tests of a worker share, each lent to one test at a time, which must leave it as it was.
 
-The same robot runs behind the plain ROS master, which validates the test, and behind the appliance, which the robot
-must not notice. Tests that crash, restart or configure a master start their own.
+A test runs with the same robot behind the plain ROS master, which validates the test, and behind the appliance. Tests
+that crash, restart or configure a master start their own.
 """
 
 import contextlib
@@ -24,9 +24,9 @@ _ASKER = "/reset"
 
 
 class Site:
-    """The policy is open. On the loopback the appliance has REST.
+    """A master with an open policy, and its hosts. On the loopback the appliance has REST.
 
-    In a lab the firewall is in force; the master is 10.77.0.2, `robot` 10.77.0.10 and `ocu` 10.77.0.20.
+    In a lab the firewall is in force. The master is 10.77.0.2, `robot` 10.77.0.10 and `ocu` 10.77.0.20.
     """
 
     def __init__(self, mode: Mode, home: Path, lab: Lab | None = None) -> None:

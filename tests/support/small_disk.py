@@ -8,7 +8,7 @@ from tests.support.requirements import need_root
 
 @contextmanager
 def small_disk(place: Path, size: str, *options: str) -> Iterator[Path]:
-    """The end does not wait for open files: a process that was killed a moment ago may still have one."""
+    """Mount a small file system for the block, and unmount it even while a killed process has files open."""
     need_root()
     place.mkdir(exist_ok=True)
     words = ",".join([f"size={size}", *options])

@@ -63,7 +63,10 @@ class LeaseBounds:
 
 @dataclass(frozen=True, slots=True)
 class Bounds:
-    """With `sending`, publishers send forever. With `refusing`, there are specifications that the relay cannot take."""
+    """The bounds of the insertion's model. `sending` lets publishers send forever.
+
+    With `refusing`, there are specifications that the relay cannot take.
+    """
 
     publishers: int = 1
     subscribers: int = 1
@@ -105,9 +108,9 @@ class Found:
 def search(
     folder: Path, bounds: Bounded, mutant: str = "", traced: Path | None = None, *, large: bool = False
 ) -> Found:
-    """`folder` gets the model, or its copy with a trace. Fails when the states do not fit into memory.
+    """Search all states, with `folder` for the files. `traced` is a copy of the model with a trace.
 
-    With `large`, the checker is compiled with optimization, which takes four seconds.
+    Fail when the states do not fit into memory. With `large`, the checker is optimized, which takes four seconds.
     """
     spin, compiler = need_program("spin", "spin"), need_program("gcc", "g++")
     wrong = [f"-DMUTANT_{mutant}"] if mutant else []

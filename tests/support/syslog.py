@@ -1,5 +1,3 @@
-"""Receive syslog: RFC 5424 parsed strictly by its grammar, over UDP, TCP and TLS."""
-
 import contextlib
 import re
 import socket

@@ -1,6 +1,7 @@
 """Transcripts of the command line: text files with commands, their output and their exit status.
 
     # A title says the promise of the lines below it
+
     file p.ini
         [Nodes]
         x = *
@@ -20,14 +21,14 @@ A line at the margin is an action; the indented lines below it are its input or 
     $ COMMAND               `-> ` a request that reached the appliance, standard output, `2> ` standard error,
                             `[2]` the exit status unless it is 0
 
-A test can add actions of its own. Actions before the first title belong to every section. `rosrv` at the beginning of
+A test can add its own actions. Actions before the first title belong to every section. A `rosrv` at the beginning of
 a command runs within the test, with words that bash expands; bash runs all other commands, in which `rosrv` is the
-installed one. `| fields NAME...` prints these fields of output in JSON. The working folder is empty at first except
-for `state`, the state directory; `$REST` is the URL of REST, and `$ROOT` the folder of the project.
+installed one. `| fields NAME...` prints these fields of output in JSON. At first the working folder only has `state`,
+the state directory. `$REST` is the URL of REST, and `$ROOT` the folder of the project.
 
 In output `<time>`, `<id>` (of a record or recording), `<log>` (its id), `<sha256>`, `<version>` (ours) and `<number>`
-are placeholders; `<here>` is the working folder and `<rest>` the URL. `...` is any text in a line; as a line of its
-own, any lines. A line with characters that could change a terminal is marked `(unprintable)`.
+are placeholders; `<here>` is the working folder and `<rest>` the URL. `...` is any text in a line; as a separate
+line, any lines. A line with characters that could change a terminal is marked `(unprintable)`.
 
 `TRANSCRIPTS=write` writes the output of this run into the file, to be read and kept or corrected.
 """

@@ -1,6 +1,6 @@
-"""A host that joins the appliance with its kit: unpacked, with its own charon, in the host's namespace.
+"""A host that joins the appliance with its kit: the unpacked files and its own charon, in the host's namespace.
 
-The kit's own `join.sh` needs a machine with systemd; here the same strongSwan is given the same files.
+The kit's own `join.sh` needs a machine with systemd; here the same strongSwan gets the same files.
 """
 
 import os
@@ -53,8 +53,9 @@ class JoinedHost:
         log: str = "",
         programs: Path | None = None,
     ) -> None:
-        """`directory` must be new; `log` is added to charon's log settings (`chd = 4`). Programs in `programs` are
-        found first.
+        """Unpack the kit into the new folder `directory`. `log` is added to charon's log settings (`chd = 4`).
+
+        Programs in `programs` are found first.
         """
         self.outer = host
         self.log = log

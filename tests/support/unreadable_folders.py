@@ -1,5 +1,3 @@
-"""Folders that may not be read, also for root, whom permissions do not stop."""
-
 import errno
 import os
 from pathlib import Path

@@ -6,7 +6,7 @@ _SECOND = 1_000_000_000
 
 
 class VirtualClock:
-    """All readings in nanoseconds; `wall` is the system time, and begins at the present one if it is not given."""
+    """A clock that starts at `now` and `wall` in seconds; the default of `wall` is the present time."""
 
     def __init__(self, *, wall: float | None = None, now: float = 1000.0) -> None:
         self._now = round(now * _SECOND)

@@ -19,7 +19,10 @@ class NoAnswerError(AssertionError):
 def eventually(
     condition: Callable[[], T | None], what: str | Callable[[], str], seconds: float = 2 * LIMIT
 ) -> T:
-    """Fail with `what`, perhaps a function, after `seconds`, which are generous. `NoAnswerError` means: not yet."""
+    """Return the condition's value once it is true. A `NoAnswerError` means: not yet.
+
+    After a generous number of `seconds`, fail with `what`, or with its result.
+    """
     deadline, pause, moment = time.monotonic() + seconds, threading.Event(), 0.02
     while True:
         found, why = _tried(condition)
@@ -42,7 +45,7 @@ def _tried(condition: Callable[[], T | None]) -> tuple[T | None, str]:
 def allowed(seconds: float) -> float:
     """Return the time limit, with the present load, for work that takes `seconds` on an idle machine.
 
-    Only for an upper bound that the product promises; if an event shows the promise, wait for the event.
+    It is only for an upper bound that the product promises. If an event shows the promise, wait for the event.
     """
     average, _, _, running, _ = Path("/proc/loadavg").read_text(encoding="ascii").split()
     wanting = max(float(average), float(running.partition("/")[0]))

@@ -55,7 +55,7 @@ class Frame:
 
     @property
     def returned(self) -> "Frame | None":
-        """Return the beginning of the packet that an ICMP error quotes; None for other packets."""
+        """Return the beginning of the packet that an ICMP error quotes, or None for other packets."""
         if self.protocol != socket.IPPROTO_ICMP or self.data[self.header] != _UNREACHABLE:
             return None
         return Frame(self.data[:14] + self.data[self.header + 8 :])
@@ -67,7 +67,7 @@ class Frame:
         return self.data[start + 8 : start + length]
 
     def with_payload(self, payload: bytes) -> bytes:
-        """The kernel leaves the UDP checksum to the hardware, so a captured frame has none."""
+        """Return the packet with another payload, and like a captured frame without a UDP checksum."""
         start = self.header
         head = self.data[: start + 6] + bytes(2)
         assert len(payload) == len(self.udp_payload)
@@ -75,7 +75,6 @@ class Frame:
 
     @property
     def esp(self) -> bool:
-        """Not IKE, whose packets on port 4500 begin with four zeros."""
         return (
             self.ipv4
             and self.protocol == _UDP

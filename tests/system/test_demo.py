@@ -39,7 +39,6 @@ def temporary() -> Iterator[Path]:
 
 
 def require_no_hosts(pid: int) -> None:
-    """Another demonstration may run on this machine."""
     assert not namespaces(f"rosrv-demo.{pid}.")
 
 

@@ -1,6 +1,6 @@
 """The Ansible role and the cloud-init example, run by their own programs in a Debian made for the test.
 
-systemd is replaced by a program that logs its calls, and `selftest` is only logged.
+A program that logs its calls takes the place of `systemctl`, and `rosrv selftest` is only logged.
 """
 
 import json

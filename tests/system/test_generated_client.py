@@ -1,6 +1,6 @@
-"""A client generated from the contract, as an integrator makes one, calls every operation and parses every answer.
+"""A client generated from the contract, as by an integrator, calls every operation and parses every answer.
 
-The generator's dependencies are not ours (`generated-client.lock`). Bodies are the contract's examples.
+The generator's dependencies are separate (`generated-client.lock`). Bodies are the contract's examples.
 """
 
 import base64
@@ -84,7 +84,7 @@ Done = dict[str, Any]  # operation -> type of its parsed answer
 
 @dataclass(frozen=True)
 class Call:
-    """Arguments and changes of the example are made from earlier answers. `inside`: by a host through its tunnel."""
+    """A call whose arguments and body depend on earlier answers. An `inside` call goes through a host's tunnel."""
 
     arguments: Callable[[Done], dict[str, Any]] = lambda _done: {}
     body: Callable[[Done], dict[str, Any]] = lambda _done: {}
@@ -164,7 +164,7 @@ REFUSED: dict[str, dict[str, Any]] = {
 }  # fmt: skip
 
 ELSEWHERE = {"begin_sign_on", "complete_sign_on", "new_guard", "set_guard", "check_driver", "add_door"}
-"""Operations that need a provider, a guard's topics or a door: the tests of these features call them."""
+"""Operations that need a provider, a guard's topics or a door. The tests of these features call them."""
 
 FOR_INVESTIGATORS = {"recording_of_memory", "recording_messages", "recording_bag", "recording_evidence"}
 

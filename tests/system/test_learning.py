@@ -1,4 +1,4 @@
-"""Monitors learnt from drives of the simulated LandShark judge other drives and injected faults."""
+"""Monitors that were learnt from drives of the simulated LandShark judge other drives and injected faults."""
 
 from benchmarks.learning import KINDS, judge
 

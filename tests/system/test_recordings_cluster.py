@@ -30,7 +30,7 @@ COMMANDS = ("run limit.rv", "learn", "coverage limit.rv", "replay limit.rv")
 
 @dataclass
 class Cluster:
-    """Nodes on this machine, with one processor each. Their processes have a mark in their environment."""
+    """Nodes on this machine with one processor each. Their processes have a mark in their environment."""
 
     folder: Path
     mark: str = field(default_factory=lambda: secrets.token_hex(8))
@@ -101,8 +101,9 @@ class Cluster:
 
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[Cluster]:
-    """The folder has a short name, because Ray's sockets have long ones. Some processes listen on all addresses, so
-    here there is only a loopback.
+    """Yield a cluster on a private loopback, because some of its processes listen on all addresses.
+
+    The folder has a short name, because Ray's sockets have long ones.
     """
     needs(find_spec("ray"), "Ray: pip install 'rosmop[ray]'")
     need_root()

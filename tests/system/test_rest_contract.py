@@ -53,12 +53,11 @@ def fuzz(rest: Rest, directory: Path, *flags: str) -> subprocess.CompletedProces
 
 
 def test_the_contract_is_true(appliance: Appliance, tmp_path: Path) -> None:
-    """No answer is a server error, or outside the contract; requests that break the contract are refused; every
-    operation needs a token; and no process was restarted.
+    """No answer is a server error or outside the contract, and requests that break the contract are rejected.
 
-    Not covered: acceptance of every well-formed request, because a schema cannot define a valid policy; the stream,
-    which does not end; the revocation of a token, because the fuzzer would revoke its own; and a new door, which
-    isolation none refuses with 503.
+    Not covered are: acceptance of every well-formed request, because a schema cannot define a valid policy; the
+    streams, which do not end; the revocation of a token, because the fuzzer would revoke its own; and a new door,
+    which needs isolation.
     """
     rest = appliance.rest()
     assert rest.get("/healthz").status == 200

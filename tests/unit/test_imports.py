@@ -51,7 +51,6 @@ def test_the_appliance_imports_only_public_modules_of_the_language(imports: dict
 
 
 def test_no_module_imports_too_many(imports: dict[str, set[str]]) -> None:
-    """Split a module that connects more modules than a reader can remember."""
     wide = {
         module
         for module, imported in imports.items()

@@ -56,7 +56,6 @@ def test_links_lead_to_headings(page: Path) -> None:
 
 
 def headings(page: Path) -> set[str]:
-    """GitHub forms anchors like this."""
     prose = re.sub(r"```.*?```", "", page.read_text(), flags=re.DOTALL)
     titles = re.findall(r"^#+ (.*)$", prose, re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", title.lower()).strip().replace(" ", "-") for title in titles}
@@ -64,7 +63,6 @@ def headings(page: Path) -> set[str]:
 
 @pytest.mark.parametrize("module", [settings_page, command_line_page], ids=lambda module: module.__name__)
 def test_generated_pages_are_current(module: ModuleType) -> None:
-    """If this fails, run the command that the page's first paragraph names."""
     name = re.findall(r"docs/[\w/-]+\.md", str(module.__doc__))[0]
     assert (ROOT / name).read_text() == module.page()
 
@@ -104,7 +102,6 @@ def test_the_sandbox_of_each_process_is_in_the_architecture() -> None:
 
 
 def test_the_state_directory_is_described() -> None:
-    """An operator looks up a folder before they remove it, or wonder what a backup lacks."""
     page = (ROOT / "docs/reference/processes.md").read_text()
     table = page.split("\n## The state directory", 1)[1].split("\n## ", 1)[0]
     folders = {
@@ -134,7 +131,6 @@ def test_tests_that_pages_name_are_there(page: Path) -> None:
 
 
 def test_tests_that_the_assurance_names_are_there() -> None:
-    """Otherwise a promise would lose its proof."""
     named = re.findall(r"([\w/]+\.py)::(test_\w+)", (ROOT / "docs/dev/assurance.md").read_text())
     texts = {file: [one.read_text() for one in (ROOT / "tests").rglob(Path(file).name)] for file, _ in named}
     assert named
@@ -267,7 +263,6 @@ _EXAMPLES = [
 
 @pytest.mark.parametrize("page", [*WITH_LINKS[:-1], *_EXAMPLES], ids=lambda page: page.name)
 def test_file_names_of_pages_and_examples_have_no_version(page: Path) -> None:
-    """A command with the version of an earlier release would install nothing."""
     assert re.findall(r"rosrv[\w-]*[_-]\d+\.\d+\.\d+[\w.-]*", page.read_text()) == []
 
 
@@ -277,7 +272,6 @@ def test_sizes_have_one_bound_on_the_settings_page() -> None:
 
 
 def test_the_architecture_lists_each_folder_once() -> None:
-    """Two rows for one folder, such as after a merge, would contradict each other."""
     rows = re.findall(
         r"^\| `(appliance/[\w/]+)` \|", (ROOT / "docs/dev/architecture.md").read_text(), re.MULTILINE
     )

@@ -1,7 +1,7 @@
 """No regular expression holds the interpreter for long, whatever text it gets.
 
-No other thread runs during a match. A pattern that backtracks over text from a peer therefore stops the appliance for
-all hosts, also if its time is linear: 8 MB of spaces took a second.
+No other thread runs during a match. So a pattern that backtracks over text from a peer stops the appliance for all
+hosts, even if its time is linear: 8 MB of spaces took a second.
 """
 
 import ast
@@ -22,7 +22,7 @@ from tests.support.pattern_cost import steps
 from tests.support.sources import LANGUAGE_TESTS, ROOT
 
 UNLIMITED = 64 << 20
-"""Characters of a text that nothing limits: the largest message of ROS, and more than any request."""
+"""The number of characters for a text without a limit: the largest message of ROS, and more than any request."""
 
 MOST_STEPS = 200_000  # ten milliseconds or less
 
@@ -192,7 +192,7 @@ def test_a_scan_costs_nothing_except_in_a_search() -> None:
 
 @pytest.mark.parametrize("tag", ["i4", "boolean", "double", "dateTime.iso8601", "nil"])
 def test_a_scalar_is_short(tag: str) -> None:
-    """A number of megabytes is rejected by its length, before anything reads its digits."""
+    """A number of megabytes is rejected by its length, before its digits are read."""
     value = f"<value><{tag}>{' ' * 4097}</{tag}></value>"
     body = f"<methodCall><methodName>a</methodName><params><param>{value}</param></params></methodCall>"
     with pytest.raises(PeerError, match=rf"<{tag}> with 4097 characters; at most 4096 are allowed"):

@@ -22,12 +22,10 @@ STRING_OR_COMMENT = re.compile(
     r'''"""(?:\\.|[^\\])*?"""|'{3}(?:\\.|[^\\])*?'{3}|"(?:\\.|[^"\\\n])*"|'(?:\\.|[^'\\\n])*'|[#][^\n]*''',
     re.DOTALL,
 )
-"""A string of Python, or a comment. It is much faster than `tokenize`."""
+"""A string of Python, or a comment. Matching it is much faster than `tokenize`."""
 
 
 class Habit(NamedTuple):
-    """A pattern, the words to write instead, and a sentence that the pattern finds."""
-
     pattern: str
     instead: str
     example: str
@@ -127,5 +125,4 @@ def test_no_page_has_a_bad_habit() -> None:
 
 @pytest.mark.parametrize("habit", HABITS, ids=lambda habit: habit.instead)
 def test_each_pattern_finds_its_example(habit: Habit) -> None:
-    """A pattern that finds nothing would never fail."""
     assert any(habit.instead in what for _line, what in bad_habits(habit.example))

@@ -1,4 +1,4 @@
-"""Regular expressions read text of hosts and of users, so none may take exponential time."""
+"""Regular expressions match text of hosts and users, so none may take exponential time."""
 
 import importlib
 import re
@@ -15,7 +15,7 @@ codes: Any = importlib.import_module("re._constants")
 
 
 def nested(parts: Any, inside: bool = False) -> bool:
-    """Whether a repeat is inside another one and neither is possessive: a text can be divided in many ways then."""
+    """Return whether a repeat contains another, neither possessive, so that a text divides in many ways."""
     return any(_is_nested(kind, given, inside) for kind, given in parts)
 
 

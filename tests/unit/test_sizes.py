@@ -10,7 +10,7 @@ SECTION = (ROOT / "docs/dev/architecture.md").read_text().split("\n## Sizes", 1)
 
 
 def test_each_part_stays_within_its_budget() -> None:
-    """The budget is at most 3 % above the size, so lower it when code goes; raise it only with a reason."""
+    """A budget is at most 3 % above the size: lower it when code is removed, and raise it only for a reason."""
     appliance, features = lines_in("appliance"), lines_in("appliance/features")
     tests = lines_in("tests"), lines_in(LANGUAGE_TESTS)
     language = lines_in("rosmop") + lines_in("roswire") - tests[1]

@@ -1,7 +1,7 @@
-"""Rules on the source, in one pass over all files: each is parsed once, and every rule sees its nodes.
+"""Rules on the source, in one pass over all files: each file is parsed once, and every rule sees its nodes.
 
-A row of `RULES` has the folders, the function that yields what it sees in a file, the function that judges this over
-all files, and sources that the rule must find and must not find.
+A row of `RULES` has the folders, a function that yields facts of a file, a function that judges the facts of all
+files, and sources that the rule must reject and accept.
 """
 
 import ast
@@ -53,7 +53,7 @@ def _is_here(line: str) -> bool:
 
 
 def exactly(listed: Iterable[str], instead: str) -> Judge:
-    """Lines of a feature that was removed with its folder may stay in the list."""
+    """Require the listed facts and no others. Facts of a feature may stay listed after its folder was removed."""
     allowed = {one for one in listed if _is_here(one)}
 
     def judge(seen: Sequence[Seen]) -> Iterator[str]:
@@ -79,7 +79,6 @@ def code_from_text(source: Source) -> Iterator[tuple[int, str]]:
 
 
 def narrow_handlers(source: Source) -> Iterator[tuple[int, str]]:
-    """`msgspec` errors may be named only to raise them."""
     if "MsgspecError" not in source.text and "DecodeError" not in source.text:
         return
     raised = {id(part) for one in source.nodes if isinstance(one, ast.Raise) for part in ast.walk(one)}
@@ -120,7 +119,6 @@ def public_classes(source: Source) -> Iterator[tuple[int, str]]:
 
 
 def once(seen: Sequence[Seen]) -> Iterator[str]:
-    """A public class name identifies one class of the appliance, the language and the collector."""
     places = defaultdict(list)
     for path, line, name in seen:
         places[name].append(f"{path}:{line}")
@@ -215,7 +213,7 @@ def _is_lookup(node: ast.AST) -> bool:
 
 
 def slots(source: Source) -> Iterator[tuple[int, str]]:
-    """Attributes that begin as an empty function, and attributes of other objects that are set."""
+    """Find attributes that begin as an empty function, and attributes of other objects that are set."""
     for node in source.nodes:
         match node:
             case ast.AnnAssign(target=target, annotation=kind, value=ast.expr() as value):
@@ -255,7 +253,6 @@ def _does_nothing(value: ast.expr) -> bool:
 
 
 def unfilled(seen: Sequence[Seen]) -> Iterator[str]:
-    """If an empty slot that another file fills is forgotten, it silently does nothing."""
     fillers = defaultdict(set)
     for path, _line, what in seen:
         if what.startswith("set "):
@@ -314,7 +311,7 @@ WALL_CLOCK = {
         "features/topics/topic_verbs.py", "features/recorder/recorder_input.py", "features/recorder/record_verbs.py",
     ],
 }  # fmt: skip
-"""Add a file only if it has one of these purposes."""
+"""Files that may read the wall clock, by purpose. Add a file only if it has one of these purposes."""
 DIRECT = {
     "appliance/base/clock.py": "offers the clocks of the operating system to the rest",
     "appliance/features/standby/witness.py": "is copied to a machine without the appliance",
@@ -325,7 +322,7 @@ _CLOCKS = {"time", "time_ns", "localtime", "gmtime", "ctime"} | {
 
 
 def wall_clocks(source: Source) -> Iterator[tuple[int, str]]:
-    """The wall clock may be set while a robot runs."""
+    """Find reads of the wall clock, which may be set while a robot runs."""
     for node in source.nodes:
         match node:
             case ast.ImportFrom(module="appliance.base.clock", names=names):
@@ -341,7 +338,7 @@ def wall_clocks(source: Source) -> Iterator[tuple[int, str]]:
 
 
 def direct_clocks(source: Source) -> Iterator[tuple[int, str]]:
-    """A test sets all clocks of `base/clock.py`."""
+    """Find reads of a clock that bypass `base/clock.py`, whose clocks a test can set."""
     for node in source.nodes:
         match node:
             case ast.ImportFrom(module="time"):  # a bare `time()` does not reveal which clock is used
@@ -358,7 +355,6 @@ def direct_clocks(source: Source) -> Iterator[tuple[int, str]]:
 
 
 def forged_signatures(source: Source) -> Iterator[tuple[int, str]]:
-    """Signatures and annotations must be those of the function as written."""
     for node in source.nodes:
         # A class, `cls`, may get fields.
         owner = node.value if isinstance(node, ast.Attribute) else None
@@ -372,7 +368,7 @@ def forged_signatures(source: Source) -> Iterator[tuple[int, str]]:
 
 
 def lost_cancellations(source: Source) -> Iterator[tuple[int, str]]:
-    """In Python 3.11 `asyncio.wait_for` loses a cancellation that comes with the event."""
+    """Find `asyncio.wait_for`, which in Python 3.11 loses a cancellation that comes with the event."""
     for node in source.nodes:
         if isinstance(node, ast.Attribute) and ast.unparse(node) == "asyncio.wait_for":
             yield node.lineno, ast.unparse(node)
@@ -391,7 +387,7 @@ def printed(source: Source) -> Iterator[tuple[int, str]]:
 
 
 def quoted(seen: Sequence[Seen]) -> Iterator[str]:
-    """docs/troubleshooting.md quotes only messages that the program can print."""
+    """Require that docs/troubleshooting.md quotes only messages that the program can print."""
     page = (ROOT / "docs/troubleshooting.md").read_text()
     cells = re.findall(r"^\| ([^|]*`[^|]*) \|", page, re.MULTILINE)
     messages = [piece for cell in cells for piece in re.findall(r"`([^`(]+)`", cell) if " " in piece]

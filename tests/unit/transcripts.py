@@ -1,6 +1,6 @@
-"""Transcripts: a line at the margin is an action, the indented lines below it are its effects.
+"""Read transcripts: a line at the margin is an action, and the indented lines below it are its effects.
 
-The title of each, after `# `, states its promise; an empty line ends it.
+The title of each, after `# `, states its promise. An empty line ends it.
 """
 
 from collections.abc import Awaitable, Callable

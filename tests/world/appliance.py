@@ -1,6 +1,6 @@
 """A simulated appliance: the product's control process, and models of its supervisor and of its relay.
 
-The relay decides with the product's own grant table. Its connections are rows, which carry messages at any time.
+The relay decides with the product's own grant table. Its connections are rows, which can carry messages at any time.
 """
 
 from collections.abc import Iterator

@@ -1,7 +1,7 @@
-"""The store and the audit log without threads, and what the kernel does with the files of a killed process.
+"""Run the store and the audit log without threads, on files that a killed process leaves as the kernel would.
 
-A kill comes between two turns of an engine: the files then have what was written, as after `kill -9`. No write is
-lost that was not synced: the machine keeps its power.
+A kill comes between two turns of an engine. As after `kill -9`, the files then have everything that was written, even
+if it was not synced, because the machine keeps its power.
 """
 
 import os

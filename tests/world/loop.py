@@ -1,8 +1,8 @@
 """Run the processes of a simulated world in one event loop with virtual time.
 
-Time advances only when no callback is ready. Callbacks of one process keep their order, as asyncio promises; which
-process runs next is chosen by the seed. A killed process runs no further callback, so its `finally` blocks do not run
-either. The timers of a process follow its machine's clock, which may be ahead and faster or slower.
+Time advances only when no callback is ready. Callbacks of one process keep their order, as asyncio promises; the seed
+chooses the process that runs next. A killed process runs no more callbacks, not even its `finally` blocks. The timers
+of a process follow the clock of its machine.
 """
 
 import asyncio
@@ -30,7 +30,7 @@ class BrokenPromiseError(AssertionError):
 
 @dataclass(eq=False)
 class Machine:
-    """Its clock is `ahead` of the world's time in seconds, and `speed` times as fast."""
+    """A machine whose clock is `ahead` of the world's time in seconds, and `speed` times as fast."""
 
     name: str
     loop: "WorldLoop"
@@ -54,7 +54,7 @@ class Machine:
 
 @dataclass(eq=False)
 class Process:
-    """`ends` are called when it is killed, as the kernel closes its files and connections."""
+    """A process. `ends` are called when it is killed, as the kernel closes its files and connections."""
 
     name: str
     machine: Machine

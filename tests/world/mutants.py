@@ -1,4 +1,4 @@
-"""Faults of the product, which the world must find: the replaced attribute, and its replacement.
+"""Faults of the product that the world must find, each with the replaced attribute and its replacement.
 
 python -m tests.world.mutants SEEDS [WORD]   print the first seed that finds each, or those with this word
 """

@@ -1,7 +1,7 @@
 """The simulated network: HTTP exchanges between hosts, and links between the processes of one machine.
 
 Each message takes a random time. If the network is cut, a request or its answer is lost, and the caller waits until
-its time limit. A killed process refuses connections, and breaks off those that it served.
+its time limit. A killed process refuses connections, and breaks those that it served.
 """
 
 import asyncio
@@ -153,7 +153,7 @@ class LinkEnd:
     def send(
         self, message: messages.Message, descriptors: tuple[Any, ...] = (), *, soon: bool = False
     ) -> None:
-        """A `soon` message may take longer, but overtakes none."""
+        """Send a message. A `soon` one may take longer, but overtakes none."""
         del soon
         if not self.closed:
             self._carry(self.other.take, message, descriptors)

@@ -2,8 +2,8 @@
 
 The promises of `world.py` hold over takeovers, and:
 
-8. At most one appliance is active, and only one that the robot admits gets a node's call.
-9. A takeover loses no acknowledged change: it was stored by the standby, or the standby was no longer in sync.
+8. At most one appliance is active, and a node's call reaches only an appliance that the robot admits.
+9. A takeover loses no acknowledged change: the standby had stored it, or was no longer in sync.
 10. Some time after the last fault, one appliance is active, and both are in sync.
 """
 

@@ -1,4 +1,4 @@
-"""The robot's computer: the product's witness and its firewall rules, on a disk that keeps the lease."""
+"""The robot's computer, with the product's witness and its firewall rules on a disk that keeps the lease."""
 
 import re
 from typing import TYPE_CHECKING

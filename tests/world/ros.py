@@ -1,8 +1,8 @@
 """Scripted ROS nodes, and a model of `rosmaster`.
 
 Nodes behave as rospy and roscpp do: they connect to each new publisher, retry broken connections, repeat a call whose
-outcome is unknown, and end on a shutdown request. They take no update of a topic while their own registering call for
-it is under way: this race exists with a plain ROS master as well.
+outcome is unknown, and end on a shutdown request. They ignore updates of a topic during their own registering call
+for it, a race that also exists with a plain ROS master.
 """
 
 import asyncio

@@ -1,4 +1,4 @@
-"""Where the product meets the world: what replaces sockets, threads, and random numbers.
+"""The replacements for the product's sockets, threads and random numbers.
 
 A descriptor is the object itself: a listening socket or an end of a link, which messages carry to other processes.
 """
@@ -53,7 +53,7 @@ class Socket:
 
 
 class _Server:
-    """The network passes each request on. The limits of `HttpServer` are not part of the world."""
+    """A server to which the network passes each request. The limits of `HttpServer` are not part of the world."""
 
     def __init__(self, network: Network, sock: Socket, handler: Handler, **limits: Any) -> None:
         self._network = network

@@ -1,7 +1,7 @@
 """Connections of bytes, and datagrams, between machines: the replication, and the messages of the lease.
 
-While two machines are cut off from each other, the bytes of a connection wait, as TCP sends them again, and datagrams
-are lost.
+While two machines are cut off from each other, the bytes of a connection wait, because TCP sends them again, and
+datagrams are lost.
 """
 
 import asyncio
@@ -138,7 +138,6 @@ class DatagramSocket:
         return self
 
     def sendto(self, data: bytes, target: Address) -> None:
-        """From a free port of the machine if none is bound."""
         if not self._address[1]:
             self.bind((self.process.machine.name, self._streams.free_port()))
         self._streams.send(data, self._address, target)

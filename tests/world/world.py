@@ -1,15 +1,15 @@
 """One history of a whole world in virtual time, made from a seed, and the promises that it must keep.
 
-1. No call and no message passes undecided: each grant at the relay, and each acknowledged registration, has its
-   allowed decision in the audit log. With `durability: strict`, the record is there before the grant.
-2. After the answer to a reload, the relay has no grant and carries nothing that the policy denies.
-3. Nodes learn no addresses but those of proxy endpoints and of the relay.
+1. No call and no message passes undecided: the audit log has the allowed decision of each grant at the relay, and of
+   each acknowledged registration. With `durability: strict`, it has the record before the grant.
+2. After the answer to a reload, the relay has no grant that the policy denies, and carries nothing that it denies.
+3. Nodes learn only the addresses of proxy endpoints and of the relay.
 4. No acknowledged change is lost: after a restart of control, or of the whole appliance, the last acknowledged policy
    is in force, and nodes read the acknowledged values of parameters.
 5. The chain of the audit log verifies at the end, over all lives of control.
 6. A restart of control interrupts no connection that the policy allows.
-7. Once faults have ended, `rosmaster` has exactly the registrations of the registry, and live subscribers are connected
-   to exactly the live publishers that the policy allows.
+7. Once faults have ended, `rosmaster` has exactly the registrations of the registry, and live subscribers are
+   connected to exactly the live publishers that the policy allows.
 """
 
 import asyncio
@@ -51,7 +51,7 @@ POLICY = (
 
 
 class Policy:
-    """As an oracle, the hosts that it lets publish, subscribe and call; those not listed are allowed."""
+    """A policy and, as the oracle, the hosts that it lets publish, subscribe and call. Other resources are open."""
 
     def __init__(self, publish: dict[str, str] | None = None, use: dict[str, str] | None = None) -> None:
         self.publish = {one: set(hosts.split()) for one, hosts in (publish or {}).items()}
@@ -188,7 +188,6 @@ class World:
         return (connection.host, connection.caller_id) == (node.host, node.name)
 
     def takes_name(self, node: Node) -> None:
-        """If the superseded node hangs it goes on; the next caller decides its state."""
         for other in self.nodes:
             if other.name == node.name and other is not node:
                 other.superseded = True
@@ -203,7 +202,7 @@ class World:
             self.decided("lookupService", grant.service, grant.host, grant.caller_id)
 
     def decided(self, call: str, resource: str, host: str, name: str) -> None:
-        """The log has the decision that allowed a call; without `strict`, a crash may lose it."""
+        """Check that the log has the decision that allowed a call. Without `strict`, a crash may lose it."""
         if self.strict and not self._recorded(
             "event = 'decision' AND decision = 'allow' AND host = ? AND resource = ? AND caller_id = ?",
             host, resource, name,
@@ -223,7 +222,7 @@ class World:
         return [path for path in paths if path.exists()]
 
     def sees(self, node: Node, uris: list[str]) -> None:
-        """Nodes get ports of the appliance only: others would bypass it."""
+        """Check that a node gets only ports of the appliance, as others would bypass it."""
         for uri in uris:
             if f"//{APPLIANCE}:" not in uri and uri != node.api:
                 self.fail(f"{node} was told {uri}, which bypasses the relay")

@@ -100,7 +100,7 @@ def test_reload_replaces_the_policy_by_the_file(appliance: Appliance) -> None:
 
 
 def reported(rest: Rest) -> dict[str, Any] | None:
-    """The relay reports the rate of /chatter once a second."""
+    """Return the topic once the relay has reported its rate, which it does every second."""
     topic: dict[str, Any] = next(
         one for one in rest.get("/v1/graph").json["topics"] if one["name"] == "/chatter"
     )

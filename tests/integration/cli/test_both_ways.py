@@ -1,4 +1,4 @@
-"""Every verb has the same output and exit status over REST (`--api`) and over the state directory (`--state`)."""
+"""Every command has the same output and exit status over REST (`--api`) and over the state directory (`--state`)."""
 
 import json
 import re

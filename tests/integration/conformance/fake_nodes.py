@@ -1,6 +1,6 @@
-"""Node APIs that tests register: one path for each node and life; the master's calls are recorded.
+"""Node APIs that tests register, with a path for each node and life. The master's calls are recorded.
 
-They answer as real nodes do, so that the appliance's liveness checks, which do not count as calls, find them alive.
+They answer as real nodes do, so that the appliance's liveness checks, which are not recorded, find them alive.
 """
 
 import os

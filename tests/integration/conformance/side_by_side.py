@@ -1,7 +1,7 @@
 """Make the same Master API call to a plain ROS master and to RVMaster, and make their answers comparable.
 
-Only URIs and ids may differ by design: each URI becomes the name of its node. `Api` and `ServiceApi` stand for URIs
-of fake nodes; each master has its own.
+Only URIs and ids may differ by design: each URI becomes the name of its node. `Api` and `ServiceApi` are placeholders
+for URIs of fake nodes, of which each master has its own.
 """
 
 import itertools
@@ -134,9 +134,10 @@ class BothMasters:
 def differences(answers: Answers) -> list[str]:
     """Return the differences that a client library would notice: code, type and content of the value, message.
 
-    The text about an invalid parameter may differ; the named parameter may not. The reason why an unregistration ends
-    nothing may differ, because a plain master counts a node whose service moved to another node. For some errors a
-    plain master returns 0 whatever the call's type is; the appliance returns an empty value of that type.
+    The message about an invalid parameter may differ, but must name the same parameter. The reason why an
+    unregistration ends nothing may differ, because a plain master counts a node whose service moved to another node.
+    For some errors, a plain master returns 0 for every call, whereas the appliance returns an empty value of the
+    call's type.
     """
     plain, appliance = answers.plain, answers.appliance
     if isinstance(plain, Fault) or isinstance(appliance, Fault):
@@ -155,7 +156,7 @@ def differences(answers: Answers) -> list[str]:
 
 
 def same(one: Any, other: Any) -> bool:
-    """`1` differs from `True` and `1.0`; `nan` equals `nan`."""
+    """Return whether values are equal with the same types: `1` differs from `True` and `1.0`, `nan` equals `nan`."""
     if type(one) is not type(other):
         return False
     if isinstance(one, dict):

@@ -1,6 +1,6 @@
 """A rospy node gives the answers to the calls in `conversations/node_api.txt`, behind either master.
 
-Differences by design are those of `side_by_side`, process ids and the numbers of connections.
+Process ids and numbers of connections may differ, in addition to the differences that `side_by_side` allows.
 """
 
 import re

@@ -57,9 +57,6 @@ def ask(sock: socket.socket) -> Value:
     [("10.77.0.2", "10.77.0.10", "10.77.2.{}"), ("fd77::2", "fd77::10", "fd77::2:{}")],
 )
 def test_a_full_queue_of_unknown_hosts(lab: Lab, target: str, robot: str, crowd: str) -> None:
-    """A connection of the robot is established at once; the robot and a host of `*` get answers when control
-    continues.
-    """
     length = 64 if ":" in target else 16
     unknown_hosts = [crowd.format(number) for number in range(1, 201)]
     middle = lab.host("appliance", f"{target}/{length}")

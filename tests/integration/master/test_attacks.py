@@ -1,4 +1,4 @@
-"""Attacks that only the wire shows; `tests/unit/master/conversations/attacks.txt` has the attacks by calls.
+"""Attacks that need real connections. `tests/unit/master/conversations/attacks.txt` has those that consist of calls.
 
 After each attack the robot's talker and its operator's listener still run.
 """
@@ -64,7 +64,7 @@ def graph(battlefield: Field) -> None:
 
 @pytest.fixture(autouse=True)
 def no_hidden_port_is_revealed(field: Field) -> Iterator[None]:
-    """Ports of `rosmaster`, of master-side endpoints and of real nodes are hidden."""
+    """Check that no answer of the block has a port of `rosmaster`, of a master-side endpoint or of a real node."""
     since = len(field.answers)
     yield
     hidden = {port for address, port in field.middle.run(_listening) if address == LOOPBACK}
@@ -294,7 +294,6 @@ def bomb(connection: socket.socket, _request: bytes) -> None:
     "behave", [silent, endless, twice, rubbish, redirect, drip, bomb], ids=lambda one: one.__name__
 )
 def test_misbehaving_node(field: Field, behave: Any) -> None:
-    """Its callers get a well-formed answer, or a closed connection, as from a node that does not exist."""
     before = field.memory()
     with Impostor(field.attacker, behave) as node:
         name, topic = f"/liar_{behave.__name__}", f"/shared/liar_{behave.__name__}"

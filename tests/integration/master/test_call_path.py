@@ -10,7 +10,6 @@ from tests.support.sources import ROOT
 
 
 def test_the_path_of_a_call_is_the_one_on_the_page(tmp_path: Path) -> None:
-    """docs/dev/architecture.md lists the files that one registerPublisher enters in control."""
     need_root()
     needs(has_ros(), "ROS 1 (run `make setup`)")
     page = (ROOT / "docs/dev/architecture.md").read_text()

@@ -62,7 +62,7 @@ class Burst:
         self.node.__exit__(*exc)
 
     def _unregister(self) -> None:
-        """Control would later find them dead, and unregister them during another test."""
+        """Unregister the nodes: control would otherwise find them dead during another test."""
         with xmlrpc.client.ServerProxy(self._field.master) as server:
             calls: Any = xmlrpc.client.MultiCall(server)
             for name in self.registered:

@@ -1,4 +1,4 @@
-"""The policy grants the rogue everything, so only limits protect the other hosts."""
+"""Floods of a rogue to which the policy grants everything, so that only limits protect the other hosts."""
 
 import contextlib
 import threading

@@ -1,5 +1,5 @@
-"""`tests/unit/rpc/test_refused_requests.py` and `tests/unit/roswire/test_xmlrpc.py` have all malformed HTTP and
-XML-RPC.
+"""Malformed requests at the real port. `tests/unit/rpc/test_refused_requests.py` and
+`tests/unit/roswire/test_xmlrpc.py` have all of them.
 """
 
 import re

@@ -1,4 +1,4 @@
-"""When a node's machine is gone, a node on another host takes over its name at once.
+"""When a node's machine is gone, a node on another host immediately takes over its name.
 
 `tests/unit/master/conversations/attacks.txt` has the answers while the node runs or hangs.
 """
@@ -68,7 +68,7 @@ def deleted(pair: Pair, voice: Process) -> None:
 
 @pytest.mark.parametrize("away", [unplugged, dropped, deleted])
 def test_a_vanished_machine_releases_its_names(pair: Pair, away: Callable[[Pair, Process], None]) -> None:
-    """The node on the other machine is heard at its first attempt, even before the silent node counts as lost."""
+    """The node on the other machine succeeds at its first attempt, even before the silent node counts as lost."""
     voice = pair.talker(pair.first)
     pair.ear.wait_for(event="received")
     away(pair, voice)

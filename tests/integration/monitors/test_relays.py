@@ -163,10 +163,10 @@ def test_services_use_the_relay_of_their_monitor(
 def test_one_message_after_waiting_for_a_subscriber_is_not_lost_to_the_monitor(
     common_appliance: Appliance, tmp_path: Path, client: Client
 ) -> None:
-    """The monitor counts as the subscriber that the node waits for.
+    """The monitor is the subscriber that the node waits for, and the relay repeats its first second to listeners.
 
-    A message within a second of the first one reaches the listener. A node on an overloaded machine may need longer,
-    so each listener must get three of twelve; without this second, a roscpp listener gets no message.
+    On an overloaded machine a listener may need longer, so each must get three of twelve messages. Without the
+    repetition, a roscpp listener gets none.
     """
     with RosSession(common_appliance.master_uri, tmp_path) as ros:
         listeners = [ros.listener(client, "/left", name=f"ear{number}") for number in range(2)]

@@ -41,7 +41,6 @@ def change(appliance: Appliance, _: RosSession) -> None:
 
 
 def tighten(appliance: Appliance, ros: RosSession) -> None:
-    """Set the bound beyond the distance that the next scan reports; the text and the state stay."""
     appliance.rosrv("monitor", "set", "guard", "least=9")
     scan(appliance, ros, "5")
 

@@ -1,4 +1,4 @@
-"""Small processes that follow the protocol of the real ones, so that the supervisor can be tested alone.
+"""Small processes that follow the protocol of the real ones, to test the supervisor alone.
 
 Each prints its messages as JSON. The actor for control answers each connection with its process id.
 """

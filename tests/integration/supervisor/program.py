@@ -1,6 +1,6 @@
 """Run the supervisor with the real rosmaster and rosout: `program.py STATE [ROLE=ENTRY…]`.
 
-Actors take the place of our processes.
+Actors replace the appliance's own processes.
 """
 
 import json

@@ -1,6 +1,6 @@
 """The sandbox of each process, tested from inside as the role's user, with the settings of the role's row.
 
-The same attempts without a sandbox show that the sandbox causes the refusals.
+The same attempts succeed without a sandbox, so the sandbox causes the refusals.
 """
 
 import json
@@ -227,7 +227,6 @@ def test_a_relay_runs_modules_in_its_sandbox(place: Place) -> None:
 
 
 def test_status_shows_the_sandbox(appliance: Appliance) -> None:
-    """A relay with a specification has the runtime of its module, and no writable memory for code."""
     needs(landlock.version() >= landlock.SIGNALS, "a kernel with Landlock 6")
     rows = appliance.processes()
     rest = {row["role"]: row for row in appliance.rest().get("/v1/status").json["processes"]}

@@ -54,7 +54,7 @@ def up(directory: Path, *more: str) -> Iterator[Process]:
 
 
 def refusal(directory: Path, *more: str, before: tuple[str, ...] = ()) -> str:
-    """Standard output must be empty. `before` is a program, with its arguments, that runs the start."""
+    """Return the error of a start that fails without other output. `before` is a command that runs it."""
     done = subprocess.run(
         [*before, *command(directory, *more)],
         env=ENVIRONMENT,

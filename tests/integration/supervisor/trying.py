@@ -108,7 +108,6 @@ def _call(name: str) -> str:
 
 
 def _new_namespace() -> str:
-    """In a user namespace everything else would be allowed; unshare is already among the calls."""
     number = ctypes.CDLL(LIBRARY).seccomp_syscall_resolve_name(b"clone")
     libc = ctypes.CDLL(None, use_errno=True)
     arguments = (NEW_USER | signal.SIGCHLD, 0, 0, 0, 0)

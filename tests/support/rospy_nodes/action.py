@@ -1,4 +1,4 @@
-"""Run one end of an action: action.py server|client; events `executed`, `feedback`, `result`."""
+"""Run one end of an action: action.py server|client. The events are `executed`, `feedback` and `result`."""
 
 import sys
 
@@ -12,7 +12,7 @@ HEARD = "/feedback_heard"  # the client's last feedback; 0 once it knows its goa
 
 
 def serve():
-    """actionlib drops feedback that overtakes the goal or is overtaken by the result."""
+    """Serve in step with the client: actionlib drops feedback that comes before the goal or after the result."""
 
     def until(reached):
         while not reached() and not rospy.is_shutdown():

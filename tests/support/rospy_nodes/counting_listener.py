@@ -1,8 +1,8 @@
-"""counting_listener.py TOPIC [--slow SECONDS], for a topic of `flood_talker.py`; `first` has the first number.
+"""Count the messages of `flood_talker.py`: counting_listener.py TOPIC [--slow SECONDS].
 
-For each line on the input, `counted` has the first and last number, the number of messages, gaps as pairs of the
-numbers around them, whether a number was not larger than its predecessor, and the texts that monitors appended, with
-their first numbers.
+The event `first` has the first number. For each line on the input, `counted` has the first and last number, the
+number of messages, gaps as pairs of the numbers around them, whether the order was broken, and the texts that
+monitors appended, with their first numbers.
 """
 
 import argparse

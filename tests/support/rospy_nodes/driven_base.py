@@ -1,7 +1,7 @@
 """A base on /cmd_vel with odometry on /odom: driven_base.py TIMEOUT.
 
-It obeys a command for TIMEOUT seconds, or until the next command if TIMEOUT is 0. It prints the events `moves` and
-`stands` when its speed changes, and `silent` when no command has come for 0.3 s.
+It obeys a command for TIMEOUT seconds, or with 0 until the next command. It prints the events `moves` and `stands`
+when its speed changes, and `silent` after 0.3 s without a command.
 """
 
 import sys

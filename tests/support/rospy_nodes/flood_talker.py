@@ -1,6 +1,6 @@
 """Publish numbered std_msgs/String: flood_talker.py TOPIC [--rate HZ] [--bytes N].
 
-A line on the input ends the flood; `flooded` has the number of messages.
+A line on the input ends the flood. The event `flooded` has the number of messages.
 """
 
 import argparse

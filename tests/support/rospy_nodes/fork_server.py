@@ -1,7 +1,7 @@
 """Load rospy in Debian's Python, and fork for each program that `tests/support/forks.py` orders.
 
-An order has the program, its environment and folder, and five descriptors: standard input, output and error, network
-namespace, and a socket for its process id and later for its exit status.
+An order has the program, its environment and folder, and five descriptors: standard input, output and error, the
+network namespace, and a socket for its process id and later its exit status.
 """
 
 import contextlib

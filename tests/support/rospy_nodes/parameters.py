@@ -1,7 +1,11 @@
 """Work with parameters by orders on standard input, one JSON object per line.
 
-{"do": "set", "key": K, "value": V}, {"do": "get" | "has" | "delete" | "search", "key": K}, {"do": "names"},
-{"do": "watch", "key": K} (cached: the node subscribes to it); events `done` (with `value`) or `failed`.
+    {"do": "set", "key": K, "value": V}
+    {"do": "get" | "has" | "delete" | "search", "key": K}
+    {"do": "names"}
+    {"do": "watch", "key": K}    # cached: the node subscribes to it
+
+The events are `done` (with `value`) and `failed`.
 """
 
 import json

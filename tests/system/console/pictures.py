@@ -1,7 +1,7 @@
 """Make the console's pictures in docs/pictures: `python -m tests.system.console.pictures [MINUTES]`, as root.
 
-The README's picture shows a robot of a hundred nodes after MINUTES (an hour), whose arm an operator's machine tries
-to command. Others show the demonstration and its attacker.
+The README's picture shows a robot of a hundred nodes after MINUTES (by default an hour), whose arm an operator's
+machine tries to command. Others show the demonstration and its attacker.
 """
 
 import base64

@@ -1,4 +1,4 @@
-"""Use the console in a real browser, and check that the page does nothing that it must not do.
+"""Use the console in a real browser, and check that the page does nothing forbidden.
 
 Leaving the block fails if the page requested anything from another host, violated its own content security policy,
 raised a script error, or set a cookie.
@@ -146,5 +146,5 @@ def texts(locators: Iterable[Any]) -> list[str]:
 
 
 def wait_until(page: Page, condition: str) -> None:
-    """`Page.wait_for_function` evaluates inside the page, where the content security policy forbids that."""
+    """Wait without `Page.wait_for_function`, whose evaluation the page's content security policy forbids."""
     eventually(lambda: page.evaluate(condition), condition)

@@ -30,9 +30,7 @@ def refused(appliance: Appliance, attempt: Callable[..., Any]) -> None:
 @pytest.mark.parametrize("theme", ["light", "dark"])
 @pytest.mark.parametrize("width", [1440, 390])
 def test_axe_finds_nothing(theme: str, width: int, opened: Callable[..., Reader]) -> None:
-    """Every view, dark and light, wide and narrow, with a record, an error and a dialog open; none is wider than its
-    window.
-    """
+    """Each view is dark and light, wide and narrow, with a record, an error and a dialog. None exceeds its window."""
     reader = opened(theme=theme, width=width)
     found: dict[str, list[str]] = {}
     for view in VIEWS:
@@ -77,7 +75,7 @@ def test_the_door_is_accessible(browser: Browser, appliance: Appliance) -> None:
 
 
 def test_it_goes_by_keys(opened: Callable[..., Reader]) -> None:
-    """The first Tab skips the navigation, digits change views, ? lists the keys, t changes the theme; focus shows."""
+    """The first Tab skips the navigation, digits change views, ? lists the keys, t changes the theme."""
     reader = opened()
     page = reader.go("now")
     page.keyboard.press("Tab")

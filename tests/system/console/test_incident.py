@@ -103,7 +103,7 @@ class Keys:
 def test_an_incident_by_keys(
     recording: dict[str, Any], appliance: Appliance, opened: Callable[..., Reader], token: Callable[..., str]
 ) -> None:
-    """At most 25 keys lead from Now to the drop, its record, time line, messages and evidence; then to a new policy."""
+    """At most 25 keys lead from Now to the drop, its record, timeline, messages and evidence, and a new policy."""
     page = opened(token("investigator", "carol")).go("now")
     keys = Keys(page)
     actions = page.get_by_role("region", name="Recent actions of monitors").get_by_role("listitem")
@@ -150,7 +150,6 @@ def test_an_incident_by_keys(
 def test_a_denial_is_granted_by_keys(
     appliance: Appliance, opened: Callable[..., Reader], attempt: Callable[..., Any]
 ) -> None:
-    """At most 25 keys lead from Now to a denial, the change that would grant it, and its load."""
     arguments = ("registerPublisher", "/asker", "/guarded", "std_msgs/String", "http://127.0.0.1:1/")
     assert attempt(*arguments)[0] != 1
     reader = opened()

@@ -159,7 +159,7 @@ def _corner(box: Locator) -> tuple[float, float]:
 
 
 def _boxes(page: Page) -> list[_Box]:
-    """The drawing may move between two questions."""
+    """Return the boxes in one evaluation, because the drawing may move between two."""
     boxes: list[_Box] = page.eval_on_selector_all(
         ".box .shape",
         """all => all.map(one => {

@@ -1,4 +1,4 @@
-"""The provider is not ours: canaille, with an authority of its own."""
+"""Sign on at canaille, an independent provider with its own authority."""
 
 import re
 from collections.abc import Callable, Iterator
@@ -97,7 +97,6 @@ def signed_in(appliance: Appliance, browser: Browser) -> Iterator[Callable[[str]
 def test_a_group_of_the_provider_opens_console_and_door_until_it_is_taken_away(
     provider: Canaille, appliance: Appliance, signed_in: Callable[[str], Page]
 ) -> None:
-    """The provider has another key after each start."""
     with provider.running():
         page = signed_in("alice")
         expect(page.locator(".who-name")).to_have_text("sso:alice")

@@ -90,7 +90,7 @@ def remote_browser(
 
 @pytest.fixture
 def pair(site: StandbySite, remote_browser: Browser, tokens: dict[str, str]) -> Iterator[PairConsoles]:
-    """A machine that starves the lease for a second makes `b` active, so `a` is made active before each test."""
+    """Yield the consoles with `a` active: a machine that starved the lease for a second may have made `b` active."""
     if site.holder() != "a":
         site.promote(site.holder())
         site.until_taken_over("a")
@@ -181,9 +181,7 @@ def test_only_admins_switch_over(pair: PairConsoles) -> None:
 
 
 def test_a_switchover_leads_to_the_other_console_and_back(pair: PairConsoles) -> None:
-    """The same token opens the other console. On the way back the first page is live without a reload, with unsaved
-    work.
-    """
+    """The same token opens the other console. Back on the first page, unsaved work is kept without a reload."""
     reader = pair.open("a", "admin")
     page = reader.go("policy")
     reader.write("# a draft\n")

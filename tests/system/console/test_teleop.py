@@ -107,7 +107,6 @@ def test_a_person_sees_and_drives_the_robot_through_their_own_door(
 
 
 def refused(own: Locator) -> bool:
-    """Press once: the pad is off until it knows who may drive."""
     own.get_by_role("application").press("ArrowUp")
     with contextlib.suppress(AssertionError):
         expect(own.get_by_role("alert")).to_be_visible(timeout=3000)

@@ -13,7 +13,7 @@ from tests.support.requirements import need_root
 
 @dataclass(frozen=True)
 class Site:
-    """`machine` (10.79.0.1) runs the engine; `laptop` (10.79.0.50) is another computer on its network."""
+    """The hosts of the tests: `machine` (10.79.0.1) runs the engine, `laptop` (10.79.0.50) is on its network."""
 
     engine: Engine
     machine: Host

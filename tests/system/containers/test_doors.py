@@ -1,4 +1,4 @@
-"""Doors as docs/doors.md has them in Docker: a ticket on this machine, agents in a container and on this machine."""
+"""Doors in Docker as docs/doors.md describes: a ticket on this machine, agents in a container and on this machine."""
 
 import json
 import socket
@@ -111,7 +111,6 @@ def sees_the_battery_only(battery: Any, gps: Any) -> None:
 
 
 def test_a_ticket_opens_the_door_on_this_machine(site: Site, doors: Compose) -> None:
-    """A page of the console may open it, a page of another site may not. The refusal is the record's."""
     url = ticket(doors)
 
     def work() -> None:
@@ -152,7 +151,6 @@ def test_an_agent_in_a_container_needs_no_published_port(site: Site, doors: Comp
 
 
 def test_ports_of_doors_are_published_as_documented(site: Site, doors: Compose) -> None:
-    """compose.yaml publishes no port of a door, the documented file one, on this machine only."""
     bound = site.engine.inspect(doors.container("appliance"))["HostConfig"]["PortBindings"]
     tcp = {port: [one["HostIp"] for one in bound[port]] for port in bound if port.endswith("/tcp")}
     assert tcp == {"8443/tcp": ["127.0.0.1"], "9091/tcp": ["127.0.0.1"]}

@@ -1,7 +1,7 @@
 """docs/fleet.md, followed command by command, then the collector's backup, restore, upgrade and retention.
 
-Three robots are real appliances, and a later one is an appliance in a container. The others have a real log, a real
-key, `rosrv fleet join` and the appliance's pusher.
+Three robots are real appliances, a later one in a container. The others have a real log, a real key, `rosrv fleet
+join` and the appliance's pusher.
 """
 
 import json
@@ -92,7 +92,7 @@ class Walk:
         return re.sub(r"heard \S+", "", self.fleet("robot", "list")), self.fleet("token", "list")
 
     def wait_healthy(self, service: str) -> None:
-        """The engine keeps too few events to wait for an old one."""
+        """Poll the state, because the engine keeps too few events to wait for an old one."""
         container = self.compose.container(service)
         eventually(
             lambda: self.compose.engine.inspect(container)["State"]["Health"]["Status"] == "healthy",

@@ -35,7 +35,7 @@ def drives_on(compose: Compose) -> None:
 
 
 def test_a_stop_is_clean_and_quick(alone: Compose) -> None:
-    """On an idle machine within five seconds. Processes that need more than 3.3 s are killed.
+    """Processes that need more than 3.3 s are killed. On an idle machine, a stop takes less than five seconds.
 
     As this limit does not grow with the load of the machine, only one stop of three must need no kill.
     """

@@ -29,7 +29,7 @@ ENROL = ("rosrv", "host", "add", "laptop", "--appliance", MACHINE, "--output", "
 
 
 def enrolled_as_documented(alone: Compose, kit: Path) -> Path:
-    """The commands of docs/next-to-your-robot.md: the endpoint in `.env`, the kit through standard output."""
+    """Enrol a host as in docs/next-to-your-robot.md: endpoint in `.env`, and the kit from standard output."""
     (alone.directory / ".env").write_text(f"ROSRV_ENDPOINT={MACHINE}\n")
     alone("up", "--detach", "--no-build")
     alone.wait_healthy()
@@ -91,7 +91,6 @@ def test_no_token_is_made_that_no_host_can_use(alone: Compose) -> None:
 
 
 def test_low_ports_need_the_capability(alone: Compose) -> None:
-    """charon cannot open port 500 without NET_BIND_SERVICE: enrolling a host fails with this reason."""
     without(alone, "NET_BIND_SERVICE")
     alone.wait_healthy()
     done = alone.exec("appliance", *ENROL, check=False)

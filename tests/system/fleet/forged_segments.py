@@ -1,4 +1,4 @@
-"""Segments of a compromised robot: its own key seals any content, under any number of any log."""
+"""Make segments of a compromised robot, whose own key seals any content under any number of any log."""
 
 import functools
 import hashlib

@@ -1,4 +1,4 @@
-"""A cluster of PostgreSQL 15 in a temporary folder, on a Unix socket only, as user postgres."""
+"""Run PostgreSQL 15 in a temporary folder, on a Unix socket only, as the user postgres."""
 
 import contextlib
 import os

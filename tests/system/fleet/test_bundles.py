@@ -146,7 +146,6 @@ def test_only_enrolled_robots_get_bundles(site: FleetSite, tmp_path: Path) -> No
 
 
 def test_the_pusher_checks_the_name_in_the_certificate(site: FleetSite, tmp_path: Path) -> None:
-    """With `fleet.name`, the collector's certificate must have that name, not the address."""
     robot = make_certificates(tmp_path / "robot", authority="authority of arm1")
     url, files = f"https://127.0.0.1:{site.port}", (site.server.ca, robot.certificate, robot.key)
     with pytest.raises(CollectorError, match=r"not valid for 'fleet\.example'"):

@@ -216,7 +216,6 @@ PAGES = {
 
 
 def test_axe_finds_nothing(rollouts: RolloutSite) -> None:
-    """Also in the dark; at 200 % and 400 % zoom no page is wider than the window."""
     robot = rollouts.robots[0]
     robot.record(
         10, reason="no rule of the policy names 10.0.0.5, which registers /a_publisher_with_a_long_name"

@@ -1,5 +1,3 @@
-"""The damage affects its robot only, and is reported."""
-
 import gzip
 from collections.abc import Callable
 from pathlib import Path

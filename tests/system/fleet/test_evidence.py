@@ -90,7 +90,7 @@ def test_a_bundle_is_added_listed_and_returned(
 
 
 def test_removed_evidence_makes_room(site: FleetSite, make_robot: MakeRobot, tmp_path: Path) -> None:
-    """A command on the collector's machine removes a bundle while the collector runs; it can be added again."""
+    """A command on the collector's machine removes a bundle while the collector runs, and it can be added again."""
     operator, robot = Operator(site, tmp_path / "operator"), make_robot("arm1")
     bundle = incident(robot, tmp_path / "incident.zip")
     name = operator.remote("evidence", "add", str(bundle), "--robot", "arm1").split()[0]
@@ -229,7 +229,6 @@ def test_a_bundle_of_another_robot_is_refused(
 def test_a_bundle_of_a_rewritten_log_is_refused(
     carrier: Carrier, make_robot: MakeRobot, tmp_path: Path
 ) -> None:
-    """A bundle must not contradict the collected segments, even if the robot's key signed all of it."""
     robot = make_robot("arm1")
     robot.record(30)
     robot.push()

@@ -180,9 +180,9 @@ def _joins(site: FleetSite) -> list[str]:
 
 @contextlib.contextmanager
 def without_answers(port: int, answered: Callable[[], bool]) -> Iterator[int]:
-    """Forward a connection to a port of the loopback, except what comes back after the TLS handshake.
+    """Forward a connection to a port of the loopback, without its answers after the TLS handshake.
 
-    End the connection with the first bytes that come back when `answered`: those before are TLS tickets.
+    Before `answered`, the dropped bytes are TLS tickets; the first bytes after it end the connection.
     """
     listener = socket.create_server(("127.0.0.1", 0))
 

@@ -118,7 +118,6 @@ def _restart(site: StandbySite, name: str) -> None:
 
 
 def _all_pushed(site: StandbySite, fleet: Fleet, name: str) -> bool:
-    """Only records that a checkpoint seals count."""
     log = site.appliances[name].state / "control" / "audit.db"
     last = signed_checkpoints(log, 0, 1_000_000)[-1]
     found = {proof["log"]: proof["last"] for proof in fleet.proven()}

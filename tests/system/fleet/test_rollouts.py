@@ -259,7 +259,6 @@ def test_half_of_a_publication_is_not_served(fleet: Fleet) -> None:
 
 
 def _put(fleet: Fleet, name: str, **changes: Any) -> httpx.Response:
-    """The report may be one of a compromised robot."""
     report: dict[str, Any] = dict.fromkeys(("in_force", "trying", "refused", "reason", "trouble"), "")
     report |= {"site": SITE, "group": GROUP, "changed": False, "denials": 0, "failing": 0} | changes
     certificate, key = fleet.site.authority.issue(name)

@@ -124,7 +124,7 @@ def _nft(host: Host, command: str) -> None:
 
 
 def test_replayed_packets_are_refused(site: TunnelSite, kit: Path, datagrams: Datagrams) -> None:
-    """It does not arrive a second time, from any source; the log counts the replays, where charon sees them."""
+    """A packet does not arrive again, from any source. The log counts the replays where charon sees them."""
     before = site.mark
     with site.joined(kit) as joined, Capture(lab_host(site).namespace) as wire:
         send(joined, datagrams.port, b"first")

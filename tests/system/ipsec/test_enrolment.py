@@ -228,7 +228,6 @@ def test_a_man_in_the_middle_gets_nothing(site: TunnelSite, laptop: ScriptHost, 
 
 
 def test_everything_over_rest(site: TunnelSite, laptop: ScriptHost, tmp_path: Path) -> None:
-    """A kit joins under an unusual name; a repeated kit has no key; a new one closes the tunnel, as revoking does."""
     rest, ask = site.rest(), site.attacker.run
     seen = ask(lambda: rest.get("/v1/hosts"))
     new = {"name": "re.st_e-D", "endpoint": MIDDLE, "how": "kit"}

@@ -1,6 +1,6 @@
-"""Real tunnels between namespaces: two charons, real nodes on both sides, a policy that trusts the tunnel only.
+"""Real tunnels between namespaces: two charons, real nodes on both sides, and a policy that trusts only the tunnel.
 
-The hosts: `robot` in clear text, `ocu` behind a tunnel as `host:ocu-1`, `attacker` on the same Ethernet.
+The hosts are `robot` in clear text, `ocu` behind a tunnel as `host:ocu-1`, and `attacker` on the same Ethernet.
 """
 
 import json

@@ -32,9 +32,7 @@ def _machine() -> None:
 
 
 def calls_during(flood: "subprocess.Popen[str]", robot: Host, server: socket.socket) -> list[bool]:
-    """Return whether the flood delayed each call: only such a call has sent a packet again. An unanswered call
-    raises.
-    """
+    """Return, for each call, whether the flood delayed it: it was slow and has sent a packet again."""
     address, pause = server.getsockname()[:2], threading.Event()
     delayed = []
     while flood.poll() is None:
@@ -51,14 +49,14 @@ def calls_during(flood: "subprocess.Popen[str]", robot: Host, server: socket.soc
 
 
 def repeated_packets(connection: socket.socket) -> int:
-    """`tcpi_total_retrans` of `struct tcp_info` (linux/tcp.h)."""
+    """Return `tcpi_total_retrans` of `struct tcp_info` (linux/tcp.h)."""
     return int.from_bytes(
         connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, 104)[100:], sys.byteorder
     )
 
 
 def accepted(server: socket.socket, port: int) -> socket.socket:
-    """A repeated SYN cookie makes a second connection, which is closed."""
+    """Accept the connection from this port. A repeated SYN cookie makes another connection, which is closed."""
     for _ in range(100):
         peer, (_, seen, *_) = server.accept()
         if seen == port:
@@ -69,10 +67,10 @@ def accepted(server: socket.socket, port: int) -> socket.socket:
 
 
 def unharmed(robot: Host, attacker: Host, protected: Host, ports: tuple[int, ...], backlog: int) -> None:
-    """Flood each port under the robot's address, on both families; the robot's calls are answered at once.
+    """Flood each port under the robot's address, on both families, and check that the robot is answered at once.
 
-    A forged half-open connection on the port that the robot then chooses delays that call by a second. Up to a
-    hundredth of the calls may be delayed in this way.
+    If the robot then happens to use the port of a forged half-open connection, its call is delayed by a second. Up to
+    a hundredth of the calls may be delayed in this way.
     """
     for target, named in ((protected.address, robot.address), (protected.address6, robot.address6)):
         for port in ports:
@@ -93,7 +91,7 @@ def unharmed(robot: Host, attacker: Host, protected: Host, ports: tuple[int, ...
 
 @pytest.fixture(params=[False, True], ids=["resets", "silent"])
 def silent(request: pytest.FixtureRequest, robot: Host) -> bool:
-    """If the robot's own firewall drops unexpected answers, forged connections stay half-open."""
+    """Let the robot's own firewall drop unexpected answers, so that forged connections stay half-open."""
     if request.param:
         load(robot.namespace, "nft", _SILENT)
     return bool(request.param)

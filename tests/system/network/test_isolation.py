@@ -100,7 +100,7 @@ def test_source_addresses_are_preserved_in_the_namespace(bare: Host, node: Host,
 
 @pytest.mark.parametrize("wildcard", ["0.0.0.0", "::"])
 def test_a_continuous_tunnel_follows_the_rules(bare: Host, node: Host, tmp_path: Path, wildcard: str) -> None:
-    """The connection tracker forgets the destination of UDP packets when the appliance starts or stops."""
+    """When the appliance starts or stops, it lets the connection tracker forget the destination of UDP packets."""
     family = socket.AF_INET6 if ":" in wildcard else socket.AF_INET
     target = (bare.address6 if ":" in wildcard else bare.address, 4500)
     # a NAT rule such as a container engine's: the connection tracker then remembers every conversation

@@ -59,7 +59,7 @@ def listening(host: Host, *ports: int) -> Iterator[None]:
 
 
 def reaches(host: Host, address: str, port: int) -> bool:
-    """A refusal must be explicit, not silence."""
+    """Return whether a connection is accepted. A refusal must be explicit; silence raises."""
     with host.entered():
         try:
             socket.create_connection((address, port), timeout=10).close()
@@ -216,7 +216,6 @@ def test_an_unroutable_network_is_not_reported_as_open(attacker: Host, address: 
 
 
 def test_a_machine_cannot_check_itself(robot: Host) -> None:
-    """From the machine itself everything is open by design."""
     for address in (robot.address, robot.address6, "localhost"):
         assert "run the check on another machine" in protect(robot, "--check", address, status=2)
 

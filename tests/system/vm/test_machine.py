@@ -1,4 +1,4 @@
-"""Promises that no namespace can show: each test runs tests *in* the machine, with Debian's own kernel."""
+"""Promises that no namespace can show. Each test runs tests *in* the machine, with Debian's own kernel."""
 
 from collections.abc import Iterator
 
@@ -52,6 +52,5 @@ def test_the_firewall_in_debians_kernel(machine: Machine) -> None:
 
 
 def test_the_machine_is_alone(machine: Machine) -> None:
-    """It has no network card, so the tests' effects stay inside."""
     assert machine.run("uname", "-r").output.strip().endswith("cloud-amd64")
     assert machine.run("ls", "/sys/class/net").output.split() == ["lo"]

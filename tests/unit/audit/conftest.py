@@ -60,7 +60,6 @@ def key() -> Ed25519PrivateKey:
 
 @pytest.fixture
 def make_log(path: Path, key: Ed25519PrivateKey, notary: Notary) -> Iterator[MakeLog]:
-    """The logs are closed after the test. The signer uses the retention that the log is opened with."""
     logs: list[AuditLog] = []  # the open log
     made: list[AuditLog] = []
     public = key.public_key().public_bytes_raw()

@@ -94,7 +94,6 @@ def test_a_message_must_come_with_its_descriptors(pair: Pair) -> None:
 
 
 def test_foreign_data_is_rejected(pair: Pair) -> None:
-    """An overlong message is an error even before it is complete."""
     for frame, reason in (
         (_frame(msgspec.msgpack.encode(StateBegan(1))), "Invalid value"),
         (_frame(b"\xc1"), "malformed"),

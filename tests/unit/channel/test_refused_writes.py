@@ -107,7 +107,7 @@ def attached(sock: Socket) -> tuple[Channel, Loop]:
 def test_messages_that_the_kernel_refuses_for_a_while_are_sent_later_in_order(
     sock: Socket, refusal: int
 ) -> None:
-    """One timer tries again, because the socket stays writable."""
+    """A timer tries again: no event would, because the socket stays writable."""
     end, loop = attached(sock)
     sock.refusal = refusal
     sent = [SocketKept("first"), Ping(2), SocketKept("third"), Ping(4)]
@@ -145,7 +145,7 @@ def test_a_socket_that_is_full_is_written_when_it_is_writable(sock: Socket) -> N
 
 @pytest.mark.parametrize("error", [errno.EPIPE, errno.EPERM])
 def test_any_other_error_ends_the_stream_for_both_ends(sock: Socket, error: int) -> None:
-    """Otherwise the sender would count a message as sent that is missing between others."""
+    """Otherwise a message would be missing between others that arrive."""
     end, _loop = attached(sock)
     sock.refusal = error
     end.send(Ping(1))

@@ -1,4 +1,4 @@
-"""`tests/support/transcript.py` defines the form of the transcripts (`*.txt`), also of features' folders."""
+"""Run the transcripts (`*.txt`) here and in the features' folders. `tests/support/transcript.py` defines their form."""
 
 import functools
 from collections.abc import Callable, Iterator
@@ -30,7 +30,10 @@ def write_bag(name: str, md5sum: str | None = None, *, below: list[str]) -> None
 
 
 def write_log(signed: str | None = None, *, below: list[str]) -> None:
-    """`log [signed]`: an audit log of decisions, each `NUMBER {FIELD: VALUE}`; `signed`: each tenth is a checkpoint."""
+    """`log [signed]` makes an audit log of decisions, each `NUMBER {FIELD: VALUE}`.
+
+    With `signed`, it has a checkpoint for every ten.
+    """
     file, key = Path("state/control/audit.db"), Ed25519PrivateKey.generate()
     file.parent.mkdir(exist_ok=True)
     public, logs = key.public_key().public_bytes_raw(), list[AuditLog]()

@@ -99,7 +99,7 @@ async def test_it_builds_what_relays_run(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 async def test_large_specifications_are_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The limit holds for the whole set and for each relay's part, so that no link breaks."""
+    """The limit applies to the whole set and to each relay's part, so that no message exceeds a link's limit."""
     monkeypatch.setattr(resource, "setrlimit", lambda *_limit: None)
     compiled = check(Sources({"a.rv": GOOD}, DEFINITIONS), ()).compiled
     monkeypatch.setattr("appliance.specifications.checking._LONGEST", 1000)
@@ -182,7 +182,6 @@ process.main(int(sys.argv[1]))
 
 
 async def test_a_dry_run_ends_with_its_budget() -> None:
-    """It would take minutes; the process ends normally."""
     with started(_COMPILER.format(1)) as (running, _supervisor, control):
         answers: asyncio.Queue[Any] = asyncio.Queue()
         control.attach(
@@ -202,7 +201,6 @@ async def test_a_dry_run_ends_with_its_budget() -> None:
 
 @pytest.mark.parametrize("used", [3.0, 0.0], ids=["works", "starts"])
 async def test_a_compiler_without_its_link_ends(used: float) -> None:
-    """Otherwise the next question would get no compiler."""
     with started(_COMPILER.format(1000)) as (running, _supervisor, control):
         control.send(messages.ContentsWanted(4, {"a.rv": nested_repetitions(118)}, {}, dry_run=True))
         await asyncio.to_thread(_until_used, running.pid, used)

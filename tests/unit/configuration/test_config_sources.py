@@ -102,7 +102,6 @@ def test_monitors_to_enable_as_a_list(file: Path) -> None:
 
 
 def test_a_key_given_twice_is_a_mistake(file: Path) -> None:
-    """YAML would silently use the last value."""
     file.write_text("relays: 1\nlisten: 127.0.0.1:1\nrelays: 1\n")
     assert mistakes(file) == [f"{file}:3: relays is given twice"]
 

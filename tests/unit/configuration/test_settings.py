@@ -122,7 +122,6 @@ def test_the_endpoint_is_an_address_or_a_name(endpoint: str) -> None:
     ],
 )
 def test_an_unreachable_endpoint_is_rejected(endpoint: str, said: str) -> None:
-    """The error comes with the configuration, not when a host cannot join."""
     with pytest.raises(ValidationError, match=said):
         read({"ipsec": {"endpoint": endpoint}})
 
@@ -132,7 +131,7 @@ def test_an_empty_endpoint_is_unset() -> None:
 
 
 def test_rules_of_annotated_keys_are_enforced() -> None:
-    """pydantic ignores a rule beside the annotation of an annotated type."""
+    """pydantic ignores a rule that is beside the annotation of an annotated type."""
 
     def sections(section: Any) -> Iterator[Any]:
         yield section

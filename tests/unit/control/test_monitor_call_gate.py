@@ -56,7 +56,7 @@ class Control:
 
 
 def test_an_allowed_call_is_recorded_and_granted() -> None:
-    """The grant is that of a client, so its revocation by another policy cuts the call."""
+    """The grant is like a client's, so its revocation by another policy cuts the call."""
     control = Control(ALLOWED)
     assert control.answer() == MonitorCallAnswered(7, "127.0.0.1", 4711, "/rosrv", "")
     assert control.records == [("127.0.0.1 /rosrv lookupService", "/arm", True)]

@@ -138,7 +138,7 @@ def test_two_folders_have_the_same_module(checkout: Checkout, original: Checkout
 
 
 def test_it_is_hardened(original: Checkout) -> None:
-    """The addresses of functions are read-only after loading; an overflow of a buffer ends the process."""
+    """The addresses of functions are read-only after loading, and a buffer overflow ends the process."""
     shown = subprocess.run(
         ["readelf", "--wide", "--dynamic", "--program-headers", "--symbols", str(original.made)],
         capture_output=True, text=True, check=True,

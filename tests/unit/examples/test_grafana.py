@@ -77,6 +77,5 @@ def test_options_are_complete(panel: dict[str, Any]) -> None:
 
 
 def test_the_data_source_is_a_variable() -> None:
-    """The dashboard can be imported unchanged."""
     assert [one["name"] for one in DASHBOARD["templating"]["list"]] == ["source", "instance"]
     assert {panel["datasource"]["uid"] for panel in PANELS} == {"${source}"}

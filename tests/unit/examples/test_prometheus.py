@@ -20,7 +20,6 @@ def rules() -> list[dict[str, Any]]:
 
 
 def test_metrics_of_alerts_exist() -> None:
-    """Otherwise the alert would never fire."""
     known = {metric.name: metric for metric in METRICS}
     for rule in rules():
         names = re.findall(r"\brosrv_(?!fleet_)\w+", rule["expr"].replace('job="rosrv"', ""))

@@ -58,7 +58,6 @@ def test_a_bundle_from_the_folder_to_the_collector(desk: Desk) -> None:
 
 
 def test_a_folder_that_may_not_be_read_is_not_signed(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The bundle would be signed without the files in it, for example without its monitors."""
     (desk.robot / "monitors").mkdir()
     make_unreadable(desk.robot / "monitors", monkeypatch)
     done = desk.run("add", "site-a/arms", str(desk.robot))

@@ -118,7 +118,7 @@ def test_rollouts_continue(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_tracebacks_show_no_values(capfd: pytest.CaptureFixture[str]) -> None:
-    """A value of a local variable may be a key."""
+    """The value of a local variable may be a key."""
     earlier = structlog.get_config()
     try:
         configure_log()

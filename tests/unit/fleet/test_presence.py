@@ -1,5 +1,3 @@
-"""A robot is silent if one of its appliances neither pushed a segment nor stated that nothing waits."""
-
 from pathlib import Path
 from types import SimpleNamespace
 from typing import cast

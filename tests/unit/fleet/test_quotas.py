@@ -61,7 +61,7 @@ def test_a_robot_that_was_off_sends_its_backlog_faster(clock: _Clock, tmp_path: 
 
 
 def test_a_tiny_segment_has_its_price(clock: _Clock, tmp_path: Path) -> None:
-    """A robot cannot store countless files with few bytes."""
+    """Otherwise a robot could store countless files with few bytes."""
     found = quotas(tmp_path, clock)
     for _ in range(1_000_000 // 65_536 + 1):
         found.check("arm1")

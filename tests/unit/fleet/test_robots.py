@@ -82,7 +82,6 @@ def test_a_wrong_group_enrols_nothing(group: str, data: Path, tmp_path: Path) ->
 
 
 def test_an_invitation_keeps_the_group(data: Path, tmp_path: Path) -> None:
-    """Otherwise the appliance would get no bundles after a join."""
     key, certificate = map(str, _files(tmp_path, "arm7"))
     _run(data, "robot", "add", "arm7", "--key", key, "--certificate", certificate, "--group", "site-a/arms")
     (tmp_path / "c").write_bytes(make_own_certificate("rosrv-fleet", 1, "127.0.0.1")[1])
@@ -92,7 +91,7 @@ def test_an_invitation_keeps_the_group(data: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize("used", [False, True], ids=["unused", "used"])
 @pytest.mark.parametrize("act", ["remove", "renew"])
 def test_a_changed_robot_has_no_invitation(act: str, used: bool, data: Path, tmp_path: Path) -> None:
-    """It would let the robot connect with another certificate."""
+    """Otherwise the invitation would let the robot connect with another certificate."""
     key, certificate = map(str, _files(tmp_path, "arm7"))
     _run(data, "robot", "add", "arm7", "--key", key, "--certificate", certificate)
     invitations = Invitations(data / "invitations")
@@ -280,7 +279,6 @@ def test_two_changes_of_tokens_do_not_undo_each_other(tmp_path: Path) -> None:
 
 
 def test_an_unreadable_folder_is_not_an_empty_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Otherwise the collector would reject all robots."""
     folder = tmp_path / "robots"
     folder.mkdir()
     make_unreadable(folder, monkeypatch)
@@ -361,7 +359,6 @@ _NO_TIMES = [b"\x18\x0f00000101000000Z", b"\x18\x0f20260101000099Z", b"\x17\x0d2
 
 @pytest.mark.parametrize("until", _NO_TIMES, ids=["year 0", "second 99", "month 13"])
 def test_a_certificate_without_a_time_is_refused(until: bytes, tmp_path: Path) -> None:
-    """The certificate is well-formed and signed."""
     certificate = own_certificate_until(until)
     key, _ = _files(tmp_path, "arm1")
     with pytest.raises(EnrolmentError, match="not a valid certificate"):

@@ -165,7 +165,6 @@ def test_a_canary_ring_without_robots_stops_after_its_time() -> None:
     ids=["right", "beside a right name", "later", "percent"],
 )
 def test_rings_fit_the_enrolled_robots(rings: list[Ring], fault: str) -> None:
-    """A first ring without robots would never be taken."""
     found = fault_of_rings(begun(Terms(0, rings)), ROBOTS)
     assert fault in found
     assert bool(found) == bool(fault)

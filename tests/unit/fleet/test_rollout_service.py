@@ -55,7 +55,7 @@ class _Memory(RolloutStore):
 
 
 class _Calls:
-    """Runs calls at once instead of in a thread. The first call with the name `held` waits for `go`.
+    """Runs calls in the loop instead of in a thread. The first call of `held` waits for `go`.
 
     It waits before its work, or with `answered` after it.
     """

@@ -46,7 +46,7 @@ def test_a_certificate_of_an_authority_ends_with_it(tmp_path: Path) -> None:
 
 
 def test_robots_need_an_ip_address(tmp_path: Path) -> None:
-    """Robots look up no names."""
+    """Robots do not resolve names."""
     config = config_in(tmp_path)
     config.certificate.write_bytes(make_own_certificate("collector", 1)[1])
     with pytest.raises(ServerCertificateError, match="names no IP address"):

@@ -1,7 +1,7 @@
 """Verifiers agree: each attack on a log, its segments or its evidence has the verdicts that verdicts.txt lists.
 
-The log is verified alone, and with the signer's memory and copies. Its second segment is verified by its reader, and
-in the collector's store. Evidence of records 3 and 12 to 22 is verified by the bundle's program.
+The log is verified alone, with the signer's memory, and with copies of its checkpoints. The segment reader and the
+collector's store verify its second segment, and the bundle's program verifies evidence of records 3 and 12 to 22.
 """
 
 import gzip
@@ -368,7 +368,7 @@ def attack(log: Path, statement: str) -> None:
 
 @pytest.mark.parametrize("title", CASES, ids=CASES)
 def test_verdict(title: str, sites: tuple[Site, Site], tmp_path: Path) -> None:
-    """With `TRANSCRIPTS=write` the test writes the verdicts into its file."""
+    """With `TRANSCRIPTS=write`, the test writes the verdicts to the file."""
     written, took_place = CASES[title], list[str]()
     actions = [line for line in written if not line.startswith(" ")]
     assert actions

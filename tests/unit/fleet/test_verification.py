@@ -23,7 +23,7 @@ _OLD = 1_500_000_000 * 10**9
 
 
 class _Store(SegmentStore):
-    """`remove` is called once, after a proof has the names of the files, or with `listed=False` before it has them."""
+    """Calls `remove` once, after a proof has listed the files, or with `listed=False` before."""
 
     remove: Callable[[], object] = staticmethod(bool)
     listed = True

@@ -82,7 +82,7 @@ def test_an_invalid_request_is_refused(tmp_path: Path, request_text: bytes) -> N
 
 
 def with_another_version(request: bytes) -> bytes:
-    """PKCS #10 has only the first version, written as 0; this is 3."""
+    """Return the request as version 3, written where 0 denotes the only version of PKCS #10."""
     der = x509.load_pem_x509_csr(request).public_bytes(Encoding.DER)
     start = der.index(b"\x02\x01\x00")
     text = base64.encodebytes(der[:start] + b"\x02\x01\x02" + der[start + 3 :])

@@ -17,7 +17,6 @@ def checkpoint(number: int, previous: str = _NONE, log: str = "a" * 32, digest: 
 
 
 def digest(text: bytes) -> str:
-    """The next checkpoint carries it as `previous`."""
     return hashlib.sha256(text).hexdigest()
 
 
@@ -65,7 +64,6 @@ def test_refused(tmp_path: Path, text: bytes, reason: str) -> None:
 
 
 def test_logs_are_separate_and_bounded(tmp_path: Path) -> None:
-    """Control cannot fill the signer's disk with invented logs."""
     signed = CheckpointMemory(tmp_path, wall_ns)
     for number in range(MOST_LOGS):
         signed.approve(checkpoint(1, log=f"{number:032x}"))

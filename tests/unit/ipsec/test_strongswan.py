@@ -26,13 +26,12 @@ def test_a_host_gets_one_address_and_reaches_the_appliance_only() -> None:
 
 
 def test_a_host_is_identified_by_its_certificate() -> None:
-    """The name must be in a valid certificate of this authority; without a valid list no host connects."""
+    """A valid certificate of this authority must have the name. Without a valid revocation list, no host connects."""
     remote = connection(HOST, STATED, Proposals())["host-ocu-1"]["remote"]
     assert remote == {"auth": "pubkey", "cacerts": [b"A"], "id": "fqdn:ocu-1", "revocation": "strict"}
 
 
 def test_nothing_weak_is_offered() -> None:
-    """AES-256-GCM, SHA-384, Curve25519 or ECP-384."""
     assert {proposal.rpartition("-")[0] for proposal in IKE_PROPOSALS} == {"aes256gcm16-prfsha384"}
     assert {proposal.rpartition("-")[0] for proposal in ESP_PROPOSALS} == {"aes256gcm16"}
     assert {proposal.rpartition("-")[2] for proposal in (*IKE_PROPOSALS, *ESP_PROPOSALS)} == {

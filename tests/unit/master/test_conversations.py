@@ -1,6 +1,6 @@
-"""`tests/support/conversation.py` defines the form of `conversations/*.txt`.
+"""Run `conversations/*.txt`, whose form `tests/support/conversation.py` defines.
 
-With `TRANSCRIPTS=write` a test writes the effects to its file.
+With `TRANSCRIPTS=write`, a test writes the effects to its file.
 """
 
 import os

@@ -1,5 +1,3 @@
-"""A dry run names exactly what a reload revokes, for generated policies, registries and grants."""
-
 import ipaddress
 from typing import Any
 

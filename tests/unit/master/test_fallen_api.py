@@ -1,4 +1,4 @@
-"""A compromised api, simulated at its end of the link, and control's answers to its messages.
+"""Control's answers to a compromised api, which is simulated at its end of the link.
 
 The link, the tokens, their keys and the proofs are control's own code. Orders are only recorded.
 """
@@ -246,7 +246,7 @@ async def test_a_reading_key_changes_nothing(world: World, token: str, api: Api)
 async def test_bare_tokens_are_accepted_by_configuration_only(
     world: World, token: str, *, require_proof: bool
 ) -> None:
-    """With api_require_proof, a bare token still opens the views."""
+    """With `api_require_proof`, a bare token still opens the views."""
     await world.store.settled()
     world.begin(require_proof=require_proof)
     api = Api(world)

@@ -1,4 +1,4 @@
-"""The host that sets a parameter is charged for it; a naive count of single parameters must agree."""
+"""The host that sets a parameter is charged for it. A naive count of single parameters must agree."""
 
 import contextlib
 import copy

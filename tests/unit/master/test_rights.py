@@ -1,6 +1,6 @@
 """The gate, `explain`, the cases, `diff`, `grant` and revocation agree on each call.
 
-`NEEDS` lists the rights for each call again, by section, as docs/policy.md does.
+`NEEDS` lists the rights for each call independently, by section, like docs/policy.md.
 """
 
 import ipaddress
@@ -192,7 +192,6 @@ POLICIES = st.fixed_dictionaries(
 
 
 def granted_by(decision: Decision) -> bool:
-    """Audit-only mode allows denied requests."""
     return decision.allowed and not decision.would_deny
 
 

@@ -34,7 +34,7 @@ def test_the_file_closes_the_range_after_all_that_stays_open() -> None:
 
 
 def test_no_appliance_is_an_error() -> None:
-    """The file would block every host, including the appliance."""
+    """The file would block every host, even the appliance."""
     with pytest.raises(ValueError, match="at least one appliance"):
         protection([], RANGE, ())
 

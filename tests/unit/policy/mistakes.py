@@ -1,5 +1,3 @@
-"""Rows of `mistakes.txt`: each line has a mistake in a policy and its messages, separated by ` => `."""
-
 from pathlib import Path
 
 _SECTIONS = (

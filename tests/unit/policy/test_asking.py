@@ -63,7 +63,7 @@ def test_a_host_behind_ask_passes_only_while_its_approval_lasts() -> None:
 
 
 def test_a_denial_goes_before_a_missing_approval() -> None:
-    """No operator is asked for what would be denied anyway, such as a node name, or a parameter below."""
+    """Operators are not asked for requests that would be denied anyway, for example because of a parameter below."""
     nameless = policy(TEXT.replace("default = operator agent-1", "default = operator", 1))
     assert verdict(nameless, Category.PUBLISH, "/cmd_vel") == ("deny", False)
     below = Right(Request(AGENT, "/it", Category.WRITE, "/arm"), namespace=True)
@@ -75,7 +75,6 @@ def test_a_denial_goes_before_a_missing_approval() -> None:
 
 
 def test_each_right_that_asks_needs_its_own_approval() -> None:
-    """A write of `/arm/x` also replaces the value of `/arm`."""
     text = TEXT.replace("write /arm/**", "write /arm = ask agent-1\nwrite /arm/**")
     request = Request(AGENT, "/it", Category.COMMAND, "setParam")
     rights = rights_of_call(request, "setParam", "/arm/x", value=1, tree={"arm": 5})

@@ -1,4 +1,4 @@
-"""The compiled policy is compared with a naive decider written from the documentation."""
+"""Compare the compiled policy with a naive decider written from the documentation."""
 
 import fnmatch
 import ipaddress
@@ -70,7 +70,6 @@ NAME = st.lists(st.sampled_from([*NAMES, "arms"]), min_size=1, max_size=4).map(l
 
 @st.composite
 def policies(draw: st.DrawFn) -> tuple[Rules, dict[str, list[str]]]:
-    """A group names only later groups, so that no group contains itself."""
     leaves = st.lists(WORDS.filter(lambda word: not word.startswith("g")), max_size=2, unique=True)
     groups = {
         f"g{n}": draw(leaves) + ([f"g{n + 1}"] if n < 2 and draw(st.booleans()) else []) for n in range(3)

@@ -216,7 +216,7 @@ def test_a_stock_tool_gets_all_that_it_needs(file: Path, caller: str) -> None:
 
 @pytest.mark.parametrize("name", ["/record", "/cmd_1_1700000000000", "/arm"])
 def test_another_name_is_granted_alone(name: str) -> None:
-    """A host that invents a name with numbers gets no pattern such as /cmd_*, which would also match /cmd_vel."""
+    """A host that invents a numbered name gets no pattern such as /cmd_*, which would also match /cmd_vel."""
     assert stock_tool(name) is None
     wanted = Request(HOST, name, Category.NODE, name)
     found = grant("[Nodes]\n/x = 10.0.0.1\n", "p.ini", KNOWN, DecidedRequest(wanted, rights_of(wanted)))

@@ -1,6 +1,6 @@
-"""Dialogues of control and peers with a relay as text; each line is a step that fails if it does not happen.
+"""Dialogues of control and peers with a relay as text. Each line is a step, which must happen.
 
-Steps (`Dialogue.say`): a word with `=` is an equal field, a word with `~` a field that contains the text:
+Steps (`Dialogue.say`): a word with `=` is an equal field, a word with `~` a field that contains the text.
 
     listener asks callerid=/x | client calls            a peer connects with a header
     talker publishes latching=1 | server serves         a peer accepts the relay's connection and answers with a header
@@ -21,7 +21,7 @@ Steps (`Dialogue.say`): a word with `=` is an equal field, a word with `~` a fie
                                                         services, connections, bytes of messages
     pause 0.3                                           the loop turns for this time
 
-and for a relay with monitors, whose specifications are in `SPECIFICATIONS`:
+A relay with monitors has more steps. Its specifications are in `SPECIFICATIONS`.
 
     load GUARD|"bad"|"worse" restarted guard=off        load specifications, with a text replaced
     taken began=guard held= | refused ~text             the relay's answer
@@ -41,7 +41,7 @@ from tests.unit.relay.world import ASK, CALL, HEADER, LOOPBACK, Peer, World
 
 
 class Dialogue:
-    """Steps of control and peers in a world; `string` makes the frame of a word."""
+    """Steps of control and peers in a world. `string` makes the frame of a word."""
 
     served: ClassVar = {"callerid": "/talker", "type": "x/Y", "md5sum": "m"}
     asked = ASK

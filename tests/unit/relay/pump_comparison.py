@@ -1,4 +1,4 @@
-"""Compare the pump with the path in Python: two relays with the same peers, of which one never arms a connection.
+"""Compare the pump with the path in Python: two relays have the same peers, and one never uses the pump.
 
     .venv/bin/python -m tests.unit.relay.pump_comparison SEED BATCHES
 
@@ -167,7 +167,7 @@ class ComparedRelay(Monitored):
 
 
 def _nothing(_batch: Batch) -> None:
-    """A tap keeps the pump from a topic."""
+    """Do nothing: a tap keeps the pump from a topic."""
 
 
 class PumpComparison:
@@ -225,7 +225,6 @@ class PumpComparison:
         self._settle()
 
     def _both_at_once(self) -> None:
-        """Unless a monitor depends on the order of their messages."""
         if self._ordered:
             return
         messages = [self._message() for _ in _TOPICS]

@@ -252,7 +252,7 @@ def test_a_publisher_that_cannot_be_reached_is_asked_for_again(world: World) -> 
 
 
 def test_a_publisher_that_always_closes_is_waited_for_ever_longer_until_it_stays(world: World) -> None:
-    """Otherwise the relay would retry ten times a second after each answered header."""
+    """Otherwise the relay would reconnect ten times a second to a publisher that answers and closes."""
     world.connect(encode_header(ASK))
     waits = []
     for _ in range(6):
@@ -283,7 +283,7 @@ def test_a_publisher_that_always_closes_is_waited_for_ever_longer_until_it_stays
 
 @pytest.mark.parametrize("host", ["robot.local", "", "10.0.0", "127.0.0.1\0"])
 def test_a_publisher_is_only_looked_for_at_an_address(world: World, host: str) -> None:
-    """Looking up a name would block all peers."""
+    """A name lookup would block all peers."""
     world.connect(encode_header(ASK))
     world.hears(UpstreamWanted)
     world.state(UpstreamFound("k", "/chatter", host, 1))

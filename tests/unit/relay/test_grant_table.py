@@ -63,7 +63,7 @@ def test_a_node_takes_everything_of_its_incarnation_with_it() -> None:
 
 
 def test_hosts_that_only_a_star_names_pay_as_one() -> None:
-    """All other hosts with a registration count as one, and all hosts without a registration as another."""
+    """All of them with a registration share one quota, and all hosts without a registration another."""
     table = stated()
     for number in range(200):
         host = f"10.9.0.{number}"

@@ -162,7 +162,6 @@ def test_headers_of_unknown_hosts_leave_room_for_the_robots(world: World) -> Non
 
 
 def test_headers_of_publishers_and_servers_count_while_they_are_connected(world: World) -> None:
-    """Peers choose the length of their headers and the relay stores them."""
     share = world.engine.memory.frames.of("10.9.9.9")
     publisher, _subscriber = publish(world, 1, "10.9.9.9", HEADER | {"message_definition": "x" * 60_000})
     assert 60_000 < share.used < 61_000

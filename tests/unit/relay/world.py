@@ -1,6 +1,6 @@
-"""An engine that talks to peers on loopback: control's messages, the peers' bytes, and the answers.
+"""An engine that talks to peers on loopback. Tests give control's messages and the peers' bytes, and get the answers.
 
-The engine runs in the test's own thread; every step lets the loop turn until the expected event has happened.
+The engine runs in the test's own thread. Every step lets the loop turn until the expected event has happened.
 """
 
 import socket
@@ -44,7 +44,7 @@ LIMITS = replace(
     connections_per_host=15,
 )
 IMPATIENT = replace(LIMITS, header_seconds=0.3, grant_seconds=0.1, connect_seconds=1.0, service_seconds=1.0)
-"""For tests of these limits only: a busy machine may take longer for any step."""
+"""Limits only for tests of these limits: a busy machine may take longer for any step."""
 UNHURRIED = replace(LIMITS, linger=3600.0)
 HEADER = {
     "callerid": "/talker",
@@ -99,7 +99,7 @@ class HeldWork:
 
 
 class WorldLoop(EventLoop):
-    """Does the work beside it at its next turn, without a thread, and not while the test `holds` it."""
+    """A loop that does background work in its next turn, without a thread, unless the test `holds` it."""
 
     holds = False
 
@@ -120,7 +120,7 @@ class WorldLoop(EventLoop):
 
 
 class World:
-    """An engine with a control, one node `/talker` (key `k`) that publishes /chatter and offers /mode."""
+    """An engine with a control, and a node `/talker` (key `k`) that publishes /chatter and offers /mode."""
 
     def __init__(self, limits: RelayLimits = LIMITS) -> None:
         self.loop = WorldLoop()

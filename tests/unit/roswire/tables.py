@@ -1,4 +1,4 @@
-"""Tables for tests: each line of `tables.txt` is a row, with columns between ` => ` and Python's escapes."""
+"""Read tables of tests: each line of `tables.txt` is a row, with columns between ` => ` and Python's escapes."""
 
 from pathlib import Path
 

@@ -88,7 +88,6 @@ def test_types_that_contain_themselves_are_refused() -> None:
 
 
 def test_nesting_is_bounded() -> None:
-    """No robot's types are nested deeper."""
     files = {f"a/T{level}.msg": f"T{level + 1} x" for level in range(64)} | {"a/T64.msg": "int8 x"}
     definitions = Definitions.from_files(files)
     with pytest.raises(DefinitionError, match="deeper than 64"):

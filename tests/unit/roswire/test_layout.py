@@ -81,7 +81,6 @@ def nested(values: Values) -> Values:
 
 
 def without_empty(value: Any) -> Any:
-    """Nested messages without fields have no bytes."""
     if isinstance(value, dict):
         return {name: without_empty(item) for name, item in value.items() if item != {}}
     if isinstance(value, list):

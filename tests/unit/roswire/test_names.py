@@ -212,7 +212,7 @@ def test_caller_id_must_be_a_global_name(caller_id: str) -> None:
     [("//a", "/a"), ("/ns//a", "/ns/a"), ("/a/", "/a"), ("///ns///a//", "/ns/a"), ("/" * 1000 + "a", "/a")],
 )
 def test_caller_id_is_folded_as_by_rospy_and_roscpp(caller_id: str, canonical: str) -> None:
-    """rosgo sends `//name`, where rospy and roscpp would send `/name`; relative names resolve against that one."""
+    """rosgo sends `//name` where rospy and roscpp send `/name`. Relative names are resolved against the folded name."""
     assert names.canonical_caller_id(caller_id) == names.canonical_tool_id(caller_id) == canonical
     assert names.resolve("x", caller_id) == names.resolve("x", canonical)
     assert names.resolve("~x", caller_id) == f"{canonical}/x"

@@ -24,7 +24,7 @@ def test_every_type_is_whole(standard: Definitions) -> None:
 
 
 def test_constants_keep_their_places(standard: Definitions) -> None:
-    """Lichtblick reports a change of a definition whose constants are in another order than in ROS's file."""
+    """Lichtblick reports a changed definition if the order of constants differs from ROS's file."""
     name = "sensor_msgs/NavSatStatus"
     lines = [line.rpartition(" ")[2].partition("=")[0] for line in standard.message(name).text.splitlines()]
     assert lines[4:] == [

@@ -59,7 +59,6 @@ def python_loads(body: bytes) -> tuple[tuple[Any, ...], str | None]:
 
 
 def without_bare_returns(value: Value) -> Value:
-    """Return `value` after xmlrpc.client wrote it: a bare `` is then read as a line feed."""
     match value:
         case str():
             return value.replace("\r\n", "\n").replace("\r", "\n")
@@ -116,7 +115,6 @@ def test_doubles_keep_every_bit(number: float) -> None:
 
 
 def test_nan_survives() -> None:
-    """Robots use not-a-number as a parameter."""
     for text in ("nan", "NaN", "-nan", "NAN"):
         assert math.isnan(read(f"<value><double>{text}</double></value>"))  # type: ignore[arg-type]  # it is a double
     assert b"<double>nan</double>" in build_response(math.nan)
@@ -135,7 +133,6 @@ ROSCPP_CALL = (
 
 
 def test_roscpp_calls_are_read() -> None:
-    """XmlRpc++ writes strings without a type."""
     expected = ("/listener", "/chatter", "std_msgs/String", "http://h:4567/")
     assert parse_call(ROSCPP_CALL) == MethodCall("registerSubscriber", expected)
 
@@ -379,7 +376,6 @@ def test_scraps_raise_only_the_error_for_the_peer(scraps: list[str], whole: bool
 @settings(max_examples=examples(300))
 @given(data=st.data())
 def test_damaged_calls_raise_only_the_error_for_the_peer(data: st.DataObject) -> None:
-    """A call with bytes changed, cut or doubled is refused, or read as rosmaster reads it."""
     body = bytearray(build_call("m", [data.draw(VALUES)]))
     for _ in range(data.draw(st.integers(1, 4))):
         at = data.draw(st.integers(0, len(body) - 1))
@@ -421,7 +417,6 @@ def test_random_bytes_are_refused(data: bytes) -> None:
     ],
 )
 def test_values_without_a_notation_are_errors(value: object, text: str) -> None:
-    """Such a value is an error of the sending program."""
     with pytest.raises(EncodingError, match=text):
         build_response(value)  # type: ignore[arg-type]  # the test is a value of a wrong type
     with pytest.raises(EncodingError, match=text):

@@ -77,7 +77,7 @@ def test_counting_ends_at_the_limit() -> None:
 
 @pytest.mark.parametrize("letter", ["x", "&", "<", ">", "\u00e9", "\U00010348"], ids=ascii)
 def test_weight_is_about_what_is_written(letter: str) -> None:
-    """Bounded parameters could not be sent if the weight were off by more than a factor of two."""
+    """Bounded parameters could not be sent if the weight were wrong by more than a factor of two."""
     value: Value = {"a": [1, 2.5, "text", {"b": True}] * 100, "c": letter * 5000, letter * 5000: 1}
     texts: list[Value] = [letter * 5000] * 9
     for one in (value, texts):

@@ -91,7 +91,7 @@ def test_many_addresses_do_not_keep_a_named_host_out() -> None:
 
 
 def test_a_registered_host_gets_the_reserve() -> None:
-    """All others are being served, so none makes room: the reserve is free, and then nothing more."""
+    """All other connections are being served, so none can make room, and only the reserve is left."""
     quota_classes = QuotaClasses({OTHER: QuotaClass.NAMED, ROBOT: QuotaClass.REGISTERED})
     connection_table = books(quota_classes, Bounds(whole=10, host=10, unknown=0, kept=4))
     assert sum(come(connection_table, OTHER, Stage.SERVED) is not None for _ in range(10)) == 6

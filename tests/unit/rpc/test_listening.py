@@ -15,7 +15,6 @@ pytestmark = pytest.mark.anyio
     [("10.0.0.1", "10.0.0.1"), ("::ffff:10.0.0.1", "10.0.0.1"), ("fe80::1%eth0", "fe80::1"), ("::1", "::1")],
 )
 def test_plain_address(text: str, plain: str) -> None:
-    """An IPv4 peer of an IPv6 socket is the IPv4 host that the policy names."""
     assert plain_address(text) == ipaddress.ip_address(plain)
 
 

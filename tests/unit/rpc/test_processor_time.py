@@ -117,7 +117,7 @@ def test_no_host_saves_time_and_debts_stay() -> None:
 
 
 def test_a_charge_costs_the_same_for_any_number_of_hosts() -> None:
-    """Each host of a flood has a new address, so all owe."""
+    """In a flood each host has a new address, so all of them have debts."""
     looked_at = 0
 
     class Host(int):

@@ -91,7 +91,7 @@ async def test_a_request_with_expect_is_refused_at_once() -> None:
 
 
 async def test_refused_before_the_body() -> None:
-    """A peer that no rule names is answered also when the rest of its request does not come."""
+    """A peer that no rule names gets the answer even if the rest of its request never comes."""
     async with serving(refusal=b"<fault/>") as server:
         client = await server.connect()
         await client.send(post(b"", length=1000))
@@ -112,7 +112,6 @@ async def test_chunked_body_beyond_the_limit() -> None:
     "framing", [b"1\r\nx\r\n", b"1;" + b"e" * 1000 + b"\r\nx\r\n"], ids=["tiny", "extension"]
 )
 async def test_more_framing_than_body(framing: bytes) -> None:
-    """Chunks of one byte, or with endless extensions, are refused long before they cost memory."""
     async with serving(limits=replace(LIMITS, head_bytes=4096, body_bytes=1 << 16)) as server:
         client = await server.connect()
         client.writer.write(b"POST / HTTP/1.1\r\nTransfer-Encoding: chunked\r\n\r\n" + framing * 20_000)

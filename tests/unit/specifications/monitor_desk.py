@@ -1,6 +1,6 @@
-"""The monitors of one control over its life times, with a relay that takes everything; and orders to them as text.
+"""Orders about monitors as text, for a control and the controls that follow it, with a relay that takes everything.
 
-Orders (`Dialogue.say`); `b` is the file b.rv with the text `b` of `TEXTS`, `c.rv:u` the file c.rv with the text `u`:
+Orders (`Dialogue.say`): `b` is the file b.rv with the text `b` of `TEXTS`, `c.rv:u` the file c.rv with the text `u`.
 
     start [enable=none] [restarted] [no-folder]     a control starts
     folder b | folder c.rv:u |    folder -b         write or delete a file of the folder
@@ -12,7 +12,8 @@ Orders (`Dialogue.say`); `b` is the file b.rv with the text `b` of `TEXTS`, `c.r
     eve load b shadow confirm_within=0              an operator's order, with fields of its request
     revision 3                                      the time limit of a change ends; its rollback is this revision
 
-Effects follow: the answer (or refusal), what the relay is sent, the records, and the monitors if they have changed.
+Effects follow: the answer (or refusal), the statements to the relay, the records, and the monitors if they have
+changed.
 """
 
 import asyncio

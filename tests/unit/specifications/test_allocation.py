@@ -109,7 +109,6 @@ def test_running_monitors_move_only_when_they_must() -> None:
 
 
 def test_topics_move_in_one_direction() -> None:
-    """A relay that gets topics can try their monitors first, because it gives up none of its own."""
     allocation = Allocation(2)
     first = {name: spec(name, f"/{name}") for name in "abcd"}
     allocation.adopt(allocation.plan(checked(**first)))

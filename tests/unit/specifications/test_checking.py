@@ -31,7 +31,6 @@ def test_a_start_leaves_out_only_the_files_with_errors() -> None:
 
 
 def test_a_file_is_left_out_with_the_file_whose_variables_it_uses() -> None:
-    """Without its variables it would judge by nothing."""
     assert set(unbuilt(a=USER, b=GOOD.replace("last = v", "last = x"))) == {"good", "user"}
 
 

@@ -179,7 +179,7 @@ async def test_crossing_moves_go_one_way_and_are_tried_first(world: World) -> No
 async def test_a_relay_that_starts_during_a_load_gets_it_before_any_topic(
     world: World,
 ) -> None:
-    """Without it, topics would bypass the monitors that moved to this relay until it has compiled them."""
+    """Otherwise topics would bypass the monitors that moved to this relay until it has compiled them."""
     relay, world.fleet.away = 0, {0}
     stated: list[messages.SpecificationsStated] = []
 

@@ -66,7 +66,6 @@ def test_a_folder_that_cannot_be_read_is_refused(tmp_path: Path) -> None:
 def test_an_unreadable_folder_is_not_an_empty_one(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A start without the specifications or definitions of a folder would go unnoticed."""
     (tmp_path / "msg" / "own_msgs").mkdir(parents=True)
     make_unreadable(tmp_path / name, monkeypatch)
     with pytest.raises(SpecificationsRefusedError, match="cannot be read: Permission denied"):

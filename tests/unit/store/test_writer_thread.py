@@ -437,7 +437,6 @@ def test_changes_that_the_database_has_are_not_repeated(tmp_path: Path) -> None:
 
 
 def test_a_large_value_that_is_lost_takes_no_later_change_with_it(tmp_path: Path) -> None:
-    """Large values are not in the file, so their numbers are missing there."""
     ahead = WriteAhead(tmp_path / "state.ahead")
     ahead.append([encoded(2, "second"), encoded(5, "fifth")])
     ahead.close()

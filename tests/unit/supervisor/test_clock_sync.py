@@ -15,7 +15,7 @@ from appliance.supervisor.clock_sync import clock_is_synchronised
 def test_the_kernels_flag_decides(
     monkeypatch: pytest.MonkeyPatch, status: int, answer: int, expected: bool | None
 ) -> None:
-    """Other flags are ignored; if the call is forbidden, the state is unknown. The clock is never set."""
+    """Other flags are ignored. If the call is forbidden, the state is unknown. The clock is never set."""
     asked = []
 
     def adjtimex(given: Any) -> int:

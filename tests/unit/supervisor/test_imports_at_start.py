@@ -13,7 +13,7 @@ NEVER: Final = {"rich", "pygments", "typer", "lark", "numpy", "pyroute2", "z3", 
 
 ENTRIES: Final = {role.name: role.entry.partition(":")[0] for role in ROLES if role.entry is not None}
 MAY: Final = {"bundles": {"rich", "pygments"}}
-"""httpx imports its own command, with the libraries of that, if they are installed."""
+"""httpx imports its own command-line interface, with its libraries, if they are installed."""
 
 _BARE = {"rosbags", "appliance.configuration.inventory"}
 _LINKED = _BARE | {"appliance.channel.admin"}

@@ -92,7 +92,6 @@ async def test_the_master_side_port_is_closed_and_then_probed(surroundings: Surr
 async def test_a_master_side_port_that_cannot_be_closed_is_reported(
     surroundings: Surroundings, port: int
 ) -> None:
-    """For any reason, this control and the next learn that they must not serve."""
     told: list[Message] = []
     watchdog = IsolationWatchdog(surroundings, told.append)
     assert "cannot be closed to others" in str(await watchdog.control_ready(port, 4712))
@@ -122,7 +121,6 @@ async def test_a_failing_probe_is_a_finding_and_probes_go_on(
 
 @pytest.mark.nightly
 def test_tunnels_that_cannot_be_opened_are_answered(surroundings: Surroundings) -> None:
-    """Control waits for the answer, so an unexpected error is also answered."""
     answer = asyncio.run(
         IsolationWatchdog(surroundings, lambda _message: None).open_tunnels("10.9.0.0/24", "10.9.0.1")
     )

@@ -21,7 +21,7 @@ def write(memory: MonitorMemory, index: int, more: bytes = b"") -> None:
 
 
 def test_only_relays_have_files_each_its_own(tmp_path: Path) -> None:
-    """The file has its full size from the start, so no write fails later; only root reads the folder."""
+    """A file has its full size from the start, so no write fails later. Only root can read the folder."""
     memory = MonitorMemory(tmp_path, 2)
     assert [*memory.messages_for("control", 0)] == []
     for index in range(2):

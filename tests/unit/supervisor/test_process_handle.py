@@ -35,7 +35,7 @@ pytestmark = pytest.mark.anyio
 def test_a_slow_start_is_waited_for_and_a_hang_is_not(
     silent: float, starting: bool, still: float, hanging: bool
 ) -> None:
-    """A serving process must answer within seconds; a starting process must only make progress."""
+    """A serving process must answer within seconds, but a starting one must only make progress."""
     assert is_hanging(silent, starting=starting, still=still) is hanging
 
 

@@ -7,7 +7,6 @@ from appliance.supervisor.restore_mark import refuse_half_restored, set_mark
 
 
 def test_a_marked_directory_is_refused(tmp_path: Path) -> None:
-    """The error says how to continue; a second restore cannot set its own mark."""
     refuse_half_restored(tmp_path)
     mark = set_mark(tmp_path)
     with pytest.raises(StartError, match="remove this folder, and run `rosrv restore` again"):

@@ -62,7 +62,6 @@ def test_a_missing_rosmaster_is_an_error_that_says_what_to_install(tmp_path: Pat
 
 
 def test_links_are_between_roles_and_go_both_ways() -> None:
-    """A restart of either end renews the link."""
     for role in ROLES:
         for other in role.links:
             assert role.name in BY_NAME[other].links

@@ -57,7 +57,7 @@ def crowd(monkeypatch: pytest.MonkeyPatch) -> Crowd:
 
 
 def test_each_is_asked_first_and_rosmaster_last(crowd: Crowd) -> None:
-    """Our processes get a message, and programs get SIGTERM; processes that must outlive control come last."""
+    """Our processes get a message, and programs SIGTERM. Processes that must outlive control come last."""
     crowd.add("rosmaster", "SIGTERM", is_program=True, last=True)
     crowd.add("control", "Stop")
     crowd.add("rosout", "SIGTERM", is_program=True)
@@ -77,7 +77,6 @@ def test_a_process_that_does_not_end_is_killed(crowd: Crowd) -> None:
 
 
 def test_an_unkillable_process_does_not_delay_the_end(crowd: Crowd) -> None:
-    """Even the kernel cannot end it (a broken disk)."""
     crowd.add("control", "never")
     crowd.add("rosmaster", "Stop", last=True)
     done = crowd.end()

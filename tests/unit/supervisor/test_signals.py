@@ -1,6 +1,6 @@
-"""Signals that arrive during operations which must be completed.
+"""Signals that arrive during operations that must be completed.
 
-Each test runs a separate process: a signal to a thread of the test runner would end the runner.
+Each test runs a separate process, because a signal to a thread of the test runner would end the runner.
 """
 
 import subprocess

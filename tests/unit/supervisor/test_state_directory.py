@@ -89,7 +89,7 @@ def test_a_directory_that_cannot_be_made_is_a_clear_error(tmp_path: Path) -> Non
 
 
 def test_a_part_that_a_group_may_traverse(tmp_path: Path) -> None:
-    """As root, the folder has the reader's group, which new files inherit; without root, a single user owns it."""
+    """As root, the folder has the reader's group, which new files inherit. Without root, a single user owns it."""
     shared = (Role(name="control", user="rosrv", part="control", readable_by="rosrv-api"),)
     for roles in (ROLES[:1], shared, shared):
         state = StateDirectory(tmp_path)
@@ -113,7 +113,6 @@ def folder(path: Path, *files: str) -> Path:
 
 
 def test_a_directory_of_others_is_refused_and_unchanged(tmp_path: Path) -> None:
-    """`--state /tmp` must not close /tmp."""
     theirs = folder(tmp_path / "theirs", "notes.txt", "a", "b", "c", "d")
     with pytest.raises(
         StartError, match=r"theirs is not the state directory.* contains a, b, c ….* name another"

@@ -75,8 +75,6 @@ def test_a_deadlock_names_what_the_tasks_wait_for() -> None:
 
 
 def test_a_poll_without_end_fails() -> None:
-    """No time passes, so the condition would be looked at for ever."""
-
     async def poll() -> None:
         while True:
             await asyncio.sleep(0.01)
@@ -96,7 +94,6 @@ async def test_a_socket_and_a_program_are_refused() -> None:
 
 
 async def test_a_descriptor_and_another_thread_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A reader would never be called, and a call of a thread would come at any time."""
     loop = asyncio.get_running_loop()
     with pytest.raises(RealLoopError):
         loop.add_reader(0, print)

@@ -73,7 +73,6 @@ def test_the_table_of_a_start_has_a_ratio_for_each_measured_row() -> None:
 
 
 def test_a_start_is_a_finding_only_if_every_round_differs_by_a_fifth() -> None:
-    """A single round within 20 % of the table, or on its other side, is enough to see no change."""
     table = {"up": 2.0}
     assert findings({"up": [2.41, 2.5, 3.0]}, table)
     assert findings({"up": [1.0, 1.5, 1.66]}, table)

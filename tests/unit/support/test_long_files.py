@@ -13,7 +13,7 @@ def test_every_long_file_exists() -> None:
 
 @pytest.mark.nightly
 def test_rules_on_the_source_run_with_make_check() -> None:
-    """They are long, but what `make check` accepts must not fail in CI by a word in a comment."""
+    """They are slow, but a commit that passes `make check` must not fail in CI because of a word in a comment."""
     command = subprocess.run(
         ["make", "--dry-run", "unit"], cwd=TESTS.parent, capture_output=True, text=True, check=True
     ).stdout

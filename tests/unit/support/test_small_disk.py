@@ -9,7 +9,7 @@ ELSEWHERE = {
 
 
 def test_only_small_disk_mounts() -> None:
-    """An `umount` of a test's own fails when a process that was killed a moment ago has a file open."""
+    """An ordinary `umount` fails if a process that was just killed still has a file open."""
     found = {
         str(path.relative_to(ROOT))
         for path in (ROOT / "tests").rglob("*.py")

@@ -49,7 +49,6 @@ def reasons_in(text: str) -> Iterator[str]:
 
 
 def sources() -> Iterator[Path]:
-    """This file is excluded because it is full of examples."""
     for folder in FOLDERS:
         for path in (ROOT / folder).rglob("*"):
             ours = path != Path(__file__) and not {"vendor", "__pycache__"} & set(path.parts)

@@ -40,7 +40,7 @@ def trail(log: Log, *, deny: bool, details: RecordDetails = lambda *_: {}) -> Au
 
 
 def test_errors_do_not_reveal_the_path_of_the_log() -> None:
-    """While the log cannot be written requests are denied; a node does not learn the cause either."""
+    """While the log cannot be written, requests are denied, and a node does not learn the cause."""
     one = trail(Log(), deny=True)
     assert one.obstacle == NOT_RECORDED
     assert "/" not in NOT_RECORDED

@@ -27,7 +27,6 @@ def test_a_flood_holds_a_minute_of_seconds() -> None:
 
 
 def test_only_denials_count_as_denied() -> None:
-    """Requests that an audit-only policy would deny do not count."""
     meter = Meter()
     for outcome in ("deny", "allow", "would deny", "deny"):
         meter.decided("publish", outcome, 0.001, "10.0.0.1")

@@ -1,8 +1,11 @@
 """Work with topics by orders on standard input, one JSON object per line.
 
-{"do": "subscribe" | "unsubscribe" | "advertise" | "unadvertise" | "publish" | "abandoned", "topic": T, "text": X,
-"latch": B},
-{"do": "now"} (the node's time), {"do": "log", "text": X} (to rosout); events `done`, `received`, `connected`.
+    {"do": "subscribe" | "unsubscribe" | "advertise" | "unadvertise" | "publish" | "abandoned",
+     "topic": T, "text": X, "latch": B}
+    {"do": "now"}                 # the node's time
+    {"do": "log", "text": X}      # to rosout
+
+The events are `done`, `received` and `connected`.
 """
 
 import json
@@ -35,7 +38,7 @@ class Orders:
         self.subscribers.pop(told["topic"]).unregister()
 
     def abandoned(self, told):
-        """rospy mistakes a publisher that returns before the topic has no connection for the old one."""
+        """Wait until the old connection is gone: rospy would take a publisher that returns before for the old one."""
         subscriber = self.subscribers[told["topic"]]
         for _ in range(3000):
             if not subscriber.get_num_connections():

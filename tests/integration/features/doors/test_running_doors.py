@@ -157,9 +157,6 @@ def test_large_messages_for_clients_that_read_nothing_take_bounded_memory(
 def test_a_ticket_opens_the_door_of_a_person_until_it_is_over(
     appliance: Appliance, common_robot: Host, tmp_path: Path
 ) -> None:
-    """The secret is in no record. The connection ends with its ticket, also if the control that passed it on has
-    died.
-    """
     appliance.rosrv("door", "add", "alice")
     made = appliance.rosrv("door", "ticket", "alice", "--for", "8s").stdout.strip()
     url = made.replace("ADDRESS:8443", "10.77.0.2:8443")

@@ -43,7 +43,6 @@ def cast(answer: Any) -> list[Any]:
 
 
 def proved(bundle: Path, key: Path) -> str:
-    """The bundle's own verifier runs by the system's Python without an environment."""
     with zipfile.ZipFile(bundle) as archive:
         program = archive.read("verify.py")
     command = ["/usr/bin/python3", "-I", "-", str(bundle), "--key", str(key)]

@@ -21,7 +21,6 @@ LIMIT = 4
 
 @pytest.fixture(scope="module")
 def guarded(common_lab: Lab) -> Iterator[Appliance]:
-    """The reports of the deadman come from a real relay."""
     deadman = text_of(Guard("deadman", PRESETS["deadman"]))
     host = common_lab.host("guarded", "10.77.0.5/24")
     with Appliance(host, options=("--api", "off"), monitors={"deadman": deadman}) as running:

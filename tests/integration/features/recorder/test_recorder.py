@@ -72,7 +72,7 @@ def fetched(appliance: Appliance, recording: str, folder: Path) -> Path:
 
 
 def said(ros: RosSession, bag: Path, topic: str) -> list[str]:
-    """Debian's rosbag reads in sequence and, as rqt_bag does, by the index."""
+    """Return the texts in a bag, read by Debian's rosbag in sequence and, like rqt_bag, by the index."""
     program = (
         "import rosbag, sys\n"
         "bag, topics = rosbag.Bag(sys.argv[1]), [sys.argv[2]]\n"

@@ -1,4 +1,4 @@
-"""Single sign-on at a provider that is not ours (oidc-provider-mock, over TLS), over REST as a browser does it."""
+"""Sign on over REST as a browser does, at an independent provider (oidc-provider-mock, over TLS)."""
 
 import base64
 import contextlib

@@ -1,4 +1,4 @@
-"""A follower with the kernel's firewall and real connections: it does as the witness does, or shuts out both."""
+"""A follower with the kernel's firewall and real connections admits the appliance that the witness admits, or none."""
 
 import contextlib
 import os

@@ -1,4 +1,4 @@
-"""The process `lease` with real sockets: a witness and another appliance that answer, are silent, or lie."""
+"""The process `lease` with real sockets, and with a witness and another appliance that answer, are silent, or lie."""
 
 import asyncio
 import contextlib
@@ -151,7 +151,7 @@ def test_a_grant_is_reported_with_its_end_and_its_epoch_is_on_the_disk(site: Sit
 def test_without_answers_no_extension_follows(site: Site) -> None:
     """The last report ends in less than an expiry, so the supervisor stops the service without any message.
 
-    A renewal in the same epoch may follow, but not after the other appliance has had the time to claim.
+    A renewal in the same epoch may follow, but not once the other appliance has had the time to claim.
     """
     site.start()
     site.until(site.held)

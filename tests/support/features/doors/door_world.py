@@ -166,7 +166,7 @@ class DoorWorld:
 
 @asynccontextmanager
 async def door_world() -> AsyncIterator[DoorWorld]:
-    """At the end the door is closed, and no task of it remains and no memory is held."""
+    """Yield a door and its surroundings. At the end, no task of them may remain, and no memory may be held."""
     before = asyncio.all_tasks()
     world = DoorWorld()
     await world.start()

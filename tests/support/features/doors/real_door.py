@@ -1,6 +1,6 @@
-"""A door on real sockets; run the module with MASTER_URI ADDRESS PORT [FILE.srv …], and it serves until killed.
+"""A door on real sockets. Run the module with MASTER_URI ADDRESS PORT [FILE.srv …], and it serves until it is killed.
 
-Each connection comes as a descriptor from another part, which listens, as in the door process.
+As in the door process, another part listens, and passes each connection on as a descriptor.
 """
 
 import asyncio

@@ -1,10 +1,10 @@
 """Run one side of the replication in a process, which tests kill.
 
-python -m tests.support.features.standby.replication_process SIDE DIRECTORY PORT DESCRIPTOR
+    python -m tests.support.features.standby.replication_process SIDE DIRECTORY PORT DESCRIPTOR
 
 The active side makes random changes, and prints the number of each mark that is acknowledged. After a line on
-standard input it stops, and prints `equal` when the standby has all changes. The listening socket (DESCRIPTOR) is its
-parent's, so its port stays the same.
+standard input it stops, and prints `equal` when the standby has all changes. Its parent owns the listening socket
+(DESCRIPTOR), so the port stays the same.
 """
 
 import asyncio

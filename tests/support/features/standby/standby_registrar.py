@@ -2,9 +2,9 @@
 
     standby_registrar.py MASTER_URI OWN_ADDRESS
 
-Each call is repeated until it is answered; event `acknowledged` has the number of answered calls and the time of the
-monotonic clock. A line `check` on the input compares the master's state with all answers; event `checked` has the
-differences. After a line `time` it reports each call, otherwise each 20th.
+Each call is repeated until it is answered. The event `acknowledged` has the number of answered calls and the
+monotonic time; it reports each 20th call, and after an input line `time` each call. The input line `check` compares
+the master's state with all answers, and the event `checked` has the differences.
 """
 
 import http.client

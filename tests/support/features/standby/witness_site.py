@@ -38,11 +38,14 @@ class Peer:
         self.sent = b""
 
     def ask(self, operation: Operation, epoch: int) -> WitnessAnswer:
-        """A lost answer is asked for again, and a late one to an earlier question ignored."""
+        """Repeat a request until it is answered, and ignore late answers to earlier requests."""
         asked: list[WitnessRequest] = []
 
         def is_of_this(request: WitnessRequest) -> bool:
-            """A repeated claim may have been granted; an appliance claims with each epoch once."""
+            """Accept the answer to an earlier claim of this epoch, because that claim may have been granted.
+
+            Each epoch is claimed once.
+            """
             claimed = (request.operation, request.epoch) == ("claim", epoch)
             return any(request is one for one in asked) or (operation == "claim" and claimed)
 

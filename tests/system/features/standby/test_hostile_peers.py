@@ -223,7 +223,6 @@ def port_of(frame: bytes) -> int:
 
 
 def send_always(recorded: list[bytes], ended: threading.Event) -> None:
-    """Damaged frames and garbage are sent too, each from the attacker's Ethernet address."""
     own = bytes.fromhex(Path(f"/sys/class/net/{INTERFACE}/address").read_text().replace(":", ""))
     frames = [frame[:6] + own + frame[12:] for frame in recorded]
     frames += [frame[:-1] + bytes([frame[-1] ^ 1]) for frame in frames]

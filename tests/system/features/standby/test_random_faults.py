@@ -1,4 +1,4 @@
-"""Some random faults of the pair, others each night: each edge, process, disk and order has its turn."""
+"""Some random faults of the pair, others each night, so that each edge, process, disk and order has its turn."""
 
 import datetime
 
@@ -12,7 +12,7 @@ _FAULTS = 20
 
 
 def test_random_faults_break_no_promise() -> None:
-    """The seed of a failure is in its message: `python -m benchmarks.pair_faults --faults 20 --seed NUMBER`."""
+    """To repeat a failure: `python -m benchmarks.pair_faults --faults 20 --seed NUMBER`, as in the message."""
     need_root()
     need_program("nft", "nftables")
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")

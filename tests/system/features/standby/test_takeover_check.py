@@ -1,6 +1,6 @@
-"""A standby that could not serve: both appliances report it, it does not claim, and recovers automatically.
+"""When the standby could not serve, both appliances report it, and the standby does not claim until it recovers.
 
-The standby `b` has keys of the site, which `a` does not know. Each test brings the policy that it needs into force.
+The standby `b` has keys of the site, which `a` does not know. Each test puts the policy in force that it needs.
 """
 
 from collections.abc import Iterator
@@ -68,7 +68,7 @@ def make_ready(site: StandbySite) -> None:
 
 
 def test_other_site_keys(site: StandbySite) -> None:
-    """A switchover is refused with the reason, and a power cut of the active one waits for it. The first signed
+    """A switchover is refused with the reason, and after a power cut the active one is waited for. The first signed
     policy makes the standby ready.
     """
     load(site, f"{OPEN_POLICY}# unsigned\n", "")
@@ -104,9 +104,9 @@ def test_a_policy_that_it_cannot_load(site: StandbySite) -> None:
 
 
 def test_a_missing_folder(site: StandbySite) -> None:
-    """The active appliance has no specifications, so a takeover would read the folder of the standby.
+    """The active appliance has no stored specifications, so a takeover would read the folder of the standby.
 
-    The active appliance loses its power in the meantime: the standby takes over when its folder is there again.
+    When the active appliance loses its power, the standby waits, and takes over as soon as its folder exists again.
     """
     make_ready(site)
     folder = site.appliances["b"].directory / "monitors"

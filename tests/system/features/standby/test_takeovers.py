@@ -30,7 +30,7 @@ ROLES = ("control", "relay", "rosmaster", "signer", "api", "lease")
 
 
 def orders(site: StandbySite, name: str) -> list[Any]:
-    """Policies, specifications, tokens. A takeover moves the ends of tokens."""
+    """Return the policies, specifications and tokens, without expiries of tokens: a takeover changes them."""
     one = site.appliances[name]
     monitors = one.ask(admin.MonitorsWanted(True))
     return [
@@ -127,7 +127,7 @@ def test_a_cut_between_the_appliances(site: StandbySite, robot: StandbyRobot) ->
 
 
 def test_a_lapse_of_the_lease(site: StandbySite, robot: StandbyRobot) -> None:
-    """Nothing serves until the lease is renewed; then all goes on in the same epoch, with the same processes.
+    """Nothing serves until the lease is renewed; then the same processes continue in the same epoch.
 
     Without the standby no other appliance can claim. During the pause, operators learn the reason within seconds,
     over the socket, REST and the health check of a container.

@@ -1,4 +1,4 @@
-"""Hosts in tunnels when one of two appliances loses its power: real nodes, real strongSwan with its own settings.
+"""Hosts in tunnels when one of two appliances loses its power, with real nodes and a real strongSwan.
 
 `robot` has the witness and a node in clear text, `ocu` a node behind a tunnel to the active appliance.
 """

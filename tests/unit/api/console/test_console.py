@@ -62,7 +62,6 @@ def test_the_page_shows_the_configured_notice() -> None:
 
 
 def test_the_headers_close_the_page(client: Client) -> None:
-    """The page may load, run and connect only to this origin, cannot be framed, and runs no script from text."""
     for path in ("/", "/console/static/js/main.js"):
         headers = client.get(path).headers
         policy = dict(

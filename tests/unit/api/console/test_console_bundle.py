@@ -79,7 +79,7 @@ def test_styles_are_joined_in_the_order_of_their_imports() -> None:
 
 
 def test_a_late_module_has_its_folder_and_exports_its_entry() -> None:
-    """It cannot include a module of the page, which would have a second state."""
+    """It cannot include a module of the page, whose state would then exist twice."""
     sources = {
         "features/x/late/view.js": 'import { a } from "./a.js";\nexport const view = a;\n',
         "features/x/late/a.js": "export const a = 1;\n",

@@ -20,7 +20,7 @@ SERVING: dict[str, Any] = {"probe": "passed", "relay": "connected", "rosmaster":
 
 
 class Probed:
-    """REST before a control in a given state; `looks` counts the queries to control."""
+    """REST before a control in a given state. `looks` counts the queries to control."""
 
     def __init__(self, *statuses: dict[str, Any] | None) -> None:
         self._statuses = list(statuses)

@@ -69,7 +69,6 @@ async def test_followers_get_each_sample_and_an_hour_is_stored() -> None:
 
 
 async def test_samples_stay_in_order_when_the_clock_is_set_back() -> None:
-    """Samples later than the new time are removed."""
     times = [1000.0, 1010.0, 8200.0, 1005.0, 1015.0]
     machine, later = VirtualClock(), iter(times)
 

@@ -61,7 +61,7 @@ def test_equality_is_of_the_parts_that_the_client_may_read(make_log: MakeLog) ->
 
 
 def test_a_search_for_messages_says_that_they_are_never_recorded(make_log: MakeLog) -> None:
-    """An older version may have recorded messages."""
+    """The note names only this version, because an older one may have recorded messages."""
     log = make_log()
     settle(log)
     slips = Filter(event="message droped", category="publsh")

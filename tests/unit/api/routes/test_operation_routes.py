@@ -153,7 +153,7 @@ LEAST = {
         "admin",
     ),
 }  # fmt: skip
-"""The least role of each operation, by its name in the contract; a dry run is for operators."""
+"""The lowest role of each operation, by its name in the contract. A dry run is for operators."""
 
 PROBLEM = "urn:rosrv:problem:"
 IDS = [f"{method} {path} {number}" for number, (method, path, _body) in enumerate(REQUESTS)]

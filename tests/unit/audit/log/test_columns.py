@@ -80,7 +80,6 @@ def test_fields_of_a_wrong_type(fields: dict[str, Any]) -> None:
 
 
 def test_small_details_survive_large_ones() -> None:
-    """A load of many files keeps its revision and hash; the record names the omitted fields."""
     names = [f"monitor_{number}" * 20 for number in range(1000)]
     detail = {
         "sha256": "a" * 64,

@@ -125,7 +125,6 @@ def test_many_waiters_share_commits(make_log: MakeLog, path: Path) -> None:
 
 
 def test_a_reopened_log_continues(make_log: MakeLog, path: Path) -> None:
-    """Ids continue, even with the clock set back."""
     first = make_log(clock=lambda: 2_000_000_000_000_000_000)
     first.record(decision(first))
     assert first.close() is None
@@ -370,7 +369,6 @@ def test_the_process_that_locks_the_log_is_named(path: Path, monkeypatch: pytest
 
 
 def test_a_missing_directory_is_a_failure(tmp_path: Path) -> None:
-    """The failure and its end are printed once, and then recorded."""
     path = tmp_path / "missing" / "audit.db"
     with structlog.testing.capture_logs() as said:
         log = AuditLog(path, drive=ByHand)

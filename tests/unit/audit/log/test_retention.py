@@ -189,7 +189,7 @@ def denial(number: int, host: str, **fields: Any) -> AuditRecord:
 
 
 def test_a_flood_of_denials_leaves_those_of_other_hosts(time: VirtualClock) -> None:
-    """At most half of the removed records are copied: alarms first, then hosts in turn; unknown hosts count as one."""
+    """At most half of the removed records are copied: alarms, then hosts in turn. Unknown hosts count as one."""
     flood = [denial(number, "10.0.0.66") for number in range(400)]
     unknown = [denial(1000 + n, f"10.9.0.{n}", detail={"unknown_host": True}) for n in range(90)]
     few = [denial(2000 + number, "10.0.0.5") for number in range(10)]

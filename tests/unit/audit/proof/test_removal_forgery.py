@@ -158,7 +158,6 @@ def test_an_old_log_is_valid_with_a_note(old: Path) -> None:
 
 
 def test_an_old_log_is_continued(old: Path) -> None:
-    """After the first checkpoint of this version, every further removal must be signed."""
     log = AuditLog(old, drive=ByHand, checkpoint_every=10)
     for number in range(50):
         log.record(decision(log, number))

@@ -67,7 +67,7 @@ def found(path: Path, **arguments: Any) -> list[tuple[FindingKind, int, int]]:
 def test_a_first_signature_during_the_verification_has_its_key(
     path: Path, key: Ed25519PrivateKey, monkeypatch: pytest.MonkeyPatch, moment: str, *, signed: bool
 ) -> None:
-    """The key is read after the log, because it is pinned before its first signature is stored."""
+    """The verification reads the key after the log, because the key is pinned before its first signature is stored."""
     asked: list[tuple[int, bytes]] = []
     log = AuditLog(path, drive=ByHand, checkpoint_every=5, signer=lambda *one, **_: asked.append(one))
     for number in range(10):
@@ -126,7 +126,7 @@ ATTACKS = transcripts(Path(__file__).with_name("attacks.txt"))
 
 @pytest.mark.parametrize("title", ATTACKS, ids=ATTACKS)
 def test_attack(log: Path, title: str) -> None:
-    """Each attack (SQL on the file) has exactly its listed findings; tests/unit/fleet/verdicts.txt has further ones."""
+    """Each attack (SQL on the file) has exactly its listed findings. tests/unit/fleet/verdicts.txt has more attacks."""
     statements = [line for line in ATTACKS[title] if not line.startswith(" ")]
     columns = COLUMNS.split(", ", 1)[1]
     attack(log, *(statement.replace("OTHER_COLUMNS", columns) for statement in statements))
@@ -160,7 +160,6 @@ def test_a_removed_end_is_found(log: Path) -> None:
 
 
 def rewrite(path: Path, start: int) -> None:
-    """An attacker who knows the program would recompute all later hashes."""
     with closing(sqlite3.connect(path)) as connection:
         connection.execute("UPDATE record SET decision = 'deny' WHERE sequence = ?", (start,))
         (log_id,) = connection.execute("SELECT id FROM log").fetchone()

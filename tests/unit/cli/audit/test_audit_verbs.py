@@ -1,4 +1,4 @@
-"""The files `audit.txt` and `signed.txt` have the rest."""
+"""Exports and verifications that need real files. The transcripts `audit.txt` and `signed.txt` have the rest."""
 
 import contextlib
 import json

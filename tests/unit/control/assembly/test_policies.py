@@ -387,7 +387,7 @@ async def test_a_rollback_restores_a_signed_revision(tmp_path: Path) -> None:
 
 
 async def test_keys_are_replaced_while_both_are_valid(tmp_path: Path) -> None:
-    """The same text with a new signature is a new revision, so that no later crash requires the old key."""
+    """The same text with a new signature is a new revision, so no later crash requires the old key."""
     appliance = Appliance(tmp_path)
     beside = tmp_path / "policy.ini.sig"
     beside.write_text(signed(OPEN))

@@ -44,7 +44,7 @@ def test_on_a_nearly_full_disk_it_allows_any_record(tmp_path: Path) -> None:
 
 
 class _Signer:
-    """Signs as the process does: never a checkpoint that precedes a signed one."""
+    """Signs like the real process: never a checkpoint that precedes a signed one."""
 
     def __init__(self, folder: Path) -> None:
         folder.mkdir(exist_ok=True)

@@ -105,7 +105,7 @@ async def test_the_order_of_a_killed_tool_is_withdrawn(tmp_path: Path) -> None:
 
 
 def _once(event: asyncio.Event, method: Any) -> Any:
-    """The call waits for the event, so that other threads can call the method."""
+    """Return the method behind a wait for the event, which lets other threads call it in the meantime."""
     loop = asyncio.get_running_loop()
 
     def later(*arguments: Any) -> Any:

@@ -76,7 +76,7 @@ def test_a_publishers_md5sum_is_known_once_a_relay_has_seen_its_header() -> None
 
 
 def test_a_topic_moves_for_a_minute_after_its_last_message() -> None:
-    """An earlier control may have seen messages, so it counts as moving in the first minute."""
+    """In the first minute every topic counts as moving, because an earlier control may have seen messages."""
     registry = Registry()
     registry.add(Incarnation("k", "/n", ipaddress.ip_address("10.0.0.5"), API, str(API), "10.0.0.1", 1, 2))
     counted = RelayTraffic(cast(Any, None), registry, 1, lambda _node, _topic: None)

@@ -188,7 +188,7 @@ async def test_a_topic_and_a_parameter_are_approved_for_some_time(site: Site, ca
 
 
 async def test_a_lease_on_a_motion_ends_by_silence_and_the_guards_stop_the_robot(site: Site) -> None:
-    """A motion is in a group, or has a guard. Silence counts from the first message on."""
+    """A motion is a topic in a group or with a guard. Silence counts from the first message."""
     site.guarded = ["/arm"]
     for topic in ("/cmd_vel", "/arm", "/other"):
         await site.orders.approve(ApproveCall(number_in(site.publish(topic)), 60.0), "ann")
@@ -250,7 +250,7 @@ async def test_a_lease_that_is_extended_still_ends_by_silence(site: Site) -> Non
 
 
 async def test_the_end_of_a_lease_stops_the_robot_without_a_report_of_a_message(site: Site) -> None:
-    """Relays report once a second, and nothing of a node that has ended. A host without the group moved nothing."""
+    """Relays report once a second, and never for a node that has ended. A host without the group moved nothing."""
     for holder in (AGENT, OTHER):
         site.text = replace(site.text, holders={"base": holder})
         site.decide_again()

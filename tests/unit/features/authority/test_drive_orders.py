@@ -61,7 +61,6 @@ class Site:
         self.records.append({"event": event, "reason": reason, **detail})
 
     async def after(self, host: str, topics: frozenset[str], why: str) -> None:
-        """No relay lets the host through any longer, and no other holds the group."""
         assert address_of(host) not in self.applied
         assert self.orders.holders() == {}
         self.records.append({"event": "motion stopped", "reason": why, "topics": sorted(topics)})

@@ -76,7 +76,6 @@ def test_a_duplicate_name_is_rejected(tmp_path: Path) -> None:
 
 
 def test_too_many_files_are_rejected(tmp_path: Path) -> None:
-    """They would fill the disk with names."""
     many = b"".join(header(f"api/{number}") for number in range(10_001))
     refused(archive(tmp_path / "evil", many), tmp_path / "state", "more than 10000 files")
 

@@ -137,7 +137,6 @@ def test_a_missing_state_directory_is_an_error(tmp_path: Path) -> None:
 
 @pytest.mark.nightly
 def test_an_unreadable_part_is_an_error(state: Path, tmp_path: Path) -> None:
-    """A backup without the keys would be useless, so no file is left."""
     need_root()
     file = Path(tempfile.mkdtemp(prefix="rosrv-backup-test-"))
     file.chmod(0o777)
@@ -209,7 +208,6 @@ def test_a_file_of_another_user_is_refused(state: Path, tmp_path: Path) -> None:
 
 
 def test_a_sparse_file_is_refused(state: Path, tmp_path: Path) -> None:
-    """It cannot fill the disk or the backup's memory."""
     with (state / "api" / "hole").open("wb") as file:
         file.truncate(1 << 40)
     with pytest.raises(BackupError, match="api/hole has 1099511627776 bytes"):

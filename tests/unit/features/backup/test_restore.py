@@ -80,7 +80,7 @@ def test_an_existing_folder_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 
 def test_a_folder_changes_owner_after_its_contents(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """While `restore` hands a part over, its user cannot replace a remaining file by a link."""
+    """Otherwise the new owner could replace a remaining file with a link while `restore` changes owners."""
     need_root()
     given: list[str] = []
     monkeypatch.setattr(os, "chown", lambda path, *_ids, **_more: given.append(str(path)))

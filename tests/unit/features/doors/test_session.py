@@ -120,7 +120,7 @@ async def test_a_publication_without_a_grant_is_refused_until_it_is_granted_agai
 
 
 async def test_wills_and_arguments_of_waiting_calls_are_bounded() -> None:
-    """Each counts with its bytes, not with its whole frame."""
+    """Each is charged its own bytes, not those of its whole frame."""
     async with door_world() as world:
         robot, client = await world.robot("10.0.0.3", "/robot"), await world.client()
         slow = ServiceType.defined(standard_definitions(), "roscpp/SetLoggerLevel")
@@ -548,7 +548,6 @@ async def test_an_image_of_a_large_text_delays_no_other_client(monkeypatch: pyte
 
 
 async def test_a_client_that_does_not_read_gives_shared_memory_back_within_seconds() -> None:
-    """A client that reads slowly, or that holds no memory of the others, stays."""
     async with door_world() as world:
         publication = await talks(await world.robot("10.0.0.3", "/robot"), "/image")
         clients = [await world.client() for _number in range(4)]
@@ -618,7 +617,7 @@ async def test_a_message_that_has_no_room_in_its_encoding_is_refused_in_words() 
 async def test_a_frame_that_is_too_large_even_inflated_ends_the_connection(
     deflate: bool, frame: str | bytes, code: int
 ) -> None:
-    """Unread bytes would reset the connection before the closing frame."""
+    """The rest of the frame is read, because unread bytes would reset the connection before the closing frame."""
     async with door_world() as world:
         client = await world.client(deflate=deflate)
         client.send(frame)

@@ -293,7 +293,6 @@ def test_data_outside_members_is_named(bundle: Path, tmp_path: Path, reviewer: R
         return place
 
     def between(archive: zipfile.ZipFile) -> None:
-        """The member stays in the file, only the directory loses it."""
         archive.writestr("left", b"out")
         archive.filelist.pop()
 
@@ -558,7 +557,6 @@ def test_unproven_facts_are_listed(control: Control, tmp_path: Path, reviewer: R
 
 
 def _as_before(previous: bytes, columns: tuple[object, ...]) -> bytes:
-    """Version 0.1.0 computed the hash like this."""
     return hashlib.sha256(previous + msgspec.msgpack.encode(columns)).digest()
 
 

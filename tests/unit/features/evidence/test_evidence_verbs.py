@@ -1,5 +1,3 @@
-"""A bundle gets its final name only when it is complete."""
-
 import re
 import stat
 from collections.abc import Iterator

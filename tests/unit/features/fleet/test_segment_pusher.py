@@ -180,7 +180,7 @@ def test_a_full_disk_is_reported_and_passes(
 
 
 def test_a_wait_of_a_year_is_an_hour(collector: Collector, make: Make) -> None:
-    """Retry-After cannot silence a robot for longer."""
+    """Retry-After must not silence a robot for longer."""
     collector.refusal = CollectorError("later", 503, 365 * 86_400.0)
     assert make().step() == 3600.0
 

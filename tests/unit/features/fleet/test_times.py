@@ -23,7 +23,7 @@ def at(years: float) -> VirtualClock:
 
 @pytest.mark.parametrize("years", [-3, 3], ids=["behind", "ahead"])
 def test_a_join_with_a_wrong_clock_is_refused(years: float, tmp_path: Path) -> None:
-    """The collector could not accept the certificate, so the answer has its times and the collector's clock."""
+    """The collector could not accept the certificate later. The error has its times and the collector's clock."""
     robots = Robots(tmp_path / "robots")
     with using(at(years)):
         robot = JoiningAppliance()
@@ -47,7 +47,7 @@ def test_a_join_after_the_clock_was_corrected(tmp_path: Path, monkeypatch: pytes
 
 
 def test_a_robot_names_its_clock(tmp_path: Path) -> None:
-    """With a clock of 1970 it does not even connect: TLS would only say that a certificate is not valid."""
+    """With a clock of 1970 it does not even connect, because TLS would only report an invalid certificate."""
     key, certificate = make_own_certificate("arm7", 825)
     files = tmp_path / "ca.pem", tmp_path / "robot.pem", tmp_path / "robot.key"
     for file, text in zip(files, (certificate, certificate, key), strict=True):

@@ -177,7 +177,6 @@ def test_endless_data_is_cut(field: Field) -> None:
 
 
 def test_slow_retrieval_is_cut(field: Field, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A collector that sends a byte now and then is given up at the deadline."""
     monkeypatch.setattr(connection, "_EXCHANGE_SECONDS", 0.3)
 
     def slow(handler: http.server.BaseHTTPRequestHandler) -> None:
@@ -259,7 +258,6 @@ def test_an_invalid_selection_is_rejected(field: Field, selection: str) -> None:
 
 
 def test_a_later_ring_does_not_take_a_bundle_early(field: Field) -> None:
-    """The operator has signed a time for each ring."""
     rings = (Ring("canary", ["canary-1"]), Ring("rest", [], 100, 3600))
     path = field.site.add(terms=everywhere(None, *rings))
     with pytest.raises(BundleTooEarlyError):

@@ -59,7 +59,7 @@ class Guarded:
             self.receive(one, (one.time - BEGIN) // MS)
 
     def tell(self, given: str, data: bytes, at: int, node: str = "/a", *, faults: bool = False) -> Outcome:
-        """`faults`: the message is too much for the guard."""
+        """Give a message to the guard. With `faults`, it must be too much for the guard."""
         self.advance(at)
         topic = self.topics[given]
         outcome = self.monitors.judge(

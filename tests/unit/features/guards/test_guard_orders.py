@@ -199,7 +199,7 @@ async def test_a_monitor_that_is_not_a_guard_is_unknown(orders: GuardOrders) -> 
 async def test_a_new_guard_is_in_shadow_mode_or_in_force(
     manager: Manager, orders: GuardOrders, shadow: bool
 ) -> None:
-    """Where new monitors are disabled (`enable: none`, as in the package), it would stop nothing."""
+    """It is enabled even with `enable: none`, as in the package, because it would stop nothing otherwise."""
     request = guard_requests.GuardNew("speed", {"command": "/c"}, {"vMax": "0.3"}, {"command": TYPES["command"]},
                                       shadow=shadow, confirm_within=300.0)  # fmt: skip
     await orders.new(request, "eve")

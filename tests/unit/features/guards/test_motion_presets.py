@@ -150,7 +150,7 @@ def odometry(x: float, y: float, yaw: float) -> bytes:
 
 
 def depth(x: float, y: float) -> float:
-    """In metres to the edge of the square of 4 m; negative outside."""
+    """Return the distance in metres to the edge of the 4 m square, negative outside."""
     if max(abs(x), abs(y)) <= 2:
         return 2 - max(abs(x), abs(y))
     return -math.hypot(max(abs(x) - 2, 0), max(abs(y) - 2, 0))
@@ -220,7 +220,7 @@ def test_a_fence_may_be_clockwise_and_have_corners_on_an_edge(polygon: str) -> N
 
 @pytest.mark.parametrize("orientation", [(0, 0, 0, 0), (0, 0, 0.01, 0), (0, 0, 0, math.inf)])
 def test_without_a_direction_only_turns_pass(orientation: tuple[float, ...]) -> None:
-    """A driver that knows no direction sends zeros, which are not the direction of the x axis."""
+    """A driver that knows no direction sends zeros, which do not mean the direction of the x axis."""
     parts = {f"pose__pose__orientation__{axis}": part for axis, part in zip("xyzw", orientation, strict=True)}
     pose = message("nav_msgs/Odometry", **parts)
     guard, world = Guarded("fence"), Guarded("fence", worldFrame=True)

@@ -23,7 +23,7 @@ from tests.unit.features.guards.guarding import DEFINITIONS
 
 ROOT = Path(__file__).parents[4]
 INTERPRETED = {"joints", "answer"}
-"""Presets with arrays of messages or slices, which the module leaves to the engine."""
+"""Presets with arrays of messages or slices, which the compiled module leaves to the engine."""
 
 
 def compiled(text: str) -> Compiled:

@@ -138,7 +138,6 @@ def test_json_changes_no_less(tmp_path: Path, capsys: pytest.CaptureFixture[str]
 
 @pytest.mark.parametrize("new", [True, False])
 def test_json_refuses_no_less(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, new: bool) -> None:
-    """A plan that would be refused is not replayed."""
     robot, replayed = Robot(tmp_path, FENCE), list[str]()
     robot.as_json = True
     monkeypatch.setattr(verbs, "_replay", lambda _robot, row, _text, _since: replayed.append(row.name))
@@ -155,8 +154,6 @@ def test_json_refuses_no_less(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, n
 def test_a_plan_holds_without_the_flight_recorder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, status: int
 ) -> None:
-    """The recorder is off in a new appliance; a mistake still ends the verb."""
-
     def replay(*_given: Any, **_options: Any) -> None:
         raise typer.Exit(status)
 
@@ -178,7 +175,7 @@ def test_a_disabled_guard_is_not_planned_in_force(tmp_path: Path, capsys: pytest
 def test_a_folder_that_cannot_be_changed_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], as_json: bool
 ) -> None:
-    """As in compose.yaml: there even the removal of a missing file fails."""
+    """In a read-only file system, as in compose.yaml, even the removal of a missing file fails."""
 
     def fails(_path: Path, missing_ok: bool = False) -> None:
         raise OSError(errno.EROFS, "Read-only file system")
@@ -196,7 +193,6 @@ def test_a_folder_that_cannot_be_changed_is_reported(
 
 
 def test_over_rest_no_folder_of_this_machine_changes(tmp_path: Path) -> None:
-    """Both machines of a pair have a folder of this name."""
     robot = Robot(tmp_path, FENCE)
     robot.place = "https://10.0.0.2:8443"
     (tmp_path / "fence.rv").write_text("x")

@@ -112,7 +112,7 @@ def test_a_parameter_call_needs_the_call_and_the_key() -> None:
 
 
 def test_the_robot_is_called_robot() -> None:
-    """With the group, the policy also holds at another address."""
+    """With the group, the policy remains valid if the robot gets another address."""
     learned = learn(
         [seen("192.0.2.10", Category.PUBLISH, "/a"), seen("10.0.0.1", Category.PUBLISH, "/a")], [ROBOT]
     )

@@ -17,7 +17,6 @@ FILES = {
 
 
 def test_the_sums_of_excluded_types_are_those_of_their_definitions() -> None:
-    """With a wrong sum a camera or a microphone would be recorded."""
     definitions = standard_definitions().extended(Definitions.from_files(FILES))
     never = RecorderRules().never
     assert known_sums(never) == {name: definitions.md5sum(name) for name in never}

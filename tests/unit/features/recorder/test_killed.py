@@ -1,4 +1,4 @@
-"""A recorder killed at any file operation leaves complete recordings, and loses none silently."""
+"""A recorder that is killed at any file operation leaves complete recordings, and loses none silently."""
 
 import hashlib
 import os

@@ -9,7 +9,7 @@ from tests.unit.features.recorder.test_bag_writer import HEADER, SECOND, body
 
 
 def read(path: Path, bag: Path) -> tuple[list[tuple[str, str, int]], list[tuple[str, int, bytes]]]:
-    """`rosbags` accepts only files marked as ROS 2; everything else is the same for both."""
+    """Read the file as ROS 2, because `rosbags` accepts no other MCAP. Everything else is the same for both."""
     path.write_bytes(b"".join(as_mcap(bag)).replace(b"ros1", b"ros2"))
     reader = McapReader(path)
     reader.open()

@@ -361,7 +361,7 @@ def test_the_next_recorder_continues_after_a_crash(scene: Scene) -> None:
 
 
 def test_a_restart_of_the_appliance_ends_a_recording(scene: Scene) -> None:
-    """The memory is new, so the written part is marked as incomplete; an empty part is removed."""
+    """The new recorder's memory is empty, so the written part is marked as incomplete. An empty part is removed."""
     scene.happen()
     scene.later(0.1)
     (scene.folder / f".{'a' * 20}.part").mkdir()

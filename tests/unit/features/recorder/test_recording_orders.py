@@ -254,7 +254,6 @@ async def test_the_memory_can_be_fetched_and_is_not_listed() -> None:
 
 @pytest.mark.nightly
 async def test_more_topics_than_a_record_can_name_are_rejected(scene: Scene) -> None:
-    """The record of a fetch must name every topic that is read."""
     recorder = scene.attach(lambda _message: [])
     recorder.send(recorder_link.RecordingsStated([KEPT]))
     await told(scene, lambda: bool(cast(Any, scene.orders.state()).recordings))

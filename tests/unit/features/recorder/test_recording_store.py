@@ -91,7 +91,6 @@ def test_a_noted_recording_is_reported_once(tmp_path: Path) -> None:
 
 
 def test_the_kind_with_most_bytes_makes_room(tmp_path: Path) -> None:
-    """A flood of drops removes no other recording."""
     store = RecordingStore(tmp_path, disk=64 * MIB, seconds=None, clock=wall_ns)
     put(store, recording(1, "order", 8 * MIB))
     put(store, recording(2, "fault", 8 * MIB))

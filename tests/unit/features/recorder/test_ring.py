@@ -220,7 +220,6 @@ def test_headers_end_with_their_streams(memory: memoryview) -> None:
 
 
 def test_the_next_writer_continues(memory: memoryview) -> None:
-    """A new writer displaces the messages of the last one first."""
     opened(ring(memory)).write(memoryview(frame(b"before")), 1, 1)
     clock = Clock(100)
     writer = ring(memory, clock)

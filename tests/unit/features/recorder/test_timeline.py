@@ -173,7 +173,6 @@ def test_an_impossible_date_is_refused(text: str) -> None:
 
 
 def test_publishers_cannot_forge_events(tmp_path: Path) -> None:
-    """A node's message on the recorder's own topic counts as a message."""
     writer = BagWriter(tmp_path / "a.bag", {})
     forger = writer.connect(RECORDS | {"host": "10.0.0.66"})
     writer.write([BagMessage(forger, BEGAN, record(1, event="message dropped", severity="alarm"))])

@@ -72,7 +72,7 @@ def part(value: Any) -> str:
 
 
 class ScriptedProvider:
-    """`payload`, `header` and `key` make the next ID token; `down` names the endpoints that do not answer."""
+    """A provider. `payload`, `header` and `key` make the next ID token; `down` names endpoints without an answer."""
 
     def __init__(self, wanted: Sso | None = None, secret: str | None = "s3:cret") -> None:  # noqa: S107  of a test
         self.wanted = wanted or sso()

@@ -1,9 +1,9 @@
 """Mutants of the rules of the lease, which the simulation must find.
 
-Histories seldom show a replayed request, a late order, or a smaller epoch of the witness; `test_lease.py` and
-`test_witness.py` have a test of each.
+    python -m tests.unit.features.standby.mutants HISTORIES      prints the first seed that finds each
 
-python -m tests.unit.features.standby.mutants HISTORIES      prints the first seed that finds each
+Histories seldom show a replayed request, a late order, or a smaller epoch of the witness, so `test_lease.py` and
+`test_witness.py` have a test of each.
 """
 
 import importlib.util
@@ -18,7 +18,7 @@ from tests.unit.features.standby.simulation import History, Product, Violation
 
 
 class Mutant(NamedTuple):
-    """`seed` is the first seed whose history finds the change, with these kinds of faults (or any)."""
+    """A change of the source. `seed` is the first whose history finds it, with these kinds of faults (or any)."""
 
     module: ModuleType
     old: str

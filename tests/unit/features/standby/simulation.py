@@ -2,12 +2,12 @@
 
     python -m tests.unit.features.standby.simulation SEED HISTORIES [--trace]
 
-A history is a random sequence of faults of links, processes, disks and power in virtual time; each process has a
-clock with its own speed. After every step these promises are checked:
+A history is a random sequence of faults of links, processes, disks and power in virtual time. Each process has a
+clock with its own speed. These promises are checked after every step:
 
 1. The robot admits at most one appliance, and translates its fixed address only to that one.
 2. At most one appliance is active.
-3. Each appliance that becomes active has every acknowledged write, and a greater epoch than all before.
+3. An appliance that becomes active has every acknowledged write, and a greater epoch than all before.
 4. A grant is answered only when the robot admits its holder.
 5. Within ten seconds after the last fault, one appliance is active and admitted, and both are in sync. If one link
    stays cut, one is active and admitted if an appliance in sync reaches the robot.
@@ -267,7 +267,7 @@ class SimulatedRobot(Host):
         self.firewall = witness.LeaseFirewall(SETTINGS, "nft", self._nft)
 
     def started(self) -> None:
-        """After a boot, the boot rule ran before the network was up."""
+        """Start the witness. After a boot, the boot rule has run before the network is up."""
         product = self.history.product.witness
         if not self.network_up:
             self.boot += 1

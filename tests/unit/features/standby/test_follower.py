@@ -314,7 +314,7 @@ def test_a_damaged_epoch_accepts_no_answer(tmp_path: Path) -> None:
 
 
 class RandomHistory:
-    """Appliances that come and go, a witness that restarts, a network that loses, delays and repeats; 3 % of drift."""
+    """Appliances that come and go, a witness that restarts, a network that loses, delays and repeats, and drift."""
 
     def __init__(self, seed: int) -> None:
         self.random = random.Random(seed)  # noqa: S311  a reproducible history

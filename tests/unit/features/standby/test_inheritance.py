@@ -69,7 +69,7 @@ class Pairs:
 
 
 class Relays:
-    """With None the relay does not answer."""
+    """Relays with these copies of the state. A relay with None does not answer."""
 
     def __init__(self, *contents: bytes | None) -> None:
         self.contents = contents
@@ -183,7 +183,6 @@ def test_an_epoch_in_between_makes_the_state_void(pairs: Pairs) -> None:
 
 
 def test_a_control_that_dies_before_its_relays_have_the_state_inherits_again(pairs: Pairs) -> None:
-    """Otherwise its monitors would begin in their initial state."""
     pairs.active("a")
     pairs.active("b", taken=False)
     pairs.epoch -= 1

@@ -21,9 +21,7 @@ pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
 async def test_a_lapse_of_the_lease_stops_what_serves_the_robot(
     tmp_path: Path, end: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A renewal in the same epoch lets it go on; otherwise it is killed. The api goes on, so that it can answer
-    operators.
-    """
+    """A renewal in the same epoch lets the service continue; otherwise it is killed. The api answers all along."""
     roles = (
         CONTROL,
         Role("relay", "u", "p", "m:f"),

@@ -110,7 +110,7 @@ def test_a_lapse_that_no_renewal_ends(end: str) -> None:
 
 @pytest.mark.parametrize("reason", ["starting", "not renewable"])
 def test_a_lapse_that_cannot_be_suspended_ends_the_service(reason: str) -> None:
-    """A process that is only starting would start to serve; a new process of the lease gets a new epoch."""
+    """A process that is still starting would begin to serve; a new lease process gets a new epoch."""
 
     async def work(role: Role) -> None:
         role.watch.held(clock.since_boot() + 0.05, 5)
@@ -141,8 +141,6 @@ def test_a_late_report_of_an_active_appliance_stops_it_at_once() -> None:
 
 
 def test_a_new_epoch_ends_the_state_of_the_old_one() -> None:
-    """Another appliance may have been active in between."""
-
     async def work(role: Role) -> None:
         role.watch.held(clock.since_boot() + 60, 5)
         role.watch.held(clock.since_boot() + 60, 7)

@@ -68,7 +68,7 @@ def attached(rest: PassiveRest) -> tuple[Channel, asyncio.Queue[Any]]:
 
 @pytest.mark.nightly
 async def test_a_new_api_learns_the_tokens_at_once(tmp_path: Path) -> None:
-    """With an empty list, users would be signed out."""
+    """Until then, its empty list would sign users out."""
     row, token = made("alice")
     save(tmp_path, row)
     rest = rest_of(tmp_path)

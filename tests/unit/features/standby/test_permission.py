@@ -1,4 +1,4 @@
-"""The right to answer alone: the lease, control's replication and the witness, with messages in all orders."""
+"""The exclusive right to answer: the lease, control's replication and the witness, with messages in all orders."""
 
 import asyncio
 import contextlib
@@ -237,7 +237,7 @@ def test_it_answers_alone_and_waits_again(tmp_path: Path, monkeypatch: pytest.Mo
 def test_a_standby_has_the_time_that_a_large_value_needs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The lease learns of a wait only when a living standby would have stored the bytes."""
+    """A wait for a large value is reported with a later beginning: a standby also needs time to store it."""
 
     async def waits(size: int) -> float:
         pair.start_control(taken_over=False)

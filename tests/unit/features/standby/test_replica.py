@@ -70,7 +70,7 @@ def test_changes_and_their_number_are_stored_together(tmp_path: Path) -> None:
 
 
 def test_a_sync_brings_what_is_stored_to_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A commit does not wait for the disk, because an answer waits for it; `sync` synchronizes SQLite's log."""
+    """A commit does not wait for the disk, because an answer waits for it. `sync` then synchronizes SQLite's log."""
     synced: list[str] = []
     replica = begun(tmp_path)
     monkeypatch.setattr(

@@ -70,7 +70,7 @@ async def until(condition: Callable[[], Any]) -> None:
 
 
 async def require_equal(directory: Path, active: ActiveSide) -> None:
-    """The standby's rows may be there before the active one has them on its disk."""
+    """Check the tables. The standby may have rows before the active appliance has them on its disk."""
     await active.database.settled()
     assert tables_of(directory / "standby.db") == tables_of(directory / "active.db")
 

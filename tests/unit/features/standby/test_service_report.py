@@ -49,7 +49,7 @@ def test_a_full_disk_is_an_obstacle(control: Control, monkeypatch: pytest.Monkey
 
 
 def test_a_log_that_fails_is_an_obstacle_only_if_nothing_is_granted_then(control: Control) -> None:
-    """`audit.on_audit_failure: allow` goes on without records."""
+    """With `audit.on_audit_failure: allow`, control continues without records."""
     report = control.report()
     assert report.now() == ControlServes("", keeps_state=False)
     control.audit.failed = "audit.db: the disk is full"

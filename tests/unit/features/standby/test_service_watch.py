@@ -48,7 +48,6 @@ def test_a_control_that_hangs_and_one_that_starts_again() -> None:
 
 
 def test_an_obstacle_that_lasts() -> None:
-    """Control reports a full disk repeatedly. If the disk is free again in time, the lease stays."""
     watch = serving()
     for now in (103.0, 102.9 + OBSTACLE_SECONDS):
         watch.reported(now, "full", keeps_state=False)

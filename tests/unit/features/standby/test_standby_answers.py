@@ -83,7 +83,7 @@ def test_the_problem_names_the_active_appliance(gate: RequestGate, method: str, 
 
 
 def test_a_host_that_enrols_gets_the_same_problem(gate: RequestGate) -> None:
-    """A kit's script learns the address at which it must enrol."""
+    """A kit's script learns from it at which address it must enrol."""
     answer = requested(gate, "POST", "/v1/enrol", json=ENROLMENT)
     assert (answer.status_code, answer.json()["active"]) == (503, "10.0.0.1")
 

@@ -42,7 +42,6 @@ class Pair:
 
 
 async def test_the_order_is_on_disk_before_the_switchover() -> None:
-    """The switchover ends the process, and the record names the operator."""
     pair = Pair("active")
     after = await pair.orders().promote(standby_requests.StandbyPromote(), "alice")
     assert after.role == "standby"

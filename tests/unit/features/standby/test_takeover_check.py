@@ -114,7 +114,7 @@ async def test_a_standby_without_obstacles(standby: Standby) -> None:
 
 
 async def test_other_site_keys(standby: Standby) -> None:
-    """The policy of the active appliance must have a signature that this one accepts; so must its specifications."""
+    """The active appliance's policy and specifications must have signatures that this one accepts."""
     async with standby.checked(site_keys=[LINE]) as checked:
         assert "revision 1:1:1: error: it has no signature of the site" in await checked.next_obstacle()
         standby.store.save_revision(standby.revision(OPEN_POLICY, signed(OPEN_POLICY)))

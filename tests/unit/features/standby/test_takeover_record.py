@@ -124,7 +124,7 @@ def test_a_restart_within_an_epoch_repeats_no_record(tmp_path: Path) -> None:
 
 
 def test_the_own_log_knows_the_takeover_before(tmp_path: Path) -> None:
-    """A crash may come before the state has the last takeover."""
+    """A crash may have come before the state had the last takeover."""
 
     async def story(a: Member, _b: Member) -> None:
         await a.recorder.took_over(5)
@@ -136,8 +136,6 @@ def test_the_own_log_knows_the_takeover_before(tmp_path: Path) -> None:
 
 
 def test_the_state_has_a_takeover_only_once_its_record_is_on_disk(tmp_path: Path) -> None:
-    """While the log cannot be written, the state does not claim a takeover that a power failure could lose."""
-
     async def story(a: Member, _b: Member) -> None:
         a.path.rename(a.path.with_name("away"))
         await a.recorder.took_over(1)

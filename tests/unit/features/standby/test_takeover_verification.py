@@ -1,6 +1,4 @@
-"""The attacker is root on one appliance, with its signing key and its signer's memory: each forged log alone is
-valid.
-"""
+"""The attacker is root on one appliance, with its signing key and signer's memory: each forged log is valid alone."""
 
 import shutil
 import sqlite3

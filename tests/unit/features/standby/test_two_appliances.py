@@ -91,7 +91,6 @@ async def test_another_authority_is_reported_once(tmp_path: Path, store: StateSt
 
 
 async def test_without_a_list_no_tunnel_opens(tmp_path: Path, store: StateStore) -> None:
-    """Without it a revoked certificate would be accepted."""
     await SharedAuthority(near(tmp_path, "a"), store.hosts).certificate()
     second = SharedAuthority(near(tmp_path, "b"), store.hosts)
     with pytest.raises(AuthorityError, match="no list of revoked certificates was signed yet"):

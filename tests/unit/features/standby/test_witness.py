@@ -237,7 +237,7 @@ def test_a_replayed_request_changes_nothing() -> None:
 
 
 def test_only_a_new_request_moves_the_socket_of_an_appliance() -> None:
-    """A forged, replayed or earlier datagram names no sender whose port the witness would prefer."""
+    """The witness must not send to the source port of a forged, replayed or earlier datagram."""
     robot = granted()
     seen = []
     for datagram, address in (

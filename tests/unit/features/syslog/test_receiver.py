@@ -108,7 +108,7 @@ def test_a_wrong_certificate_gets_nothing(certificates: Certificates, tmp_path: 
 
 @pytest.mark.nightly
 def test_tls_with_client_certificates(certificates: Certificates, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without one, the receiver's refusal is an error although TLS 1.3 reports it late."""
+    """Without a certificate, the receiver's refusal is an error, although TLS 1.3 reports it late."""
     monkeypatch.setattr("appliance.features.syslog.receiver._OBJECTION_SECONDS", LIMIT)
     with StreamCollector(context=server_context(certificates, clients=True)) as collector:
         receiver = StreamReceiver(

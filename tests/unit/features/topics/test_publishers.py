@@ -45,7 +45,6 @@ def counted(sequence: int, scope: str, event: str, **fields: Any) -> LogEntry:
 
 
 def test_registrations_that_were_only_counted_are_reported() -> None:
-    """A host above its budget cannot hide a publication."""
     topic = {"category": "publication", "resource": "/a"}
     log = [
         entry(1, "log begun"),
@@ -68,7 +67,7 @@ def test_registrations_that_were_only_counted_are_reported() -> None:
 
 
 def test_the_end_of_a_registration_shows_its_beginning_only_without_a_loss() -> None:
-    """A node that unregistered later was registered before the log begins, unless records were lost in between."""
+    """A node that unregistered was registered before the log begins, unless records were lost in between."""
     end = entry(8, "unregistered", host="10.0.0.9", caller_id="/n", category="publication", resource="/a")
     log = [entry(1, "decision"), counted(7, KIND, "decision"), end]
     assert [one.node for one in found(log, 5).publishers] == ["/n"]

@@ -1,5 +1,3 @@
-"""`rosrv topic echo --field`: omitted parts differ from missing ones."""
-
 import pytest
 import typer
 

@@ -18,7 +18,7 @@ pytestmark = pytest.mark.nightly
 
 
 class Standing(NamedTuple):
-    """The name of the connection, the number of its IKE SA, and that of its child SA (0: none)."""
+    """A tunnel: the name of its connection, and the numbers of its IKE SA and its child SA (0 for none)."""
 
     tunnel: str
     ike: int
@@ -34,7 +34,7 @@ class Standing(NamedTuple):
 
 
 class StandIn:
-    """Accepts every command; `standing` are its tunnels, `asked` its commands, `events` its notices."""
+    """A charon that accepts every command. `standing` are its tunnels, `asked` its commands, `events` its notices."""
 
     def __init__(self, path: Path) -> None:
         self.events = bytes([Packet.EVENT_CONFIRM])

@@ -246,7 +246,7 @@ async def test_addresses_are_given_in_order_and_kept(bench: Bench) -> None:
 async def test_an_unavailable_name_or_address_is_refused(
     bench: Bench, name: str, address: str | None, why: str
 ) -> None:
-    """The appliance's name is reserved, and case does not distinguish names, as in IKE."""
+    """The appliance's name is reserved, and names must differ in more than case, as in IKE."""
     await bench.add("laptop")
     with pytest.raises(HostRefusedError, match=why):
         await bench.hosts.add(
@@ -255,8 +255,6 @@ async def test_an_unavailable_name_or_address_is_refused(
 
 
 def test_without_a_firewall_no_name_stands_for_an_address(tmp_path: Path) -> None:
-    """The supervisor cannot keep clear text out then."""
-
     async def enrol(bench: Bench) -> None:
         await bench.add("a")
         assert list(bench.tunnels.addresses) == ["a"]

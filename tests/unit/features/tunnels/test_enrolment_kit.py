@@ -98,7 +98,7 @@ def test_the_firewall_of_a_host_names_the_appliance_in_the_tunnel() -> None:
 
 
 def test_the_script_removes_the_rule_that_does_not_apply() -> None:
-    """The right rule depends on where ESP runs: a kernel without IPsec cannot even load the other one."""
+    """The right rule depends on where ESP runs, and a kernel without IPsec cannot even load the other one."""
     files = unpack(KIT)
     script, text = files["rosrv-ocu-1/join.sh"][0], files["rosrv-ocu-1/protect.nft"][0]
     patterns = re.findall(r"""^    never=(?:'(.*)'|"(.*)")$""", script, re.MULTILINE)
@@ -137,7 +137,7 @@ def test_a_kit_for_two_appliances_has_a_connection_to_each() -> None:
 
 @pytest.mark.parametrize("kit", [KIT, TWO], ids=["one", "two"])
 def test_charon_opens_no_tunnel_itself(kit: Kit) -> None:
-    """keep.sh does; two tunnels to two appliances could be open otherwise."""
+    """keep.sh opens it, as otherwise tunnels to both appliances could be open."""
     found = re.findall(r"(start|close|dpd)_action = (\S+)", swanctl_conf(kit))
     assert set(found) == {("start", "none"), ("close", "none"), ("dpd", "clear")}
 

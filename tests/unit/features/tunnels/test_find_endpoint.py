@@ -23,7 +23,6 @@ async def _several() -> EndpointFound:
 
 
 def test_the_configured_endpoint_comes_first() -> None:
-    """Nothing is searched then, so the setting also helps where no endpoint can be found."""
     assert autojump.run(find_endpoint(_settings("robot.example.org"), _several)) == Endpoint(
         "robot.example.org", "ipsec.endpoint of the configuration"
     )

@@ -1,6 +1,6 @@
-"""The part of the kit's `join.sh` that decides which certificate stays, on a folder in the place of `/etc/swanctl`.
+"""The part of the kit's `join.sh` that decides which certificate stays, with a folder in place of `/etc/swanctl`.
 
-`openssl` is the real one, with the spelling of the version that is tested.
+The real `openssl` runs, with the spelling of the tested version.
 """
 
 import os
@@ -60,7 +60,7 @@ class Machine:
 
 @pytest.mark.parametrize("openssl", SPELLINGS)
 def test_a_renewed_certificate_stays(tmp_path: Path, openssl: str) -> None:
-    """When join.sh runs again, this holds however openssl writes a name."""
+    """When join.sh runs again, it must recognise the certificate however openssl writes a name."""
     machine = Machine(tmp_path, SPELLINGS[openssl])
     machine.put("kit", "laptop", 10)
     machine.put("etc", "laptop", 20)

@@ -45,7 +45,6 @@ def test_it_asks_of_its_tools_what_ubuntu_20_04_has(script: Path) -> None:
 
 @pytest.mark.nightly
 def test_a_zombie_does_not_count_as_running() -> None:
-    """Process 1 of a container may not collect its children: waiting for such a program would never end."""
     runs = next(line for line in (FOLDER / "stop.inc").read_text().splitlines() if line.startswith("runs() "))
     with subprocess.Popen(["/bin/true"]) as ended:
         os.waitid(os.P_PID, ended.pid, os.WEXITED | os.WNOWAIT)

@@ -56,7 +56,6 @@ class Bench(process.TunnelProcess):
 
 @pytest.mark.nightly
 async def test_charon_gets_one_request_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Otherwise a query and the configuration would read each other's answers."""
     monkeypatch.setattr(process, "REPORT_SECONDS", 0.01)
     (ours, theirs), (lifeline, child) = socket.socketpair(), socket.socketpair()
     own, supervisor, link = (

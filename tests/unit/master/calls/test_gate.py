@@ -74,9 +74,9 @@ def test_no_node_replaces_a_service_of_the_appliance(path: str, allowed: bool) -
 
 
 def test_the_appliances_nodes_may_ask_others_for_a_topic() -> None:
-    """The rosout aggregator subscribes at other nodes' proxy endpoints, even if the policy gives this machine no right.
+    """The rosout aggregator subscribes to other nodes' proxy endpoints, even without a right in the policy.
 
-    Other machines may not use the aggregator's name, and on this machine the name grants nothing else.
+    Other machines must not use the aggregator's name, and on this machine the name grants nothing else.
     """
     policy = compile_policy(
         f"[Nodes]\ndefault = {OPERATOR}\n[Subscribers]\ndefault = {OPERATOR}\n", file="p.ini"

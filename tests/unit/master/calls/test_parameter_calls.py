@@ -1,4 +1,4 @@
-"""After every step, the mirror of the parameters equals the tree of rosmaster's own code."""
+"""After every step, the mirror of the parameters equals the tree that rosmaster's own code makes."""
 
 import asyncio
 import copy
@@ -94,7 +94,7 @@ def test_a_value_beyond_the_bound_is_refused_before_it_is_set() -> None:
 
 
 def test_key_and_value_together_are_bounded_in_depth() -> None:
-    """The ROS master answers recursively, so values too deep for its answers are refused."""
+    """The ROS master writes answers recursively, so it cannot return values that are too deep."""
     there = mirror(depth_limit=5)
     there.check("/a/b/c", measure({"d": [1]})[1])
     with pytest.raises(ProtocolError, match="nest deeper"):

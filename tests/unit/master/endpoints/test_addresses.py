@@ -23,7 +23,6 @@ def peer(host: str, local: str) -> Peer:
     ],
 )
 def test_the_appliance_listens_on_the_address_in_answers(listen: str, local: str, told: str) -> None:
-    """Answers have the address that the peer connected to, unless the appliance does not listen there."""
     assert AdvertisedAddresses([], None, listen).address_for(peer("127.0.0.1", local)) == told
 
 

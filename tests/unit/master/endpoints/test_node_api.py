@@ -105,7 +105,7 @@ async def test_programs_that_serve_two_nodes_with_one_api(telling: NodeCall) -> 
 
 
 async def test_a_connection_is_kept_for_the_next_call_but_not_to_find_out_whether_a_node_is_there() -> None:
-    """A process that is gone must not be taken for a silent one on its old connection."""
+    """On its old connection, a process that is gone would seem silent."""
     street = Street()
     made: list[tuple[str, int]] = []
     closed: list[str] = []

@@ -15,9 +15,7 @@ class Told:
 
 
 def test_ports_are_closed_once() -> None:
-    """A node is closed when it is replaced and again when it is forgotten. By then, another node may have these
-    ports.
-    """
+    """A node is closed when it is replaced, and again when it is forgotten: then another node may have its ports."""
     places, server = Told(), Told()
     faces = ProxyEndpoints(cast(Any, None), cast(Any, places), *[cast(Any, None)] * 3)
     faces.servers["key"] = cast(Any, server)

@@ -1,4 +1,4 @@
-"""Each relay receives its topics with its own port of each node; a moved topic keeps its grants."""
+"""Each relay receives its topics with its own port of each node. A topic keeps its grants in another relay."""
 
 import asyncio
 import ipaddress

@@ -188,7 +188,7 @@ class History(ControlParts):
                 self.graph.forgotten(node)
 
     def _register(self, node: Incarnation, kind: Kind, topic: str) -> None:
-        """Earlier values arrive before the answer, whose value is not sent again. A list that waits is older."""
+        """Register a node. Values arrive before its answer, which replaces a list that waits."""
         if kind not in {Kind.SUBSCRIPTION, Kind.PARAMETER}:
             self.graph.registered(node, kind, topic, "4001")
             return

@@ -106,7 +106,7 @@ async def test_a_node_of_another_machine_is_refused() -> None:
 async def test_a_node_that_reaches_another_address_gets_its_lists_with_it(
     monkeypatch: pytest.MonkeyPatch, lost: bool
 ) -> None:
-    """The address is also stored, since the lists after a restart of control have it too."""
+    """The address is stored as well, for the lists after a restart of control."""
     world = await world_with(SlowFaces())
     stored = list[str]()
     monkeypatch.setattr(world.store, "save_incarnation", lambda row: stored.append(row.told))

@@ -1,4 +1,4 @@
-"""Faults of the sinks, each of which the histories of `sink_history.py` must find: a part of a function is replaced."""
+"""Faults of the sinks, which the histories of `sink_history.py` must find. Each replaces a part of a function."""
 
 import inspect
 import textwrap
@@ -19,7 +19,7 @@ _SEEDS = 500
 
 
 class Fault(NamedTuple):
-    """`text`, which occurs once in the function `name` of a class or module, is replaced by `wrong`."""
+    """The replacement of `text`, which occurs once in the function `name` of a class or module, with `wrong`."""
 
     place: Any
     name: str

@@ -1,4 +1,4 @@
-"""After any history, each sink has exactly the state of the registry, as if it had started just now."""
+"""After any history, each sink has exactly the state of the registry, as if it had just started."""
 
 import asyncio
 from collections.abc import Sequence
@@ -40,7 +40,6 @@ async def test_a_change_without_a_flush_is_stated_in_the_same_turn() -> None:
 async def test_the_changes_of_a_turn_are_stored_together(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A crash loses all of them or none. A turn with thousands of changes is written in parts, in order."""
     world = History(tmp_path)
     await world.round()
     written = list[int]()
@@ -83,7 +82,7 @@ async def test_a_relay_that_takes_no_messages_delays_no_other_sink() -> None:
 
 @pytest.mark.anyio
 async def test_a_relay_gets_what_it_could_not_take_as_soon_as_it_reads() -> None:
-    """Neither a grant, a revocation nor the end of a node waits for a later change or for a new relay."""
+    """No grant, revocation or end of a node waits for a later change or for a new relay."""
     world = await ControlParts.begun()
     ended, node = world.node("/ended", 1), world.node("/n", 2)
     for one in (ended, node):

@@ -1,4 +1,4 @@
-"""Nodes get the lists that they lack: after control died during a change, and while they are not connected."""
+"""Nodes get the lists that they lack after control died during a change, and after they were disconnected."""
 
 from typing import Any, cast
 
@@ -13,7 +13,6 @@ pytestmark = pytest.mark.anyio
 
 
 async def test_the_next_control_repeats_the_news_of_a_lost_topic() -> None:
-    """Else subscribers would keep the old publisher."""
     world = await ControlParts.begun()
     node = world.node("/ear")
     await world.register(node, Kind.SUBSCRIPTION, "/secret")

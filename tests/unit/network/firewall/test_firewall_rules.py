@@ -53,7 +53,7 @@ def test_no_other_machine_uses_or_reaches_the_own_network() -> None:
 
 
 def test_the_rules_only_ever_refuse() -> None:
-    """No accepted packet overrides another firewall."""
+    """To accept a packet would override another firewall."""
     refusing = {PacketVerdict.RETURN, PacketVerdict.RESET, PacketVerdict.DROP}
     assert {rule.verdict for rule in appliance_rules(FULL)} == refusing | {PacketVerdict.COUNTED}
 
@@ -319,7 +319,7 @@ def test_replication_and_lease_are_for_the_other_appliance() -> None:
 
 @pytest.mark.parametrize("name", [one.name for one in fields(PacketRule)])
 def test_both_back_ends_translate_each_condition(name: str) -> None:
-    """An ignored condition would match more packets; iptables rejects rules in other chains."""
+    """An ignored condition would match more packets. The other chains need nftables."""
     if name in ("purpose", "verdict", "chain"):
         return
     rule, value = CONDITIONS[name]

@@ -54,7 +54,6 @@ def test_the_reason_says_what_is_missing_until_nothing_is() -> None:
 @pytest.mark.parametrize("kind", [TOPIC, SERVICE])
 @pytest.mark.parametrize("name", ["", "listener", "/", "/a\nb", "/" + "a" * 2000, "/é"])
 def test_an_invalid_callerid_is_refused(kind: dict[str, str], name: str) -> None:
-    """A peer must send a global name before the relay looks up or sends anything."""
     assert "caller_id" in flaw(kind | {"callerid": name}, b"")
     assert flaw(kind | {"callerid": "/rosservice-4711"}, b"") == ""
 

@@ -75,7 +75,7 @@ def test_a_reply_without_a_request_is_an_error_while_one_is_held() -> None:
 
 
 def test_requests_are_refused_without_control() -> None:
-    """Also those that wait when control ends. Each answer comes in a later turn, so that no flood nests."""
+    """So are requests that wait when control ends. Answers come in later turns, so a flood does not recurse."""
     relay = Relay()
     relay.request(b"\x01")
     relay.approvals.attach(False)
@@ -99,7 +99,6 @@ def test_a_client_that_asks_no_longer_is_not_held() -> None:
 
 
 def test_control_gets_few_questions_of_a_host_at_once() -> None:
-    """A flood of one host does not delay another; a client that has ended asks no more."""
     relay = Relay()
     numbers = [relay.question("10.0.0.66") for _ in range(1000)]
     other = relay.question("10.0.0.7")

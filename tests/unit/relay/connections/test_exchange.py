@@ -76,7 +76,6 @@ def test_a_second_request_waits_for_the_first_reply() -> None:
 
 
 def test_a_reply_without_a_request_is_the_services_fault() -> None:
-    """Such a reply would be taken for the answer to the next request."""
     call = Conversation(persistent=True)
     with pytest.raises(ProtocolError, match="without a request"):
         call.exchange.from_service(encode_service_reply(b""))

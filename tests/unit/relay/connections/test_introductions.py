@@ -1,5 +1,3 @@
-"""The headers with which the relay asks a publisher, in order, until it accepts one."""
-
 import pytest
 
 from appliance.relay.connections.introductions import Introductions

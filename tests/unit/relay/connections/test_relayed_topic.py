@@ -183,7 +183,7 @@ def test_a_subscriber_whose_limit_kept_the_latched_message_from_it_gets_it_later
 
 
 def test_a_withheld_topic_reaches_only_other_hosts() -> None:
-    """Each message alone, also of one batch; the pump leaves the topic to Python."""
+    """Each message is decided alone, even within a batch. The pump leaves the topic to Python."""
     story, hidden, judged = Story(), [False], []
 
     def through(one: Batch) -> Batch:
@@ -205,7 +205,7 @@ def test_a_withheld_topic_reaches_only_other_hosts() -> None:
 
 
 def test_a_withheld_latched_message_is_given_when_the_topic_is_free() -> None:
-    """Also to a subscriber that came in the meantime; other hosts get it at once, and each host once."""
+    """A subscriber that came in the meantime gets it as well. Other hosts get it at once, and each host once."""
     story, hidden = Story(), [True]
     story.topic.withhold(lambda host: hidden[0] and host == "10.0.0.2")
     early = story.join()
@@ -310,7 +310,7 @@ STOP, FORWARD, BACK = (bytes(batch(text).view) for text in (b"stop", b"forward",
 
 @pytest.mark.parametrize("latching", ["0", "1"])
 def test_a_guards_stop_follows_the_motions_before_it_on_their_connection(latching: str) -> None:
-    """It is sent once, and until the next message it is all that a base gets that connects again."""
+    """It is sent once. Until the next message, a base that reconnects gets only the stop."""
     story = monitored(latching=latching)
     early = story.join()
     story.receive(batch(b"forward"))
@@ -338,7 +338,7 @@ def test_a_command_of_a_monitor_is_not_repeated_as_a_stop() -> None:
 
 @pytest.mark.parametrize("latching", ["0", "1"])
 def test_a_guards_stop_outlasts_the_connection_of_its_publisher(latching: str) -> None:
-    """A base gets it that connects again after a cut, unless the publisher returns with another type."""
+    """A base that reconnects after a cut gets it, unless the publisher returns with another type."""
     story = monitored(latching=latching)
     base = story.join()
     story.receive(batch(b"forward"))

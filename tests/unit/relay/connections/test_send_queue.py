@@ -18,8 +18,6 @@ def frame(size: int, fill: int = 0) -> bytes:
 
 
 class NaiveOutbox:
-    """The same rules on a list of frames, and the rest of the frame that is being sent."""
-
     def __init__(self) -> None:
         self.started = b""
         self.frames: list[bytes] = []

@@ -26,7 +26,7 @@ def frames(messages: int, size: int = 8) -> Batch:
     [[(1, 8)] * 201, [(150, 8), (51, 8)], [(1, 600 << 10), (1, 600 << 10)], [(201, 8)], [(1, 2 << 20)]],
 )
 def test_never_more_than_the_bounds(added: list[tuple[int, int]]) -> None:
-    """Beyond the limits all first messages are dropped, so that no gap is left."""
+    """Beyond a bound, all first messages are dropped, so that no gap is left."""
     memory = share()
     words = replay(memory)
     assert [kept(words, frames(*one)) for one in added] == [True] * (len(added) - 1) + [False]

@@ -33,7 +33,7 @@ guard() {
 }
 """
 BEGINNING = GUARD.replace("guard()", "begin guard()")
-"""The same, which does not hold its topics where its state is lost."""
+"""Like `GUARD`, but it does not hold its topics when its state is lost."""
 
 
 def string(text: str) -> bytes:
@@ -123,8 +123,6 @@ SPECIFICATIONS = {
 
 
 class MonitoredDialogue(Dialogue):
-    """Steps with a relay that has monitors; messages are of type std_msgs/String."""
-
     served: ClassVar = {"callerid": "/talker", "type": "std_srvs/SetBool", "md5sum": SET_BOOL_MD5}
     asked = WANTED
     published = TYPED
@@ -196,7 +194,7 @@ class MonitoredDialogue(Dialogue):
 
 
 def _text(word: str) -> str:
-    """`NAME|old|new` replaces text, and `hold:` in front makes the specification hold its topics."""
+    """Return a specification. `NAME|old|new` replaces text, and the prefix `hold:` lets it hold its topics."""
     name, *change = word.removeprefix("hold:").split("|")
     text = SPECIFICATIONS.get(name, name)
     text = text.replace(*change) if change else text  # type: ignore[arg-type]  # two texts

@@ -1,4 +1,4 @@
-"""Monitors without sockets, threads and clocks: statements and messages in, reports out."""
+"""Monitors without sockets, threads and clocks, with statements and messages as input and reports as output."""
 
 from collections.abc import Callable
 from typing import Any

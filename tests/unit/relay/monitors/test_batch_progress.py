@@ -133,7 +133,7 @@ class Monitored:
         return self.interceptor.observer.rows(self.set, self.interceptor.now())
 
     def state(self) -> list[object]:
-        """`next_due` is left out: it may be too early."""
+        """Return the state to compare, without `next_due`, which may be too early."""
         state: list[object] = []
         for monitor in self.set.monitors:
             state.append((monitor.name, monitor.seen, monitor.faults, monitor.held))
@@ -417,7 +417,6 @@ def test_a_deadline_that_a_message_begins_wakes_the_loop() -> None:
 
 
 def test_a_deadline_of_the_engine_is_over_before_the_next_message() -> None:
-    """The prepared fast path must not go past it, although the loop has not yet called the timer."""
     text = """s() { bool late = false;
         event other(int c) /plain own/Plain '{count:c}' when (c != 9) { if (late) { return; } }
         event e(int c) /plain own/Plain '{count:c}' when (c == 9) { c = 1; }

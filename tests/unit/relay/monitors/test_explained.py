@@ -1,7 +1,7 @@
 """Every action of a monitor is explained: the host, the events, the values and the line.
 
-The events that a record names are replayed alone, from the initial state; they must have the same effect. The lines
-for people come from the record, as `rosrv audit why`, REST and the console show it.
+The events that a record names are replayed alone, from the initial state, and must have the same effect. The lines
+for people come from the record, as `rosrv audit why`, REST and the console show them.
 """
 
 import struct
@@ -27,7 +27,7 @@ from tests.unit.relay.monitors.test_batch_progress import Monitored
 
 MS = 1_000_000
 START = 1_900_000_000_000 * MS
-"""Later than now: specifications in shadow mode read the clock, which must not be ahead of the messages."""
+"""Later than the present: in shadow mode, specifications read the clock, which must not be ahead of the messages."""
 
 
 class Given(NamedTuple):
@@ -44,7 +44,7 @@ class Row(NamedTuple):
     by: str
     at: str
     because: list[tuple[str, str]]
-    """The events that explain a verdict, or the verdict in whose handler it happened, and who sent each."""
+    """The events, with their senders, that explain the verdict, or the verdict whose handler acted."""
     where: dict[str, dict[str, object]]
     values: Mapping[str, object] = MappingProxyType({})
     restarted: bool = False
@@ -114,7 +114,6 @@ def place(text: str, piece: str) -> str:
 
 
 def check(row: Row, *, together: bool, shadow: bool = False) -> None:
-    """The named events must be enough."""
     found = told(row, row.given, together=together, shadow=shadow)
     assert found is not None
     detail = found.detail
@@ -169,7 +168,7 @@ BOTH = [("a", ARM), ("b", STICK)]
 
 
 def given(text: str) -> list[Given]:
-    """`a5`: 5 on /a, from the arm; `b1`: 1 on /b, from the stick; 10 ms apart.
+    """Parse messages 10 ms apart: `a5` is 5 on /a from the arm, `b1` is 1 on /b from the stick.
 
     A `.` adds 10 ms, and `c0` lets the time pass.
     """

@@ -14,7 +14,7 @@ from appliance.relay.monitors.host_mask import HostMask
     ],
 )
 def test_hosts_of_withheld_networks_get_nothing_while_they_are_withheld(host: str, hidden: bool) -> None:
-    """A host without an address may be any host."""
+    """A host without an address could be any host."""
     networks: list[tuple[str, ...]] = [()]
     mask = HostMask(lambda: networks[0])
     assert not mask.hides(host)

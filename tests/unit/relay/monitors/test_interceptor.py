@@ -139,7 +139,6 @@ def test_specifications_of_a_new_control_are_in_force_before_its_placements(
 
 
 def test_ticks_that_take_longer_than_their_period_do_not_starve_the_relay(world: Monitored) -> None:
-    """Late ticks are left out and reported."""
     slow = "slow() { int n; event tick() every 1ms { for (int i = 0; i < 60000; i++) n += i; } }"
     world.load(slow)
     longest = 0.0

@@ -23,7 +23,6 @@ print(len(gc.get_objects()))
 
 @pytest.mark.nightly
 def test_the_garbage_collector_looks_at_the_specifications_and_not_at_what_compiles_them() -> None:
-    """Scanning their hundred thousand objects would delay messages."""
     data = stated(1, [("m.rv", TEXT)]).part
     done = subprocess.run(
         [sys.executable, "-c", PROGRAM, data.hex()], capture_output=True, text=True, check=True

@@ -254,7 +254,7 @@ def test_lines_that_differ_only_in_numbers_are_one_count(together: bool) -> None
 
 @pytest.mark.parametrize("together", [False, True])
 def test_further_drops_have_a_number_and_times(together: bool) -> None:
-    """The texts of further drops are unknown to the fast path, so their count claims none."""
+    """The fast path does not know the texts of later drops, so their count has no text."""
     told = Told(together=together, texts=(SAYS,))
     told.send(*[(0, 0, turn) for turn in (5, 6, 7)])
     first, more = told.events("drop")

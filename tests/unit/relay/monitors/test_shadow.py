@@ -123,7 +123,6 @@ def test_shadow_mode_has_a_bounded_part_of_the_processor(
 
 
 def test_waiting_messages_are_bounded(world: Trying, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The subscriber gets all messages beyond the limit."""
     monkeypatch.setattr(shadow, "_MOST_WAITING", 5)
     world.state_shadows(GUARD, shadowed=("guard",))
     publisher, subscriber = world.typed()

@@ -1,4 +1,4 @@
-"""If a process is killed at any write, the memory has the state before or after it, and no other."""
+"""If a process is killed at any write, the memory has the state before or after the write, and no other."""
 
 from collections.abc import Callable
 from typing import Any

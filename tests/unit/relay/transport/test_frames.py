@@ -70,7 +70,6 @@ def test_every_way_of_cutting_the_stream_gives_the_same_frames(lengths: list[int
 
 
 def test_a_torn_frame_is_never_part_of_a_batch() -> None:
-    """A dying publisher tears no stream."""
     one, budget = receiver()
     (batch,) = feed(one, frame(10) + frame(20) + frame(30)[:-1], [SCRATCH])
     assert batch == (frame(10) + frame(20), 2, 14)
@@ -111,7 +110,6 @@ def test_the_limit_holds_for_a_frame_after_a_large_one() -> None:
 
 
 def test_a_declared_length_costs_nothing_until_its_bytes_come() -> None:
-    """Otherwise declared lengths could fill the relay."""
     one, budget = receiver()
     feed(one, struct.pack("<I", LIMIT) + b"x" * 10, [14])
     assert budget.used == 14

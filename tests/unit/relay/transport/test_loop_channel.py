@@ -56,7 +56,7 @@ def ends() -> Iterator[Ends]:
 
 
 def test_thousands_of_messages_are_carried_out_a_quantum_at_a_time_and_in_order(ends: Ends) -> None:
-    """Other sockets get their turns in between, because a message here costs a hundredth of a quantum."""
+    """Other sockets get their turns in between: a message costs a hundredth of a quantum here."""
     send(ends.raw, 1000)
     ends.loop.turn(1)
     assert 0 < len(ends.received) <= 210

@@ -183,7 +183,7 @@ def test_a_holder_that_leaves_and_comes_back_wins_nothing() -> None:
 
 
 def test_names_of_a_host_share_its_limit() -> None:
-    """Fifteen nodes of one host together get what one node would get, in equal parts."""
+    """Fifteen nodes of one host together get the limit of one node, in equal parts."""
     flows = RateLimits(lambda: 0.0)
     shares = [flows.of(FlowLimit(messages=30), "/scan", "10.0.0.9", holder=str(name)) for name in range(15)]
     counts = passed([event for share in shares if share is not None for event in flood(share, 10)])

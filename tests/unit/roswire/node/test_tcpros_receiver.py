@@ -14,7 +14,7 @@ LIMIT = 1 << 20
 
 
 class Connection(asyncio.Transport):
-    """Feed a receiver as an event loop does; bytes wait while it does not read."""
+    """Feeds a receiver as an event loop does. Bytes wait while the receiver does not read."""
 
     def __init__(self, memory: int = 10 * LIMIT) -> None:
         super().__init__()

@@ -20,10 +20,11 @@ BASE = 1_767_225_600
 
 
 def keep_recordings(fake: FakeAppliance, before: str, how: str = "", *, below: list[str]) -> None:
-    """`recordings SECONDS [fleeting]`: recordings, each `LETTER BEGAN ENDED {FIELD: VALUE}`, and the memory's contents.
+    """`recordings SECONDS [fleeting]` keeps recordings, each `LETTER BEGAN ENDED {FIELD: VALUE}`, and the memory.
 
-    The id is the letter 20 times; `m` is the memory, with SECONDS of messages, and `o` is still being made. A recording
-    has one number a second, the last digit of that second. A fleeting one is removed when the next one is fetched.
+    The id is the letter 20 times; `m` is the memory, with SECONDS of messages, and `o` is still being made. A
+    recording has one number a second, the last digit of that second. A fleeting one is removed when the next one is
+    fetched.
     """
     known, fetched = dict[str, Recording](), list[str]()
     for line in below:

@@ -78,14 +78,13 @@ def test_each_kit_has_a_lease_of_its_own() -> None:
 
 
 def test_the_first_lease_has_a_greater_epoch_than_the_appliance() -> None:
-    """Otherwise the witness would refuse the appliance as one that knows more."""
+    """Otherwise the witness would refuse the appliance, because it knows a later epoch."""
     write_epoch("first", 41)
     join_first()
     assert "--in-sync a --epoch 42 " in Path("kit/witness/install.sh").read_text()
 
 
 def test_a_damaged_epoch_is_refused() -> None:
-    """A kit with a smaller epoch would be useless."""
     write_epoch("first", 1).write_text("damaged")
     done = rosrv("standby", "join", "--state", "first", *FIRST, "--output", "kit")
     assert done.returncode == 1 and "does not contain an epoch" in done.stderr
@@ -103,7 +102,6 @@ def test_the_ports_are_those_of_the_running_appliance() -> None:
 
 
 def test_a_running_appliance_does_not_become_the_other_one() -> None:
-    """Its changes until the restart would be lost."""
     join_first()
     running = StateDirectory(Path("second"))
     try:
@@ -115,7 +113,7 @@ def test_a_running_appliance_does_not_become_the_other_one() -> None:
 
 
 def test_an_epoch_of_another_pair_does_not_count() -> None:
-    """It could be greater than the new witness's, which would then shut out both."""
+    """If it were greater than the new witness's, the witness would shut out both appliances."""
     join_first("kit", state="first")
     epoch = write_epoch("second", 99)
     assert rosrv("standby", "join", "kit/standby-b.json", "--state", "second").returncode == 0
