@@ -164,7 +164,7 @@ class _Gathered:
                 continue
             path: KeyPath = tuple(part.lower() for part in name.removeprefix(_PREFIX).split("__"))
             value: Any = environment[name]
-            if value[:1] in "[{":
+            if value.startswith(("[", "{")):
                 try:
                     value = yaml.safe_load(value)
                 except yaml.YAMLError as error:

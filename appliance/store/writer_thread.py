@@ -75,9 +75,10 @@ class _Waiter(NamedTuple):
     synced: bool
 
 
-class _Gathered(NamedTuple):
-    thread: int
-    changes: list[tuple[Change, bool]]
+class _Gathered(threading.local):
+    """The changes of this thread that wait for the end of a block."""
+
+    changes: list[tuple[Change, bool]] | None = None
 
 
 class StoreError(Exception):
@@ -118,7 +119,7 @@ class Database:
         except (OSError, ValueError, ChangeError) as error:
             raise StoreError(f"{path.with_suffix('.ahead')}: {error}") from error
         self._feeds: tuple[ChangeFeed, ...] = ()
-        self._gathered: _Gathered | None = None
+        self._gathered = _Gathered()
         self._queue: deque[_Queued | _Waiter] = deque()
         self._group: list[_Queued | _Waiter] = []
         self._retry_at = -math.inf
@@ -150,25 +151,24 @@ class Database:
 
     def _submit(self, change: Change, *, ahead: bool) -> None:
         self.tables.check(change)
-        gathered = self._gathered
-        if gathered is not None and gathered.thread == threading.get_ident():
-            gathered.changes.append((change, ahead))
-        else:
+        if self._gathered.changes is None:
             self._keep([(change, ahead)])
+        else:
+            self._gathered.changes.append((change, ahead))
 
     @contextlib.contextmanager
     def together(self) -> Iterator[None]:
         """Write this thread's changes in the block together at its end; none survives the process before."""
-        if self._gathered is not None:
+        if self._gathered.changes is not None:
             yield
             return
-        gathered = self._gathered = _Gathered(threading.get_ident(), [])
+        gathered = self._gathered.changes = []
         try:
             yield
         finally:
-            self._gathered = None
-            if gathered.changes:
-                self._keep(gathered.changes)
+            self._gathered.changes = None
+            if gathered:
+                self._keep(gathered)
 
     def _keep(self, changes: list[tuple[Change, bool]]) -> None:
         encoded = [

@@ -53,7 +53,7 @@ class MessageCursor:
         self._locator = locator
         self._layout = layout
         self._starts = [start]
-        self._elements: dict[tuple[int, int], MessageCursor | Spot] = {}
+        self._elements: dict[tuple[Spot, int], MessageCursor | Spot] = {}
 
     def start_of(self, part: int) -> Spot:
         while len(self._starts) <= part:
@@ -78,7 +78,7 @@ class MessageCursor:
             rest = path[position + 1 :]
             if step.index is None:
                 return start.plus(_PARTS_OF_TIME[rest[0].name]) if rest else start
-            return self._element(place.part, place.item, start, step, rest)
+            return self._element(place.item, start, step, rest)
         return self._first(".".join(names) + ".")
 
     def _first(self, prefix: str) -> Spot | None:
@@ -90,7 +90,6 @@ class MessageCursor:
 
     def _element(
         self,
-        part: int,
         item: FixedField | StringPart | ArrayPart,
         start: Spot,
         step: tree.PathStep,
@@ -98,7 +97,7 @@ class MessageCursor:
     ) -> Spot | None:
         assert isinstance(item, FixedField | ArrayPart)  # its type is an array here
         index = step.index or 0
-        key = (part * 1_000_000 + start.offset, index)
+        key = start, index
         if key not in self._elements:
             spot = self._locator.element(item, start, step)
             self._elements[key] = (

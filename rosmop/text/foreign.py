@@ -63,7 +63,7 @@ _NAMES = _TEMPLATES | {
     "Publisher": "publish with `PUBLISH(/topic, package/Type, value);`, without declaring it",
     "Subscriber": "an `event` subscribes; leave this out",
     "ServiceServer ServiceClient service::call": (
-        "services cannot be called; `event … service` observes the calls of other nodes"
+        "write `CALL(/service, package/Type, request);`; `event … service` observes the calls of other nodes"
     ),
     "NodeHandle AsyncSpinner CallbackQueue spin spinOnce ok rospy roscpp ros::init": _NO_NODE,
     "param::get param::param param::set": (

@@ -35,7 +35,7 @@ def run(
         specifications = read_for_recordings(program, files, folders)
         if options.single is not None:
             with program.reports():
-                _run_single(program, specifications, options.single, output, as_json=as_json)
+                _run_single(program, specifications, options, options.single, output, as_json=as_json)
             return 0
     except SpecificationError as error:
         raise refused(error.findings) from None
@@ -85,23 +85,38 @@ def run_spans(
 
 
 def _run_single(
-    program: CommandContext, specifications: Specifications, bag: Path, output: Path | None, *, as_json: bool
+    program: CommandContext,
+    specifications: Specifications,
+    options: RecordingsOptions,
+    bag: Path,
+    output: Path | None,
+    *,
+    as_json: bool,
 ) -> None:
     with closing(open_recording(bag)) as reader:
         monitors = specifications.monitors(definitions_of(reader))
         for text in refusals(monitors, reader):
             program.warn(f"{text}; its messages are dropped")
         if output is None:
-            _report(monitors, reader, None, as_json=as_json)
+            _report(monitors, reader, None, options, as_json=as_json)
         else:
             with OutputBag(output, monitors.definitions) as recording:
-                _report(monitors, reader, recording, as_json=as_json)
+                _report(monitors, reader, recording, options, as_json=as_json)
 
 
-def _report(monitors: MonitorSet, reader: Reader, recording: OutputBag | None, *, as_json: bool) -> None:
+def _report(
+    monitors: MonitorSet,
+    reader: Reader,
+    recording: OutputBag | None,
+    options: RecordingsOptions,
+    *,
+    as_json: bool,
+) -> None:
     counts = {"passed": 0, "changed": 0, "dropped": 0}
     verdicts = faults = 0
-    with progress("replaying", lambda: reader.message_count, shares_screen=True) as advance:
+    with progress(
+        "replaying", lambda: reader.message_count, shares_screen=True, always=options.progress
+    ) as advance:
         for number, replayed in enumerate(replay(monitors, reader, recording)):
             outcome = replayed.outcome
             if replayed.index is not None:

@@ -81,7 +81,7 @@ def followed(appliance: Appliance, ros: RosSession, folder: Path) -> Trace:
             last_end = next(
                 what for what in reversed(["closed", *there]) if what in ("opened", "closed", "revoked")
             )
-            # More are opened where a listener that had connected by itself is reminded to connect.
+            # More are opened where a listener that has already connected again is reminded to connect.
             ready = there.count("opened") >= opened and last_end == "opened"
             return known if ready and there.count("loaded") == revision - 1 else None
 

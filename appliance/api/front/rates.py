@@ -15,7 +15,7 @@ def peer_key(host: str) -> str:
         address = ipaddress.ip_address(host)
     except ValueError:
         return host
-    if address.version == 4:
+    if address.version == 4 or address.is_loopback:
         return host
     if address.ipv4_mapped is not None:
         return str(address.ipv4_mapped)

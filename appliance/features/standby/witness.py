@@ -766,7 +766,7 @@ def run_program(command: List[str], text: str) -> str:
 
 def chosen_backend(release: str, find: Callable[[str], Optional[str]]) -> str:
     """Return nft or iptables. Before Linux 4.18, translations of nft and iptables exclude one another."""
-    version = tuple(int(number) for number in re.findall(r"[0-9]+", release)[:2])
+    version = tuple(int(number) for number in re.findall(r"[0-9]{1,9}", release)[:2])
     if find("nft") and version >= (4, 18):
         return "nft"
     if find("iptables-restore"):

@@ -78,22 +78,26 @@ class ListeningPorts:
                 if error.errno in _EXHAUSTED:
                     self._pause(key, listening)
                     return
+                used = self._loop.used()
                 continue  # this peer has left already; the next may be connected
-            try:
-                tune(sock)
-            except OSError:
-                sock.close()
-                continue
             host = address[0].removeprefix("::ffff:")
             payer = self._payer(host)
-            reason = self._take(host)
-            if reason:
-                sock.close()
-                self._turned_away(key, host, reason)
-            else:
-                self._arrived(key, sock, host)
+            self._receive(key, sock, host)
             before, used = used, self._loop.used()
             self._loop.charge(payer, used - before)
+
+    def _receive(self, key: str, sock: socket.socket, host: str) -> None:
+        try:
+            tune(sock)
+        except OSError:  # this peer has left already
+            sock.close()
+            return
+        reason = self._take(host)
+        if reason:
+            sock.close()
+            self._turned_away(key, host, reason)
+        else:
+            self._arrived(key, sock, host)
 
     def _pause(self, key: str, listening: socket.socket) -> None:
         self._loop.unwatch(listening.fileno())

@@ -56,7 +56,7 @@ class ShadowMonitors:
         self._spent = 0.0
         self._foreign: set[str] = set()
         self._timer: LoopTimer | None = None
-        self._resting: set[MonitorSet] = set()
+        self._resting: dict[MonitorSet, str] = {}  # with the reason
 
     # --- the monitors ---
 
@@ -138,10 +138,11 @@ class ShadowMonitors:
         while self.waiting and last - began < longest:
             waiting = self.waiting.popleft()
             self._bytes -= len(waiting.tapped.data)
-            if self._spent > SHARE or waiting.tapped.shadow in self._resting:
-                self._miss(waiting.tapped.shadow, waiting.point, _TOO_SLOW, waiting.observed)
-            else:
+            why = _TOO_SLOW if self._spent > SHARE else self._resting.get(waiting.tapped.shadow)
+            if why is None:
                 self._give(waiting)
+            else:
+                self._miss(waiting.tapped.shadow, waiting.point, why, waiting.observed)
             now = time.thread_time()
             self._spent += now - last
             last = now
@@ -158,8 +159,8 @@ class ShadowMonitors:
                 observed.sender(source) if observed is not None else MessageSender(source)
             )
         except Exception as error:  # noqa: BLE001  a defect of the monitors must not end the relay
-            self._resting.add(shadow)
-            self._miss(shadow, point, observer.defect(error, point, self._now(), observed), observed)
+            self._resting[shadow] = observer.defect(error, point, self._now(), observed)
+            self._miss(shadow, point, self._resting[shadow], observed)
             return
         observer.report(outcome, point, observed)
         if self._rests(shadow):
@@ -177,8 +178,8 @@ class ShadowMonitors:
             try:
                 outcomes = shadow.advance(now)
             except Exception as error:  # noqa: BLE001  a defect of the monitors must not end the relay
-                self._resting.add(shadow)
-                self._miss(shadow, NOWHERE, self._observer.defect(error, NOWHERE, now))
+                self._resting[shadow] = self._observer.defect(error, NOWHERE, now)
+                self._miss(shadow, NOWHERE, self._resting[shadow])
                 continue
             for outcome in outcomes:
                 self._observer.report(outcome, NOWHERE)
@@ -188,7 +189,7 @@ class ShadowMonitors:
     def _rests(self, shadow: MonitorSet) -> bool:
         spent = shadow.late or any(monitor.context.budget < 0 for monitor in shadow.monitors)
         if spent:
-            self._resting.add(shadow)
+            self._resting[shadow] = _TOO_LONG
         return spent
 
     def _miss(

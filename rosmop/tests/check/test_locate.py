@@ -1,13 +1,17 @@
 """A bound parameter equals the decoded field, and changing it equals encoding the whole changed message."""
 
+import struct
 from collections.abc import Iterator
 from random import Random
 
 import pytest
 
+from rosmop.check.sources import compiled_from
+from rosmop.run.engine import MonitorSet
 from rosmop.tests.acting import definitions, load, message
 from rosmop.types import value_types
 from rosmop.types.messages import MessageTypes
+from roswire.definitions import Definitions
 
 KINDS = (
     "nav_msgs/Odometry", "sensor_msgs/JointState", "sensor_msgs/LaserScan", "nav_msgs/Path", "sensor_msgs/PointCloud2",
@@ -81,3 +85,15 @@ def test_every_field_of_a_random_message(kind: str, seed: int) -> None:
 def _encoded(kind: str, value: object) -> bytes:
     assert isinstance(value, dict)
     return message(kind, **value)
+
+
+def test_an_array_behind_a_large_one_and_a_string_is_not_the_array_before_them() -> None:
+    pad = 2_000_000
+    own = {"own/Large.msg": f"int8[{pad}] pad\nint32[2] x\nstring s\nint32[2] y\n"}
+    text = "s() { event e(int a, int b) /t own/Large '{x[0]:a, y[0]:b}' { ROS_INFO(\"%d %d\", a, b); } }"
+    monitors = MonitorSet.of(
+        compiled_from({"x.rv": text}, definitions().extended(Definitions.from_files(own)))
+    )
+    monitors.start(0)
+    data = bytes(pad) + struct.pack("<iiI3sii", 11, 12, 3, b"abc", 21, 22)
+    assert [line.text for line in monitors.process("/t", data, 0).log] == ["11 21"]

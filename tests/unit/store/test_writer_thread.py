@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -310,6 +311,33 @@ def test_rows_of_one_table_are_one_statement(
     expected = {f"row {size % 70}": size for size in range(100)} | {"row 2": 1}
     del expected["row 1"]
     assert rows == expected
+
+
+@pytest.mark.nightly
+def test_a_block_of_one_thread_is_whole_beside_that_of_another(
+    database: Database, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    numbers: list[int] = []
+    append = WriteAhead.append
+
+    def observed(ahead: WriteAhead, changes: Sequence[Encoded]) -> None:
+        numbers.append(len(changes))
+        append(ahead, changes)
+
+    monkeypatch.setattr(WriteAhead, "append", observed)
+
+    def other() -> None:
+        with database.together():
+            database.delete("thing", name="c")
+            database.put("thing", "d", 1)
+        assert numbers == [2], "both changes of this block, and none of the other"
+
+    with database.together():
+        database.put("thing", "a", 1)
+        with ThreadPoolExecutor(1) as pool:
+            pool.submit(other).result()
+        database.delete("thing", name="b")
+    assert numbers == [2, 2]
 
 
 def test_a_block_of_statements_is_one_transaction(

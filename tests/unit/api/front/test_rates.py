@@ -36,4 +36,5 @@ def test_addresses_of_one_peer() -> None:
     assert peer_key("10.0.0.1") == "10.0.0.1"
     assert peer_key("::ffff:10.0.0.1") == "10.0.0.1"
     assert peer_key("2001:db8::1") == peer_key("2001:db8::ffff:2") != peer_key("2001:db8:0:1::1")
+    assert peer_key("::1") == "::1", "the operator's own machine"
     assert peer_key("somewhere") == "somewhere"

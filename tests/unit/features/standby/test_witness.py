@@ -500,6 +500,7 @@ def test_its_patterns_compile_on_python_3_5() -> None:
         if isinstance(node, ast.Call)
         and ast.unparse(node.func).startswith("re.")
         and isinstance(node.args[0], ast.Constant)
+        and isinstance(node.args[0].value, str)
     ]
     assert patterns
     assert [one for one in patterns if newer.search(one)] == []

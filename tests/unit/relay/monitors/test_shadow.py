@@ -1,5 +1,6 @@
 import time
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 
@@ -10,6 +11,8 @@ from appliance.channel.messages import (
     SpecificationsTaken,
 )
 from appliance.relay.monitors import shadow
+from appliance.relay.monitors.observation_points import ObservationPoint
+from appliance.relay.monitors.observer import Observer
 from tests.support.stated import stated
 from tests.unit.relay.monitors.monitored import (
     GUARD,
@@ -129,6 +132,29 @@ def test_waiting_messages_are_bounded(world: Trying, monkeypatch: pytest.MonkeyP
     publisher.send(string("a") * 30)
     world.gets(subscriber, string("a") * 30)
     assert "queue for monitors in shadow mode is full" in world.event("shadow missed", count=0).text
+
+
+def test_each_message_that_is_missed_has_the_reason_of_the_rest(
+    world: Trying, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reasons: list[str] = []
+    missed = Observer.missed
+
+    def noted(
+        self: Observer, monitor: str, point: ObservationPoint, time: int, text: str, *rest: Any
+    ) -> None:
+        reasons.append(text)
+        missed(self, monitor, point, time, text, *rest)
+
+    monkeypatch.setattr(Observer, "missed", noted)
+    monkeypatch.setattr(shadow.ShadowMonitors, "tick", lambda _self: None)
+    world.state_shadows(GUARD, shadowed=("guard",))
+    publisher, subscriber = world.typed()
+    for _ in range(5):
+        publisher.send(string("loop"))
+    world.gets(subscriber, string("loop") * 5)
+    world.until(lambda: len(reasons) == 5)
+    assert all("the limit in shadow mode" in reason for reason in reasons), reasons
 
 
 def test_a_defect_in_it_ends_no_message(world: Trying) -> None:
