@@ -103,7 +103,7 @@ ROLES = (
     ),
     _ours(
         "api", "rosrv-api", "api", "appliance.api.process:main",
-        ended_early=800, nice=10, files=4096, after="control", listens=True, dispensable=True, stands_by=True,
+        ended_early=800, nice=5, files=4096, after="control", listens=True, dispensable=True, stands_by=True,
         sandbox=lambda facts: SandboxPlan(
             allowlist=True,
             reads=(

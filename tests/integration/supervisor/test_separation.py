@@ -77,7 +77,7 @@ def test_the_weights_of_processes(appliance: Appliance) -> None:
     pids = {role: int(row["pid"]) for role, row in appliance.processes().items()}
     nice = {role: os.getpriority(os.PRIO_PROCESS, pid) for role, pid in pids.items()}
     own = os.getpriority(os.PRIO_PROCESS, 0)
-    assert nice["relay"] == own - 10 and nice["api"] == own + 10
+    assert nice["relay"] == own - 10 and nice["api"] == own + 5
     assert nice["control"] == own - 5 and nice["rosmaster"] == own
     for role in ("relay", "control", "api"):
         group = Path(f"/proc/{pids[role]}/autogroup")
