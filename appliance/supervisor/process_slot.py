@@ -30,6 +30,7 @@ class ProcessSlot:
     short_runs: int = 0  # number of short runs in a row
     due: asyncio.TimerHandle | None = None
     wanted: bool = False  # for a role on demand: requested again since its last start
+    dismissed: bool = False  # for a role on demand: killed, because control asked for its end
     pardoned: bool = False  # the supervisor ends this process because the appliance is not active any more
     since: str = ""  # time of the last start
     reason: str = ""  # why the last run ended, in the process's own words if it sent any

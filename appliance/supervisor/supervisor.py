@@ -75,6 +75,7 @@ _FROM_CONTROL: tuple[type[messages.Message], ...] = (
     messages.TunnelsWanted,
     messages.CompilerWanted,
     messages.ProcessWanted,
+    messages.ProcessOverdue,
     messages.OwnNetworkWanted,
 )
 
@@ -355,6 +356,8 @@ class Supervisor:
                 self._demand("compiler")
             case messages.ProcessWanted(role, index):
                 self._demand(role, index)
+            case messages.ProcessOverdue(role, index):
+                self._dismiss(role, index)
             case messages.OwnNetworkWanted(network, ports):
                 self._answer(process, self._open_own_network(process, network, ports))
             case messages.ApplianceStopRequested(reason):
@@ -535,6 +538,13 @@ class Supervisor:
                 if slot.is_free:
                     self.start(slot)
 
+    def _dismiss(self, role: str, index: int) -> None:
+        for slot in self.slots:
+            if slot.role.name == role and slot.index == index and slot.role.on_demand and slot.process:
+                log.error("process did not end in time and is killed", role=role, pid=slot.process.pid)
+                slot.dismissed = True
+                slot.process.kill()
+
     def _spawn(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
         task = asyncio.get_running_loop().create_task(work)
         self._tasks.add(task)
@@ -601,7 +611,7 @@ class Supervisor:
         if self.stopping.is_set():
             return
         self._gate.died(slot.role.name, serves_robot=slot.role.serves_robot)
-        if slot.role.on_demand and code == 0:
+        if slot.role.on_demand and (code == 0 or slot.dismissed):
             self._ended(slot)
             return
         if slot.pardoned:
@@ -629,7 +639,7 @@ class Supervisor:
     def _ended(self, slot: ProcessSlot) -> None:
         log.info("process ended", role=slot.role.name)
         slot.starts -= 1
-        slot.short_runs = 0
+        slot.short_runs, slot.dismissed = 0, False
         self._tell_processes()
         if slot.wanted:
             self.start(slot)

@@ -178,6 +178,13 @@ class ProcessWanted(Message):
     index: int
 
 
+class ProcessOverdue(Message):
+    """Kill a process of a role on demand, which did not end in time, or closed its link and lives on."""
+
+    role: str
+    index: int
+
+
 class OwnNetworkWanted(Message):
     """Control asks for a network that only the appliance itself may use, and for open TCP ports.
 
@@ -249,7 +256,8 @@ Lifeline = (
     Ping | Pong | Stop | Walled | Ready | Failed | LinkOpened | SocketKept | SocketDropped | SocketRestored
     | SocketsRestored | Announced | ProcessesChanged | ClockRead | FirewallReported | ProbeFailed | ProbePassed
     | PolicyReloadRequested | RouteWanted | EndpointWanted | EndpointFound
-    | TunnelsWanted | TunnelsEnclosed | ProcessWanted | OwnNetworkWanted | OwnNetworkOpened
+    | TunnelsWanted | TunnelsEnclosed | ProcessWanted | ProcessOverdue
+    | OwnNetworkWanted | OwnNetworkOpened
     | MemoryGiven | StateGiven | RouteFound | LogHeld | CompilerWanted | ApplianceStopRequested
     | SignatureWanted | SignatureMade
     | LeaseHeld | LeaseEnded | Activated | ServicePaused

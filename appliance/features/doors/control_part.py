@@ -222,6 +222,7 @@ class DoorOrders:
         for number in range(1 << 62):
             await asyncio.sleep(_LOOK_SECONDS)
             self._processes.define()
+            self._processes.end_overdue()
             ended = {row.id: row.door for row in self._visits.ended()}
             ended |= {one: self._used.pop(one) for one in [*self._used] if self._tickets.ended(one)}
             for ticket, name in ended.items():

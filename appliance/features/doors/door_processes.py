@@ -4,7 +4,9 @@
    proxy endpoints and relays. At most `_MOST_PENDING` requests for sockets wait at once.
 2. A process of a door that was removed or replaced gets `DoorEnded`, and nothing after it. A door that was added
    again counts as a new door, because its tickets and its agent's address are new.
-3. On each new link, a process gets the valid tickets, and ends connections with any other ticket.
+3. A process that got `DoorEnded` must end, and one without its link must be replaced, within `_END_SECONDS`. Otherwise
+   the supervisor kills it, so no process keeps a slot.
+4. On each new link, a process gets the valid tickets, and ends connections with any other ticket.
 """
 
 import asyncio
@@ -29,6 +31,7 @@ from appliance.store.door_tables import DoorRow
 
 ROLE = "door"
 _CONNECT_SECONDS = 5.0
+_END_SECONDS = 5.0
 _MOST_PENDING = 64
 _BACKLOG = 128
 _MOST_DEATHS = 16
@@ -44,6 +47,8 @@ class _Slot:
     started: bool = False
     ending: Channel | None = None
     """The channel to a process that got `DoorEnded`."""
+    leaving: float | None = None
+    """Since when the slot waits for the end of its process, or for a new link."""
     pending: int = 0
     definitions: Mapping[str, str] = field(default_factory=dict)
     restarts: int = 0
@@ -132,7 +137,16 @@ class DoorProcesses:
 
     def _end_process(self, slot: _Slot) -> None:
         if self._send(slot, door_link.DoorEnded()):
-            slot.ending = slot.link.channel
+            slot.ending, slot.leaving = slot.link.channel, clock.now()
+
+    def end_overdue(self) -> None:
+        for number, slot in enumerate(self._slots):
+            if slot.link.channel not in (None, slot.ending):
+                slot.leaving = None
+            elif slot.leaving is not None and clock.now() - slot.leaving >= _END_SECONDS:
+                slot.leaving = None
+                self._base.lifeline.say(messages.ProcessOverdue(ROLE, number))
+                self.start()
 
     def end_ticket(self, row: DoorRow, ticket: str) -> None:
         self._send(self._slots[row.slot or 0], door_link.TicketEnded(ticket))
@@ -146,6 +160,7 @@ class DoorProcesses:
             return slot.link.send(message, descriptors)
         except ChannelFullError:
             slot.link.close()
+            slot.leaving = clock.now()
             return False
 
     # --- messages of a process ---
@@ -176,6 +191,7 @@ class DoorProcesses:
     def _lost(self, number: int, _reason: str) -> None:
         slot, row = self._slots[number], self._table.in_slot(number)
         slot.clear()
+        slot.leaving = clock.now()
         ended, slot.ending = slot.ending is not None, None
         if ended:
             self.start()  # the next door of the slot

@@ -9,7 +9,7 @@ from typing import Any, cast
 import pytest
 from structlog.testing import capture_logs
 
-from appliance.channel.messages import CompilerWanted, RouteWanted
+from appliance.channel.messages import CompilerWanted, ProcessOverdue, ProcessWanted, RouteWanted
 from appliance.supervisor import supervisor as module
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.process_handle import ProcessHandle
@@ -157,6 +157,42 @@ async def test_a_slow_start_is_waited_for_and_reported(
     }  # fmt: skip
     (reason,) = reasons
     assert "still waiting for control" in reason
+
+
+def test_control_may_have_only_a_process_on_demand_killed(tmp_path: Path) -> None:
+    supervisor = made(tmp_path, ROSMASTER)
+    [slot] = supervisor.slots
+    master = StandIn()
+    slot.process = cast(ProcessHandle, master)
+    supervisor.control_said(cast(ProcessHandle, StandIn()), ProcessOverdue("rosmaster", 0), ())
+    assert not master.killed
+    supervisor.kept.close()
+
+
+@pytest.mark.parametrize("wanted", [False, True])
+async def test_the_slot_of_an_overdue_process_is_free_for_the_next_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, wanted: bool
+) -> None:
+    role = Role(
+        name="door", user="rosrv-doors", part="doors", entry="m:f", indexed=True, most=2, on_demand=True
+    )
+    supervisor = made(tmp_path, role)
+    filled: list[int] = []
+    monkeypatch.setattr(supervisor, "start", lambda slot: filled.append(slot.index))
+    processes = [StandIn(), StandIn()]
+    for slot, process in zip(supervisor.slots, processes, strict=True):
+        slot.process = cast(ProcessHandle, process)
+    control = cast(ProcessHandle, StandIn())
+    if wanted:
+        supervisor.control_said(control, ProcessWanted("door", 1), ())
+    supervisor.control_said(control, ProcessOverdue("door", 1), ())
+    assert [process.killed for process in processes] == [False, True]
+    supervisor.died(cast(ProcessHandle, processes[1]), -9)
+    assert supervisor.slots[1].is_free and filled == [1] * wanted
+    supervisor.died(cast(ProcessHandle, processes[0]), -9)
+    assert supervisor.slots[0].due is not None  # control did not ask for this end
+    supervisor.slots[0].due.cancel()
+    supervisor.kept.close()
 
 
 @pytest.mark.parametrize("wanted", [False, True])

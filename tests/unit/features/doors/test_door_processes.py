@@ -6,6 +6,7 @@ import pytest
 
 from appliance.base import clock
 from appliance.channel import messages
+from appliance.channel.channel import ChannelFullError
 from appliance.control.assembly.foundation import Foundation
 from appliance.features.doors import door_link, door_processes
 from appliance.features.doors.door_processes import DoorProcesses
@@ -26,6 +27,7 @@ class Bench:
         self.records: list[str] = []
         self.made: list[int] = []
         self.left: list[tuple[str, str]] = []
+        self.full = False
         settings = SimpleNamespace(
             of=lambda _kind: Doors(),
             listen_address=("0.0.0.0", 11311),
@@ -58,9 +60,14 @@ class Bench:
         monkeypatch.setattr(self.processes, "_given", self._given)
 
     def _link(self, heard: Any, lost: Any) -> SimpleNamespace:
-        return SimpleNamespace(heard=heard, lost=lost, send=self._send, channel=object())
+        return SimpleNamespace(heard=heard, lost=lost, send=self._send, channel=object(), close=self._close)
+
+    def _close(self) -> None:
+        self.link.channel = None
 
     def _send(self, message: Any, *_rest: Any, **_more: Any) -> bool:
+        if self.full:
+            raise ChannelFullError("the process does not read")
         self.sent.append(message)
         return True
 
@@ -122,6 +129,50 @@ async def test_the_process_of_a_removed_door_gets_nothing_of_the_next_one(bench:
     await asyncio.sleep(0)
     assert (bench.sent, bench.made) == ([], [])
     assert bench.processes.state(bench.rows[0])[1] == "its process is starting"
+
+
+@pytest.mark.parametrize("loses", ["nothing", "the link", "patience"])
+def test_a_process_that_does_not_end_in_time_is_killed_once(bench: Bench, loses: str) -> None:
+    machine = VirtualClock()
+    killed = [messages.ProcessOverdue("door", 0), messages.ProcessWanted("door", 0)]
+
+    def asked(seconds: float) -> list[Any]:
+        machine.advance(seconds)
+        before = len(bench.asked)
+        bench.processes.end_overdue()
+        return bench.asked[before:]
+
+    with clock.using(machine):
+        bench.hears(NEW)
+        assert asked(1000.0) == []
+        if loses == "the link":
+            bench.link.channel = None
+            bench.link.lost("")
+        elif loses == "patience":
+            bench.full = True
+            bench.policies.revision += 1
+            bench.processes.define()
+        else:
+            bench.hears(door_link.DoorStarted("bob", 1.0, True))
+        assert asked(4.0) == []
+        assert asked(1.0) == (killed if loses != "nothing" else killed[:1])
+        assert asked(60.0) == []
+
+
+def test_a_process_that_ends_in_time_or_gets_a_new_link_is_not_killed(bench: Bench) -> None:
+    with clock.using(machine := VirtualClock()):
+        bench.hears(NEW)
+        bench.processes.end(bench.rows.pop())
+        bench.ends()
+        bench.rows.append(ALICE)
+        bench.hears(NEW)
+        bench.link.channel = None
+        bench.link.lost("")
+        bench.link.channel = object()  # of the next process, which is loading
+        bench.asked.clear()
+        machine.advance(5.0)
+        bench.processes.end_overdue()
+        assert bench.asked == []
 
 
 def test_a_process_without_a_door_ends(bench: Bench) -> None:
