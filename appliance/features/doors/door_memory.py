@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from appliance.features.doors.quotas import DOOR_BYTES, DOOR_CONNECTIONS
+from appliance.features.doors.unfinished import Unfinished
 from roswire.errors import LimitExceededError
 
 
@@ -33,6 +34,7 @@ class ClientMemory:
     def __init__(self, door: DoorMemory) -> None:
         self.held = 0
         self.closed = False
+        self.unfinished = Unfinished()
         self._door = door
         self._shared = 0  # of the bytes that it holds, those of the shared half
         self._leaving = 0

@@ -38,10 +38,10 @@ class FragmentStore:
             )
         data = frame.parts[fragment.num] = fragment.data.encode()
         self._charge(frame, len(data) + _OVERHEAD)
+        self._memory.unfinished.grew(("fragment", fragment.id), frame.bytes)
         if self._bytes > self._most_bytes or self._memory.refusal(0):
-            self._frames.clear()
-            self._memory.add(-self._bytes)
-            self._bytes = 0
+            for key in [*self._frames]:
+                self._remove(key)
             raise OperationError(
                 f"more than {self._most_bytes} bytes of fragments without the rest of their frames, or no memory of"
                 " the door is left; all are dropped"
@@ -58,5 +58,6 @@ class FragmentStore:
 
     def _remove(self, key: ClientId) -> None:
         size = self._frames.pop(key).bytes
+        self._memory.unfinished.finished(("fragment", key))
         self._bytes -= size
         self._memory.add(-size)

@@ -25,12 +25,14 @@ DOOR_BYTES = QuotaRow(
     " disconnected with the reason; values that take too much are refused in words",
     between="each client has 1/68 for itself (half of the whole, divided by `doors.connections` and two); beyond that,"
     " a client gets at most as much as it leaves for all others, and is disconnected if it takes less than 512 KB in"
-    " five seconds. Two more count as clients: messages to other nodes, and arguments of calls that wait for answers",
+    " five seconds, or sends less than 256 KB in ten seconds of a frame that it has begun. Two more count"
+    " as clients: messages to other nodes, and arguments of calls that wait for answers",
     counting="host: a client's connection",
     alarm="`rosrv_door_messages_dropped_total`",
     shown_by=(
         "unit/features/doors/test_door_memory.py::test_greedy_clients_leave_memory_for_the_next_one",
         "unit/features/doors/test_session.py::test_a_client_that_does_not_read_gives_shared_memory_back_within_seconds",
+        "unit/features/doors/test_unfinished.py::test_a_client_that_holds_memory_of_others_must_send_the_rest_faster",
     ),
 )
 

@@ -11,6 +11,8 @@
    not take.
 6. A client that holds memory which all clients share (`door_memory.py`) must take frames: `_LEAST_TAKEN` bytes in
    `_TAKING_SECONDS`. Otherwise it is disconnected, because large messages of others may find no room.
+7. A client must finish what it has begun (`unfinished.py`), also if it answers pings. Its handshake takes at most
+   `handshake_seconds`.
 """
 
 import asyncio
@@ -177,7 +179,9 @@ class DoorSession:
             if await self._handshake():
                 await self._serve()
         except TimeoutError:
-            self.end = self.end or "the client was silent for too long"
+            began = self._socket.state is not State.CONNECTING
+            late = f"no WebSocket handshake in {self._options.handshake_seconds:g} s"
+            self.end = self.end or ("the client was silent for too long" if began else late)
         except OSError as error:
             self.end = self.end or f"the connection broke: {error}"
         finally:
@@ -257,10 +261,9 @@ class DoorSession:
     async def _receive(self) -> None:
         size = _READ_DEFLATED_BYTES if self._socket.extensions else _READ_BYTES
         while not self._socket.close_expected():
-            options = self._options
-            silent = options.will_silent_seconds if self._wills else options.silent_seconds
-            async with asyncio.timeout(silent):
-                data = await self._reader.read(size)
+            data = await self._read(size)
+            if data is None:
+                break
             if not data:
                 self._socket.receive_eof()
                 break
@@ -274,15 +277,42 @@ class DoorSession:
             self._charge_unfinished()
             self._wake.set()  # for the answer to a ping
             if self._pings > _MOST_PINGS:
-                await self._flush()
+                async with asyncio.timeout(self._silent_seconds):
+                    await self._flush()
         self.end = self.end or f"the client ended the connection{_reason(self._socket)}"
         if self._socket.parser_exc is not None or self._over.is_set():
             await self._drop_rest()
+
+    @property
+    def _silent_seconds(self) -> float:
+        return self._options.will_silent_seconds if self._wills else self._options.silent_seconds
+
+    async def _read(self, size: int) -> bytes | None:
+        """Return None if the client is disconnected, and nothing at the end. Raises `TimeoutError`."""
+        loop, unfinished = asyncio.get_running_loop(), self.memory.unfinished
+        until = loop.time() + self._silent_seconds
+        while not self._socket.close_expected():
+            data, began = None, loop.time()
+            try:
+                async with asyncio.timeout_at(min(until, began + unfinished.left)) as limit:
+                    data = await self._reader.read(size)
+            except TimeoutError:
+                if not limit.expired() or loop.time() >= until:
+                    raise
+            if reason := unfinished.waited(loop.time() - began, shares=self.memory.shares):
+                self.disconnect(reason)
+            elif data is not None:
+                return data
+        return None
 
     def _charge_unfinished(self) -> None:
         size = len(self._frame) + len(self._socket.reader.buffer)
         self.memory.add(size - self._unfinished)
         self._unfinished = size
+        if size or self._socket.current_size is not None:
+            self.memory.unfinished.grew("frame", size)
+        else:
+            self.memory.unfinished.finished("frame")
         if size > _READ_BYTES and (reason := self.memory.refusal(0)):
             self._disconnect(CloseCode.MESSAGE_TOO_BIG, reason)
 
@@ -309,6 +339,7 @@ class DoorSession:
             size = len(data)
             self.memory.add(-self._unfinished)
             self._unfinished = 0
+            self.memory.unfinished.finished("frame")
             # A small frame, such as a stop, is always carried out.
             try:
                 with self.memory.holding(_COPIES * size) if size > _READ_BYTES else contextlib.nullcontext():
@@ -373,7 +404,8 @@ class DoorSession:
         finally:
             if self._alarm is not None:
                 self._alarm.cancel()
-        await asyncio.sleep(_CLOSING_SECONDS)  # for the client's answer to the closing frame
+        await self._flush()  # the closing frame
+        await asyncio.sleep(_CLOSING_SECONDS)  # for the client's answer to it
 
     def _wake_at(self, when: float) -> None:
         if self._alarm_time != when:

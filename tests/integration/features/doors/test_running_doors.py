@@ -154,6 +154,25 @@ def test_large_messages_for_clients_that_read_nothing_take_bounded_memory(
         assert appliance.row("door", "list")["dropped"] > 0
 
 
+def test_a_client_that_does_not_finish_a_message_is_disconnected_and_recorded(
+    appliance: Appliance, common_robot: Host
+) -> None:
+    eventually(lambda: not appliance.row("door", "list")["trouble"], "the door serves")
+
+    def work() -> bytes:
+        with stuck_client() as client:
+            client.sendall(bytes([0x01, 0x81]) + bytes(4) + b"{")  # a text without its end
+            return b"".join(iter(lambda: client.recv(1000), b""))
+
+    end = on_robot(common_robot, work)
+    assert end[:1] == b"\x88" and end[2:4] == (1008).to_bytes(2) and b"of what it has begun" in end
+
+    def reasons() -> list[str]:
+        return [one["reason"] for one in appliance.audit(event="door disconnected", resource="agent-1")]
+
+    eventually(lambda: any("of what it has begun" in one for one in reasons()), "the record has the reason")
+
+
 def test_a_ticket_opens_the_door_of_a_person_until_it_is_over(
     appliance: Appliance, common_robot: Host, tmp_path: Path
 ) -> None:
