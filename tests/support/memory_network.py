@@ -30,7 +30,7 @@ class MemoryNetwork:
         if address not in self.servers:
             raise ConnectionRefusedError(111, "Connection refused")
         self.connections.append((source, address))
-        near, far = MemoryWriter(address), MemoryWriter(address)
+        near, far = MemoryWriter(address), MemoryWriter(address, source)
         near.peer, far.peer = far, near
         self._open += near, far
         task = asyncio.ensure_future(self._serve(self.servers[address], far))
@@ -132,6 +132,7 @@ class _Reader(asyncio.StreamReader):
 @dataclass(eq=False)
 class MemoryWriter:
     address: tuple[str, int]
+    source: str = ""  # of the peer
     closed: bool = False
     reader: _Reader = field(init=False)
     peer: "MemoryWriter" = field(init=False)

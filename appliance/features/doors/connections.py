@@ -1,6 +1,7 @@
 """Serve the connections of one door, which arrive as descriptors, and limit their number and rate.
 
-An agent that makes a connection for each call is normal; a client that connects in a loop is not.
+An agent that makes a connection for each call is normal; a client that connects in a loop is not. Beyond its first
+connection, a host gets only a part of the present and of the new ones (`host_shares.py`).
 """
 
 import asyncio
@@ -11,6 +12,7 @@ from dataclasses import dataclass
 from http import HTTPStatus
 from typing import Protocol
 
+from appliance.features.doors.host_shares import HostShares
 from roswire.node.network import BUFFER_BYTES, ByteWriter, OwnedTasks
 
 
@@ -44,23 +46,25 @@ class DoorConnections:
 
     def __init__(self, limits: ConnectionLimits) -> None:
         self.refused = 0
-        self._limits = limits
-        self._open = 0
+        self._open = HostShares("connections", limits.connections)
+        self._new = HostShares("new connections in ten seconds", limits.in_ten_seconds)
         self._refusing = 0
-        self._recent: deque[float] = deque()
+        self._recent: deque[tuple[float, str]] = deque()
         self._tasks = OwnedTasks()
 
-    def adopt(self, descriptor: int, serve: ServeClient, refused: Callable[[str], None]) -> None:
-        self._tasks.start(self._adopt(socket.socket(fileno=descriptor), serve, refused))
+    def adopt(
+        self, descriptor: int, serve: ServeClient, refused: Callable[[str], None], *, host: str
+    ) -> None:
+        self._tasks.start(self._adopt(socket.socket(fileno=descriptor), serve, refused, host))
 
     async def _adopt(
-        self, connection: socket.socket, serve: ServeClient, refused: Callable[[str], None]
+        self, connection: socket.socket, serve: ServeClient, refused: Callable[[str], None], host: str
     ) -> None:
         connection.setblocking(False)
         local = connection.family == socket.AF_UNIX
         opening = asyncio.open_unix_connection if local else asyncio.open_connection
         reader, writer = await opening(sock=connection, limit=BUFFER_BYTES)
-        await self.serve(serve, reader, _StreamWriter(writer), refused=refused)
+        await self.serve(serve, reader, _StreamWriter(writer), refused=refused, host=host)
 
     async def serve(
         self,
@@ -69,28 +73,28 @@ class DoorConnections:
         writer: ClientWriter,
         *,
         refused: Callable[[str], None],
+        host: str,
     ) -> None:
-        reason = self._excess()
+        reason = self._excess(host)
         if reason:
             refused(reason)
             await self._refuse(reader, writer, reason)
             return
-        self._open += 1
+        self._open.take(host)
         try:
             await serve(reader, writer)
         finally:
-            self._open -= 1
+            self._open.give_back(host)
 
-    def _excess(self) -> str:
+    def _excess(self, host: str) -> str:
         now = asyncio.get_running_loop().time()
-        while self._recent and self._recent[0] <= now - 10:
-            self._recent.popleft()
-        if self._open >= self._limits.connections:
-            return f"this door has {self._open} connections; at most {self._limits.connections} are allowed"
-        if len(self._recent) >= self._limits.in_ten_seconds:
-            return f"this door had {len(self._recent)} new connections in ten seconds; connect again later"
-        self._recent.append(now)
-        return ""
+        while self._recent and self._recent[0][0] <= now - 10:
+            self._new.give_back(self._recent.popleft()[1])
+        reason = self._open.refusal(host) or self._new.refusal(host)
+        if not reason:
+            self._new.take(host)
+            self._recent.append((now, host))
+        return reason
 
     async def _refuse(self, reader: asyncio.StreamReader, writer: ByteWriter, reason: str) -> None:
         self.refused += 1

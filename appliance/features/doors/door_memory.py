@@ -4,14 +4,16 @@ Messages that wait for other nodes count as one client, and so do the arguments 
 messages from other nodes have a memory of their own until they are complete, so slow clients cannot use it up.
 
 1. Each client may always hold `least` bytes: half of the whole, divided by the maximum number of clients.
-2. Beyond `least`, clients share the other half. A client gets no more of it than it leaves for all others, and is
-   disconnected if it does not read the frames that take it (`session.py`).
+2. Beyond `least`, clients share the other half. A client gets no more of it than it leaves for all others, and all
+   clients of a host get at most `HOST_SHARE` times that. A client is disconnected if it does not read the frames that
+   take it (`session.py`).
 """
 
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Hashable, Iterator
 from contextlib import contextmanager
 
-from appliance.features.doors.quotas import DOOR_BYTES, DOOR_CONNECTIONS
+from appliance.features.doors.quotas import DOOR_BYTES, DOOR_CONNECTIONS, HOST_SHARE
 from appliance.features.doors.unfinished import Unfinished
 from roswire.errors import LimitExceededError
 
@@ -23,19 +25,22 @@ class DoorMemory:
         self.most_shared = DOOR_BYTES.bounds.whole // 2
         self.least = self.most_shared // (connections + 2)
         self.shared = 0
+        self.shared_by: Counter[Hashable] = Counter()  # by host
 
-    def client(self) -> "ClientMemory":
-        return ClientMemory(self)
+    def client(self, host: Hashable = None) -> "ClientMemory":
+        """Return the memory of a client; without a host, it is the only client of its host."""
+        return ClientMemory(self, object() if host is None else host)
 
 
 class ClientMemory:
     """One client's share of the memory; it holds `held` bytes."""
 
-    def __init__(self, door: DoorMemory) -> None:
+    def __init__(self, door: DoorMemory, host: Hashable) -> None:
         self.held = 0
         self.closed = False
         self.unfinished = Unfinished()
         self._door = door
+        self.host = host
         self._shared = 0  # of the bytes that it holds, those of the shared half
         self._leaving = 0
 
@@ -46,6 +51,9 @@ class ClientMemory:
         if self.held > self._door.least or self._shared:
             shared = max(0, self.held - self._door.least)
             self._door.shared += shared - self._shared
+            self._door.shared_by[self.host] += shared - self._shared
+            if not self._door.shared_by[self.host]:
+                del self._door.shared_by[self.host]
             self._shared = shared
 
     def send(self, size: int) -> None:
@@ -72,6 +80,9 @@ class ClientMemory:
             return f"the client would hold {held} bytes; at most {most}"
         if shared > max(left, 0):
             return f"the client would hold {held} bytes of its door and leave {max(left, 0)} for all others"
+        of_host = self._door.shared_by[self.host] + shared - self._shared
+        if of_host > HOST_SHARE * left:
+            return f"the clients of one host would hold {of_host} bytes of a door and leave {left} for all others"
         return ""
 
     def try_take(self, size: int) -> bool:

@@ -1,14 +1,14 @@
 """The node of a door, which all connections of its identity share.
 
 Agents make a new connection for each call, so a topic stays registered for some seconds after its last client has
-left. The master and the relay decide about a door as about any host.
+left, unless a new topic needs its slot. The master and the relay decide about a door as about any host.
 """
 
 import asyncio
 import contextlib
-from collections.abc import Awaitable, Callable, Iterable, Mapping
+from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping, Sized
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol
+from typing import Protocol
 from weakref import WeakValueDictionary
 
 import msgspec
@@ -17,9 +17,11 @@ from msgspec import Raw
 from appliance.base import clock
 from appliance.features.doors.door_memory import ClientMemory
 from appliance.features.doors.door_parameters import TOO_MANY_CALLS, DoorParameters, ParameterClient
+from appliance.features.doors.host_shares import HostShares, exceeds_share
 from appliance.features.doors.known_types import DoorMessage, KnownTypes, SharedFrames
 from appliance.features.doors.lingering import Lingering
 from appliance.features.doors.message_writer import MessageWriter, Now
+from appliance.features.doors.quotas import DOOR_CALLS
 from appliance.features.doors.requests import (
     AdvertiseTopic,
     AnswerCall,
@@ -64,12 +66,19 @@ BuiltIn = Callable[[CallOfService], "Awaitable[Raw] | None"]
 
 
 class _Subscriber(Protocol):
+    @property
+    def memory(self) -> ClientMemory:
+        """Return the memory that is charged for the connection's requests."""
+
     def heard(self, message: DoorMessage, now: float) -> None: ...
 
     def failed(self, request: DoorRequest, reason: str) -> None: ...
 
 
+@dataclass(frozen=True, slots=True)
 class _Learner:
+    memory: ClientMemory
+
     def heard(self, message: DoorMessage, now: float) -> None: ...
 
     def failed(self, request: DoorRequest, reason: str) -> None: ...
@@ -77,10 +86,6 @@ class _Learner:
 
 class DoorClient(_Subscriber, ParameterClient, Protocol):
     """A connection, as the node uses it."""
-
-    @property
-    def memory(self) -> ClientMemory:
-        """Return the memory that is charged for the connection's requests."""
 
     def answered(self, call: int, values: Raw | bytes) -> None: ...
 
@@ -129,6 +134,7 @@ class DoorNode:
         self.node = node
         self._most_topics = most_topics
         self._calls = calls
+        self._waiting_calls = HostShares("calls that wait for answers", DOOR_CALLS.bounds.whole)
         self._types = types
         self._built_in = built_in
         self._publications: dict[str, _Publication] = {}
@@ -200,7 +206,10 @@ class DoorNode:
         async with self._lock(f"publisher {request.topic}"):
             known = self._publications.get(request.topic)
             if known is None:
-                self._check_room(self._publications)
+                users = [one.clients for one in self._publications.values()]
+                await self._make_room(
+                    self._publications, users, client, self._published, self._end_publication
+                )
                 name = request.type or await self._type_of(request.topic)
                 codec, definitions = self._types.message(name)
                 publication = await self.node.advertise(
@@ -287,7 +296,9 @@ class DoorNode:
                 self._subscribed.used(topic)
                 self.node.repeat(topic, lambda body, header: self._hear(topic, body, header, [client]))
                 return
-            self._check_room(self._heard)
+            await self._make_room(
+                self._heard, self._heard.values(), client, self._subscribed, self._end_subscription
+            )
             self._heard[topic] = {client: request}
             try:
                 await self.node.subscribe(
@@ -338,7 +349,10 @@ class DoorNode:
         given = request.values
         values = given.copy() if isinstance(given, Raw) else given  # not the whole frame
         size = memoryview(values).nbytes
+        if reason := self._waiting_calls.refusal(client.memory.host):
+            raise LimitExceededError(TOO_MANY_CALLS + reason)
         self._calls.take(size, TOO_MANY_CALLS)
+        self._waiting_calls.take(client.memory.host)
         self._tasks.start(self._call(replace(request, values=values), client, size))
 
     async def _call(self, request: CallOfService, client: DoorClient, size: int) -> None:
@@ -349,6 +363,7 @@ class DoorNode:
             client.failed(request, str(error))
         finally:
             self._calls.add(-size)
+            self._waiting_calls.give_back(client.memory.host)
 
     async def _call_node(self, request: CallOfService) -> Raw | bytes:
         header = await self.node.probe_service(request.service)
@@ -414,7 +429,7 @@ class DoorNode:
                 raise
 
     async def learn(self, topic: str) -> None:
-        learner = _Learner()
+        learner = _Learner(self._calls)
         await self._subscribe(SubscribeTopic(topic), learner)
         try:
             async with asyncio.timeout(_LEARN_SECONDS):
@@ -425,12 +440,29 @@ class DoorNode:
         finally:
             self._unsubscribe(topic, learner)
 
-    def _check_room(self, topics: dict[str, Any]) -> None:
-        if len(topics) >= self._most_topics:
+    async def _make_room(
+        self,
+        topics: Sized,
+        users: Iterable[Collection[_Subscriber]],
+        client: _Subscriber,
+        unused: Lingering,
+        end: Callable[[str], Awaitable[None]],
+    ) -> None:
+        """A topic without a client ends early if a new one needs its slot."""
+        used, host = [clients for clients in users if clients], client.memory.host
+        left = self._most_topics - len(used) - 1
+        if left < 0:
             raise LimitExceededError(
-                f"the clients of this door use {len(topics)} topics; at most {self._most_topics}. A topic that no "
-                f"client uses any longer ends after {_LINGER_SECONDS:g} s"
+                f"the clients of this door use {len(used)} topics; at most {self._most_topics}"
             )
+        if exceeds_share(len(used), left):  # otherwise, no host can have too many
+            own = sum(any(one.memory.host == host for one in clients) for clients in used)
+            if exceeds_share(own, left):
+                raise LimitExceededError(
+                    f"one host uses {own} topics of this door; the others are kept for other hosts"
+                )
+        while len(topics) >= self._most_topics and (topic := unused.pop()) is not None:
+            await end(topic)
 
     def _lock(self, name: str) -> asyncio.Lock:
         lock = self._locks.get(name) or asyncio.Lock()

@@ -22,6 +22,13 @@ class Lingering:
     def used(self, topic: str) -> None:
         self._ends.pop(topic, None)
 
+    def pop(self) -> str | None:
+        """Return the topic that would end first, which the caller ends."""
+        topic = next(iter(self._ends), None)
+        if topic is not None:
+            del self._ends[topic]
+        return topic
+
     def close(self) -> None:
         self._ends.clear()
         if self._timer is not None:

@@ -12,13 +12,15 @@ from typing import Literal, NamedTuple
 from appliance.features.doors.known_types import KnownTypes
 from appliance.features.doors.rosapi import Sight
 from appliance.features.doors.surroundings import DoorSurroundings, SeenService, SeenTopic, VisibleGraph
-from roswire.errors import DefinitionError, RosError
+from roswire.errors import DefinitionError, LimitExceededError, RosError
 from roswire.node import MasterDenialError
 from roswire.node.network import PeerUnreachableError
 
 _FRESH_SECONDS = 1.0
 _MOST_PROBES = 50  # topics and services that one look asks about
-_AGAIN_SECONDS = 10.0  # after which a node that did not answer is asked again
+_AGAIN_SECONDS = (
+    10.0  # after which a node is asked again that did not answer, or for which the door had no slot
+)
 
 _Thing = tuple[Literal["topic", "service"], str]
 
@@ -95,7 +97,7 @@ class Lookout:
         try:
             await (self._learn if kind == "topic" else self._probe)(name)
             self._asked[thing] = _Asked(nodes)
-        except PeerUnreachableError:
+        except (PeerUnreachableError, LimitExceededError):
             self._asked[thing] = _Asked(nodes, again=asyncio.get_running_loop().time() + _AGAIN_SECONDS)
         except RosError as error:
             self._asked[thing] = _Asked(

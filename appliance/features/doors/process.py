@@ -15,6 +15,7 @@ from typing import Any
 import structlog
 import uvloop
 
+from appliance.api.front.rates import peer_key
 from appliance.channel import messages
 from appliance.channel.channel import Channel
 from appliance.channel.child_process import Child
@@ -28,6 +29,7 @@ from appliance.features.doors.foxglove import SUBPROTOCOLS, Foxglove, FoxgloveLi
 from appliance.features.doors.given_network import GivenNetwork
 from appliance.features.doors.known_types import KnownTypes
 from appliance.features.doors.lookout import Lookout
+from appliance.features.doors.quotas import DOOR_TOPICS
 from appliance.features.doors.rosapi import MasterSight, Rosapi
 from appliance.features.doors.rosbridge import Rosbridge, RosbridgeLimits
 from appliance.features.doors.session import ClientProtocol, DoorSession, SessionOptions
@@ -39,7 +41,6 @@ from roswire.node import NodeLimits, RosNode
 from roswire.node.network import OwnedTasks
 from roswire.standard import standard_definitions
 
-_MOST_TOPICS = 500
 _AGAIN_SECONDS = 1.0
 _REPORT_SECONDS = 1.0
 _MOST_PEERS = 256  # in one report
@@ -204,7 +205,9 @@ class _Process:
                 continue
             types = self._types
             sight = MasterSight(node, present_time)
-            door = DoorNode(node, types, Rosapi(sight, types).answer, most_topics=_MOST_TOPICS, calls=calls)
+            door = DoorNode(
+                node, types, Rosapi(sight, types).answer, most_topics=DOOR_TOPICS.bounds.whole, calls=calls
+            )
             limits = ConnectionLimits(given.connections, given.in_ten_seconds)
             self._door = _Door(
                 door,
@@ -251,7 +254,7 @@ class _Process:
 
     def _admit(self, door: _Door, connection: socket.socket, peer: str, ticket: str) -> None:
         serve, refused = partial(self._serve, peer, ticket), partial(self._ended, peer, ticket)
-        door.connections.adopt(connection.detach(), serve, refused)
+        door.connections.adopt(connection.detach(), serve, refused, host=peer_key(peer))
 
     async def _serve(
         self, peer: str, ticket: str, reader: asyncio.StreamReader, writer: ClientWriter
@@ -262,7 +265,7 @@ class _Process:
             self._ended(peer, ticket, "the ticket was over before the door could serve")
             return
         queues: list[ViewerQueue[Any]] = []
-        memory = door.memory.client()
+        memory = door.memory.client(peer_key(peer))
         session = DoorSession(
             reader,
             writer,

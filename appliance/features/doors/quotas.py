@@ -3,16 +3,22 @@
 from appliance.quotas.pool import Bounds
 from appliance.quotas.table import QuotaRow
 
+HOST_SHARE = 3
+"""A host gets at most this many times what it leaves for all others."""
+
 DOOR_CONNECTIONS = QuotaRow(
     thing="connections of a door",
     bounds=Bounds(whole=1024, host=32, unknown=0, kept=0),
     at_limit="503 with the reason",
-    between="each door has a process and connections of its own: a flood at one door takes nothing of another",
+    between="each door has a process and connections of its own: a flood at one door takes nothing of another. A host"
+    " gets one connection of a door, and further ones up to three times what is left for all others (24 of 32); the"
+    " same holds for new connections",
     counting="host: a door",
     alarm="`rosrv door list`, `rosrv limits`",
     setting="doors.connections",
     shown_by=(
         "unit/features/doors/test_session.py::test_connections_of_a_door_are_bounded_in_number_and_rate",
+        "unit/features/doors/test_connections.py::test_a_host_leaves_connections_for_others",
         "unit/features/doors/test_door_table.py::test_doors_are_bounded",
     ),
 )
@@ -25,15 +31,42 @@ DOOR_BYTES = QuotaRow(
     " disconnected with the reason; values that take too much are refused in words",
     between="each client has 1/68 for itself (half of the whole, divided by `doors.connections` and two); beyond that,"
     " a client gets at most as much as it leaves for all others, and is disconnected if it takes less than 512 KB in"
-    " five seconds, or sends less than 256 KB in ten seconds of a frame that it has begun. Two more count"
+    " five seconds, or sends less than 256 KB in ten seconds of a frame that it has begun. All"
+    " clients of one host get at most three times what is left for those of other hosts. Two more count"
     " as clients: messages to other nodes, and arguments of calls that wait for answers",
     counting="host: a client's connection",
     alarm="`rosrv_door_messages_dropped_total`",
     shown_by=(
         "unit/features/doors/test_door_memory.py::test_greedy_clients_leave_memory_for_the_next_one",
+        "unit/features/doors/test_door_memory.py::test_the_clients_of_one_host_leave_memory_for_other_hosts",
         "unit/features/doors/test_session.py::test_a_client_that_does_not_read_gives_shared_memory_back_within_seconds",
         "unit/features/doors/test_unfinished.py::test_a_client_that_holds_memory_of_others_must_send_the_rest_faster",
     ),
 )
 
-ROWS = (DOOR_CONNECTIONS, DOOR_BYTES)
+DOOR_TOPICS = QuotaRow(
+    thing="topics that clients of one door publish, and topics to which they subscribe",
+    bounds=Bounds(whole=500, host=375, unknown=0, kept=0),
+    at_limit="refused in words",
+    between="a host gets at most three times what is left for all others; a topic without a client ends early",
+    counting="host: the address of a client",
+    alarm="`rosrv_door_refusals_total`",
+    shown_by=(
+        "unit/features/doors/test_session.py::test_topics_of_a_door_are_bounded_over_all_its_hosts",
+        "unit/features/doors/test_session.py::test_a_client_that_goes_through_a_thousand_topics_a_second_takes_none_of_another",
+    ),
+)
+
+DOOR_CALLS = QuotaRow(
+    thing="calls of services by clients of one door that wait for answers, also after the client has left",
+    bounds=Bounds(whole=256, host=192, unknown=0, kept=0),
+    at_limit="refused in words",
+    between="a client has at most 100; a host gets at most three times what is left for all others",
+    counting="host: the address of a client",
+    alarm="`rosrv_door_refusals_total`",
+    shown_by=(
+        "unit/features/doors/test_session.py::test_a_thousand_calls_that_get_no_answer_leave_calls_for_other_hosts",
+    ),
+)
+
+ROWS = (DOOR_CONNECTIONS, DOOR_BYTES, DOOR_TOPICS, DOOR_CALLS)

@@ -2,7 +2,6 @@ import asyncio
 import json
 from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
-from functools import partial
 from typing import Any
 
 import cbor2
@@ -112,9 +111,13 @@ class DoorWorld:
         self.door = DoorNode(self.node, self.types, built_in, most_topics=50, calls=self.calls)
         self.lookout = Lookout(sight, self.types, self.door.learn)
         connections = DoorConnections(self.limits)
-        self.network.listen(
-            DOOR[0], partial(connections.serve, self.serve, refused=self.refusals.append), DOOR[1]
-        )
+
+        async def arrive(reader: asyncio.StreamReader, writer: Any) -> None:
+            await connections.serve(
+                self.serve, reader, writer, refused=self.refusals.append, host=writer.source
+            )
+
+        self.network.listen(DOOR[0], arrive, DOOR[1])
 
     async def robot(self, address: str, name: str, memory: NodeMemory | None = None) -> RosNode:
         node = RosNode(
@@ -130,7 +133,7 @@ class DoorWorld:
         return node
 
     async def serve(self, reader: asyncio.StreamReader, writer: Any) -> None:
-        memory = self.memory.client()
+        memory = self.memory.client(writer.source)
         self.memories.append(memory)
         queue: ViewerQueue[Any] = ViewerQueue(message_bytes=1 << 20, reply_bytes=1 << 20, memory=memory)
         self.queues.append(queue)
@@ -152,10 +155,15 @@ class DoorWorld:
         await session.run()
 
     async def client(
-        self, *, origin: str | None = None, subprotocols: Sequence[str] = (), deflate: bool = False
+        self,
+        host: str = "10.0.0.9",
+        *,
+        origin: str | None = None,
+        subprotocols: Sequence[str] = (),
+        deflate: bool = False,
     ) -> WebSocketClient:
         client = WebSocketClient(
-            *self.network.connect("10.0.0.9", DOOR),
+            *self.network.connect(host, DOOR),
             origin=None if origin is None else Origin(origin),
             subprotocols=[*map(Subprotocol, subprotocols)] or None,
             extensions=[ClientPerMessageDeflateFactory()] if deflate else None,

@@ -79,7 +79,7 @@ async def _accept(listener: socket.socket, connections: DoorConnections, serve: 
     while True:
         connection, _address = await asyncio.get_running_loop().sock_accept(listener)
         with connection:
-            connections.adopt(os.dup(connection.fileno()), serve, lambda _reason: None)
+            connections.adopt(os.dup(connection.fileno()), serve, lambda _reason: None, host="")
 
 
 async def main(master_uri: str, source: str, port: str, *files: str) -> None:

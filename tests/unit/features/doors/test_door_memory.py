@@ -68,3 +68,18 @@ def test_greedy_clients_leave_memory_for_the_next_one() -> None:
     queue.reply(b"an answer after the end")
     assert quiet.take(0.0) and quiet.take(0.0)
     assert door.shared == 0
+
+
+def test_the_clients_of_one_host_leave_memory_for_other_hosts() -> None:
+    door = DoorMemory()
+    greedy = [door.client("10.0.0.9") for _ in range(24)]
+    for memory in greedy:
+        while memory.try_take(_MIB):
+            pass
+    assert door.most_shared * 0.7 < door.shared <= door.most_shared * 0.75
+    assert "the clients of one host would hold" in greedy[-1].refusal(_MIB)
+    other = door.client("10.0.0.10")
+    other.take(16 * _MIB)
+    for memory in (*greedy, other):
+        memory.close()
+    assert door.shared == 0 and not door.shared_by

@@ -766,7 +766,8 @@ async def test_a_viewer_that_answers_pings_stays_connected_for_hours() -> None:
 
 async def test_connections_of_a_door_are_bounded_in_number_and_rate() -> None:
     async with door_world() as world:
-        answers = [(await world.client()).response for _ in range(world.limits.connections + 5)]
+        hosts = [f"10.0.1.{number}" for number in range(world.limits.connections + 5)]
+        answers = [(await world.client(host)).response for host in hosts]
         statuses = [answer.status_code for answer in answers if answer is not None]
         assert statuses == [101] * world.limits.connections + [503] * 5
         assert len(world.refusals) == 5
@@ -775,8 +776,8 @@ async def test_connections_of_a_door_are_bounded_in_number_and_rate() -> None:
         await asyncio.sleep(20)
         assert world.limits.in_ten_seconds == 200
         refused = 0
-        for _ in range(250):
-            client = WebSocketClient(*world.network.connect("10.0.0.9", DOOR))
+        for number in range(250):
+            client = WebSocketClient(*world.network.connect(f"10.0.0.{number}", DOOR))
             await asyncio.sleep(0.01)
             refused += client.response is not None and client.response.status_code == 503
             client.writer.close()
@@ -785,16 +786,72 @@ async def test_connections_of_a_door_are_bounded_in_number_and_rate() -> None:
         assert (await world.client()).is_open
 
 
-async def test_topics_of_a_door_are_bounded_over_all_its_connections() -> None:
+@pytest.mark.parametrize("op", ["subscribe", "advertise"])
+async def test_topics_of_a_door_are_bounded_over_all_its_hosts(op: str) -> None:
     async with door_world() as world:
-        refused = 0
-        for _connection in range(3):
+        request = {"op": op, "type": "std_msgs/String"}
+        greedy, others = await world.client(), [await world.client(f"10.0.1.{n}") for n in range(14)]
+        for number in range(50):
+            greedy.send(request | {"topic": f"/a{number}"})
+        await asyncio.sleep(2)
+        refusals = [(await greedy.next())["msg"] for _number in range(13)]
+        assert set(refusals) == {"one host uses 37 topics of this door; the others are kept for other hosts"}
+        for number in range(13):
+            others[number].send(request | {"topic": f"/b{number}"})
+        await asyncio.sleep(2)
+        assert greedy.frames.empty() and all(other.frames.empty() for other in others)
+        others[13].send(request | {"topic": "/c"})
+        assert "use 50 topics; at most 50" in (await others[13].next())["msg"]
+
+
+@pytest.mark.parametrize(("begin", "end"), [("subscribe", "unsubscribe"), ("advertise", "unadvertise")])
+async def test_a_client_that_goes_through_a_thousand_topics_a_second_takes_none_of_another(
+    begin: str, end: str
+) -> None:
+    async with door_world() as world:
+        flooding, other = await world.client(), await world.client()
+        registered = world.master.subscribers if begin == "subscribe" else world.master.publishers
+        other.send({"op": begin, "topic": "/own", "type": "std_msgs/String"})
+        for second in range(5):
+            for number in range(1000):
+                topic = f"/t{second}_{number}"
+                flooding.send({"op": begin, "topic": topic, "type": "std_msgs/String"})
+                flooding.send({"op": end, "topic": topic})
+            await asyncio.sleep(1)
+            other.send({"op": begin, "topic": f"/own{second}", "type": "std_msgs/String"})
+            await asyncio.sleep(1)
+            present = {topic for topic, nodes in registered.items() if nodes}
+            assert len(present) <= 50 and {"/own", f"/own{second}"} <= present
+        assert other.frames.empty() and flooding.frames.empty()
+        await asyncio.sleep(11)
+        assert {t for t, nodes in registered.items() if nodes} == {"/own", *(f"/own{n}" for n in range(5))}
+
+
+async def test_a_thousand_calls_that_get_no_answer_leave_calls_for_other_hosts() -> None:
+    """A call waits on although its client has left."""
+    async with door_world() as world:
+        robot = await world.robot("10.0.0.3", "/robot")
+
+        async def answer(_body: bytes) -> bytes:
+            await asyncio.sleep(3600)
+            return b""
+
+        kind = ServiceType.defined(standard_definitions(), "std_srvs/Empty")
+        await robot.offer("/hangs", kind, answer)
+        words = []
+        for _client in range(10):
             client = await world.client()
-            for number in range(20):
-                client.send({"op": "subscribe", "topic": f"/t{_connection}_{number}"})
-            await asyncio.sleep(2)
-            while not client.frames.empty():
-                assert "use 50 topics; at most 50" in client.frames.get_nowait()["msg"]
-                refused += 1
+            for number in range(100):
+                client.send({"op": "call_service", "service": "/hangs", "id": number})
+            await asyncio.sleep(0.5)
+            words += [client.frames.get_nowait()["values"]["message"] for _ in range(client.frames.qsize())]
             client.writer.close()
-        assert refused == 10
+        assert len(words) == 1000 - 192
+        assert "one host has 192 calls that wait for answers" in words[0]
+        other = await world.client("10.0.0.10")
+        other.send({"op": "call_service", "service": "/rosapi/get_time", "id": 1})
+        assert (await other.next())["result"] is True
+        await asyncio.sleep(61)
+        last = await world.client()
+        last.send({"op": "call_service", "service": "/rosapi/get_time", "id": 1})
+        assert (await last.next())["result"] is True
