@@ -6,7 +6,7 @@ left, unless a new topic needs its slot. The master and the relay decide about a
 
 import asyncio
 import contextlib
-from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping, Sized
+from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping, Sequence, Sized
 from dataclasses import dataclass, field, replace
 from typing import Protocol
 from weakref import WeakValueDictionary
@@ -21,7 +21,7 @@ from appliance.features.doors.host_shares import HostShares, exceeds_share
 from appliance.features.doors.known_types import DoorMessage, KnownTypes, SharedFrames
 from appliance.features.doors.lingering import Lingering
 from appliance.features.doors.message_writer import MessageWriter, Now
-from appliance.features.doors.quotas import DOOR_CALLS
+from appliance.features.doors.quotas import DOOR_CALLS, DOOR_SERVICES
 from appliance.features.doors.requests import (
     AdvertiseTopic,
     AnswerCall,
@@ -384,6 +384,9 @@ class DoorNode:
             await self._withdraw(request.service)
         elif known is not None:
             raise ProtocolError(f"{request.service} is already offered by a client of this door")
+        self._check_share(
+            "services", DOOR_SERVICES.bounds.whole, [{o.client} for o in self._offers.values()], client
+        )
         given, response, definitions = self._types.service(request.type)
         offer = self._offers[request.service] = _Offer(client, response)
 
@@ -449,20 +452,22 @@ class DoorNode:
         end: Callable[[str], Awaitable[None]],
     ) -> None:
         """A topic without a client ends early if a new one needs its slot."""
-        used, host = [clients for clients in users if clients], client.memory.host
-        left = self._most_topics - len(used) - 1
+        self._check_share("topics", self._most_topics, [clients for clients in users if clients], client)
+        while len(topics) >= self._most_topics and (topic := unused.pop()) is not None:
+            await end(topic)
+
+    def _check_share(
+        self, what: str, most: int, used: Sequence[Collection[_Subscriber]], client: _Subscriber
+    ) -> None:
+        left, host = most - len(used) - 1, client.memory.host
         if left < 0:
-            raise LimitExceededError(
-                f"the clients of this door use {len(used)} topics; at most {self._most_topics}"
-            )
+            raise LimitExceededError(f"the clients of this door use {len(used)} {what}; at most {most}")
         if exceeds_share(len(used), left):  # otherwise, no host can have too many
             own = sum(any(one.memory.host == host for one in clients) for clients in used)
             if exceeds_share(own, left):
                 raise LimitExceededError(
-                    f"one host uses {own} topics of this door; the others are kept for other hosts"
+                    f"one host uses {own} {what} of this door; the others are kept for other hosts"
                 )
-        while len(topics) >= self._most_topics and (topic := unused.pop()) is not None:
-            await end(topic)
 
     def _lock(self, name: str) -> asyncio.Lock:
         lock = self._locks.get(name) or asyncio.Lock()

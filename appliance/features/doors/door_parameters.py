@@ -1,15 +1,16 @@
 """Read, write and follow parameters for the connections of a door, which share one subscription for each parameter.
 
 A read takes two calls for each of hundreds of parameters, so a connection's later requests, such as a stop, do not
-wait for it.
+wait for it. The hosts of clients take turns in reading.
 """
 
 import asyncio
 import sys
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from functools import partial
 from typing import Any, Protocol
+from weakref import WeakValueDictionary
 
 import msgspec
 
@@ -34,6 +35,10 @@ _MOST_SUBSCRIBED = 2000  # of all connections
 class ParameterClient(Protocol):
     """A connection that reads parameters or subscribes to them."""
 
+    @property
+    def memory(self) -> ClientMemory:
+        """Return the memory that is charged for the connection's requests."""
+
     def parameters(self, values: Mapping[str, Any], reply_to: str | None) -> None:
         """Take the values of parameters."""
 
@@ -56,6 +61,7 @@ class DoorParameters:
         self._lock = asyncio.Lock()  # for registrations
         self._reads: Counter[ParameterClient] = Counter()  # that wait
         self._reading = asyncio.Lock()
+        self._turns: WeakValueDictionary[Hashable, asyncio.Lock] = WeakValueDictionary()  # by host
         self._tasks = OwnedTasks()
 
     async def close(self) -> None:
@@ -74,7 +80,9 @@ class DoorParameters:
 
     async def _read_for(self, request: ReadParameters, client: ParameterClient, size: int) -> None:
         try:
-            async with self._reading:
+            turn = self._turns.get(client.memory.host) or asyncio.Lock()
+            self._turns[client.memory.host] = turn
+            async with turn, self._reading:  # so the others wait for one read of this host
                 if client in self._reads:  # else it left
                     client.parameters(await self._read(request.names), request.reply_to)
         except RosError as error:

@@ -69,4 +69,16 @@ DOOR_CALLS = QuotaRow(
     ),
 )
 
-ROWS = (DOOR_CONNECTIONS, DOOR_BYTES, DOOR_TOPICS, DOOR_CALLS)
+DOOR_SERVICES = QuotaRow(
+    thing="services that clients of one door offer",
+    bounds=Bounds(whole=400, host=300, unknown=0, kept=0),
+    at_limit="refused in words",
+    between="a client offers at most 100; a host gets at most three times what is left for all others",
+    counting="host: the address of a client",
+    alarm="`rosrv_door_refusals_total`",
+    shown_by=(
+        "unit/features/doors/test_session.py::test_services_that_one_host_offers_leave_some_for_others",
+    ),
+)
+
+ROWS = (DOOR_CONNECTIONS, DOOR_BYTES, DOOR_TOPICS, DOOR_CALLS, DOOR_SERVICES)

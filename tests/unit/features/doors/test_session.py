@@ -855,3 +855,61 @@ async def test_a_thousand_calls_that_get_no_answer_leave_calls_for_other_hosts()
         last = await world.client()
         last.send({"op": "call_service", "service": "/rosapi/get_time", "id": 1})
         assert (await last.next())["result"] is True
+
+
+async def test_services_that_one_host_offers_leave_some_for_others() -> None:
+    async with door_world() as world:
+        offer = {"op": "advertise_service", "type": "std_srvs/Empty"}
+        clients = [await world.client() for _number in range(4)]
+        for number in range(400):
+            clients[number // 100].send(offer | {"service": f"/s{number}"})
+        await asyncio.sleep(5)
+        assert sum(client.frames.qsize() for client in clients) == 100
+        assert "one host uses 300 services of this door" in (await clients[3].next())["msg"]
+        other = await world.client("10.0.0.10")
+        other.send(offer | {"service": "/other"})
+        await asyncio.sleep(1)
+        assert other.frames.empty() and "/other" in world.master.services
+
+
+async def test_reads_of_parameters_of_one_host_delay_another_by_one_read() -> None:
+    async with door_world() as world:
+        foxglove = ["foxglove.websocket.v1"]
+        flooding = [await world.client(subprotocols=foxglove) for _number in range(4)]
+        other = await world.client("10.0.0.10", subprotocols=foxglove)
+        world.master.before_answer = lambda _call: asyncio.sleep(0.01)
+        read = {"op": "getParameters", "parameterNames": [f"/p{number}" for number in range(100)]}
+        for client in flooding:
+            for number in range(8):
+                client.send(read | {"id": str(number)})
+        await asyncio.sleep(1)
+        other.send({"op": "getParameters", "parameterNames": ["/p"], "id": "own"})
+        async with asyncio.timeout(6):
+            while (await other.next()).get("id") != "own":
+                pass
+        world.master.before_answer = None
+        await asyncio.sleep(100)
+
+
+@pytest.mark.parametrize("pings", [0, 5000])
+async def test_a_driver_whose_window_is_full_stops_the_robot_in_time(pings: int) -> None:
+    """Also if it has sent pings whose answers it does not take."""
+    async with door_world() as world:
+        robot, client = await world.robot("10.0.0.3", "/robot"), await world.client()
+        heard: list[Body] = []
+        await robot.subscribe("/cmd", lambda body, _header: heard.append(body))
+        image = await talks(robot, "/image")
+        client.send({"op": "advertise", "topic": "/cmd", "type": "std_msgs/String", "will": {"data": "stop"}})
+        client.send({"op": "subscribe", "topic": "/image"})
+        await asyncio.sleep(1)
+        client.stop_reading()
+        for _number in range(20):
+            image.publish(string("x" * 100_000))
+            client.send({"op": "publish", "topic": "/cmd", "msg": {"data": "go"}})
+            await asyncio.sleep(1)
+        assert heard == [string("go")] * 20  # it drives on while it is heard
+        for _number in range(pings):
+            client.socket.send_ping(b"x" * 125)
+        client.flush()
+        await asyncio.sleep(6)
+        assert heard[20:] == [string("stop")]
