@@ -48,7 +48,7 @@ class DoorConnections:
         self.refused = 0
         self._open = HostShares("connections", limits.connections)
         self._new = HostShares("new connections in ten seconds", limits.in_ten_seconds)
-        self._refusing = 0
+        self._refusing = HostShares("refusals", _MOST_REFUSALS)
         self._recent: deque[tuple[float, str]] = deque()
         self._tasks = OwnedTasks()
 
@@ -78,7 +78,7 @@ class DoorConnections:
         reason = self._excess(host)
         if reason:
             refused(reason)
-            await self._refuse(reader, writer, reason)
+            await self._refuse(reader, writer, reason, host)
             return
         self._open.take(host)
         try:
@@ -96,12 +96,12 @@ class DoorConnections:
             self._recent.append((now, host))
         return reason
 
-    async def _refuse(self, reader: asyncio.StreamReader, writer: ByteWriter, reason: str) -> None:
+    async def _refuse(self, reader: asyncio.StreamReader, writer: ByteWriter, reason: str, host: str) -> None:
         self.refused += 1
-        if self._refusing >= _MOST_REFUSALS:
+        if self._refusing.refusal(host):
             writer.close()
             return
-        self._refusing += 1
+        self._refusing.take(host)
         try:
             async with asyncio.timeout(_REFUSAL_SECONDS):
                 # If bytes were unread at the end, the client would get a reset instead of the answer.
@@ -111,7 +111,7 @@ class DoorConnections:
         except (OSError, EOFError, asyncio.LimitOverrunError):  # the client sent no request, or left
             return
         finally:
-            self._refusing -= 1
+            self._refusing.give_back(host)
             writer.close()
 
     async def close(self) -> None:

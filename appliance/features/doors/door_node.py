@@ -6,7 +6,7 @@ left, unless a new topic needs its slot. The master and the relay decide about a
 
 import asyncio
 import contextlib
-from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping, Sequence, Sized
+from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping, Sized
 from dataclasses import dataclass, field, replace
 from typing import Protocol
 from weakref import WeakValueDictionary
@@ -17,7 +17,7 @@ from msgspec import Raw
 from appliance.base import clock
 from appliance.features.doors.door_memory import ClientMemory
 from appliance.features.doors.door_parameters import TOO_MANY_CALLS, DoorParameters, ParameterClient
-from appliance.features.doors.host_shares import HostShares, exceeds_share
+from appliance.features.doors.host_shares import HostShares, check_share
 from appliance.features.doors.known_types import DoorMessage, KnownTypes, SharedFrames
 from appliance.features.doors.lingering import Lingering
 from appliance.features.doors.message_writer import MessageWriter, Now
@@ -384,7 +384,7 @@ class DoorNode:
             await self._withdraw(request.service)
         elif known is not None:
             raise ProtocolError(f"{request.service} is already offered by a client of this door")
-        self._check_share(
+        check_share(
             "services", DOOR_SERVICES.bounds.whole, [{o.client} for o in self._offers.values()], client
         )
         given, response, definitions = self._types.service(request.type)
@@ -452,22 +452,9 @@ class DoorNode:
         end: Callable[[str], Awaitable[None]],
     ) -> None:
         """A topic without a client ends early if a new one needs its slot."""
-        self._check_share("topics", self._most_topics, [clients for clients in users if clients], client)
+        check_share("topics", self._most_topics, [clients for clients in users if clients], client)
         while len(topics) >= self._most_topics and (topic := unused.pop()) is not None:
             await end(topic)
-
-    def _check_share(
-        self, what: str, most: int, used: Sequence[Collection[_Subscriber]], client: _Subscriber
-    ) -> None:
-        left, host = most - len(used) - 1, client.memory.host
-        if left < 0:
-            raise LimitExceededError(f"the clients of this door use {len(used)} {what}; at most {most}")
-        if exceeds_share(len(used), left):  # otherwise, no host can have too many
-            own = sum(any(one.memory.host == host for one in clients) for clients in used)
-            if exceeds_share(own, left):
-                raise LimitExceededError(
-                    f"one host uses {own} {what} of this door; the others are kept for other hosts"
-                )
 
     def _lock(self, name: str) -> asyncio.Lock:
         lock = self._locks.get(name) or asyncio.Lock()

@@ -15,6 +15,8 @@ from weakref import WeakValueDictionary
 import msgspec
 
 from appliance.features.doors.door_memory import ClientMemory
+from appliance.features.doors.host_shares import check_share
+from appliance.features.doors.quotas import DOOR_PARAMETERS
 from appliance.features.doors.requests import (
     ReadParameters,
     SubscribeParameter,
@@ -29,7 +31,6 @@ from roswire.xmlrpc import Value
 TOO_MANY_CALLS = "too many calls of this door wait for answers; repeat it later: "
 _MOST_READ = 1000  # of one request
 _MOST_READS = 8  # of one connection that wait
-_MOST_SUBSCRIBED = 2000  # of all connections
 
 
 class ParameterClient(Protocol):
@@ -126,11 +127,8 @@ class DoorParameters:
             if name in self._clients:
                 self._clients[name].add(client)
                 return
-            if len(self._clients) >= _MOST_SUBSCRIBED:
-                raise LimitExceededError(
-                    f"{name}: the clients of this door subscribe to {_MOST_SUBSCRIBED} parameters, the most there "
-                    f"may be; subscribe to a namespace above them"
-                )
+            most, used = DOOR_PARAMETERS.bounds.whole, [*self._clients.values()]
+            check_share("subscribed parameters", most, used, client)
             self._clients[name] = {client}
             try:
                 await self._node.subscribe_parameter(name, partial(self._changed, name))

@@ -4,14 +4,35 @@ A host gets one, and further ones up to `HOST_SHARE` times what it leaves for al
 """
 
 from collections import Counter
-from collections.abc import Hashable
+from collections.abc import Collection, Hashable, Sequence
+from typing import Protocol
 
+from appliance.features.doors.door_memory import ClientMemory
 from appliance.features.doors.quotas import HOST_SHARE
+from roswire.errors import LimitExceededError
+
+
+class _Client(Protocol):
+    @property
+    def memory(self) -> ClientMemory: ...
 
 
 def exceeds_share(own: int, left: int) -> bool:
     """Whether a host with `own` pieces may not have a further one, which leaves `left` for all others."""
     return left < 0 or (own > 0 and own + 1 > HOST_SHARE * left)
+
+
+def check_share(what: str, most: int, used: Sequence[Collection[_Client]], client: _Client) -> None:
+    """Raise `LimitExceededError` if `client` may not use a further piece; `used` has the clients of each."""
+    left, host = most - len(used) - 1, client.memory.host
+    if left < 0:
+        raise LimitExceededError(f"the clients of this door use {len(used)} {what}; at most {most}")
+    if exceeds_share(len(used), left):  # otherwise, no host can have too many
+        own = sum(any(one.memory.host == host for one in clients) for clients in used)
+        if exceeds_share(own, left):
+            raise LimitExceededError(
+                f"one host uses {own} {what} of this door; the others are kept for other hosts"
+            )
 
 
 class HostShares:

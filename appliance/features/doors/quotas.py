@@ -81,4 +81,14 @@ DOOR_SERVICES = QuotaRow(
     ),
 )
 
-ROWS = (DOOR_CONNECTIONS, DOOR_BYTES, DOOR_TOPICS, DOOR_CALLS, DOOR_SERVICES)
+DOOR_PARAMETERS = QuotaRow(
+    thing="parameters to which clients of one door subscribe",
+    bounds=Bounds(whole=2000, host=1500, unknown=0, kept=0),
+    at_limit="refused in words",
+    between="a client has at most 1000; a host gets at most three times what is left for all others",
+    counting="host: the address of a client",
+    alarm="`rosrv_door_refusals_total`",
+    shown_by=("unit/features/doors/test_session.py::test_parameters_of_one_host_leave_some_for_others",),
+)
+
+ROWS = (DOOR_CONNECTIONS, DOOR_BYTES, DOOR_TOPICS, DOOR_CALLS, DOOR_SERVICES, DOOR_PARAMETERS)

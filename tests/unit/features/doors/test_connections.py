@@ -52,3 +52,13 @@ async def test_a_host_that_connects_in_a_loop_leaves_new_connections_for_others(
         assert admitted == world.limits.in_ten_seconds * 3 // 4
         assert "one host has 150 new connections in ten seconds of this door" in world.refusals[0]
         assert (await world.client("10.0.0.10")).is_open
+
+
+async def test_a_host_that_reads_no_refusals_leaves_words_for_others() -> None:
+    async with door_world() as world:
+        for number in range(SLOTS):
+            await world.client(f"10.0.1.{number}")
+        for _number in range(100):
+            world.network.connect("10.0.0.9", DOOR)  # and sends no request
+        other = await world.client("10.0.0.10")
+        assert other.response is not None and other.response.status_code == 503

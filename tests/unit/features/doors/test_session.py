@@ -913,3 +913,22 @@ async def test_a_driver_whose_window_is_full_stops_the_robot_in_time(pings: int)
         client.flush()
         await asyncio.sleep(6)
         assert heard[20:] == [string("stop")]
+
+
+async def test_parameters_of_one_host_leave_some_for_others() -> None:
+    async with door_world() as world:
+        foxglove = ["foxglove.websocket.v1"]
+        greedy = [await world.client(subprotocols=foxglove) for _number in range(2)]
+        other = await world.client("10.0.0.10", subprotocols=foxglove)
+        for number, client in enumerate(greedy):
+            names = [f"/p{number}_{parameter}" for parameter in range(1000)]
+            client.send({"op": "subscribeParameterUpdates", "parameterNames": names})
+        other.send({"op": "subscribeParameterUpdates", "parameterNames": ["/own"]})
+        await asyncio.sleep(5)
+        refusal = "one host uses 1499 subscribed parameters of this door"
+        assert sum(refusal in frame.get("message", "") for frame in _taken(*greedy)) == 501
+        assert not any("subscribed parameters" in frame.get("message", "") for frame in _taken(other))
+
+
+def _taken(*clients: WebSocketClient) -> list[Any]:
+    return [client.frames.get_nowait() for client in clients for _ in range(client.frames.qsize())]
