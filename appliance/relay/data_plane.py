@@ -288,11 +288,11 @@ class DataPlane:
 
     def _attach_monitors(self, relayed: RelayedTopic) -> None:
         interceptor, topic = self.interceptor, relayed.topic
-        wanted = interceptor.wants(topic)
+        wanted, guarded = interceptor.wants(topic), interceptor.is_guarded(topic)
         if interceptor.intercepts(topic):
             point = ObservationPoint(relayed.key, topic, relayed.host, relayed.name)
             pipeline = TopicPipeline(interceptor, point)
-            relayed.monitor(pipeline.through, wanted=wanted, call=pipeline.module_call)
+            relayed.monitor(pipeline.through, wanted=wanted, call=pipeline.module_call, guarded=guarded)
         else:
             relayed.monitor(None, wanted=wanted)
 

@@ -9,7 +9,9 @@ the queue or in the kernel. Therefore subscribers also get the stop behind these
 it instead of them (`supersede`).
 
 If the publisher's host has no memory left, a latched message is not kept. Once memory is free, a later subscriber
-makes the relay reconnect to the publisher; the other subscribers then get the message twice.
+makes the relay reconnect to the publisher; the other subscribers then get the message twice. A latched command (a
+message of a topic that had a guard, or a goal) is never requested again: it would begin a motion long after it was
+refused.
 
 While *all* subscribers are behind, the relay stops reading the publisher for at most `queue_grace`, so a subscriber
 that the scheduler paused for some milliseconds loses nothing.
@@ -151,6 +153,7 @@ class RelayedTopic:
         self._startup_replay = StartupReplay(share, clock() + (APPEARED if fresh else -1))
         self._reported = True
         self._superseded = False  # whether a guard's stop is the last message
+        self._is_command = topic.endswith("/goal")  # no monitor can declare what stops an action
 
     @property
     def members(self) -> tuple[TopicSubscriber, ...]:
@@ -234,11 +237,14 @@ class RelayedTopic:
         *,
         wanted: bool,
         call: Callable[[], ModuleCall | None] = _no_call,
+        guarded: bool = False,
     ) -> None:
         """Pass messages `through` monitors from the next batch on (None: bypass them).
 
-        With `wanted`, the topic stays connected even without a subscriber. `call` is for the pump.
+        With `wanted`, the topic stays connected even without a subscriber. `call` is for the pump. A topic that was
+        `guarded` once carries commands, also when the guard is off.
         """
+        self._is_command |= guarded
         before, self._monitoring = self._monitoring, _Monitoring(through, call, wanted)
         self.differs()
         if wanted == before.wanted:
@@ -279,7 +285,7 @@ class RelayedTopic:
 
     @property
     def lacks_latched(self) -> bool:
-        return self._latch.is_lacking
+        return self._latch.is_lacking and not self._is_command
 
     def upstream_closed(self) -> None:
         self._end_stream()
@@ -471,7 +477,7 @@ class RelayedTopic:
         if self._latch.batch is not None:
             self._served.deliver(self._latch.batch, member)
         elif self._latch.is_refused:
-            if self._latch.is_asked_again:
+            if self._latch.is_asked_again and not self._is_command:
                 self.upstream.request_latched()
         elif self._startup_replay.keeps:
             for batch in self._startup_replay.give(member.caller_id, self._clock()):

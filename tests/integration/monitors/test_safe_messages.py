@@ -115,3 +115,24 @@ def test_a_restart_sends_stops_until_a_command_comes(
         assert held(guarded) == []
         ros.talker("roscpp", "/chatter", name="again")
         base.wait_for(lambda event: "hello" in event.get("data", ""), since=mark, timeout=60)
+
+
+def test_a_goal_that_was_dropped_does_not_come_when_its_guard_is_off(
+    guarded: Appliance, common_robot: Host, tmp_path: Path
+) -> None:
+    """Its client latches it, as `rostopic pub` does."""
+    picky = guarded.directory / "picky.rv"
+    picky.write_text("begin picky() { event goal() /arm/goal std_msgs/String '{}' { DROP; } }")
+    guarded.rosrv("monitor", "load", str(picky))
+    with RosSession(guarded.master_uri, tmp_path, common_robot) as ros:
+        server = ros.listener("roscpp", "/arm/goal")
+        ros.talker("rospy", "/arm/goal", "--latch")
+        guarded.recorded(
+            "--event", "connection opened", resource="/arm/goal"
+        )  # a later one gets what is latched
+        guarded.recorded("--event", "message dropped", resource="/arm/goal")
+        guarded.rosrv("monitor", "disable", "picky")
+        ros.talker("rospy", "/arm/goal", "--latch", name="again")
+        server.wait_for(event="received", publisher="/again")
+        assert {one["publisher"] for one in server.seen(event="received")} == {"/again"}
+    guarded.rosrv("monitor", "remove", "picky")

@@ -386,6 +386,22 @@ def test_a_stop_for_which_there_is_no_memory_is_sent_and_not_repeated() -> None:
     assert "give again" not in story.upstream.asked
 
 
+@pytest.mark.parametrize("topic", ["/cmd_vel", "/arm/goal", "/map"])
+def test_a_command_that_was_not_kept_is_not_asked_for(topic: str) -> None:
+    """Not if a guard dropped it, nor if it had no memory: it would begin a motion later. A map is asked for."""
+    story = Story(topic, memory=100)
+    story.topic.monitor(lambda _batch: None, wanted=True, guarded=topic == "/cmd_vel")
+    story.topic.upstream_opened(HEADER | {"latching": "1"})
+    story.receive(batch(b"dropped"))
+    story.topic.monitor(None, wanted=False)  # the guard is off
+    assert story.topic.lacks_latched == (topic == "/map")
+    story.share.add(100)
+    story.receive(batch(b"not kept"))
+    story.share.add(-100)
+    story.join()
+    assert ("give again" in story.upstream.asked) == (topic == "/map")
+
+
 def test_nothing_is_latched_for_a_publisher_that_does_not_latch() -> None:
     story = Story()
     story.join()

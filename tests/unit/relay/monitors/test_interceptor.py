@@ -582,17 +582,57 @@ def test_a_base_that_reconnects_after_a_stop_does_not_get_the_latched_motion(wor
     world.gets(late, string("stop") + string("three"))
 
 
-def test_a_server_that_connects_again_does_not_get_a_cancelled_goal(world: Monitored) -> None:
-    goal = {"topic": "/arm/goal"}
-    world.state(PublicationPlaced("k", "/arm/goal", "*"))
-    world.state(GrantInstalled("k", "/arm/goal", LOOPBACK, "/listener"))
-    server = world.connect(encode_header(WANTED | goal))
-    world.hears(UpstreamWanted, key="k", topic="/arm/goal")
-    world.state(UpstreamFound("k", "/arm/goal", LOOPBACK, world.publisher.getsockname()[1]))
+def latching_client(world: Monitored, topic: str) -> tuple[Peer, Peer]:
+    """Return a publisher that latches, and a node that hears it."""
+    names = {"topic": topic}
+    world.state(PublicationPlaced("k", topic, "*"))
+    world.state(GrantInstalled("k", topic, LOOPBACK, "/listener"))
+    server = world.connect(encode_header(WANTED | names))
+    world.hears(UpstreamWanted, key="k", topic=topic)
+    world.state(UpstreamFound("k", topic, LOOPBACK, world.publisher.getsockname()[1]))
     publisher = world.accept(world.publisher)
     world.gets_header(publisher)
-    publisher.send(encode_header(TYPED | goal | {"latching": "1"}) + string("one"))
+    publisher.send(encode_header(TYPED | names | {"latching": "1"}))
     world.gets_header(server)
+    return publisher, server
+
+
+def shadowed(world: Monitored, text: str) -> None:
+    world.state(stated(2, [("0.rv", text)], {}, {}, False, shadows=("guard",)))
+    world.until(lambda: world.taken(SpecificationsTaken, 2))
+
+
+SAFE = 'safe std_msgs/String {data:"stop"} on /chatter every 1s; int seen'
+OFF: dict[str, Callable[[Monitored, str], object]] = {
+    "disabled": lambda world, _text: world.state(MonitorSwitched("guard", False)),
+    "removed": lambda world, _text: world.load(revision=2),
+    "replaced": lambda world, text: world.load(text.replace('"bad"', '"worse"'), revision=2),
+    "in shadow mode": shadowed,
+}
+
+
+@pytest.mark.parametrize("off", OFF)
+@pytest.mark.parametrize(("topic", "safe"), [("/chatter", SAFE), ("/arm/goal", "int seen")])
+def test_a_command_that_a_guard_has_dropped_does_not_come_when_the_guard_is_off(
+    world: Monitored, topic: str, safe: str, off: str
+) -> None:
+    """A latching client, such as `rostopic pub`, sends it on each connection: the relay makes none."""
+    text = BEGINNING.strip().replace("int seen", safe).replace("/chatter", topic)
+    world.load(text)
+    publisher, base = latching_client(world, topic)
+    publisher.send(string("bad"))
+    world.event("drop", before=string("bad")[4:])
+    world.told.clear()
+    OFF[off](world, text)
+    publisher.send(string("new"))
+    world.gets(base, string("new"))
+    assert not [one for one in world.told if isinstance(one, UpstreamWanted)]
+
+
+def test_a_server_that_connects_again_does_not_get_a_cancelled_goal(world: Monitored) -> None:
+    goal = {"topic": "/arm/goal"}
+    publisher, server = latching_client(world, "/arm/goal")
+    publisher.send(string("one"))
     world.gets(server, string("one"))
     world.state(OwnPublished("/arm/cancel", bytes(12)))
     late = world.connect(encode_header(WANTED | goal))
