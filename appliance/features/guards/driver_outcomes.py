@@ -1,4 +1,12 @@
-"""The outcomes of a driver check, as sentences and as exit statuses."""
+"""The sentences of a driver check, which the console repeats, and its outcomes as exit statuses."""
+
+CONSENT = (
+    "While the base is driven slowly, its commands are withheld for up to {:g} s. A driver without a timeout drives on"
+    " for that time: raise the wheels, or have free space and a hand on the emergency stop."
+)
+QUESTION = "May the base drive on?"
+REQUEST = "drive slowly now, at most 0.3 m/s and 0.6 rad/s, until the outcome appears"
+RESTARTED = "not measured: the appliance was restarted; its relays pass commands again after at most {:g} s"
 
 _SENTENCES = {
     "stopped": "the driver stopped the base {:.2f} s after its last command",

@@ -9,13 +9,12 @@ from appliance.cli import completion
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.durations import span_given
 from appliance.cli.output import say_json, usage_error
-from appliance.features.guards.driver_outcomes import status_of
+from appliance.features.guards.driver_outcomes import CONSENT, QUESTION, REQUEST, RESTARTED, status_of
 from appliance.features.guards.guard_answers import DriverCheck
 from appliance.features.guards.guard_requests import DriverCheckBegin, DriverCheckWanted
 from rosmop.tool.terminal import say
 
 _VERB = "rosrv guard check-driver"
-_RESTARTED = "not measured: the appliance was restarted; its relays pass commands again after at most --for"
 
 
 @speaks
@@ -52,31 +51,27 @@ def check_driver(
     _require_consent(seconds, yes=yes)
     check = appliance.ask_or_exit(request)
     if not appliance.as_json:
-        say("drive slowly now, at most 0.3 m/s and 0.6 rad/s, until the outcome is printed", "yellow")
+        say(REQUEST, "yellow")
     while check.command and not check.outcome:
         check = appliance.ask_or_exit(DriverCheckWanted())
-    _say_outcome(check, as_json=appliance.as_json)
+    _say_outcome(check, seconds, as_json=appliance.as_json)
     raise typer.Exit(status_of(check.outcome))
 
 
 def _require_consent(seconds: float, *, yes: bool) -> None:
-    typer.echo(
-        f"While the base is driven slowly, its commands are withheld for up to {seconds:g} s. A driver without a"
-        " timeout drives on for that time: raise the wheels, or have free space and a hand on the emergency stop.",
-        err=True,
-    )
+    typer.echo(CONSENT.format(seconds), err=True)
     if yes:
         return
     if not sys.stdin.isatty():
         raise usage_error("without a terminal, agree with --yes", _VERB)
-    if not typer.confirm("May the base drive on?", err=True):
+    if not typer.confirm(QUESTION, err=True):
         raise usage_error("nothing was changed", _VERB)
 
 
-def _say_outcome(check: DriverCheck, *, as_json: bool) -> None:
+def _say_outcome(check: DriverCheck, seconds: float, *, as_json: bool) -> None:
     if as_json:
         say_json(check)
     elif not check.command:
-        say(_RESTARTED, "yellow")
+        say(RESTARTED.format(seconds), "yellow")
     else:
         say(f"{check.command}: {check.text}", {0: "green", 1: "red"}.get(status_of(check.outcome), "yellow"))

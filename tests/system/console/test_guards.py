@@ -55,3 +55,33 @@ def test_a_fence_is_drawn_changed_and_enforced(
     row.get_by_role("button", name="Remove").click()
     page.get_by_role("dialog").get_by_role("button", name="Remove").click()
     expect(page.get_by_text("No guard", exact=True)).to_be_visible()
+
+
+def test_the_check_of_a_driver_asks_measures_and_ends_with_its_window(
+    appliance: Appliance, opened: Callable[..., Reader], token: Callable[..., str], tmp_path: Path
+) -> None:
+    reader = opened()
+    with RosSession(appliance.master_uri, tmp_path) as ros:
+        base = ros.node("rospy", "driven_base", "0.48")
+        driver = ros.node("rospy", "driver", name="driver")
+        base.wait_for(event="moves")
+        page = reader.go("robot")
+        page.get_by_role("button", name="Check the driver").click()
+        dialog = page.get_by_role("dialog")
+        expect(dialog).to_contain_text("May the base drive on?")
+        expect(dialog.get_by_label("Commands")).to_have_value("/cmd_vel")
+        expect(dialog.get_by_label("Odometry")).to_have_value("/odom")
+        assert reader.axe() == []
+        assert not appliance.audit("--event", "driver checked")
+        dialog.get_by_role("button", name="The base may drive on").click()
+        expect(dialog.get_by_role("status")).to_contain_text("drive slowly now")
+        expect(dialog.get_by_role("status")).to_contain_text("the driver stopped the base")
+        assert reader.axe() == []
+        driver.kill()
+        dialog.get_by_role("button", name="Check again").click()
+        expect(dialog.get_by_role("status")).to_contain_text("drive slowly now")
+        dialog.get_by_role("button", name="End the check").click()
+        records = appliance.recorded("--event", "driver checked", count=2)
+        assert {one["detail"]["outcome"] for one in records} == {"stopped", "interrupted"}
+    viewed = opened(token("viewer", "watcher")).go("robot").get_by_role("button", name="Check the driver")
+    expect(viewed).to_have_attribute("aria-disabled", "true")

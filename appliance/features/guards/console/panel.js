@@ -12,6 +12,7 @@ import { Icon } from "#console/parts/icon.js";
 import { useLook } from "#console/parts/look.js";
 import { Empty, Failure, Loading } from "#console/parts/notice.js";
 import { Link } from "#console/router.js";
+import { CheckDriver } from "./driver.js";
 import { corners } from "./geometry.js";
 import { FenceMap } from "./map.js";
 import { constant, margins, trailOf } from "./margins.js";
@@ -30,17 +31,19 @@ export function Guards() {
   const rows = body?.guards ?? [];
   const topics = /** @type {string[]} */ ([...new Set(rows.flatMap((/** @type {any} */ one) => [one.topics.by, one.topics.command].filter(Boolean)))].slice(0, WATCHED));
   const { looking, turn, seen, error: unseen } = useLook(topics);
-  const [suggesting, setSuggesting] = useState(false);
+  const [open, setOpen] = useState("");
+  const close = () => setOpen("");
   return html`<section class="panel" aria-labelledby="guards"><div class="panel-head"><h2 id="guards">Guards</h2>${body && html`<span class="muted small">${counted(rows.length, "guard")}</span>`}
       <span class="end">${rows.length > 0 && html`<${Button} small role="operator" aria-pressed=${String(looking)} title="Reads positions and commands for a minute; the audit log records it" onClick=${turn}><${Icon} name=${looking ? "pause" : "play"} size=${14} />${looking ? "Stop watching" : "Watch"}</${Button}>`}
-        <${Button} small tone=${rows.length ? "" : "primary"} onClick=${() => setSuggesting(true)}><${Icon} name="plus" size=${14} />Suggest guards</${Button}></span></div>
+        <${Button} small role="admin" title="Measures whether the driver stops the base when commands end" onClick=${() => setOpen("driver")}><${Icon} name="check" size=${14} />Check the driver</${Button}>
+        <${Button} small tone=${rows.length ? "" : "primary"} onClick=${() => setOpen("suggest")}><${Icon} name="plus" size=${14} />Suggest guards</${Button}></span></div>
     ${unseen ? html`<div class="panel-body"><${Failure} error=${unseen} /></div>` : null}
     ${error && !body ? html`<div class="panel-body"><${Failure} error=${error} retry=${again} /></div>` : !body ? html`<${Loading} rows=${3} />`
       : !rows.length ? html`<${Empty} icon="robot" title="No guard">A guard stops the robot when its commands end, when it leaves a fence or drives too fast. Suggest guards reads the graph and proposes them.</${Empty}>`
       : html`<div class="table-wrap"><table class="table stacked"><thead><tr><th>Guard</th><th>State</th><th>Guards</th><th>How close it came</th><th class="number">Stopped</th><th><span class="sr-only">Actions</span></th></tr></thead>
         <tbody>${rows.map((/** @type {any} */ one) => html`<${Guard} key=${one.name} guard=${one} guards=${guards} seen=${seen} />`)}</tbody></table></div>`}
     ${rows.map((/** @type {any} */ one) => html`<${Fence} key=${one.name} guard=${one} seen=${seen} />`)}
-    ${suggesting && html`<${Suggest} guards=${guards} close=${() => setSuggesting(false)} />`}</section>`;
+    ${open === "suggest" && html`<${Suggest} guards=${guards} close=${close} />`}${open === "driver" && html`<${CheckDriver} close=${close} />`}</section>`;
 }
 
 function Guard(/** @type {{guard: any, guards: ReturnType<typeof useGuards>, seen: Record<string, any[]>}} */ { guard, guards, seen }) {

@@ -1,3 +1,4 @@
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -7,6 +8,7 @@ from appliance.channel import admin
 from appliance.channel.answers.graph_answers import Graph, Topic
 from appliance.channel.messages import MonitorEvent
 from appliance.control.errors import SenselessError
+from appliance.features.guards import driver_outcomes as sentences
 from appliance.features.guards.driver_check import NAME, DriverChecks
 from appliance.features.guards.driver_outcomes import status_of
 from appliance.features.guards.guard_requests import DriverCheckBegin, DriverCheckWanted
@@ -190,3 +192,11 @@ async def test_a_check_that_is_refused_or_in_shadow_mode_does_not_begin(manager:
     assert (await site.checks.begin(BEGIN, "eve")).outcome == "interrupted"
     await site.checks.look()
     assert manager.removed()
+
+
+@pytest.mark.parametrize(
+    "sentence", [sentences.CONSENT, sentences.QUESTION, sentences.REQUEST, sentences.RESTARTED]
+)
+def test_the_console_asks_and_warns_as_the_command_does(sentence: str) -> None:
+    page = (Path(sentences.__file__).parent / "console" / "driver.js").read_text()
+    assert sentence.replace("{:g}", "${seconds}") in page
