@@ -67,6 +67,9 @@ class GuardList(msgspec.Struct, frozen=True):
     tag: Tag
     presets: Annotated[list[PresetRow], doc("all presets")]
     guards: Annotated[list[GuardRow], doc("the loaded guards, in the order in which they see messages")]
+    warnings: Annotated[
+        list[str], doc("guards of a topic whose order changes what they promise, and the remedy")
+    ] = []
 
 
 class GuardPlan(msgspec.Struct, frozen=True):

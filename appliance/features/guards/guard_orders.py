@@ -20,6 +20,7 @@ from appliance.features.guards.guard_answers import (
     Suggestions,
 )
 from appliance.features.guards.guard_facts import facts_of, preset_row
+from appliance.features.guards.guard_order import Placed, faults, statements
 from appliance.features.guards.plans import planned
 from appliance.features.guards.presets import (
     PRESETS,
@@ -107,8 +108,9 @@ class GuardOrders:
     async def guards(self, _request: guard_requests.GuardsWanted) -> GuardList:
         rows = [self._row(name, preset) for name, preset in self._guards().items()]
         return GuardList(
-            self._monitors.revision, self._monitors.tag, [preset_row(one) for one in PRESETS.values()], rows
-        )
+            self._monitors.revision, self._monitors.tag, [preset_row(one) for one in PRESETS.values()], rows,
+            [*faults(self._placed())],
+        )  # fmt: skip
 
     async def suggestions(self, _request: guard_requests.GuardSuggestionsWanted) -> Suggestions:
         return Suggestions(_suggestions_of(self._graph()))
@@ -185,10 +187,13 @@ class GuardOrders:
             text = text_of(planned(preset, name, request.topics, graph, request.values, request.types))
             file = f"{name}.rv"
             if name in self._monitors.checked.monitors or file in self._monitors.sources.files:
-                raise GuardError(f"a monitor {name} is loaded: give another name, or set its values")
+                raise GuardError(
+                    f"a monitor {name} is loaded: give another name (--name), or change it: rosrv guard set {name}"
+                )
         except GuardError as error:
             raise SenselessError(str(error)) from error
-        return file, text
+        placed = Placed(name, preset.name, request.topics["command"], file)
+        return file, text + statements(placed, self._placed())
 
     def _changed(self, name: str, values: Mapping[str, str]) -> tuple[str, str, dict[str, str]]:
         preset, text = self._guard(name)
@@ -206,6 +211,13 @@ class GuardOrders:
             name: preset_of(files.get(file, "")) for name, file in self._monitors.checked.monitors.items()
         }
         return {name: preset for name, preset in found.items() if preset is not None}
+
+    def _placed(self) -> list[Placed]:
+        files, file_of = self._monitors.sources.files, self._monitors.checked.monitors
+        return [
+            Placed(name, preset.name, topics_in(files[file_of[name]]).get("command", ""), file_of[name])
+            for name, preset in self._guards().items()
+        ]
 
     def _guard(self, name: str) -> tuple[Preset, str]:
         guards = self._guards()

@@ -18,16 +18,13 @@ from appliance.cli.output import moment, say_json
 from appliance.features.guards.guard_answers import GuardRow
 from appliance.features.guards.guard_facts import facts_of, preset_row
 from appliance.features.guards.guard_requests import GuardNew, GuardsWanted, GuardTry
-from appliance.features.guards.plans import planned
 from appliance.features.guards.presets import (
     PRESETS,
     GuardError,
     Preset,
     described,
     file_of,
-    preset_named,
     preset_of,
-    text_of,
     with_values,
 )
 from appliance.features.guards.suggestions import proposals
@@ -58,7 +55,8 @@ def list_guards(appliance: Appliance) -> None:
             _say_preset(preset)
     if not appliance.said and not _runs(appliance):
         return
-    for row in appliance.ask_or_exit(GuardsWanted()).guards:
+    body = appliance.ask_or_exit(GuardsWanted())
+    for row in body.guards:
         if appliance.as_json:
             held, shadow, on = (row.state == state for state in ("holding", "shadow", "off"))
             say_json({"guard": row.name, "preset": row.preset, "state": row.state, "shadow": shadow,
@@ -66,6 +64,11 @@ def list_guards(appliance: Appliance) -> None:
                       "stops": row.stops, "confirm_by": row.confirm_by})  # fmt: skip
         else:
             say(f"guard {row.name}: {row.preset} on {', '.join(row.topics.values())}, {_state(row)}")
+    for warning in body.warnings:
+        if appliance.as_json:
+            say_json({"warning": warning})
+        else:
+            say(warning, "yellow")
 
 
 @speaks
@@ -134,28 +137,20 @@ def new(
 
     Example: rosrv guard new deadman /cmd_vel --shadow silent=0.5
     """
-    chosen = preset_named(preset)
     topics = {"command": topic, **({} if by is None else {"by": by}), **_pairs(further, "--topic NAME=TOPIC")}
+    given, types = _pairs(values, "PARAMETER=VALUE"), _pairs(kinds, "--type NAME=TYPE")
+    guard = name or preset
     if dry_run:
-        _plan(appliance, GuardTry(preset, topics, _pairs(kinds, "--type NAME=TYPE"), name or preset,
-                                  _pairs(values, "PARAMETER=VALUE"), shadow, hold=hold))  # fmt: skip
+        _plan(appliance, GuardTry(preset, topics, types, guard, given, shadow, hold=hold))
         return
-    graph = facts_of(appliance.ask_or_exit(admin.GraphWanted()))
-    guard = planned(chosen, name or preset, topics, graph, _pairs(values, "PARAMETER=VALUE"),
-                    _pairs(kinds, "--type NAME=TYPE"))  # fmt: skip
-    text = text_of(guard)
-    loaded = appliance.ask_or_exit(admin.MonitorsWanted())
-    file = f"{guard.name}.rv"
-    if any(guard.name == row.name or file == row.file for row in loaded.monitors):
-        raise GuardError(
-            f"a monitor {guard.name} is loaded: give --name, or change it with rosrv guard set {guard.name}"
-        )
+    within = seconds_within(confirm_within, "guard")
     body = appliance.ask_or_exit(
-        GuardNew(preset, topics, _pairs(values, "PARAMETER=VALUE"), _pairs(kinds, "--type NAME=TYPE"), guard.name,
-                 shadow, confirm_within=seconds_within(confirm_within, "guard"), hold=hold)
-    )  # fmt: skip
+        GuardNew(preset, topics, given, types, guard, shadow, confirm_within=within, hold=hold)
+    )
     _say_changed(appliance, body)
-    _write(appliance, loaded, file, text, temporary=body.confirm_by is not None)
+    loaded = appliance.ask_or_exit(admin.MonitorsWanted(texts=True))
+    file = f"{guard}.rv"
+    _write(appliance, loaded, file, (loaded.files or {})[file], temporary=body.confirm_by is not None)
 
 
 @speaks

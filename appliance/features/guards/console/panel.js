@@ -10,7 +10,7 @@ import { Field } from "#console/parts/field.js";
 import { Given } from "#console/parts/given.js";
 import { Icon } from "#console/parts/icon.js";
 import { useLook } from "#console/parts/look.js";
-import { Empty, Failure, Loading } from "#console/parts/notice.js";
+import { Empty, Failure, Loading, Notice } from "#console/parts/notice.js";
 import { Link } from "#console/router.js";
 import { CheckDriver } from "./driver.js";
 import { corners } from "./geometry.js";
@@ -38,6 +38,7 @@ export function Guards() {
         <${Button} small role="admin" title="Measures whether the driver stops the base when commands end" onClick=${() => setOpen("driver")}><${Icon} name="check" size=${14} />Check the driver</${Button}>
         <${Button} small tone=${rows.length ? "" : "primary"} onClick=${() => setOpen("suggest")}><${Icon} name="plus" size=${14} />Suggest guards</${Button}></span></div>
     ${unseen ? html`<div class="panel-body"><${Failure} error=${unseen} /></div>` : null}
+    ${body?.warnings.map((/** @type {string} */ one) => html`<div key=${one} class="panel-body"><${Notice} tone="warn"><${Given} value=${one} most=${400} /></${Notice}></div>`)}
     ${error && !body ? html`<div class="panel-body"><${Failure} error=${error} retry=${again} /></div>` : !body ? html`<${Loading} rows=${3} />`
       : !rows.length ? html`<${Empty} icon="robot" title="No guard">A guard stops the robot when its commands end, when it leaves a fence or drives too fast. Suggest guards reads the graph and proposes them.</${Empty}>`
       : html`<div class="table-wrap"><table class="table stacked"><thead><tr><th>Guard</th><th>State</th><th>Guards</th><th>How close it came</th><th class="number">Stopped</th><th><span class="sr-only">Actions</span></th></tr></thead>

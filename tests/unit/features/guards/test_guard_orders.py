@@ -190,6 +190,21 @@ async def test_an_order_without_sense_changes_nothing(
     assert not manager.orders
 
 
+async def test_a_new_guard_acts_in_the_right_order_and_a_wrong_one_is_reported(
+    manager: Manager, orders: GuardOrders
+) -> None:
+    types = {"command": TYPES["command"]}
+    request = guard_requests.GuardNew("speed", {"command": "/cmd_vel"}, types=types, name="cap")
+    await orders.new(request, "eve")
+    [load] = manager.orders
+    assert load.files["cap.rv"].endswith("\norder fence < cap;\n")
+    assert (await orders.guards(guard_requests.GuardsWanted())).warnings == []
+    manager.sources.files["cap.rv"] = load.files["cap.rv"]
+    manager.checked.monitors = {"cap": "cap.rv", **manager.checked.monitors}
+    [warning] = (await orders.guards(guard_requests.GuardsWanted())).warnings
+    assert "cap acts before fence" in warning
+
+
 async def test_a_monitor_that_is_not_a_guard_is_unknown(orders: GuardOrders) -> None:
     with pytest.raises(UnknownThingError, match="there are: fence"):
         await orders.set(guard_requests.GuardSet("other", {"margin": "1"}), "eve")

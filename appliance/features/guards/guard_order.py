@@ -1,0 +1,77 @@
+"""The pairs of presets whose order on a topic changes what they promise.
+
+Guards see messages in the order of their files. A new guard whose name breaks a row gets an `order` statement.
+"""
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+
+class Precedence(NamedTuple):
+    """Each preset of `first` acts before each of `then`; `otherwise`: what happens in the other order."""
+
+    first: tuple[str, ...]
+    then: tuple[str, ...]
+    otherwise: str
+
+
+PRECEDENCES = (
+    Precedence(
+        ("agree", "arm", "deadman", "estop", "fence", "sensor", "separation"),
+        ("speed",),
+        "after a stop the base jumps to its full velocity, as if it had driven on",
+    ),
+    Precedence(("sane",), ("separation", "speed"), "an infinite velocity is limited instead of stopped"),
+    Precedence(
+        ("rate",),
+        ("fence", "separation", "speed"),
+        "a dropped command counts as the motion in force, so the real one is not stopped or limited",
+    ),
+    Precedence(("deadman",), ("rate",), "dropped commands count as silence and stop the base"),
+    Precedence(
+        ("arm", "sane"), ("rate",), "a command that has to be stopped may be dropped, and the base drives on"
+    ),
+    Precedence(
+        ("arm", "estop", "joints", "sensor"),
+        ("answer",),
+        "a goal that was dropped is reported as late, and cancelled, after the deadline",
+    ),
+)
+
+
+@dataclass(frozen=True)
+class Placed:
+    """A guard on the topic that it commands; `file` is its specification file."""
+
+    name: str
+    preset: str
+    command: str
+    file: str
+
+
+def statements(new: Placed, loaded: Iterable[Placed]) -> str:
+    """Return the `order` statements that the text of a new guard needs, as lines behind it."""
+    pairs = [sorted((new, other), key=lambda one: one.file) for other in loaded]
+    return "".join(
+        f"\norder {second.name} < {first.name};\n" for first, second in pairs if _broken(first, second)
+    )
+
+
+def faults(guards: Sequence[Placed]) -> Iterator[str]:
+    """Yield the pairs that act in the wrong order, with the remedy; `guards` are in the order in which they act."""
+    for place, first in enumerate(guards):
+        for second in guards[place + 1 :]:
+            if why := _broken(first, second):
+                yield (
+                    f"{first.name} acts before {second.name}: {why}; write order {second.name} < {first.name}; into"
+                    f" {first.file}, and load it with rosrv monitor load"
+                )
+
+
+def _broken(first: Placed, second: Placed) -> str:
+    """Return what happens if `first` acts before `second`, or nothing if this order is right."""
+    if first.command != second.command:
+        return ""
+    rows = (one.otherwise for one in PRECEDENCES if second.preset in one.first and first.preset in one.then)
+    return next(rows, "")

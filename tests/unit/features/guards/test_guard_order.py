@@ -1,0 +1,153 @@
+import math
+from collections.abc import Callable
+from graphlib import TopologicalSorter
+from itertools import product
+from pathlib import Path
+
+import pytest
+
+from appliance.features.guards.guard_order import PRECEDENCES, Placed, faults, statements
+from appliance.features.guards.message_types import GOAL
+from appliance.features.guards.presets import PRESETS, Guard, text_of
+from rosmop.check.sources import compiled_from
+from rosmop.run.engine import MonitorSet
+from rosmop.tests.acting import fields, message
+from tests.unit.features.guards.guarding import BEGIN, DEFINITIONS, MS, NODES, Guarded, twist
+from tests.unit.features.guards.test_watching_presets import button, with_id
+
+
+class Together(Guarded):
+    """Two guards of one topic, of which `last` is made last and acts first by its name."""
+
+    def __init__(self, first: str, last: str, types: dict[str, str] | None = None, *, ordered: bool,
+                 **values: dict[str, object]) -> None:  # fmt: skip
+        placed, files = list[Placed](), {}
+        for name, preset in (("z", first), ("a", last)):
+            wanted = {each: str(value) for each, value in values.get(preset, {}).items()}
+            topics = {"command": "/move_base/goal"} if types else {}
+            guard = Guard(name, PRESETS[preset], topics, {"command": next(iter(PRESETS[preset].topics["command"])),
+                          **(types or {})}, wanted)  # fmt: skip
+            new = Placed(name, preset, "/c", f"{name}.rv")
+            files[new.file] = text_of(guard) + (statements(new, placed) if ordered else "")
+            placed.append(new)
+        self.monitors = MonitorSet.of(compiled_from(dict(sorted(files.items())), DEFINITIONS))
+        self.monitors.name_senders(lambda source: ("10.0.0.1", NODES[source]))
+        self.topics = PRESETS[last].given_topics | PRESETS[first].given_topics
+        if types:
+            self.topics = self.topics | {"command": "/move_base/goal"}
+        self.got = []
+        self.monitors.start(BEGIN - 100 * MS)
+        self.advance(0)
+
+
+def jumps(ordered: bool) -> bool:
+    guards = Together("estop", "speed", ordered=ordered, speed={"aMax": 1})
+    for at in range(100, 1500, 100):
+        guards.drive(twist(0.5), at)
+    for given, on, at in (
+        ("stop", True, 1500),
+        ("stop", False, 1510),
+        ("reset", False, 1520),
+        ("reset", True, 1900),
+    ):
+        guards.tell(given, button(on), at)
+        guards.drive(twist(0.5), at + 5)
+    return guards.drive(twist(0.5), 2000)[0] > 0.3
+
+
+def passes_infinity(ordered: bool) -> bool:
+    guards = Together("sane", "separation", ordered=ordered)
+    scan = message("sensor_msgs/LaserScan", range_min=0.1, range_max=9.0, ranges=[5.0], angle_increment=0.1)
+    guards.tell("by", scan, 1)
+    return guards.drive(twist(math.inf), 2)[0] > 0
+
+
+def leaves_the_fence(ordered: bool) -> bool:
+    """Forward passes, backward is dropped: the base drives forward."""
+    guards = Together(
+        "rate", "fence", ordered=ordered, rate={"interval": 1, "burst": 1}, fence={"silent": 10}
+    )
+    guards.tell("by", _pose(1.0), 1)
+    assert guards.drive(twist(0.5), 1000) == twist_legs(0.5)
+    assert guards.drive(twist(-0.5), 1100) == ()
+    guards.got.clear()
+    guards.tell("by", _pose(1.85), 1200)
+    return not guards.got
+
+
+def stops_a_node_that_commands(ordered: bool) -> bool:
+    guards = Together("deadman", "rate", ordered=ordered, rate={"interval": 2, "burst": 1})
+    guards.drive(twist(0.5), 100)
+    guards.got.clear()
+    for at in range(200, 1500, 100):
+        guards.drive(twist(0.5), at)
+    return any(data == twist(0) for _at, data in guards.got)
+
+
+def ignores_a_command_that_is_not_a_number(ordered: bool) -> bool:
+    guards = Together("sane", "rate", ordered=ordered, rate={"interval": 1, "burst": 1})
+    assert guards.drive(twist(0.5), 1000) == twist_legs(0.5)
+    return guards.drive(twist(math.nan), 1100) == ()
+
+
+def cancels_a_dropped_goal(ordered: bool) -> bool:
+    guards = Together("estop", "answer", {"command": GOAL}, ordered=ordered, answer={"limit": "1s"})
+    guards.tell("stop", button(True), 1)
+    assert guards.tell("command", with_id("a", 24, 72), 10).result == "dropped"
+    guards.advance(3000)
+    return "a" in {fields("actionlib_msgs/GoalID", data).id for _at, data in guards.got}
+
+
+def _pose(x: float) -> bytes:
+    return message("nav_msgs/Odometry", pose__pose__position__x=x, pose__pose__orientation__w=1.0)
+
+
+def twist_legs(x: float) -> tuple[float, ...]:
+    return (x, 0, 0, 0, 0, 0)
+
+
+CONSEQUENCES: list[Callable[[bool], bool]] = [
+    jumps, passes_infinity, leaves_the_fence, stops_a_node_that_commands, ignores_a_command_that_is_not_a_number,
+    cancels_a_dropped_goal,
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("happens", CONSEQUENCES, ids=[one.__name__ for one in CONSEQUENCES])
+def test_the_wrong_order_has_its_consequence_and_a_new_guard_is_put_right(
+    happens: Callable[[bool], bool],
+) -> None:
+    assert happens(False)
+    assert not happens(True)
+
+
+def test_each_row_of_the_table_has_its_test_and_no_order_contradicts_another() -> None:
+    assert len(PRECEDENCES) == len(CONSEQUENCES)
+    pairs = [pair for row in PRECEDENCES for pair in product(row.first, row.then)]
+    assert {name for pair in pairs for name in pair} <= PRESETS.keys()
+    before: dict[str, set[str]] = {}
+    for first, second in pairs:
+        before.setdefault(second, set()).add(first)
+    assert len([*TopologicalSorter(before).static_order()]) == len({name for pair in pairs for name in pair})
+
+
+def test_the_page_has_the_table() -> None:
+    page = (Path(__file__).parents[4] / "docs" / "guards.md").read_text()
+    for first, then, otherwise in PRECEDENCES:
+        names = [", ".join(f"`{name}`" for name in part) for part in (first, then)]
+        assert f"| {names[0]} | {names[1]} | {otherwise} |" in page
+
+
+def test_a_guard_is_ordered_among_those_of_its_topic_only_where_its_name_is_wrong() -> None:
+    def placed(name: str, preset: str, command: str = "/cmd_vel") -> Placed:
+        return Placed(name, preset, command, f"{name}.rv")
+
+    stop, fence = placed("estop", "estop"), placed("yard", "fence")
+    assert statements(placed("speed", "speed"), [stop, placed("z", "fence", "/arm/cmd_vel")]) == ""
+    assert statements(placed("cap", "speed"), [stop, fence]) == "\norder estop < cap;\n\norder yard < cap;\n"
+    assert statements(fence, [placed("cap", "speed")]) == "\norder yard < cap;\n"
+    [fault] = faults([stop, placed("speed", "speed"), fence])
+    assert (
+        fault.startswith("speed acts before yard: after a stop")
+        and "order yard < speed; into speed.rv" in fault
+    )
+    assert not [*faults([stop, fence, placed("speed", "speed")])]
