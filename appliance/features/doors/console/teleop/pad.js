@@ -1,4 +1,7 @@
-/** The pad: a finger, the mouse or the arrow keys drive the base. Whatever ends the hold stops it. */
+/**
+ * The pad: a finger, the mouse or the arrow keys drive the base. Whatever ends the hold stops it. A hold that begins
+ * before it is known who drives counts from the answer on.
+ */
 
 import { html, useEffect, useId, useMemo, useRef, useState } from "/console/static/vendor/preact.js";
 import { COMMANDS, Drive } from "./drive.js";
@@ -18,7 +21,8 @@ export function Pad(/** @type {import("./picture.js").Given & {name: string, add
   const listed = bases.some((one) => one.name === topic);
   const fastest = SPEEDS.find(([word]) => word === speed) ?? SPEEDS[0];
   const held = !group || group.holder === address;
-  const why = !topic ? "Name a topic" : !guards && !error ? "Looking who drives" : error ? "It is not known who drives" : held ? "" : `Take ${group.group} first`;
+  const looking = Boolean(topic) && !guards && !error;
+  const why = !topic ? "Name a topic" : looking ? "Looking who drives" : error ? "It is not known who drives" : held ? "" : `Take ${group.group} first`;
   return html`<section class="stack-tight" aria-label="Pad"><h3>Pad</h3>
     <${parts.Field} label="Commands" mono value=${topic} set=${setChosen} list=${list} placeholder="/cmd_vel" hint=${listed ? type : topic ? "not listed by the door: sent as geometry_msgs/Twist" : "no topic of velocities is listed: name one"} />
     <${parts.Field} label="Speed" value=${speed} set=${setSpeed} options=${SPEEDS.map(([word, shown]) => [word, shown])} hint=${`turns with ${fastest[3]} rad/s`} />
@@ -27,7 +31,7 @@ export function Pad(/** @type {import("./picture.js").Given & {name: string, add
     ${group && html`<${Authority} parts=${parts} group=${group} held=${held} name=${name} again=${again} />`}
     ${topic && guards && !guards.includes("deadman") && html`<${parts.Notice} tone="warn" title="No deadman guards this topic">If the connection breaks, the robot keeps its last command: <code>rosrv guard new deadman <${parts.Given} value=${topic} most=${80} /></code></${parts.Notice}>`}
     ${guards?.length ? html`<span class="muted small">Guards: ${guards.join(", ")}</span>` : null}
-    <${Plate} key=${`${topic} ${type}`} parts=${parts} door=${door} topic=${topic} type=${type} speed=${fastest} why=${why} /></section>`;
+    <${Plate} key=${`${topic} ${type}`} parts=${parts} door=${door} topic=${topic} type=${type} speed=${fastest} why=${why} looking=${looking} /></section>`;
 }
 
 /** The holder of the group, and the buttons that hand it over. */
@@ -68,12 +72,14 @@ function useMotion(/** @type {any} */ parts, /** @type {string} */ topic) {
   return { ...state, again: look };
 }
 
-function Plate(/** @type {{parts: any, door: import("./connection.js").DoorConnection, topic: string, type: string, speed: any, why: string}} */ { parts, door, topic, type, speed, why }) {
+function Plate(/** @type {{parts: any, door: import("./connection.js").DoorConnection, topic: string, type: string, speed: any, why: string, looking: boolean}} */ { parts, door, topic, type, speed, why, looking }) {
   const [driving, setDriving] = useState(false);
   const [said, setSaid] = useState("");
   const [at, setAt] = useState({ x: 0, y: 0 });
   const keys = useRef(/** @type {Set<string>} */ (new Set()));
   const pointer = useRef(/** @type {number | null} */ (null));
+  const aim = useRef({ x: 0, y: 0 });
+  const off = Boolean(why) && !looking;
   const drive = useMemo(() => new Drive(door, topic, type, (on, text) => {
     setDriving(on);
     setSaid(text);
@@ -88,8 +94,9 @@ function Plate(/** @type {{parts: any, door: import("./connection.js").DoorConne
     const length = Math.hypot(x, y);
     const scale = length < DEAD ? 0 : 1 / Math.max(1, length);
     const [, , fastest, turn] = speed;
+    aim.current = { x, y };
     setAt({ x: x * scale, y: y * scale });
-    drive.go(y * scale * fastest, -x * scale * turn);
+    if (!looking) drive.go(y * scale * fastest, -x * scale * turn);
   };
   useEffect(() => {
     const away = () => release();
@@ -105,14 +112,15 @@ function Plate(/** @type {{parts: any, door: import("./connection.js").DoorConne
     };
   }, []);
   useEffect(() => {
-    if (why) release();
+    if (off) release();
+    else if (!looking && (pointer.current !== null || keys.current.size)) hold(aim.current.x, aim.current.y);
   }, [why]);
   const point = (/** @type {PointerEvent} */ event) => {
     const box = /** @type {Element} */ (event.currentTarget).getBoundingClientRect();
     hold(((event.clientX - box.left) / box.width) * 2 - 1, 1 - ((event.clientY - box.top) / box.height) * 2);
   };
   const down = (/** @type {PointerEvent} */ event) => {
-    if (why || pointer.current !== null || event.button !== 0) return;
+    if (off || pointer.current !== null || event.button !== 0) return;
     pointer.current = event.pointerId;
     /** @type {Element} */ (event.currentTarget).setPointerCapture(event.pointerId);
     point(event);
@@ -126,7 +134,7 @@ function Plate(/** @type {{parts: any, door: import("./connection.js").DoorConne
   const press = (/** @type {KeyboardEvent} */ event) => {
     if (!(event.key in ARROWS) || event.ctrlKey || event.altKey || event.metaKey) return;
     event.preventDefault();
-    if (why || event.repeat) return;
+    if (off || event.repeat) return;
     keys.current.add(event.key);
     steer();
   };
@@ -140,7 +148,7 @@ function Plate(/** @type {{parts: any, door: import("./connection.js").DoorConne
     hold(sides.reduce((sum, [x]) => sum + x, 0), sides.reduce((sum, [, y]) => sum + y, 0));
   };
   return html`${said && html`<${parts.Notice} tone="deny" title="The pad has stopped" role="alert"><${parts.Given} value=${said} most=${600} /></${parts.Notice}>`}
-    <div class=${`door-pad${driving ? " driving" : ""}`} tabindex="0" role="application" aria-label="Pad: hold it, or the arrow keys, to drive" aria-disabled=${why ? "true" : undefined} title=${why || undefined}
+    <div class=${`door-pad${driving ? " driving" : ""}`} tabindex="0" role="application" aria-label="Pad: hold it, or the arrow keys, to drive" aria-disabled=${off ? "true" : undefined} title=${why || undefined}
       onPointerDown=${down} onPointerMove=${move} onPointerUp=${up} onPointerCancel=${up} onLostPointerCapture=${up} onKeyDown=${press} onKeyUp=${let_go} onBlur=${() => release()} onContextMenu=${(/** @type {Event} */ event) => event.preventDefault()}>
       <span class="door-knob" style=${{ left: `${50 + at.x * 37}%`, top: `${50 - at.y * 37}%` }}></span></div>
     <span class="muted small" role="status">${why || (driving ? "Driving: let go to stop." : "Stopped. Hold the pad, or focus it and hold the arrow keys.")}</span>`;
