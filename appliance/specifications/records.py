@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from appliance.audit.log.record import Severity
+from appliance.base.counted import counted
 from appliance.channel.messages import MonitorEvent
 from appliance.telemetry.audit_trail import AuditTrail
 
@@ -21,6 +22,7 @@ _EVENTS = {
 }
 _SHADOW_KINDS = {f"shadow {kind}": kind for kind in (*_EVENTS, "missed")}
 _NOT_DONE = ("drop", "change", "publish", "call")
+_SENT = {"publish": "sends", "call": "calls"}
 KINDS = tuple(_EVENTS)
 _LEVELS = {"WARN": Severity.WARNING, "ERROR": Severity.WARNING, "FATAL": Severity.ALARM}
 
@@ -50,7 +52,10 @@ class MonitorRecords:
             for tell in tuple(self.told):  # one may remove itself
                 tell(event)
         if lost:
-            text = f"{lost} reports of monitors were lost while control was not running"
+            text = (
+                f"{counted(lost, 'report of a monitor was', 'reports of monitors were')} lost while control"
+                " was not running"
+            )
             self.trail.happened("records lost", text, lost=lost)
 
     def _record(self, event: MonitorEvent) -> None:
@@ -72,6 +77,8 @@ class MonitorRecords:
         if event.size:
             detail["size"] = event.size
         text = event.text
+        if shadowed in _SENT:
+            text = f"{event.monitor} {_SENT[shadowed]} {text}"
         if event.count:
             detail["count"] = event.count
             text = f"{event.count} more in the same second" + (f": {text}" if text else "")

@@ -103,6 +103,9 @@ class DriverChecks:
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(_ANSWER_SECONDS):
                     await self._ended.wait()
+        if not self._under_way():  # the next order of the client finds the monitor removed
+            async with self._changing:
+                await self.look()
         return self._check
 
     async def watch(self) -> None:

@@ -44,9 +44,9 @@ def _type_of(
         return kinds[given]
     close = get_close_matches(topic, [name for name, kind in known.items() if kind in rows], 1, 0.5)
     hint = f"; did you mean {close[0]}?" if close else "."
+    option = f"{given}={next(iter(rows))}" if len(rows) == 1 else f"{given}=TYPE, of {', '.join(rows)}"
     raise GuardError(
-        f"no node has the topic {topic} now{hint} If it comes later, give its type: --type {given}=TYPE, of"
-        f" {', '.join(rows)}"
+        f"no node has the topic {topic} now{hint} If it comes later, give its type: --type {option}"
     )
 
 

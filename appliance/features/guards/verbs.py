@@ -301,7 +301,9 @@ def _write(appliance: Appliance, loaded: Monitors, file: str, text: str, *, temp
     if folder is None:
         obstacle = "the appliance keeps the text; it has no folder of specifications on this machine"
     elif temporary:
-        obstacle = f"{folder} is not changed while the load waits for rosrv monitor confirm"
+        obstacle = (
+            f"the appliance keeps the text; {folder} is not changed by a load that waits for confirmation"
+        )
     else:
         try:
             write_where_told(folder / file, text.encode())
@@ -330,7 +332,8 @@ def _plan(appliance: Appliance, request: GuardTry) -> None:
             say(f"would load nothing; {plan.name} would keep its state, {how}")
         elif request.enforce:
             say(
-                f"would load nothing; {plan.name} would be {how}; it would have acted {plan.stops} times before"
+                f"would load nothing; {plan.name} would be {how}; it would have acted"
+                f" {counted(plan.stops, 'time')} before"
             )
         else:
             say("would change nothing")
@@ -365,7 +368,7 @@ def _say_preset(preset: Preset) -> None:
     for given, rows in preset.topics.items():
         say(f"    {given}: {', '.join(rows)}", "dim")
     if preset.parameters:
-        table = table_of("parameter", "default", "range", "meaning")
+        table = table_of("    parameter", "default", "range", "meaning")
         for one in preset.parameters:
             span = f"{one.least}..{one.most}" if one.least else ""
             table.add_row(f"    {one.name}", f"{one.default} {one.unit}".strip(), span, one.what)

@@ -13,7 +13,15 @@ from tests.support.engines import open_log
 NAMES = ("event", "reason", "severity", "host", "category", "resource", "rule", "decision", "more", "self")
 
 
-@pytest.mark.parametrize("kind", ["verdict", "drop", "change", "fault", "log", "publish"])
+REASONS = {
+    "shadow publish": "in shadow mode, not done: gun sends told",
+    "shadow call": "in shadow mode, not done: gun calls told",
+    "shadow drop": "in shadow mode, not done: told",
+    "shadow log": "in shadow mode: told",
+}
+
+
+@pytest.mark.parametrize("kind", ["verdict", "drop", "change", "fault", "log", "publish", *REASONS])
 def test_every_report_is_recorded(tmp_path: Path, kind: str) -> None:
     log = open_log(tmp_path / "audit.db")
     records = MonitorRecords(
@@ -34,7 +42,7 @@ def test_every_report_is_recorded(tmp_path: Path, kind: str) -> None:
         for entry in export(tmp_path / "audit.db", Filter())
         if entry.record.resource == "/trigger"
     ]
-    assert len(found) == 2
+    assert [one.reason for one in found] == [REASONS.get(kind, "told")] * 2
     assert found[0].category == "monitor"
     assert (found[0].host, found[0].caller_id) == ("10.0.0.7", "/joystick")
     assert (found[0].detail["category"], found[0].detail["logic"]) == ("its category", "fsm")

@@ -99,6 +99,17 @@ async def test_the_line_of_the_monitor_is_the_outcome(
     assert (name, text, detail["who"]) == ("driver checked", f"/cmd_vel: {found.text}", "eve")
 
 
+async def test_its_monitor_is_removed_before_the_client_reads_the_outcome(
+    manager: Manager, site: Site
+) -> None:
+    """The next order would find it loaded, and `rosrv status` a change that waits for its confirmation."""
+    await site.checks.begin(BEGIN, "eve")
+    manager.says("driver check: idle after 30.000 s")
+    assert not manager.removed()
+    assert (await site.checks.wanted(DriverCheckWanted())).outcome == "idle"
+    assert manager.removed()
+
+
 async def test_the_monitor_is_loaded_behind_all_others_and_for_a_time(manager: Manager, site: Site) -> None:
     await site.checks.begin(BEGIN, "eve")
     [load] = manager.orders
