@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import structs
 
+from appliance.base.counted import counted
 from appliance.channel.answers.field_docs import doc
 from appliance.channel.answers.status import BlocksState, ProcessInfo, Status
 from appliance.channel.status_summary import no_relay, probe_failed
@@ -61,7 +62,7 @@ def activity(status: Status) -> list[Alarm]:
         for name, drops in sorted(recent.drops.items())
     ]
     if recent.denials >= recent.attention_at:
-        text = f"{recent.denials} denials in the last minute; rosrv audit summary --since 1m"
+        text = f"{counted(recent.denials, 'denial')} in the last minute; rosrv audit summary --since 1m"
         found.insert(0, Alarm(kind="denials", severity="warning", text=text, about="audit"))
     return list(_handled(status, found))
 
@@ -162,7 +163,9 @@ def _blocks(blocks: BlocksState) -> Iterator[_Condition]:
 def _failing(process: ProcessInfo) -> str:
     lines = "".join(f"\n    {line}" for line in process.output)
     printed = f"; it printed last:{lines}" if lines else ""
-    return f"{process.role} is failing, after {process.restarts} restarts: {process.failing}{printed}"
+    return (
+        f"{process.role} is failing, after {counted(process.restarts, 'restart')}: {process.failing}{printed}"
+    )
 
 
 def _rolls_back(what: str, deadline: float, noun: str) -> str:

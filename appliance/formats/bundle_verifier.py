@@ -316,7 +316,8 @@ class Verifier:
                     )
             self.note_hash(record["event"], record["revision"], json.loads(record["detail"]))
         if missing:
-            self.findings.append(f"records.ndjson: {missing} records of its runs are missing")
+            records = "record of its runs is" if missing == 1 else "records of its runs are"
+            self.findings.append(f"records.ndjson: {missing} {records} missing")
         first, last = runs.first[0], runs.last[-1]
         if not beside[first - 1] and first > 1:
             self.notes.append(f"records before {first}: removed by retention")
@@ -462,7 +463,8 @@ def main(arguments: list[str]) -> int:
     for note in notes:
         print(f"unproven  {note}")
     if given.checkpoints:
-        print(f"{verifier.agreeing} of {verifier.checkpoints} checkpoints were also kept elsewhere")
+        checkpoints = "checkpoint was" if verifier.checkpoints == 1 else "checkpoints were"
+        print(f"{verifier.agreeing} of {verifier.checkpoints} {checkpoints} also kept elsewhere")
     print(
         f"key {verifier.raw_key}{'' if given.key else ', from the bundle: compare it with a copy kept elsewhere'}"
     )

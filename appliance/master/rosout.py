@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from appliance.base import clock
+from appliance.base.counted import counted
 from appliance.channel.messages import MonitorEvent, OwnHeaderStated, OwnPublished
 from roswire.definitions import Definitions
 from roswire.log_message import DEBUG, ERROR, FATAL, INFO, TYPE, WARN, log_message
@@ -41,7 +42,7 @@ class Rosout:
             left, self._second, self._published, self._left_out = self._left_out, second, 0, 0
             if left:
                 self._publish_line(
-                    event.time, WARN, f"{left} more lines of monitors; the audit log has them", ""
+                    event.time, WARN, f"{counted(left, 'more line')} of monitors; the audit log has them", ""
                 )
         if self._published >= _A_SECOND:
             self._left_out += event.count or 1

@@ -6,6 +6,8 @@ Errors reject the file; warnings never do.
 import enum
 from dataclasses import dataclass
 
+from appliance.base.counted import counted
+
 MAXIMUM_FINDINGS = 200
 
 
@@ -67,7 +69,7 @@ class Findings:
         findings = sorted([*self._errors, *self.warnings])
         if self._uncounted:
             last = findings[-1]
-            text = f"{self._uncounted} more errors are not shown"
+            text = f"{counted(self._uncounted, 'more error is', 'more errors are')} not shown"
             findings.append(PolicyFinding(self.file, last.line, last.column, FindingSeverity.ERROR, text))
         raise PolicyError(findings)
 

@@ -24,6 +24,8 @@ from typing import Any, Literal, NamedTuple
 
 import msgspec
 
+from appliance.base.counted import counted
+
 Value = str | int | float | bytes | None
 Comparison = Literal["=", "<", "<=", ">"]
 Condition = tuple[str, Comparison, Any]
@@ -103,7 +105,9 @@ class Tables:
             raise ChangeError(f"the state has no table {change.table[:80]!r}")
         if isinstance(change, Put):
             if not 0 < len(change.rows) <= ROWS:
-                raise ChangeError(f"a change of {change.table} has {len(change.rows)} rows, not 1 to {ROWS}")
+                raise ChangeError(
+                    f"a change of {change.table} has {counted(len(change.rows), 'row')}, not 1 to {ROWS}"
+                )
             for row in change.rows:
                 if len(row) != len(columns):
                     raise ChangeError(f"a row of {change.table} has {len(columns)} values, not {len(row)}")

@@ -25,6 +25,7 @@ import msgspec
 import structlog
 
 from appliance.base import clock
+from appliance.base.counted import counted
 from appliance.channel import messages
 from appliance.ipsec.strongswan import PROGRAM as CHARON
 from appliance.supervisor import rosmaster_probe, signals
@@ -628,7 +629,9 @@ class Supervisor:
         self._tell_processes()
         if slot.is_failing:
             if not self.is_ready:
-                self.stop(f"{process.role} died {slot.short_runs} times ({_end_of(code)}); check the log")
+                self.stop(
+                    f"{process.role} died {counted(slot.short_runs, 'time')} ({_end_of(code)}); check the log"
+                )
                 return
             log.critical(
                 "process keeps crashing", role=process.role, times=slot.short_runs, reason=slot.reason,

@@ -15,7 +15,7 @@ BUDGET = 11_907  # lines of code: lower this number with the kernel, and never r
 OUTSIDE = frozenset(
     """
     audit.log.disk_space audit.log.events audit.log.ids audit.log.lock_holders audit.proof.copies
-    base.atomic_files base.clock base.engine_thread base.input_files base.validation_messages
+    base.atomic_files base.clock base.counted base.engine_thread base.input_files base.validation_messages
     channel.channel channel.link channel.messages channel.messages.relay_link channel.rosout_address
     configuration.settings control.assembly.current master.calls.monitor_calls
     master.calls.request_peek master.endpoints.delivery master.endpoints.node_api

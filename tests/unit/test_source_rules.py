@@ -8,6 +8,7 @@ import ast
 import re
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import pytest
@@ -416,6 +417,29 @@ def shown_habits(source: Source) -> Iterator[tuple[int, str]]:
             yield from ((node.lineno, what) for _line, what in bad_habits(text))
 
 
+MISCOUNTED = re.compile(
+    r" (?:(?:more|further|new|other) )?(?:arguments|bundles|calls|changes|checkpoints|commands|connections|denials|"
+    r"errors|files|findings|hosts|lines|messages|monitors|nodes|parts|ports|records|registrations|reports|restarts|rows|rules|"
+    r"sessions|times|topics|trials|warnings)\b"
+)
+LIMIT = re.compile(r"[A-Z_]{3,}|most|limit|bound|longest|least|range")
+"""Names of numbers that are never 1."""
+
+
+def miscounted(source: Source) -> Iterator[tuple[int, str]]:
+    chosen = {
+        id(part) for node in source.nodes if isinstance(node, ast.IfExp) for part in (node.body, node.orelse)
+    }
+    for node in source.nodes:
+        if not isinstance(node, ast.JoinedStr) or id(node) in chosen:
+            continue
+        for number, behind in pairwise(node.values):
+            match number, behind:
+                case ast.FormattedValue(value=value), ast.Constant(value=str(text)):
+                    if MISCOUNTED.match(text) and not LIMIT.search(ast.unparse(value)):
+                        yield node.lineno, f"{{{ast.unparse(value)}}}{text[:30]}"
+
+
 def foreign_imports(source: Source) -> Iterator[tuple[int, str]]:
     for node in source.nodes:
         match node:
@@ -476,6 +500,11 @@ RULES = {
     "English that is shown": Rule(
         (*WITH_FLEET, "distribution/"), shown_habits, forbid("plain English"),
         ["raise ValueError(f'{name} is no group of hosts')"], ["raise ValueError(f'{name} is not a group')"],
+    ),
+    "counted": Rule(
+        ("appliance/",), miscounted, forbid("counted(number, noun) of appliance/base/counted.py: there may be one"),
+        ["f'{self.left} more errors are not shown'", "f'{len(found)} hosts'"],
+        ["f'more than {_MOST} hosts'", "'1 host' if n == 1 else f'{n} hosts'", "f'{counted(n, \"host\")} left'"],
     ),
     "language": Rule(
         (LANGUAGE_TESTS,), foreign_imports, forbid("tests of the language run without the appliance"),

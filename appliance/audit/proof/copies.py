@@ -16,6 +16,7 @@ import msgspec
 from appliance.audit.log.log_database import LogUnreadableError, reading
 from appliance.audit.log.signatures import signature_is_valid
 from appliance.audit.proof.chain_findings import Elsewhere, FindingKind, LogFinding
+from appliance.base.counted import counted
 from appliance.base.input_files import open_given
 from appliance.signing.log_proof import Checkpoint, ProofFault, parse_checkpoint, signature_fault
 
@@ -205,7 +206,8 @@ class CopiesVerifier:
             found.append(LogFinding(FindingKind.LOG_REPLACED, 0, 0, message))
         elif not self._agreeing and not found:
             message = (
-                f"of {len(self._copies)} checkpoints kept elsewhere none is of what is left of the log, which begins"
+                f"of {counted(len(self._copies), 'checkpoint')} kept elsewhere none is of what is left of the"
+                " log, which begins"
                 f" after record {removed}: they prove nothing of it"
             )
             found.append(LogFinding(FindingKind.PROVES_NOTHING, 0, removed, message))

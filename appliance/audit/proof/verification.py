@@ -26,6 +26,7 @@ from appliance.audit.proof.checkpoints import (
     read_signer_memory,
 )
 from appliance.audit.proof.copies import CopiesVerifier, SignedCheckpoint
+from appliance.base.counted import counted
 from appliance.signing.log_proof import NO_CHECKPOINT, genesis, signature_fault
 
 _WINDOW = 64
@@ -196,7 +197,9 @@ class _Verifier:
         else:
             first = first if self._further is None else self._further.first
             self._untold += 1
-            message = f"records {first} to {last}: {self._untold} further findings, not told one by one"
+            message = (
+                f"records {first} to {last}: {counted(self._untold, 'further finding')}, not told one by one"
+            )
             self._further = LogFinding(kind, first, last, message)
 
     # --- the database itself --------------------------------------------------------------------------------

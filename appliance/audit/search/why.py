@@ -6,6 +6,7 @@ from typing import Any
 from appliance.audit.log.record import AuditRecord
 from appliance.audit.log.record_format import LogEntry, rfc3339, rule_text
 from appliance.base.actors import actor
+from appliance.base.counted import counted
 
 _ACTIONS = frozenset({"message dropped", "message changed", "monitor verdict", "monitor fault"})
 """The events of monitors that trigger recordings, if `recorder.triggers` has them."""
@@ -39,7 +40,8 @@ def _counted(detail: Mapping[str, Any], host_in_words: Callable[[str], str]) -> 
             names = {
                 host_in_words(name) if what == "hosts" else name: number for name, number in found.items()
             }
-            yield f"{what}: {', '.join(f'{name} ({number} times)' for name, number in names.items())}"
+            tallies = [f"{name} ({counted(number, 'time')})" for name, number in names.items()]
+            yield f"{what}: {', '.join(tallies)}"
     texts = dict.fromkeys(str(detail[name]) for name in ("first_text", "last_text") if name in detail)
     if texts:
         yield f"from first to last: {' … '.join(texts)}"

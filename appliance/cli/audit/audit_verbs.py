@@ -21,6 +21,7 @@ from appliance.audit.proof.copies import read_copies
 from appliance.audit.search.filter_options import FILTER
 from appliance.audit.search.query import Filter, FilterError
 from appliance.audit.search.search import LARGEST_PAGE
+from appliance.base.counted import counted
 from appliance.channel.admin import PolicyWanted
 from appliance.channel.answers.policy_answers import PolicyKnown
 from appliance.cli.audit.audit_errors import Errors, fail, note
@@ -255,7 +256,7 @@ def export(
             with _new_file(output) as file:
                 count = _write_all(entries, report, file)
     if output is not None:
-        note(f"{count} records in {output}")
+        note(f"{counted(count, 'record')} in {output}")
 
 
 def _filter_of(appliance: Appliance) -> Filter:

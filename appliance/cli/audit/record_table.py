@@ -15,6 +15,7 @@ from appliance.audit.proof.chain_findings import Elsewhere, FindingKind, Verific
 from appliance.audit.search.equality import FOLDED, EqualRecords, grouped, time_span
 from appliance.audit.search.search import RecordInContext
 from appliance.base.actors import actor
+from appliance.base.counted import counted
 from appliance.policy.host_names import HostInWords
 
 _STYLES = {"allow": "green", "deny": "bold red", "would deny": "yellow"}
@@ -81,12 +82,15 @@ def print_shown(shown: RecordInContext, host_in_words: HostInWords) -> None:
 def print_verification(result: Verification) -> None:
     for finding in result.findings:
         write(f"{finding.kind.value.upper()}: {printable(finding.message)}")
-    write(f"{result.records} records ({result.first} to {result.last}), log {printable(result.log)}")
+    write(
+        f"{counted(result.records, 'record')} ({result.first} to {result.last}), log {printable(result.log)}"
+    )
     if result.removed:
         write(f"records up to {result.removed} were removed by retention, as recorded{_vouched(result)}")
     write(
-        f"{result.signed_checkpoints} of {result.checkpoints} checkpoints are signed; records up to"
-        f" {result.signed_through} are proven by a signature, the {result.unsealed} after it by the chain only"
+        f"{result.signed_checkpoints} of {counted(result.checkpoints, 'checkpoint is', 'checkpoints are')}"
+        f" signed; records up to {result.signed_through} are proven by a signature,"
+        f" the {result.unsealed} after it by the chain only"
     )
     if result.elsewhere is not None:
         for text in _elsewhere(result.elsewhere):
@@ -113,10 +117,10 @@ def _verdict(result: Verification) -> str:
 
 def _elsewhere(found: Elsewhere) -> Iterator[str]:
     if found.checkpoints:
-        yield (
-            f"{found.checkpoints} checkpoints kept elsewhere agree: records up to {found.through} are unchanged"
-            f" since {rfc3339(found.time)}"
+        agreeing = counted(
+            found.checkpoints, "checkpoint kept elsewhere agrees", "checkpoints kept elsewhere agree"
         )
+        yield f"{agreeing}: records up to {found.through} are unchanged since {rfc3339(found.time)}"
     else:
         yield "no checkpoint kept elsewhere belongs to this log"
     if found.other_logs:

@@ -5,6 +5,7 @@ from collections.abc import Callable
 
 import msgspec
 
+from appliance.base.counted import counted
 from appliance.channel import messages
 from appliance.channel.link import Link
 from appliance.forwarding.forwarding_state import ForwardingState
@@ -50,7 +51,7 @@ class ForwarderLink:
             count = report.missed - before.missed
             self._trail.happened(
                 "forwarding gap",
-                f"retention removed {count} records before {self._to} received them",
+                f"retention removed {counted(count, 'record')} before {self._to} received them",
                 count=count,
             )
         if report.trouble and self._failing is None:

@@ -5,6 +5,7 @@ from typing import Annotated
 
 import msgspec
 
+from appliance.base.counted import counted
 from appliance.base.metric import gauge
 from appliance.channel.answers.field_docs import doc
 from appliance.features.view import FeatureView, StateView, Trouble
@@ -29,7 +30,8 @@ class ApprovalCounts(msgspec.Struct, frozen=True):
 def _alarms(state: ApprovalCounts) -> Iterator[Trouble]:
     if state.unanswered:
         text = (
-            f"no operator answered {state.unanswered} calls in time, in the last ten minutes: rosrv approve"
+            f"no operator answered {counted(state.unanswered, 'call')} in time, in the last ten minutes:"
+            " rosrv approve"
         )
         yield Trouble("warning", "approval-unanswered", text)
 

@@ -8,6 +8,7 @@ import typer
 
 from appliance.backup.contents import BackupError
 from appliance.backup.create import back_up
+from appliance.base.counted import counted
 from appliance.cli.connection.target import DEFAULT_STATE, State
 from appliance.cli.output import Json, say_json
 from appliance.cli.state_confirmation import Confirm, confirm_state
@@ -43,7 +44,7 @@ def backup(
     if as_json:
         say_json({"file": str(file), "files": len(names), "bytes": size})
     else:
-        say(f"{file}: {len(names)} files, {size} bytes")
+        say(f"{file}: {counted(len(names), 'file')}, {size} bytes")
 
 
 def restore(
@@ -63,7 +64,8 @@ def restore(
         say_json({"state": str(state), "files": len(names)})
     else:
         say(
-            f"{state}: {len(names)} files; verify the log: rosrv audit verify --state {shlex.quote(str(state))}"
+            f"{state}: {counted(len(names), 'file')}; verify the log: rosrv audit verify --state"
+            f" {shlex.quote(str(state))}"
         )
 
 
@@ -86,7 +88,7 @@ def purge(
     if as_json:
         say_json({"state": str(state), "files": files, "written_over": written})
     else:
-        say(f"{state} is erased: {files} files, {written} of them overwritten first")
+        say(f"{state} is erased: {counted(files, 'file')}, {written} of them overwritten first")
 
 
 def _failed(text: str) -> typer.Exit:

@@ -9,6 +9,7 @@ from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping
 
 from msgspec.structs import asdict, replace
 
+from appliance.base.counted import counted
 from appliance.base.withdrawal import take_effect
 from appliance.control.assembly.assembly import Parts
 from appliance.control.assembly.foundation import Foundation
@@ -233,7 +234,7 @@ class BlockOrders:
         if any(address in network for network in self._policies.current.robot):
             why = "is the robot's own host"
         elif own > max(whole / 2, _FEW):
-            why = f"has {own} of {whole} registrations, so it may be the robot itself"
+            why = f"has {own} of {counted(whole, 'registration')}, so it may be the robot itself"
         else:
             return
         raise HostRefusedError(
@@ -301,7 +302,7 @@ def _difference(before: requests.BlockEnded, after: requests.BlockEnded) -> requ
 
 
 def in_words(held: requests.BlockEnded) -> str:
-    return f"{_registrations_of(held)} registrations and {held.connections} connections"
+    return f"{counted(_registrations_of(held), 'registration')} and {counted(held.connections, 'connection')}"
 
 
 def _registrations_of(held: requests.BlockEnded) -> int:

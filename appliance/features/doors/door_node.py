@@ -15,6 +15,7 @@ import msgspec
 from msgspec import Raw
 
 from appliance.base import clock
+from appliance.base.counted import counted
 from appliance.features.doors.door_memory import ClientMemory
 from appliance.features.doors.door_parameters import TOO_MANY_CALLS, DoorParameters, ParameterClient
 from appliance.features.doors.host_shares import HostShares, check_share
@@ -476,7 +477,7 @@ def _named(values: Raw, names: list[str]) -> bytes:
     given = msgspec.json.decode(text, type=list[Raw])
     if len(given) > len(names):
         raise ProtocolError(
-            f"{len(given)} arguments; the request has {len(names)} fields: {', '.join(names)}"
+            f"{counted(len(given), 'argument')}; the request has {counted(len(names), 'field')}: {', '.join(names)}"
         )
     return msgspec.json.encode(dict(zip(names, given, strict=False)))
 

@@ -18,6 +18,7 @@ from functools import partial
 from typing import Any
 
 from appliance.base import clock
+from appliance.base.counted import counted
 from appliance.channel import messages
 from appliance.channel.channel import Channel, ChannelFullError
 from appliance.channel.link import Link
@@ -307,7 +308,7 @@ class DoorProcesses:
         if change.began:
             happened(
                 "door connected",
-                f"{change.began} connections to {row.name} began",
+                f"{counted(change.began, 'connection')} to {row.name} began",
                 more=ticket,
                 count=change.began,
             )
@@ -316,7 +317,7 @@ class DoorProcesses:
             reason = change.reason or "the client left"
             happened(
                 "door disconnected",
-                f"{change.ended} connections to {row.name} ended: {reason}",
+                f"{counted(change.ended, 'connection')} to {row.name} ended: {reason}",
                 more=ticket,
                 count=change.ended,
             )

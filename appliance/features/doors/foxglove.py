@@ -12,6 +12,7 @@ from typing import Any
 import msgspec
 from msgspec import UNSET, Raw
 
+from appliance.base.counted import counted
 from appliance.features.doors.client_frames import ClientFrame, binary_frame, frame_size, text_frame
 from appliance.features.doors.foxglove_frames import (
     FOXGLOVE_OPERATION,
@@ -224,7 +225,8 @@ class Foxglove:
         elif start > len(frame) or encoding != "ros1":
             reason = f"the encoding {quoted(encoding)} of a service call; use ros1"
         elif len(self._calls) >= self._limits.calls:
-            reason = f"{len(self._calls)} calls of this client wait for answers; repeat it later"
+            waiting = counted(len(self._calls), "call of this client waits", "calls of this client wait")
+            reason = f"{waiting} for answers; repeat it later"
         if reason or seen is None:
             self._fail_call(service, call, reason)
             return []

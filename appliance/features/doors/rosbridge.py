@@ -13,6 +13,7 @@ from typing import Any
 
 from msgspec import Raw
 
+from appliance.base.counted import counted
 from appliance.features.doors.client_frames import frame_size
 from appliance.features.doors.fragments import FragmentStore
 from appliance.features.doors.known_types import DoorMessage
@@ -229,9 +230,8 @@ class Rosbridge:
         self._number += 1
         call = _Call(operation.service, reply_to)
         if len(self._calls) >= self._limits.calls:
-            self._fail_call(
-                call, f"{len(self._calls)} calls of this client wait for answers; repeat it later"
-            )
+            waiting = counted(len(self._calls), "call of this client waits", "calls of this client wait")
+            self._fail_call(call, f"{waiting} for answers; repeat it later")
             return []
         try:
             service = self._resolved(name)
@@ -328,7 +328,7 @@ class Rosbridge:
         if spelling is None:
             raise OperationError(f"the client does not offer {service} any longer")
         if len(self._asked) >= self._limits.calls:
-            raise OperationError(f"the client has not answered {len(self._asked)} calls")
+            raise OperationError(f"the client has not answered {counted(len(self._asked), 'call')}")
         self._number += 1
         call = f"service_request:{spelling}:{self._number}"
         self._asked[call] = service

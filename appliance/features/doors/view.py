@@ -5,6 +5,7 @@ from typing import Annotated
 
 import msgspec
 
+from appliance.base.counted import counted
 from appliance.base.metric import Metric, counter, gauge
 from appliance.channel.answers.field_docs import doc
 from appliance.features.view import FeatureView, Samples, StateView, Trouble
@@ -64,7 +65,7 @@ def _alarms(state: DoorsState) -> Iterator[Trouble]:
     if down:
         yield Trouble("warning", "doors-down", f"doors do not serve: {_listed(down)}; see rosrv door list")
     dying = [
-        f"{one.name} ({one.restarts_lately} times)"
+        f"{one.name} ({counted(one.restarts_lately, 'time')})"
         for one in state.doors
         if one.restarts_lately >= _MANY_RESTARTS
     ]

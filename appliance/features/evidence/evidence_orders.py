@@ -3,6 +3,7 @@
 import asyncio
 
 from appliance.audit.log.log import AuditLog
+from appliance.base.counted import counted
 from appliance.control.errors import UnavailableError
 from appliance.features.evidence.evidence_requests import EvidenceExported, LogSealed, Sealed
 from appliance.telemetry.audit_trail import AuditTrail
@@ -29,7 +30,7 @@ class EvidenceOrders:
     async def exported(self, request: EvidenceExported, who: str) -> Sealed:
         record = self._trail.happened(
             "evidence exported",
-            f"{request.records} records were exported as evidence",
+            f"{counted(request.records, 'record was', 'records were')} exported as evidence",
             who=who,
             manifest=request.manifest,
             since=request.since,

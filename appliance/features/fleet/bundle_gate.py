@@ -17,6 +17,7 @@ import structlog
 
 from appliance.base import clock
 from appliance.base.actors import UNCONFIRMED
+from appliance.base.counted import counted
 from appliance.channel import admin
 from appliance.channel.link import Link
 from appliance.control.assembly.policies import Policies, PolicyCases, RevisionChangedError
@@ -350,7 +351,7 @@ class BundleGate:
             msgspec.structs.replace(record, trial=None, interrupted=trial.sha256, interruptions=interruptions)
         )
         if interruptions >= _INTERRUPTIONS:
-            reason = f"the appliance ended during each of {interruptions} trials"
+            reason = f"the appliance ended during each of {counted(interruptions, 'trial')}"
             self._refuse(trial.path, trial.sha256, reason)
 
     async def _undo(self, trial: Trial) -> None:

@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple, Self
 
+from appliance.base.counted import counted
 from appliance.channel.answers.status import MinuteState, ProcessInfo
 from appliance.control.assembly.monitor_states import monitors_status
 from appliance.policy.model import Address
@@ -73,6 +74,7 @@ class RobotHealth(NamedTuple):
             return f"processes keep ending: {', '.join(sorted(self.processes - before.processes))}"
         if self.denials > most:
             return (
-                f"{self.denials} denials in the last minute, {before.denials} in the minute before the change"
+                f"{counted(self.denials, 'denial')} in the last minute, {before.denials} in the minute before the"
+                " change"
             )
         return ""

@@ -17,6 +17,7 @@ import msgspec
 from appliance.audit.log.record import Severity
 from appliance.audit.log.record_format import LogEntry, as_json
 from appliance.base.atomic_files import write_whole
+from appliance.base.counted import counted
 from appliance.features.recorder.bag_writer import BagMessage, BagWriter
 from appliance.features.recorder.excluded_topics import NAMED
 from appliance.features.recorder.recorder_link import RevisionsStated
@@ -221,9 +222,9 @@ class RecordingInProgress:
         reasons = [progress.why_not] if progress.why_not else []
         missed = sum(row.missed for row in progress.topics)
         if missed:
-            reasons.append(f"{missed} messages did not fit (see topics)")
+            reasons.append(f"{counted(missed, 'message')} did not fit (see topics)")
         if progress.unconnected:
-            reasons.append(f"{progress.unconnected} messages of too many different connections")
+            reasons.append(f"{counted(progress.unconnected, 'message')} of too many different connections")
         if progress.claims:
             claims = [row.topic for row in progress.left_out if row.why != NAMED][:_MOST_NAMED]
             named = ", ".join(claims) + (" and others" if progress.claims > len(claims) else "")
@@ -236,9 +237,14 @@ class RecordingInProgress:
         for reader, (missed_before, refused_before) in zip(self._readers, progress.not_there, strict=False):
             missed_now, refused_now = reader.not_there
             if missed_now > missed_before:
-                reasons.append(f"{missed_now - missed_before} messages were too long for recorder.memory")
+                reasons.append(
+                    f"{counted(missed_now - missed_before, 'message was', 'messages were')} too long for"
+                    " recorder.memory"
+                )
             if refused_now > refused_before:
-                reasons.append(f"{refused_now - refused_before} connections did not fit in recorder.memory")
+                reasons.append(
+                    f"{counted(refused_now - refused_before, 'connection')} did not fit in recorder.memory"
+                )
         return "; ".join(reasons)
 
     def _write_records(self, records: Iterable[LogEntry]) -> None:

@@ -11,6 +11,7 @@ from appliance.audit.log.log_database import LogUnreadableError
 from appliance.audit.search.query import Filter
 from appliance.audit.search.search import search
 from appliance.base import clock
+from appliance.base.counted import counted
 from appliance.base.input_files import read_given, read_given_text
 from appliance.base.shipped import SHIPPED, before_program
 from appliance.configuration.settings import Settings
@@ -59,7 +60,9 @@ def _policy(file: Path, site_keys: Sequence[str]) -> Iterator[SelftestFinding]:
         yield fail("policy", str(error.findings[0]), f"rosrv policy check {file}")
         return
     if policy.warnings:
-        yield warn("policy", f"{file}: {len(policy.warnings)} warnings", f"rosrv policy check {file}")
+        yield warn(
+            "policy", f"{file}: {counted(len(policy.warnings), 'warning')}", f"rosrv policy check {file}"
+        )
     else:
         yield ok("policy", f"{file} is valid")
     yield from _cases(file, policy)
@@ -93,7 +96,9 @@ def _monitors(folder: Path | None, site_keys: Sequence[str]) -> Iterator[Selftes
     text = f"{len(checked.monitors)} in {folder}"
     if checked.warnings:
         yield warn(
-            "monitors", f"{text}, {len(checked.warnings)} warnings", f"rosrv monitor check {folder}/*.rv"
+            "monitors",
+            f"{text}, {counted(len(checked.warnings), 'warning')}",
+            f"rosrv monitor check {folder}/*.rv",
         )
     else:
         yield ok("monitors", text)

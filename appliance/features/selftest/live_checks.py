@@ -8,6 +8,7 @@ from urllib.parse import urlsplit, urlunsplit
 from appliance.audit.log.log_database import LogUnreadableError
 from appliance.audit.search.query import Filter, FilterError
 from appliance.base import clock
+from appliance.base.counted import counted
 from appliance.channel.admin import StatusWanted
 from appliance.channel.answers.status import ProcessInfo, Status
 from appliance.cli.connection.admin_client import NotRunningError
@@ -59,7 +60,9 @@ def _status(status: Status) -> Iterator[SelftestFinding]:
 
 
 def _processes(rows: list[ProcessInfo]) -> Iterator[SelftestFinding]:
-    restarted = [f"{row.role} {row.restarts} times" for row in rows if row.restarts >= _MANY_RESTARTS]
+    restarted = [
+        f"{row.role} {counted(row.restarts, 'time')}" for row in rows if row.restarts >= _MANY_RESTARTS
+    ]
     if restarted:
         yield warn("processes", f"restarted: {', '.join(restarted)}", "see the log of rosrv up")
     else:
@@ -71,14 +74,18 @@ def _audit(appliance: Appliance) -> Iterator[SelftestFinding]:
     try:
         last = source.last()
         if last > _MANY_RECORDS:
-            yield skip("audit log", f"{last} records take too long to verify here", "rosrv audit verify")
+            yield skip(
+                "audit log",
+                f"{counted(last, 'record takes', 'records take')} too long to verify here",
+                "rosrv audit verify",
+            )
             return
         result = source.verify(None, None, lambda _sequence: None)
     except (LogUnreadableError, NotRunningError, FilterError) as error:
         yield skip("audit log", str(error))
         return
     if result.ok:
-        yield ok("audit log", f"{result.records} records are complete and unchanged")
+        yield ok("audit log", f"{counted(result.records, 'record is', 'records are')} complete and unchanged")
     else:
         yield fail("audit log", result.findings[0].message, "rosrv audit verify")
 

@@ -4,6 +4,7 @@ from typing import Annotated
 
 import typer
 
+from appliance.base.counted import counted
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.output import moment, say_json, say_row
 from appliance.features.sso.sso_requests import SessionsEnd, SessionsWanted
@@ -41,4 +42,4 @@ def end(
     if appliance.as_json:
         say_json(body)
         return
-    say(f"{body.sessions[0].name}: {len(body.sessions)} sessions ended.")
+    say(f"{body.sessions[0].name}: {counted(len(body.sessions), 'session')} ended.")

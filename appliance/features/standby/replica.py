@@ -19,6 +19,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
+from appliance.base.counted import counted
 from appliance.base.engine_thread import InCaller
 from appliance.features.standby.replication_frames import (
     Changes,
@@ -100,7 +101,9 @@ class Replica:
                 self._rows += sum(len(put.rows) for put in message.rows)
             case SnapshotEnd(rows) if self._snapshot is not None:
                 if rows != self._rows:
-                    raise ReplicationError(f"the snapshot has {self._rows} rows, and should have {rows}")
+                    raise ReplicationError(
+                        f"the snapshot has {counted(self._rows, 'row')}, and should have {rows}"
+                    )
                 begin = self._snapshot
                 self._commit(Stored(begin.epoch, begin.history, begin.number))
                 self._snapshot = None

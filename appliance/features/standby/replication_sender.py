@@ -18,6 +18,7 @@ from typing import Any, NamedTuple, TypeVar
 import msgspec
 import structlog
 
+from appliance.base.counted import counted
 from appliance.features.standby.replication_frames import (
     LARGEST_FRAME,
     EncodedChanges,
@@ -241,7 +242,7 @@ class ReplicationSender:
     def take(self, stored: Stored) -> None:
         if stored.number > self._sent:
             raise ReplicationError(
-                f"the standby acknowledged change {stored.number}, and was sent only {self._sent} changes"
+                f"the standby acknowledged change {stored.number}, and was sent only {counted(self._sent, 'change')}"
             )
         if stored.number < self._acknowledged:
             raise ReplicationError(

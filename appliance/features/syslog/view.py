@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 
+from appliance.base.counted import counted
 from appliance.base.metric import counter, gauge
 from appliance.features.view import FeatureView, StateView, Trouble
 from appliance.forwarding.forwarding_state import ForwardingState, samples_of
@@ -17,7 +18,7 @@ _METRICS = (
 
 def _alarms(state: ForwardingState) -> Iterator[Trouble]:
     if state.trouble:
-        where = f"the audit log is not forwarded to {state.to}, {state.behind} records wait"
+        where = f"the audit log is not forwarded to {state.to}, {counted(state.behind, 'record waits', 'records wait')}"
         yield Trouble("warning", "audit-not-forwarded", f"{where}: {state.trouble}", "audit")
 
 

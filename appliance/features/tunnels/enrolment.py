@@ -11,6 +11,7 @@ import ssl
 from collections.abc import Awaitable, Callable
 from functools import partial
 
+from appliance.base.counted import counted
 from appliance.base.withdrawal import take_effect
 from appliance.channel.answers.host_answers import Host
 from appliance.channel.answers.status import IpsecState
@@ -202,7 +203,8 @@ class HostEnrolment(TunnelHosts):
         taken += self._expel(ipaddress.ip_address(row.address), f"the host {name} was revoked")
         self._trail.happened(
             "host revoked",
-            f"{name} ({row.address}) may no longer connect; {taken} registrations and grants were removed",
+            f"{name} ({row.address}) may no longer connect;"
+            f" {counted(taken, 'registration or grant was', 'registrations and grants were')} removed",
             name=name,
             address=row.address,
             serial=row.serial,
@@ -254,7 +256,8 @@ class HostEnrolment(TunnelHosts):
         divergence = [f"{row.name}: {row.divergence}" for row in self._view.rows() if row.divergence]
         self._trail.happened(
             "hosts reloaded",
-            f"{self._table.declared.source}: {len(self._table.declared.hosts)} hosts are declared",
+            f"{self._table.declared.source}: {counted(len(self._table.declared.hosts), 'host is', 'hosts are')}"
+            " declared",
             opened=sorted(after - before),
             closed=sorted(before - after),
             taken_back=taken,

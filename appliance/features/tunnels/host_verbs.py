@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 from msgspec.structs import replace
 
+from appliance.base.counted import counted
 from appliance.base.validation_messages import meant
 from appliance.channel.answers.host_answers import Host, PortsSeen
 from appliance.cli import completion
@@ -149,7 +150,7 @@ def list_hosts(
     if not body.hosts:
         say("no hosts; enrol one: rosrv host add NAME")
     for machine in body.machines:
-        nodes = f"{machine.nodes} nodes in clear text"
+        nodes = f"{counted(machine.nodes, 'node')} in clear text"
         say_row([f"{running.host_in_words(machine.address):<37} {nodes:<13}", _ports_words(machine.ports)])
     for trouble in body.troubles:
         say(f"! {trouble}")
@@ -162,7 +163,7 @@ def reload(running: Appliance) -> None:
     Example: rosrv host reload
     """
     body = running.answer_or_exit(HostsReload())
-    say(f"{len(body.declared)} hosts are declared")
+    say(f"{counted(len(body.declared), 'host is', 'hosts are')} declared")
     for word, names in (("tunnel allowed again", body.opened), ("tunnel closed", body.closed)):
         if names:
             say(f"{word}: {', '.join(names)}")
@@ -180,7 +181,10 @@ def revoke(running: Appliance, name: _Name) -> None:
     if not body.serial:
         say(f"{body.name} is no longer awaited: its one-time token is invalid")
     else:
-        say(f"{body.name} ({body.address}) is revoked; {body.taken_back} registrations and grants removed")
+        say(
+            f"{body.name} ({body.address}) is revoked;"
+            f" {counted(body.taken_back, 'registration or grant', 'registrations and grants')} removed"
+        )
 
 
 def _seconds(within: str) -> float:

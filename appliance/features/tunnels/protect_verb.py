@@ -12,6 +12,7 @@ from urllib.parse import urlsplit
 import typer
 
 from appliance.base import clock
+from appliance.base.counted import counted
 from appliance.channel.admin import StatusWanted
 from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.target import Appliance, speaks_with
@@ -167,7 +168,8 @@ def _check(checked: _CheckTarget, running: Appliance) -> None:
     longest = scanner.longest(len(wanted), checked.seconds) * len(found_addresses)
     if longest > _UNANNOUNCED_SECONDS:
         sys.stderr.write(
-            f"rosrv: trying {len(wanted)} ports of {printable(checked.host)}: up to {longest:.0f} s if it does not"
+            f"rosrv: trying {counted(len(wanted), 'port')} of {printable(checked.host)}: up to {longest:.0f} s"
+            " if it does not"
             " answer\n"
         )
     results = [scanner.scan(address, wanted, checked.seconds) for address in found_addresses]
@@ -218,7 +220,8 @@ def _sentence(result: ScanResult, ports: PortRange) -> str:
         return f"{result.address}: OPEN: TCP {named}{more} of {ports}\n"
     if result.untried:
         return (
-            f"{result.address}: {result.untried} ports of {ports} could not be tried: {result.obstacle}; they may be "
+            f"{result.address}: {counted(result.untried, 'port')} of {ports} could not be tried:"
+            f" {result.obstacle}; they may be "
             "open. Check this machine's route there: ip route get\n"
         )
     if not result.answered:

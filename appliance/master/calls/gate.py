@@ -5,6 +5,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from appliance.base.counted import counted
 from appliance.master.caller import ApiUri, Caller
 from appliance.master.calls.call import Attempt, CallVerb, Identity
 from appliance.master.graph.own_node import OWN, PARAMETERS, ROSOUT, rosout_may_have
@@ -141,7 +142,7 @@ class CallGate:
             return None
         who = named if named.num_addresses > 1 else host
         return _no(
-            f"{who} has {mine} registrations, and {left} are left for all other hosts: a host may have"
+            f"{who} has {counted(mine, 'registration')}, and {left} are left for all other hosts: a host may have"
             f" {_TIMES_THE_REST} times as many as are left"
         )
 

@@ -9,6 +9,7 @@ from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
+from appliance.base.counted import counted
 from appliance.master.calls.call import Attempt, CallVerb, with_record
 from appliance.master.calls.call_execution import Execution, ServedRequest, touch
 from appliance.master.calls.parameter_calls import ParameterCalls
@@ -53,7 +54,7 @@ class Multicall:
             results += answers
             await asyncio.sleep(0)  # other hosts have their turn
         if left:
-            why = f"{why}; {len(left)} more parts are not carried out"
+            why = f"{why}; {counted(len(left), 'more part is', 'more parts are')} not carried out"
             return results + [self._fault(visit, LIMIT_FAULT, "limit exceeded", why)] * len(left)
         return results
 

@@ -12,6 +12,7 @@ from collections.abc import Awaitable, Callable, Iterable, Sequence
 
 import structlog
 
+from appliance.base.counted import counted
 from appliance.master.graph.registry import Incarnation
 from appliance.policy.host_sets import Network
 from appliance.policy.model import Address
@@ -83,7 +84,8 @@ class NodePorts:
         if left and held >= _TIMES_THE_REST * left:
             who = named if named.num_addresses > 1 else host
             raise NoPortError(
-                f"{who} has {held} ports ({self._each} per node), and {left} are left for all other hosts: a host may"
+                f"{who} has {counted(held, 'port')} ({self._each} per node), and {left} are left for all other"
+                " hosts: a host may"
                 f" have {_TIMES_THE_REST} times as many as are left; widen [Ports] range"
             )
         opened = self._open(self._each)

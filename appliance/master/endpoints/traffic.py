@@ -9,6 +9,7 @@ import msgspec
 
 from appliance.audit.log.record import Severity
 from appliance.base import clock
+from appliance.base.counted import counted
 from appliance.channel import messages
 from appliance.channel.answers.graph_answers import Flow
 from appliance.channel.messages import TopicTraffic
@@ -146,7 +147,8 @@ class RelayTraffic:
         if connections:
             self._trail.happened(
                 "records lost",
-                f"{connections} connections through a relay ended unrecorded while it was not connected to control",
+                f"{counted(connections, 'connection')} through a relay ended unrecorded while it was not"
+                " connected to control",
                 lost=connections,
             )
 

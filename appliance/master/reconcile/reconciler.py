@@ -13,6 +13,7 @@ from typing import cast
 
 import structlog
 
+from appliance.base.counted import counted
 from appliance.master.graph.registry import Kind, Registry
 from appliance.master.parameter_mirror import ParameterMirror
 from appliance.master.reconcile.entries import NAME, EntryKey, MasterEntry, MasterRegistrations
@@ -94,7 +95,8 @@ class Reconciler:
         self.subscribers.remind_all()
         if made:
             text = (
-                f"{made} registrations and {len(tree)} parameter namespaces were restored in a new ROS master"
+                f"{counted(made, 'registration')} and {counted(len(tree), 'parameter namespace')} were"
+                " restored in a new ROS master"
             )
             self.trail.happened("reconciled", text, registrations=made)
 
@@ -105,7 +107,7 @@ class Reconciler:
         ended = self.entries.differing - made
         await self.rosmaster.all_now(self.entries.take())
         if made or ended:
-            text = f"{made} registrations were made again, {ended} removed"
+            text = f"{counted(made, 'registration was', 'registrations were')} made again, {ended} removed"
             self.trail.happened("reconciled", text, made=made, settled=ended)
 
     async def _seen(self) -> dict[EntryKey, MasterEntry]:

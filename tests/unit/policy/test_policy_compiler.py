@@ -111,7 +111,7 @@ def test_a_file_beyond_the_limit_is_refused_with_the_limit() -> None:
 
 def test_errors_beyond_the_limit_are_only_counted() -> None:
     found = errors_of("[Ports]\nrange = x\n" + "x\n" * MAXIMUM_FINDINGS)
-    assert (len(found), found[-1][-27:]) == (MAXIMUM_FINDINGS + 1, "1 more errors are not shown")
+    assert (len(found), found[-1][-25:]) == (MAXIMUM_FINDINGS + 1, "1 more error is not shown")
 
 
 @pytest.mark.parametrize(

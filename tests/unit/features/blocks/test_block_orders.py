@@ -306,7 +306,7 @@ async def test_a_note_is_short_and_printable(tmp_path: Path, note: str) -> None:
 
 async def test_the_robot_is_blocked_only_by_force(tmp_path: Path) -> None:
     async with control(tmp_path, Clock(), [{ROBOT, OTHER}, {OTHER}]) as made:
-        with pytest.raises(HostRefusedError, match=r"robot's own host: .* 0 registrations and 1 connections"):
+        with pytest.raises(HostRefusedError, match=r"robot's own host: .* 0 registrations and 1 connection"):
             await made.block(ROBOT)
         assert made.denial(ROBOT) is None
         assert (await made.block(ROBOT, force=True)).ended.connections == 1
