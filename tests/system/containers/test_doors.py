@@ -146,43 +146,9 @@ def test_an_agent_in_a_container_needs_no_published_port(site: Site, doors: Comp
     sees_the_battery_only(*map(json.loads, done.stdout.splitlines()))
     other = in_container(site, doors, "172.29.78.31", BATTERY)
     assert other.returncode != 0 and not other.stdout
-    ended = eventually(lambda: doors.audit(event="door disconnected", resource="agent-2"), doors.story)
-    assert any("the agent's address is 172.29.78.30" in record["reason"] for record in ended), ended
 
+    def recorded() -> bool:
+        ended = doors.audit(event="door disconnected", resource="agent-2")
+        return any("the agent's address is 172.29.78.30" in record["reason"] for record in ended)
 
-def test_ports_of_doors_are_published_as_documented(site: Site, doors: Compose) -> None:
-    bound = site.engine.inspect(doors.container("appliance"))["HostConfig"]["PortBindings"]
-    tcp = {port: [one["HostIp"] for one in bound[port]] for port in bound if port.endswith("/tcp")}
-    assert tcp == {"8443/tcp": ["127.0.0.1"], "9091/tcp": ["127.0.0.1"]}
-
-    def reached(ports: Sequence[int]) -> list[int]:
-        found = []
-        for port in ports:
-            with socket.socket() as client:
-                client.settimeout(2)
-                if client.connect_ex(("10.79.0.1", port)) == 0:
-                    found.append(port)
-        return found
-
-    assert site.laptop.run(lambda: reached((8443, 9091, 9092))) == []
-
-
-def test_doors_and_tickets_survive_a_recreated_container(site: Site, doors: Compose) -> None:
-    url, before = ticket(doors), rows(doors)
-    doors("up", "--detach", "--no-build", "--force-recreate", "appliance")
-    doors.wait_healthy()
-    serve(doors)
-    assert [(row["name"], row["address"]) for row in rows(doors)] == [
-        (row["name"], row["address"]) for row in before
-    ]
-
-    def work() -> None:
-        with opened(url) as client:
-            assert answer(client, BATTERY)["op"] == "publish"
-        with opened(AGENT) as client:
-            assert answer(client, BATTERY)["op"] == "publish"
-            rosrv(doors, "door", "remove", "agent-1")
-            with pytest.raises(ConnectionClosed):
-                client.recv(SECONDS)
-
-    site.machine.run(work)
+    eventually(recorded, doors.story)
