@@ -102,14 +102,14 @@ class ModuleState:
         self._names = [*variables]
         self._addresses = {name: address for name, (address, _kind) in variables.items()}
         self._cells = struct.Struct(
-            "<" + "q" * len(running) + "".join(_cell(kind) for _, kind in variables.values())
+            "<" + "q" * len(running) + "".join(cell_code(kind) for _, kind in variables.values())
         )
         self._strings = [
             (place, cells.texts[address], kind)
             for place, (address, kind) in enumerate(variables.values())
             if kept_size(kind)
         ]
-        codes = "".join(_cell(kind) for _, kind in variables.values())
+        codes = "".join(cell_code(kind) for _, kind in variables.values())
         self.names = CellNames([*properties], [*map(known.get, variables)], codes, [*cells.clocks])
         self._end = cells.base + self._cells.size
         self._clocked = [*cells.clocks.values()]
@@ -133,7 +133,7 @@ class ModuleState:
         for address in self._senders:
             names, room = self._turn.names(prepared.source), address + _SPANS.size
             words = [
-                _entered(self._memory, name, room + place * MOST_KEPT, value_types.STRING)
+                entered(self._memory, name, room + place * MOST_KEPT, value_types.STRING)
                 for place, name in enumerate(names)
             ]
             _SPANS.pack_into(self._memory, address, *words)
@@ -149,7 +149,7 @@ class ModuleState:
         if self._generation:
             _LENGTH.pack_into(self._memory, self._generation, 0)
         for place, buffer, kind in self._strings:
-            values[place] = _entered(self._memory, values[place], buffer, kind)
+            values[place] = entered(self._memory, values[place], buffer, kind)
         self._cells.pack_into(self._memory, self._base, *states, *values)
         for context, site, address in self._throttles:
             _TIME.pack_into(self._memory, address, context.throttled.get(site, _NEVER))
@@ -211,7 +211,7 @@ class ModuleState:
         found = dict(zip(self._names, values[len(self._running) :], strict=True))
         for place, _, kind in self._strings:
             name = self._names[place]
-            found[name] = _left(self._memory, found[name], self._values[name], kind)
+            found[name] = left(self._memory, found[name], self._values[name], kind)
         self._values.update(found)
 
 
@@ -220,7 +220,7 @@ def packed(prepared: BatchOptions) -> bytes:
     return _PREPARED.pack(sender, prepared.told, prepared.enabled, prepared.counted)
 
 
-def _entered(memory: memoryview, value: Any, buffer: int, kind: Type) -> int:
+def entered(memory: memoryview, value: Any, buffer: int, kind: Type) -> int:
     if len(value) > most_kept(kind):
         return BEYOND << 32
     if isinstance(kind, value_types.VectorType):
@@ -230,7 +230,7 @@ def _entered(memory: memoryview, value: Any, buffer: int, kind: Type) -> int:
     return buffer | len(value) << 32
 
 
-def _left(memory: memoryview, word: int, before: Any, kind: Type) -> Any:
+def left(memory: memoryview, word: int, before: Any, kind: Type) -> Any:
     at, count = word & _ADDRESS, word >> 32
     if count == BEYOND:
         return before
@@ -239,7 +239,7 @@ def _left(memory: memoryview, word: int, before: Any, kind: Type) -> Any:
     return bytes(memory[at : at + count])
 
 
-def _cell(kind: Type) -> str:
+def cell_code(kind: Type) -> str:
     if kept_size(kind):
         return "Q"
     if isinstance(kind, value_types.BoolType):

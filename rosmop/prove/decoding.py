@@ -1,7 +1,7 @@
 """Decode a module into functions. Only the instructions that `rosmop/fast` writes are known."""
 
 import struct
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
@@ -12,7 +12,9 @@ class UnknownInstructionError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class WasmInstruction:
-    """An instruction with its constant `operands`. A block has a `body`; `if` also has the branch `otherwise`."""
+    """An instruction: `operands` are constants, or the type of a block. A block has a `body`; `if` also has the branch
+    `otherwise`.
+    """
 
     name: str
     operands: tuple[int | float, ...] = ()
@@ -68,10 +70,11 @@ def _plain() -> dict[int, str]:
 
 PLAIN: Mapping[int, str] = MappingProxyType(_plain())
 MEMORY = MappingProxyType({0x28 + place: name for place, name in enumerate(_ACCESSES.split())})
-_TRUNCATING = MappingProxyType(dict(enumerate(_TRUNCATED.split())))
-_NUMBERED = MappingProxyType({0x0C: "br", 0x0D: "br_if", 0x10: "call", 0x20: "local.get", 0x21: "local.set"})
-_BLOCKS = MappingProxyType({0x02: "block", 0x03: "loop", 0x04: "if"})
+TRUNCATING = MappingProxyType(dict(enumerate(_TRUNCATED.split())))
+NUMBERED = MappingProxyType({0x0C: "br", 0x0D: "br_if", 0x10: "call", 0x20: "local.get", 0x21: "local.set"})
+BLOCKS = MappingProxyType({0x02: "block", 0x03: "loop", 0x04: "if"})
 _ELSE, _END = 0x05, 0x0B
+_TYPES, _CHOSEN, EXPORTS, CODES = 1, 3, 7, 10  # sections
 _COPY, _FILL = 10, 11  # the byte after 0xFC
 _FLOATS = MappingProxyType(
     {0x43: ("f32.const", struct.Struct("<f")), 0x44: ("f64.const", struct.Struct("<d"))}
@@ -125,26 +128,34 @@ class Reader:
         if code in MEMORY:
             self.unsigned()  # the alignment, which is only a hint
             return WasmInstruction(MEMORY[code], (self.unsigned(),))
-        if code in _NUMBERED:
-            return WasmInstruction(_NUMBERED[code], (self.unsigned(),))
-        if code in _BLOCKS:
-            self.byte()  # the type of the block's value
+        if code in NUMBERED:
+            return WasmInstruction(NUMBERED[code], (self.unsigned(),))
+        if code in BLOCKS:
+            kind = self.byte()
             body, end = self.block()
             otherwise = self.block()[0] if end == _ELSE else ()
-            return WasmInstruction(_BLOCKS[code], (), body, otherwise)
+            return WasmInstruction(BLOCKS[code], (kind,), body, otherwise)
         if code in (0x41, 0x42):
             return WasmInstruction("i32.const" if code == 0x41 else "i64.const", (self.signed(),))
         if code in _FLOATS:
             name, layout = _FLOATS[code]
             return WasmInstruction(name, layout.unpack(self.take(layout.size)))
         number = self.unsigned() if code == 0xFC else -1
-        if number in _TRUNCATING:
-            return WasmInstruction(_TRUNCATING[number])
+        if number in TRUNCATING:
+            return WasmInstruction(TRUNCATING[number])
         if number == _COPY:
             return WasmInstruction("memory.copy", tuple(self.take(2)))
         if number == _FILL:
             return WasmInstruction("memory.fill", tuple(self.take(1)))
         raise UnknownInstructionError(f"the instruction {code:#04x}")
+
+
+def sections(module: bytes) -> Iterator[tuple[int, bytes]]:
+    """Yield the number and the content of each section."""
+    reader = Reader(module)
+    reader.take(8)
+    while reader.at < len(module):
+        yield reader.byte(), reader.take(reader.unsigned())
 
 
 def functions_of(module: bytes) -> list[Code]:
@@ -153,19 +164,16 @@ def functions_of(module: bytes) -> list[Code]:
     Raises `UnknownInstructionError`, `KeyError` for an unknown type, and `IndexError` if the module ends too
     early.
     """
-    reader = Reader(module)
-    reader.take(8)
     types: list[tuple[tuple[str, ...], tuple[str, ...]]] = []
     chosen: list[int] = []
     found: list[Code] = []
-    while reader.at < len(module):
-        section, size = reader.byte(), reader.unsigned()
-        end = reader.at + size
-        for _ in range(reader.unsigned() if section in (1, 3, 10) else 0):
-            if section == 1:
+    for section, content in sections(module):
+        reader = Reader(content)
+        for _ in range(reader.unsigned() if section in (_TYPES, _CHOSEN, CODES) else 0):
+            if section == _TYPES:
                 reader.byte()
                 types.append((reader.types(), reader.types()))
-            elif section == 3:
+            elif section == _CHOSEN:
                 chosen.append(reader.unsigned())
             else:
                 reader.unsigned()
@@ -175,5 +183,4 @@ def functions_of(module: bytes) -> list[Code]:
                     count = reader.unsigned()
                     made += [TYPES[reader.byte()]] * count
                 found.append(Code(parameters, results[0], tuple(made), reader.block()[0]))
-        reader.at = end
     return found

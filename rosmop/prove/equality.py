@@ -7,32 +7,50 @@ leaves the message to Python, which then processes it from the start, or if all 
 - both agree on whether the event happened, and dropped, replaced or changed the message;
 - the message, the variables, the rest of the budget and the lines of output are the same.
 
-Whether two strings in variables or names of senders are equal is left open, and an event that reads their
-bytes is not proved. If the function leaves the message, each variable that it wrote must be restored, and
-each byte must be in the log (`module_terms.py`).
+Before z3 is asked, the interpreter and the module run the event in some states (`random_states.py`), and in many more
+before z3 is asked about single conditions. A model of z3 is reported as a difference only if such a run shows it
+(`model_states.py`).
+
+Whether two strings in variables or names of senders are equal is left open, and an event that reads their bytes is
+not proved. If the function leaves the message, each variable that it wrote must be among those that are restored, and
+each byte in the log (`module_terms.py`).
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any
 
 import z3
 
 from rosmop.fast.abi import AREA, SENDER, kept_size, most_kept
 from rosmop.fast.batch_codegen import WasmModule, written
-from rosmop.form import nodes
-from rosmop.form.compiled import Compiled
+from rosmop.form.compiled import Compiled, EventCode
 from rosmop.form.specification_groups import groups
+from rosmop.prove.concrete_runs import (
+    BUDGET_ONLY,
+    CHANGED,
+    DROPPED,
+    ELSEWHERE,
+    HAPPENED,
+    READS_BEYOND,
+    REPLACED,
+    ConcreteRuns,
+    EventPair,
+    EventState,
+)
 from rosmop.prove.decoding import functions_of
 from rosmop.prove.form_terms import FormTerms, wrapped
 from rosmop.prove.loops import BUDGET_SLOT, assumed, loop_conditions
+from rosmop.prove.model_states import state_of
 from rosmop.prove.module_terms import LoopGuess, ModuleExecution, ModuleResult, Pointer, ReadableBytes
+from rosmop.prove.questions import MayDifferError, Questions, first_difference
+from rosmop.prove.random_states import STATES, RandomStates
 from rosmop.prove.terms import (
     DOUBLE,
     MISMATCH,
     SECONDS,
     SINGLE,
-    Abstraction,
     DiffersError,
     FormResult,
     LineTerm,
@@ -55,19 +73,15 @@ from rosmop.types.value_types import Type
 
 EQUAL = "equal"
 IN_PYTHON = "not compiled: Python evaluates the messages of this topic"
+LEFT = f"the module leaves each of {STATES} messages to Python"
 PATIENCE = 30.0
-
-_TOGETHER = 0.2
 
 _UNROLLED = (1, 2, 3)
 
+_FIRST_STATES = 100
+
 _NOW, _REST = 16, 32  # addresses of the time and of the number of bytes that are not shown
-_HAPPENED, _DROPPED, _CHANGED, _ELSEWHERE, _REPLACED = 1, 2, 4, 8, 32
 _LATEST = 1 << 62
-
-
-class _MayDifferError(Exception):
-    """The induction over the iterations of a loop fails for a state that may not occur."""
 
 
 @dataclass(frozen=True)
@@ -88,15 +102,14 @@ def findings_of(
     compiled: Compiled, clock: Callable[[], float], patience: float = PATIENCE
 ) -> Iterator[ProofFinding]:
     found = list(groups(compiled.specifications))
-    values = ValueCodec(compiled.messages)
-    module = written(compiled.functions, [group.component for group in found], values)
-    validation = Validation(compiled.functions, values, module, clock, patience)
+    module = written(compiled.functions, [group.component for group in found], ValueCodec(compiled.messages))
+    validation = Validation(compiled, module, clock, patience)
     for group in found:
-        for (topic, events), numbers in zip(group.component.topics, group.events, strict=True):
-            for place, (code, (number, index)) in enumerate(zip(events, numbers, strict=True)):
+        for (topic, _), numbers in zip(group.component.topics, group.events, strict=True):
+            for place, (number, index) in enumerate(numbers):
                 specification = compiled.specifications[number]
-                name = f"{specification.name}.{specification.events[index].name}"
-                yield validation.finding(topic, name, code.function, place)
+                event = specification.events[index]
+                yield validation.finding(topic, f"{specification.name}.{event.name}", event, place)
     in_module = {numbers for group in found for events in group.events for numbers in events}
     for number, specification in enumerate(compiled.specifications):
         for index, event in enumerate(specification.events):
@@ -105,22 +118,22 @@ def findings_of(
 
 
 class Validation:
-    """Compares the module of a set with the form. Raises `UnknownInstructionError`."""
+    """Compares the module of a set with the form. Raises `UnknownInstructionError`, and `WasmError` for an invalid
+    module.
+    """
 
     def __init__(
-        self,
-        functions: Mapping[str, nodes.Function],
-        values: ValueCodec,
-        module: WasmModule,
-        clock: Callable[[], float],
-        patience: float = PATIENCE,
+        self, compiled: Compiled, module: WasmModule, clock: Callable[[], float], patience: float = PATIENCE
     ) -> None:
-        self._forms = functions
-        self._values = values
+        self._compiled = compiled
+        self._forms = compiled.functions
+        self._values = ValueCodec(compiled.messages)
         self._module = module
         self._clock = clock
         self._patience = patience
-        self.codes = functions_of(module.code)
+        self._codes = functions_of(module.code)
+        self._runs = ConcreteRuns(compiled, module)
+        self._kinds = {name: kind for own in module.cells for name, (_, kind) in own.variables.items()}
         kept = {at: kind for own in module.cells for at, kind in own.variables.values() if kept_size(kind)}
         self._strings = [range(at, at + len(raw)) for raw, at in module.strings.items()]
         self._strings += [
@@ -133,56 +146,98 @@ class Validation:
         known = {"mismatch": MISMATCH, "seconds": SECONDS}
         self._routines = {number: known[name] for name, number in module.routines.items()}
 
-    def finding(self, topic: str, event: str, function: str, place: int) -> ProofFinding:
-        feed = self._module.feeds.get(topic)
-        if feed is None:
-            return ProofFinding(topic, event, IN_PYTHON)
+    def finding(self, topic: str, name: str, event: EventCode, place: int) -> ProofFinding:
+        """Return the result for an event, the function with this place among those of its topic."""
+        if topic not in self._module.feeds:
+            return ProofFinding(topic, name, IN_PYTHON)
         try:
-            return ProofFinding(topic, event, self._compared(function, feed.functions[place], topic))
+            return ProofFinding(topic, name, self._compared(self._pair(topic, event, place)))
         except DiffersError as error:
-            return ProofFinding(topic, event, f"not equal: {error}", differs=True)
+            return ProofFinding(topic, name, f"not equal: {error}", differs=True)
         except NotProvedError as error:
-            return ProofFinding(topic, event, str(error))
+            return ProofFinding(topic, name, str(error))
 
-    def _compared(self, name: str, number: int, topic: str) -> str:
-        begun = self._clock()
+    def difference(self, topic: str, event: EventCode, place: int, most: int = STATES) -> str | None:
+        """Return a difference in the effect that one of `most` random runs shows; z3 is not asked."""
+        pair, before = self._pair(topic, event, place), self._runs.compared
+        found = (self._runs.difference(pair, state) for state in islice(self._states(pair), most))
+        what = next((one for one in found if one not in (None, BUDGET_ONLY)), None)
+        return LEFT if self._runs.compared == before else what
+
+    def _pair(self, topic: str, event: EventCode, place: int) -> EventPair:
+        kind = value_types.RecordType(event.type or "")
+        return EventPair(event.function, self._module.feeds[topic].functions[place], topic, kind)
+
+    def _states(self, event: EventPair) -> Iterator[EventState]:
+        return RandomStates(self._compiled, self._module, event).following(self._runs, event)
+
+    def _search(self, event: EventPair, states: Iterable[EventState]) -> None:
+        """Raise `DiffersError` for the first difference; for one of the budget only if there is no other."""
+        of_budget: EventState | None = None
+        for state in states:
+            what = self._runs.difference(event, state)
+            if what == BUDGET_ONLY:
+                of_budget = of_budget or state
+            elif what is not None:
+                raise DiffersError(f"{what}, for {state}")
+        if of_budget is not None:
+            raise DiffersError(f"{BUDGET_ONLY}, for {of_budget}")
+
+    def _compared(self, event: EventPair) -> str:
+        states, before = self._states(event), self._runs.compared
+        self._search(event, islice(states, _FIRST_STATES))
+        answer = self._decided(event, states)
+        if answer == EQUAL and self._runs.compared == before:
+            self._search(event, states)
+            return EQUAL if self._runs.compared > before else LEFT
+        return answer
+
+    def _decided(self, event: EventPair, states: Iterable[EventState]) -> str:
+        until = self._clock() + self._patience
         try:
-            return self._answer(name, number, topic, begun)
-        except _MayDifferError as error:
+            return self._answer(event, until, states)
+        except MayDifferError as error:
             for most in _UNROLLED:
-                self._answer(name, number, topic, begun, most)
+                self._answer(event, until, states, most)
             raise NotProvedError(f"its loops are not known to be equal: {error}") from None
 
-    def _answer(self, name: str, number: int, topic: str, begun: float, unrolled: int = 0) -> str:
+    def _answer(self, event: EventPair, until: float, states: Iterable[EventState], unrolled: int = 0) -> str:
+        """`states` are those that are run if z3's first question leaves open whether there is a difference."""
         begin, cells, known = self._beginning()
-        module = self._module
+        module, context = self._module, self._forms[event.name].context
         meant = FormTerms(
-            self._forms, self._values, begin, name, topic=topic, lines=module.lines, unrolled=unrolled
+            self._forms,
+            self._values,
+            begin,
+            event.name,
+            topic=event.topic,
+            lines=module.lines,
+            unrolled=unrolled,
         ).result()
         form_cuts = meant.loops.cuts
-        guess = LoopGuess(form_cuts, self._names(self._forms[name].context), module.names, unrolled)
+        guess = LoopGuess(form_cuts, self._names(context), module.names, unrolled)
         done = ModuleExecution(
-            self.codes, number, begin.message, begin.size, cells, self._strings, self._routines,
+            self._codes, event.number, begin.message, begin.size, cells, self._strings, self._routines,
             self._spans(begin), guess,
         ).done()  # fmt: skip
-        self._check_undone(done, topic)
+        self._check_undone(done, event.topic)
         known += assumed(form_cuts)
         going_on = either(meant.loops.again, done.loops.again)
-        left = either(done.trapped, both(done.bits == _ELSEWHERE, opposite(done.loops.again)))
+        left = either(done.trapped, both(_bit(done.bits, ELSEWHERE), opposite(done.loops.again)))
         unknown = either(*meant.unknown.values())
         if unrolled:
             known.append(opposite(going_on))
         wrong = {
-            "it reads beyond the message": done.outside,
+            READS_BEYOND: done.outside,
             "it continues where the specification faults": both(opposite(left), meant.left),
         }
         others = {
-            "whether it happened": _bit(done.bits, _HAPPENED) != meant.happened,
-            "whether the message is dropped": _bit(done.bits, _DROPPED) != meant.dropped,
-            "whether the safe message takes its place": _bit(done.bits, _REPLACED) != meant.replaced,
-            "whether the message is changed": _bit(done.bits, _CHANGED) != meant.changed,
+            "whether it happened": _bit(done.bits, HAPPENED) != meant.happened,
+            "whether the message is dropped": _bit(done.bits, DROPPED) != meant.dropped,
+            "whether the safe message takes its place": _bit(done.bits, REPLACED) != meant.replaced,
+            "whether the message is changed": _bit(done.bits, CHANGED) != meant.changed,
             "the message": done.message != meant.message,
-            "no other bits": done.bits & ~(_HAPPENED | _DROPPED | _CHANGED | _REPLACED) != 0,
+            "no other bits": done.bits & ~(HAPPENED | DROPPED | CHANGED | REPLACED) != 0,
             **{
                 f"the variable at {place}": opposite(_same(done.cells[place], value))
                 for place, value in self._ends(meant)
@@ -193,15 +248,22 @@ class Validation:
                 for place, noted in enumerate(meant.noted)
             },
         }
-        decided = both(opposite(left), opposite(meant.left), opposite(unknown), opposite(going_on))
+        reached = both(opposite(left), opposite(meant.left), opposite(going_on))
+        decided = both(reached, opposite(unknown))
         wrong |= {text: both(decided, condition) for text, condition in others.items()}
         wrong |= loop_conditions(form_cuts, done.loops.cuts, either(meant.left, unknown), left)
-        answer = self._first(known, wrong, begun, found=_MayDifferError if form_cuts else DiffersError)
-        if answer is not None:
-            return answer
+        questions = Questions(self._clock, until, known)
+        if not questions.exclude(wrong.values()):
+            self._search(event, states)
+
+            def replay(model: Any) -> None:
+                self._search(event, [state_of(model, begin, self._kinds, context)])
+
+            answer = first_difference(questions, wrong, replay, in_induction=bool(form_cuts))
+            if answer is not None:
+                return answer
         for what, condition in meant.unknown.items():
-            question = [*known, opposite(left), opposite(meant.left), opposite(going_on), condition]
-            if self._decided(question, begun)[0] != z3.unsat:
+            if questions.decide(both(reached, condition))[0] != z3.unsat:
                 return f"uses {what}"
         return EQUAL
 
@@ -225,42 +287,6 @@ class Validation:
                     known = z3.ULE(kept.count, most_kept(kind))
                     spans.append(ReadableBytes(kept.place, kept.count * kept_size(kind), known))
         return spans
-
-    def _first(
-        self, known: Sequence[Term], wrong: Mapping[str, Term], begun: float, *, found: type[Exception]
-    ) -> str | None:
-        possible = {
-            text: simple for text, one in wrong.items() if not z3.is_false(simple := z3.simplify(one))
-        }
-        every = [*known, either(*possible.values())]
-        if self._asked(Abstraction(floats=True).of(every), begun, part=_TOGETHER)[0] == z3.unsat:
-            return None
-        undecided = False
-        for text, condition in possible.items():
-            answer, model = self._decided([*known, condition], begun)
-            if model is not None:
-                raise found(f"{text}, for {_example(model)}")
-            undecided = undecided or answer != z3.unsat
-        return "not decided in time" if undecided else None
-
-    def _decided(self, question: Sequence[Term], begun: float) -> tuple[Any, Any]:
-        for abstraction in (Abstraction(floats=True), Abstraction()):
-            answer, guess = self._asked(abstraction.of(question), begun)
-            if answer == z3.unsat:
-                return answer, None
-        if guess is not None and _holds(question, guess):
-            return answer, guess
-        return self._asked(question, begun)
-
-    def _asked(self, conditions: Sequence[Term], begun: float, *, part: float = 1) -> tuple[Any, Any]:
-        rest = int(1000 * part * (begun + self._patience - self._clock()))
-        if rest <= 0:
-            return z3.unknown, None
-        solver = z3.Solver()
-        solver.set("timeout", rest)
-        solver.add(*conditions)
-        answer = solver.check()
-        return answer, solver.model() if answer == z3.sat else None
 
     def _beginning(self) -> tuple[StartTerms, dict[int, Term], list[Term]]:
         now, size = z3.BitVec("now", 64), z3.BitVec("size", 32)
@@ -311,24 +337,6 @@ class Validation:
         taken_back = {*undone, *(address + 4 for address in undone)}  # eight bytes each
         for address in sorted(done.stored - set(self._module.budgets.values()) - taken_back):
             raise DiffersError(f"its write at {address} is not undone")
-
-
-def _holds(conditions: Sequence[Term], guess: Any) -> bool:
-    values = [
-        (declaration(), guess[declaration]) for declaration in guess.decls() if declaration.arity() == 0
-    ]
-    known = [
-        (declaration, value)
-        for declaration, value in values
-        if value is not None and not isinstance(value, z3.FuncInterp)
-    ]
-    return all(z3.is_true(z3.simplify(z3.substitute(condition, *known))) for condition in conditions)
-
-
-def _example(model: Any) -> str:
-    return ", ".join(
-        f"{declaration} = {model[declaration]}" for declaration in model.decls() if declaration.arity() == 0
-    )
 
 
 def _text(name: str, address: int, cells: dict[int, Term]) -> TextTerm:

@@ -28,8 +28,9 @@ def check(
     dot: Path | None,
     svg: Path | None,
 ) -> int:
-    if prove and find_spec("z3") is None:
-        raise program.usage_error("--prove needs the package z3-solver: pip install z3-solver")
+    for package, module in (("z3-solver", "z3"), ("wasmtime", "wasmtime")):
+        if prove and find_spec(module) is None:
+            raise program.usage_error(f"--prove needs the package {package}: pip install {package}")
     try:
         monitors = MonitorSet.of(load(program, files, folders))
         certificates, data = certified(monitors.compiled)

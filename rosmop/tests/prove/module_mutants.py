@@ -6,13 +6,13 @@ from dataclasses import replace
 from itertools import islice
 
 from rosmop.check.sources import compiled_from
-from rosmop.fast.batch_codegen import written
+from rosmop.fast.batch_codegen import WasmModule, written_of
 from rosmop.form.compiled import Compiled
 from rosmop.form.specification_groups import groups
-from rosmop.prove.decoding import Code, WasmInstruction
+from rosmop.prove.decoding import Code, WasmInstruction, functions_of
 from rosmop.prove.equality import EQUAL, Validation
 from rosmop.run.engine import MonitorSet
-from rosmop.runtime.values import ValueCodec
+from rosmop.tests.prove.encoding import with_function
 from rosmop.tests.random_specifications import definitions
 from roswire.definitions import Definitions
 
@@ -155,28 +155,28 @@ def faulty_event(
     code: Compiled, event: str, every: int, *, patience: float = 100
 ) -> Iterator[tuple[str, str]]:
     [group] = groups(code.specifications)
-    module = written(code.functions, [group.component], ValueCodec(code.messages))
-    validation = Validation(
-        code.functions, ValueCodec(code.messages), module, time.monotonic, patience=patience
-    )
-    [(topic, one, place)] = [
-        (topic, one, place)
-        for (topic, events), numbers in zip(group.component.topics, group.events, strict=True)
-        for place, (one, (number, index)) in enumerate(zip(events, numbers, strict=True))
+    module = written_of(code)
+    [(topic, meant, place)] = [
+        (topic, code.specifications[number].events[index], place)
+        for (topic, _), numbers in zip(group.component.topics, group.events, strict=True)
+        for place, (number, index) in enumerate(numbers)
         if code.specifications[number].events[index].name == event
     ]
-    name = f"{code.specifications[0].name}.{event}"
-    assert validation.finding(topic, name, one.function, place).answer == EQUAL
+
+    def answer(module: WasmModule) -> str:
+        validation = Validation(code, module, time.monotonic, patience=patience)
+        return validation.finding(topic, event, meant, place).answer
+
+    assert answer(module) == EQUAL
+    codes = functions_of(module.code)
     wrong = (
         (number, kind, other)
-        for number in _called(validation.codes, module.feeds[topic].functions[place])
+        for number in _called(codes, module.feeds[topic].functions[place])
         if number not in module.routines.values()  # the proof takes these as given
-        for kind, other in mutants(validation.codes[number])
+        for kind, other in mutants(codes[number])
     )
     for number, kind, other in islice(wrong, 0, None, every):
-        before, validation.codes[number] = validation.codes[number], other
-        yield kind, validation.finding(topic, name, one.function, place).answer.partition(":")[0]
-        validation.codes[number] = before
+        yield kind, answer(replace(module, code=with_function(module.code, number, other))).partition(":")[0]
 
 
 def _called(codes: Sequence[Code], number: int) -> list[int]:
