@@ -1,14 +1,13 @@
 """Doors in Docker as docs/doors.md describes: a ticket on this machine, agents in a container and on this machine."""
 
 import json
-import socket
 import ssl
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.exceptions import InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Origin
 
