@@ -360,7 +360,7 @@ async def test_a_service_of_the_robot_is_called_by_name_or_in_order() -> None:
         for args, words in (
             ([False], "the arm is blocked"),
             ([1], "got `int` - at `$.data`"),
-            ([True, 1], "2 arguments; the request has 1 fields: data"),
+            ([True, 1], "2 arguments; the request has 1 field: data"),
             ({"x": 1}, "unknown field `x`"),
             ("true", "Expected `object`, got `str`"),
         ):
