@@ -13,7 +13,7 @@ import socket
 import subprocess
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -27,11 +27,14 @@ BOOT_SECONDS = 900.0  # for a machine that makes progress; waiting for a stalled
 _STILL_SECONDS = 60.0  # a halted kernel stops its processors
 KVM = Path("/dev/kvm")
 MEGABYTES = 2048
+BARE = ("-nodefaults", "-no-user-config", "-display", "none", "-no-reboot", "-nic", "none")
 # An emulated processor pays for every change of address space. The kernel's defences against other tenants cost more
 # than everything else, and there are no other tenants.
 # On a busy host the ticks of the emulated timer come too late for the kernel's own test, which ends the boot ("8254
 # timer not connected to IO-APIC"). The timer exists, so the test is skipped.
-_KERNEL = "no_timer_check mitigations=off nowatchdog audit=0 systemd.show_status=0"
+KERNEL_SETTINGS = (
+    f"console=ttyS0 panic=-1 quiet rosrv.root={ROOT} no_timer_check mitigations=off nowatchdog audit=0"
+)
 _TRY_SECONDS = 8.0
 _OFF_SECONDS = 180.0
 # Programs in an emulated machine have time limits of their own: it gets priority over other processes. Where the kernel
@@ -56,6 +59,9 @@ class Machine:
     It writes to `disk`, or without one works on a snapshot. `freight` writes the archive that the agent unpacks
     before it takes orders; the default is the checkout.
     """
+
+    _has_priority = True
+    _power_off: tuple[str, ...] = ("systemd-run", "--quiet", "systemctl", "poweroff")
 
     def __init__(
         self,
@@ -82,10 +88,11 @@ class Machine:
         program = need_program("qemu-system-x86_64", "qemu-system-x86")
         kernel = newest_kernel()
         disk = self._own_disk or machine_disk(kernel)
-        self.accelerator = accelerator(program, kernel)
+        self.accelerator = self._choose_accelerator(program, kernel)
         checkout = self.directory / "checkout.tar"
         self._freight(checkout)
         port = self.directory / "agent.sock"
+        priority = ("nice", f"--adjustment={_NICE}") if self._has_priority else ()
         began = time.monotonic()
         # The death signal is sent when the starting *thread* ends: pytest's fixtures run in the main thread.
         assert threading.current_thread() is threading.main_thread()
@@ -93,29 +100,32 @@ class Machine:
             self._process = subprocess.Popen(
                 [
                     *("/usr/bin/setpriv", "--pdeathsig=SIGKILL"),
-                    *("nice", f"--adjustment={_NICE}", program),
+                    *(*priority, program),
                     *self._arguments(kernel, disk, checkout, port),
                 ],
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 stderr=log,
-                start_new_session=True,
+                start_new_session=self._has_priority,
                 env=os.environ | {"TMPDIR": str(self.directory)},  # of the snapshot
             )
-        with contextlib.suppress(OSError):
-            Path(f"/proc/{self._process.pid}/autogroup").write_text(_NICE)
+        if self._has_priority:
+            with contextlib.suppress(OSError):
+                Path(f"/proc/{self._process.pid}/autogroup").write_text(_NICE)
         self._line = self._connect(port)
         assert self._hear(BOOT_SECONDS, still=_STILL_SECONDS) == {"ready": True}
         self.boot_seconds = time.monotonic() - began
         return self
 
-    def run(self, *argv: str, seconds: float = 600.0, check: bool = True) -> Done:
+    def run(
+        self, *argv: str, seconds: float = 600.0, check: bool = True, patience: float | None = None
+    ) -> Done:
+        """The program gets `seconds` of the machine's clock; its answer `patience` of this one, 60 more by default."""
         assert self._line is not None, "the machine is not running"
         self._number += 1
-        order = {"number": self._number, "argv": argv, "seconds": seconds}
         began = time.monotonic()
-        self._line.sendall(json.dumps(order).encode() + b"\n")
-        answer = self._hear(seconds + 60.0)
+        self._order(self._number, argv, seconds)
+        answer = self._hear(seconds + 60.0 if patience is None else patience)
         assert answer["number"] == self._number
         done = Done(int(answer["status"]), str(answer["output"]), time.monotonic() - began)
         if check and done.status != 0:
@@ -130,7 +140,7 @@ class Machine:
         orderly = False
         if process.poll() is None and self._line is not None:
             try:
-                self.run_detached("systemctl", "poweroff")
+                self._order(0, self._power_off, 20.0)
                 orderly = process.wait(_OFF_SECONDS) == 0
             except (subprocess.TimeoutExpired, OSError):
                 os.kill(process.pid, signal.SIGKILL)
@@ -142,9 +152,9 @@ class Machine:
             self._line = None
         return orderly
 
-    def run_detached(self, *argv: str) -> None:
+    def _order(self, number: int, argv: Sequence[str], seconds: float) -> None:
         assert self._line is not None
-        order = {"number": 0, "argv": ["systemd-run", "--quiet", *argv], "seconds": 20}
+        order = {"number": number, "argv": argv, "seconds": seconds}
         self._line.sendall(json.dumps(order).encode() + b"\n")
 
     def story(self) -> str:
@@ -152,14 +162,22 @@ class Machine:
         log = self.directory / "qemu.log"
         return f"--- the machine's console\n{words}\n--- qemu\n{log.read_text() if log.exists() else ''}"
 
+    def _choose_accelerator(self, program: str, kernel: Kernel) -> str:
+        return accelerator(program, kernel)
+
     def _arguments(self, kernel: Kernel, disk: Path, checkout: Path, port: Path) -> list[str]:
         snapshot = "on" if self._own_disk is None else "off"
-        append = f"root=/dev/vda rw console=ttyS0 panic=-1 quiet rosrv.root={ROOT} {_KERNEL}"
         return [
             *_hardware(self.accelerator),
             *("-smp", str(self.processors), "-m", str(MEGABYTES)),
-            *("-kernel", str(kernel.image), "-initrd", str(kernel.initrd), "-append", append),
+            *("-kernel", str(kernel.image), "-initrd", str(kernel.initrd)),
+            *("-append", f"root=/dev/vda rw {KERNEL_SETTINGS} systemd.show_status=0"),
             *("-drive", f"file={disk},if=virtio,format=raw,snapshot={snapshot},cache=unsafe"),
+            *self._attached(checkout, port),
+        ]
+
+    def _attached(self, checkout: Path, port: Path) -> list[str]:
+        return [
             *("-drive", f"file={checkout},if=virtio,format=raw,readonly=on"),
             *("-device", "virtio-rng-pci"),
             *("-device", "virtio-serial-pci"),
@@ -240,5 +258,5 @@ def _hardware(accelerator: str) -> list[str]:
     how = "kvm" if accelerator == "kvm" else "tcg,thread=multi"
     return [
         *("-machine", "q35", "-accel", how, "-cpu", processor),
-        *("-nodefaults", "-no-user-config", "-display", "none", "-no-reboot", "-nic", "none"),
+        *BARE,
     ]
