@@ -1,4 +1,4 @@
-"""Keep the ends of things by the system time, although its clock may step back."""
+"""Keep the ends of tokens and sessions by the system time, although its clock may step back."""
 
 import math
 from collections.abc import Collection, Mapping

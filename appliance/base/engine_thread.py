@@ -77,7 +77,7 @@ class EngineThread:
 
 
 class InCaller:
-    """Runs an engine in its only caller's thread: at first, at the end, and when the caller waits."""
+    """Runs an engine in its only caller's thread: at the start, at the end, and when the caller waits."""
 
     def __init__(self, _name: str, turn: Turn, _gather: float) -> None:
         self._turn = turn

@@ -1,4 +1,4 @@
-"""Open a file that an operator names where only its owner may reach it.
+"""Open a file that an operator names, even where only its owner may reach it.
 
 1. A process first uses its own rights.
 2. Root then acts as the owner of the folder, and after that as the owner of the file: in a container, root lacks
@@ -53,7 +53,7 @@ def open_named(path: Path) -> int:
 
 
 def is_named_there(path: Path) -> bool:
-    """Return whether the path exists, with the rights that open it: root's own may not suffice."""
+    """Return whether the path exists, checked with the rights that open it: root's own may not suffice."""
     try:
         os.close(open_named(path))
     except (FileNotFoundError, NotADirectoryError):

@@ -1,4 +1,4 @@
-"""Show errors of the system to people, who do not know their numbers."""
+"""Show errors of the system to people, without the numbers."""
 
 import re
 

@@ -1,4 +1,4 @@
-"""Replace the numbers in a text, so that two reports of one cause with other measured values have the same words.
+"""Replace the numbers in a text, so that two reports of one cause with different measured values become equal.
 
 Digits that name something are kept, as in `joint_1`, `10.0.0.66` and `robot.ini:12`.
 """

@@ -2,7 +2,7 @@
 
 Only the owner of the state directory and root may use the admin socket, which carries one JSON document per line in
 each direction. The docstring of a request with `@rest` is its description in the REST contract, unless the row has
-`words`. A change is rejected if another revision than `expected` is in force.
+`words`. A change is rejected if the revision in force is not `expected`.
 """
 
 import functools
@@ -116,7 +116,7 @@ class PolicyConfirm(AdminRequest[policy_answers.PolicyConfirmed], frozen=True, t
     of=POLICY, dry_run="loading a policy",
 )  # fmt: skip
 class PolicyLoad(AdminRequest[policy_answers.Loaded], frozen=True, tag="policy load"):
-    """Check, test and load a new text, decide again what is live, and report; for admins.
+    """Check, test and load a new text, decide all live rights again, and report. For admins.
 
     A text with an error changes nothing: the answer (422) has every finding with its line and column.
     """
@@ -130,7 +130,7 @@ class PolicyLoad(AdminRequest[policy_answers.Loaded], frozen=True, tag="policy l
 
 @rest("viewer")
 class PolicyWanted(AdminRequest[policy_answers.PolicyKnown], frozen=True, tag="policy"):
-    """The text of a revision (None: the one in force), and what it is judged with: its tests, the robot."""
+    """The text of a revision (None: the one in force), with the test cases and addresses needed to judge it."""
 
     revision: int | None = None
 
@@ -147,7 +147,7 @@ class PolicyRevisionWanted(AdminRequest[policy_answers.RevisionText], frozen=Tru
 
 @rest("viewer", "GET", "/v1/policy/revisions", name="policy_revisions")
 class PolicyRevisions(AdminRequest[policy_answers.PolicyRevisionList], frozen=True, tag="policy revisions"):
-    """The kept revisions, the newest first."""
+    """The kept revisions, newest first."""
 
 
 @rest("viewer")
@@ -299,7 +299,7 @@ class MonitorConfirm(AdminRequest[monitor_answers.MonitorsConfirmed], frozen=Tru
 class MonitorRevisions(
     AdminRequest[monitor_answers.MonitorRevisionList], frozen=True, tag="monitor revisions"
 ):
-    """The kept revisions of the specifications, the newest first."""
+    """The kept revisions of the specifications, newest first."""
 
 
 @rest("viewer", "GET", "/v1/monitors/revisions/{revision}", name="monitor_revision", problems=_NO_MONITOR)
@@ -395,7 +395,7 @@ class TokenRotate(AdminRequest[token_answers.RotatedToken], frozen=True, tag="to
 
 @rest("admin", "GET", "/v1/tokens", name="tokens")
 class TokenList(AdminRequest[token_answers.Tokens], frozen=True, tag="token list"):
-    """All access tokens that were made, without their secrets; for admins."""
+    """All access tokens that were made, without their secrets. For admins."""
 
 
 @rest(
@@ -410,7 +410,7 @@ class TokenRevoke(AdminRequest[token_answers.Token], frozen=True, tag="token rev
 
 @rest("viewer", "GET", "/v1/challenge", name="challenge", tag="status")
 class ChallengeWanted(AdminRequest[token_answers.Challenge], frozen=True, tag="challenge"):
-    """A challenge: an order that changes something is signed under one, and each is good once."""
+    """A challenge: each order that changes something is signed with one, and each is accepted once."""
 
 
 CORE_REQUESTS: tuple[type[AdminRequest[Any]], ...] = (TokenAdd, TokenRotate, *rows())
@@ -432,9 +432,9 @@ class AdminAnswer(msgspec.Struct, Generic[A], frozen=True):
     """The answer: `ok` with a body, or an error with its findings.
 
     `trouble` is the kind of an error: `request` (makes no sense), `refused` (the policy or name given is wrong),
-    `conflict` (another revision is in force than expected), `unknown` (no such thing), `forbidden` (not for this
-    client), `busy` (too much at once), `failed` (the appliance cannot do it now), `standby` (only the active appliance
-    can do it).
+    `conflict` (the revision in force is not the expected one), `unknown` (does not exist), `forbidden` (not for this
+    client), `busy` (too much at once), `failed` (the appliance cannot do it now), `standby` (only the active
+    appliance can do it).
     """
 
     ok: bool

@@ -53,7 +53,7 @@ class Child:
             return False
 
     def fail(self, reason: str, output: list[str]) -> None:
-        """Report that this process cannot serve; `output` is of the program that it ran."""
+        """Report that this process cannot serve; `output` has the last lines of the program that it ran."""
         self._answer(Failed(reason, output))
 
     def close(self) -> None:

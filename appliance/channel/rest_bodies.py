@@ -52,7 +52,7 @@ class PolicyText(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Rollback(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The revision to return to; null: the revision before the present one."""
+    """The revision to return to, or null for the revision before the present one."""
 
     revision: Annotated[int, msgspec.Meta(ge=1, le=LONGEST_REVISION)] | None = None
 
@@ -112,6 +112,6 @@ class Switch(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
 
 class SwitchMany(Switch, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The same for several monitors at once: for all, or for none if a name is unknown."""
+    """The wanted state of several monitors. Nothing changes if one of the names is unknown."""
 
     names: Annotated[list[MonitorName], msgspec.Meta(min_length=1, max_length=1000)]

@@ -25,7 +25,7 @@ _SECOND = 1_000_000_000
 
 
 class NoOrderError(ValueError):
-    """A request does not make an order; the message gives the reason."""
+    """A request cannot be converted to an order; the message gives the reason."""
 
 
 class BadTagError(NoOrderError):
@@ -46,7 +46,7 @@ def is_dry_run(query: str) -> bool:
 
 
 def meant(asked: ClientRequest, *, dry_run: bool = False) -> AdminRequest[Any]:
-    """Return the order that a request makes; with `dry_run`, it must be a dry run. Raises `NoOrderError`."""
+    """Return the order in a request; with `dry_run`, it must be a dry run. Raises `NoOrderError`."""
     path, _mark, text = asked.target.partition("?")
     if is_dry_run(text) is not dry_run:
         raise NoOrderError("a dry run changes nothing")

@@ -60,7 +60,7 @@ class Versioned(NamedTuple):
 
 @dataclass(frozen=True)
 class Operation:
-    """One way to send a request over REST. Without `role`, it needs no token; without `path`, it serves other routes.
+    """One way to send a request over REST. Without `role`, it needs no token; without `path`, other routes use it.
 
     A field of the request is sent in the path, in the query, in `If-Match` (`expected`), or otherwise in the body. If
     a class has several of these decorators, the top row is first.

@@ -40,7 +40,7 @@ Look = Callable[[], StatusView]
 
 
 class _Looks:
-    """The views of the status. While the appliance does not answer, a view has the reason and the time since then."""
+    """The views of the status. While the appliance does not answer, a view shows the reason, and for how long."""
 
     def __init__(self, look: Look) -> None:
         self._look = look

@@ -193,7 +193,7 @@ def _rest_url(settings: Settings) -> str | None:
 
 
 def _keep_token(state: Path, token: str) -> Path:
-    """Write the token to a file that only its owner can read. Raises `StartError`, and then leaves no file."""
+    """Write the token to a file that only its owner can read. Raises `StartError`; no file is then left."""
     path = state / "first-token"
     try:
         path.unlink(missing_ok=True)

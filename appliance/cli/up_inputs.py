@@ -34,7 +34,7 @@ _LAST_POLICY = """
 def read_inputs(settings: Settings, robot: str | None = None) -> range:
     """Return the range of ports for nodes. Raises `StartError` with every error.
 
-    One of two appliances, which knows the address of the `robot`, starts with the policy of the active one.
+    The standby, which knows the address of the `robot`, starts with the active appliance's policy.
     """
     state = settings.state / _STATE
     author = _last_author(state)

@@ -79,7 +79,7 @@ def is_loopback(host: str) -> bool:
 class FeatureSection:
     """The settings of a feature; `place` is the section's key in `appliance.yaml`, such as `audit.syslog`.
 
-    `stored_in` is a file in the state directory that also has values of the section; empty: none.
+    `stored_in` names a file in the state directory that also has values of the section, or is empty.
     """
 
     place: ClassVar[str]

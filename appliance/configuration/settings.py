@@ -282,7 +282,7 @@ class Ipsec:
 
 @section
 class ApiLimits:
-    """Limits of the REST interface; beyond them a client gets 429 or 503 with the time to repeat."""
+    """Limits of the REST interface. Beyond them, a client gets 429 or 503 with the seconds to wait."""
 
     body_bytes: Size = key(default=1 << 20, description="body of a request")
     requests_per_second: Seconds = key(default=50.0, description="of one host, on average")

@@ -37,7 +37,7 @@ class MotionStop:
     policy: Callable[[], Policy]
 
     async def after(self, host: str, topics: Iterable[str], why: str) -> None:
-        """Stop the topics that this host commanded, and record it even if no guard stops them.
+        """Stop the topics that this host commanded, and record the stop even if no guard carries it out.
 
         A topic without a guard needs no stop unless it is in a group of `[Authority]`.
         """

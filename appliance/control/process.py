@@ -1,8 +1,8 @@
 """Run the control process: start its parts, serve until the supervisor stops the process, end the parts.
 
-The start receives the listening sockets of an earlier control, opens the log and the store, brings the policy into
-force, restores the registry, serves the listeners, registers all nodes with the ROS master in the first reconcile
-round, and then sends `Ready`.
+At its start, control takes over the listening sockets of an earlier control, opens the log and the store, brings the
+policy into force, restores the registry, serves the listeners, registers all nodes with the ROS master in the first
+reconcile round, and then sends `Ready`.
 """
 
 import asyncio

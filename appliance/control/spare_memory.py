@@ -1,7 +1,7 @@
 """Return unused memory of control to the system.
 
-glibc keeps up to 64 MiB of freed memory for each thread that reads or writes large values. A mapping for every large
-block would return it at once, but take twice as long.
+glibc keeps up to 64 MiB of freed memory for each thread that reads or writes large values. Mapping every large block
+separately would return it at once, but take twice as long.
 """
 
 import asyncio

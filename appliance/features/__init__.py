@@ -1,1 +1,1 @@
-"""Features: each folder has all that one feature adds, and `table.py` lists them."""
+"""Features: each folder has everything that one feature adds, and `table.py` lists them."""

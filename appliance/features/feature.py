@@ -1,4 +1,4 @@
-"""Define all that a feature adds to the core.
+"""Define everything that a feature can add to the core.
 
 1. The core knows only these classes and `table.py`. No feature imports another one.
 2. Each process loads the table, so a row imports only settings and roles. Everything else is imported when it is
@@ -127,8 +127,8 @@ class FeaturePart:
 class ConsolePart(NamedTuple):
     """A component of the console, in a file of the feature's folder `console`.
 
-    A `view` is a page with this title; the others are parts of the core's pages: `banner` of every view, `record`
-    of an audit record, and `standby` the page of an appliance that is not active.
+    A `view` is a page with this title. A `banner` is shown on every view, a `record` beside an audit record, and
+    `standby` is the page of an appliance that is not active.
     """
 
     place: Literal["view", "banner", "now", "record", "robot", "standby"]
@@ -139,9 +139,9 @@ class ConsolePart(NamedTuple):
 
 @dataclass(frozen=True)
 class Feature:
-    """All that a feature adds.
+    """Everything that a feature adds.
 
-    Hooks of control are named by `module:name`, so that their modules may import what imports the table.
+    Hooks of control are named by `module:name`, so that a hook's module may import modules that import the table.
     """
 
     name: str

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from appliance.policy.policy import Approval
 
 LONGEST = 64 << 20
-"""The limit of a message, unless a part has a smaller one."""
+"""The largest message in bytes, unless a part sets a smaller limit."""
 
 
 _NO_APPROVALS = "no operator can approve calls on this appliance"

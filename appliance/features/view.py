@@ -34,7 +34,7 @@ class StateView(Generic[S]):
     part: Literal["status", "audit"] = "status"
     """The field belongs to the status, or to its `audit`."""
     before: str = ""
-    """The name of the field that follows; empty: the field is the last."""
+    """The name of the field that follows, or empty if the field is the last."""
     required: bool = False
     alarms: Callable[[S], Iterable[Trouble]] = lambda _state: ()
     metrics: tuple[Metric, ...] = ()

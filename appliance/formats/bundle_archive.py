@@ -35,7 +35,7 @@ _SIGNATURE = ".sig"
 class BundleContents(msgspec.Struct, frozen=True):
     """The texts of a bundle; missing signatures are empty.
 
-    `definitions` are by `package/Type.msg` (or `.srv`), and `signatures` by the names of both kinds of files.
+    `definitions` is keyed by `package/Type.msg` (or `.srv`), and `signatures` by the names of the signed files.
     """
 
     policy: str

@@ -3,7 +3,7 @@
 1. No other host gets the virtual address of a name, even after a revocation. An address promised with a token is
    also reserved, and an address declared in hosts.yaml goes to another host only on request.
 2. A replaced or revoked certificate is on the list of revoked certificates at once.
-3. `revision` grows with every change by an operator or a host, also across restarts.
+3. `revision` grows with every change by an operator or a host, even across restarts.
 """
 
 import datetime

@@ -2,9 +2,9 @@
 
 1. A revoked certificate stays on the list until a day after its expiry, and is deleted more than a year later, so
    it stays revoked even if the clock was ahead for a while and is then set back.
-2. charon and swanctl reject a list that does not fit into one value of vici (65,535 bytes in DER). If it would
-   not, certificates of hosts that are not enrolled are left out: charon has no connection that matches them.
-   Before certificates of enrolled hosts exceed the limit, `require_room` rejects further replacements.
+2. charon and swanctl reject a list that does not fit into one value of vici (65,535 bytes in DER). If it would not,
+   certificates of hosts that are not enrolled are left out: charon has no connection that matches them. Before
+   certificates of enrolled hosts exceed the limit, `require_room` rejects more replacements.
 """
 
 from collections.abc import Iterable, Set

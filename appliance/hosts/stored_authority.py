@@ -23,7 +23,7 @@ class StoredAuthority:
 
     @property
     def waits(self) -> str:
-        """Return the work that needs the authority's key, and until when tunnels open."""
+        """Return the work that waits for the authority's key, and the time until which tunnels still open."""
         return ""
 
     async def certificate(self) -> bytes:

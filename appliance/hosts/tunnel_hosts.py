@@ -1,4 +1,4 @@
-"""Define what other parts of control need of the hosts in tunnels; this is an appliance without tunnels."""
+"""Define the interface to the hosts in tunnels, as an appliance without tunnels implements it."""
 
 from appliance.channel.answers.host_answers import Host
 from appliance.channel.answers.status import IpsecState
@@ -15,7 +15,7 @@ class TunnelHosts:
         return self._text
 
     async def take_bundle(self, text: str, who: str) -> object:
-        """Take the hosts of a bundle; an empty text stands for the file. Raises `HostRefusedError`."""
+        """Take the hosts of a bundle; an empty string stands for the file. Raises `HostRefusedError`."""
         del who
         if text.strip():
             raise HostRefusedError("the bundle declares hosts, and this appliance has no tunnels")

@@ -60,7 +60,7 @@ charon-systemd {{
 
 @dataclass(frozen=True)
 class Proposals:
-    """The proposals of charon, the best first."""
+    """The proposals of charon, best first."""
 
     ike: tuple[str, ...] = IKE_PROPOSALS
     esp: tuple[str, ...] = ESP_PROPOSALS

@@ -51,7 +51,7 @@ def parse_ports(text: str) -> PortRange:
 
 
 def parse_address(text: str) -> str:
-    """Return the IP address of an appliance; a network or a name is a `ValueError`."""
+    """Return the IP address of an appliance. Raises `ValueError` for a network or a name."""
     try:
         address = ipaddress.ip_address(text)
     except ValueError:

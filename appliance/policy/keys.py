@@ -246,7 +246,7 @@ def _find(path: list[_Node[Value]], parts: list[str]) -> tuple[Key, Value] | Non
 
 
 def _find_behind_star(node: _Node[Value], parts: list[str], depth: int) -> tuple[Key, Value] | None:
-    """Return the best pattern behind a star.
+    """Return the best pattern after a star.
 
     All patterns here have the same literal beginning, so at most one with `/**` matches, and at most one without.
     """

@@ -58,7 +58,7 @@ def address_of(text: str) -> Address:
 
 
 class Category(enum.StrEnum):
-    """The kind of access. Each category has its own section, except that both for parameters share one."""
+    """The kind of access. Each category has its own section, except READ and WRITE, which share one."""
 
     NODE = "node"  # use a node name                [Nodes]
     PUBLISH = "publish"  # publish a topic          [Publishers]
@@ -111,7 +111,7 @@ class Decision:
 
     `rule` is None if no rule matches. `told` is the reason without names and addresses of other hosts; None if
     `reason` contains none. In audit-only mode, `would_deny` is true if the rules deny the request, and `allowed` is
-    true. `needs` names the further right that decided, if any. `asks` is the request that needs an operator's
+    true. `needs` names the additional right that decided, if any. `asks` is the request that needs an operator's
     approval, even while it has one.
     """
 

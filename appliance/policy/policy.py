@@ -1,8 +1,8 @@
 """A compiled policy, and the one pure function that decides: `Policy.decide(request)`.
 
 1. An operator's block denies every request of its host, whatever the rules say, even in audit-only mode.
-2. A request that no rule grants is denied, unless its section is an extension and missing. One rule decides: the rule
-   with the most specific matching key of its section, or `default`.
+2. A request that no rule grants is denied, unless its section is an extension and the policy lacks it. One rule
+   decides: the rule with the most specific matching key of its section, or `default`.
 3. `Decision.reason` is a sentence shorter than 300 characters.
 4. Memory does not grow with requests: answers are kept for at most `_KEPT_DECISIONS` short resource names, and hosts.
 """
@@ -126,7 +126,7 @@ class Policy:
         self._commanded = {name: group for group in self.authority.values() for name in group.names}
 
     def decide(self, request: Request) -> Decision:
-        """Decide by the rules of the request's own category; `policy/rights` decides on further rights."""
+        """Decide by the rules of the request's own category; `policy/rights` decides on additional rights."""
         host = request.host
         key = (host.version, int(host), request.category, request.resource)
         decision = self.kept.get(key)

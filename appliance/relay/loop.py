@@ -11,9 +11,9 @@ turn, the other ready payers share one quantum.
 
 - A handler is never called for a descriptor that was unwatched earlier in the same turn. `discard` closes a socket
   only at the end of the turn, so its number cannot refer to another socket in that turn.
-- A turn calls the relay's own handlers first. Once payers have used `QUANTUM` in a turn, it serves only one costly
-  payer more. A payer, or all timers together, starts no handler after `QUANTUM`. A handler with much to do stops when
-  the quantum is `over`, and passes the rest to `later`.
+- A turn calls the relay's own handlers first. Once payers have used `QUANTUM` in a turn, it serves at most one more
+  costly payer. A payer, or all timers together, starts no handler after `QUANTUM`. A handler with much to do stops
+  when the quantum is `over`, and passes the rest to `later`.
 - A handler that raises an exception has a defect: the process ends, and the supervisor starts another.
 """
 

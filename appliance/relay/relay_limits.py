@@ -28,7 +28,7 @@ class RelayLimits:
     """The longest message, request or response in bytes; a peer that declares more is cut. At least 1 MiB."""
 
     queue_messages: int = 1000
-    """The most messages that wait for one slow subscriber; beyond, the oldest are dropped."""
+    """The most messages that wait for one slow subscriber; beyond that, the oldest are dropped."""
 
     queue_bytes: int = 64 * MIB
     """The most bytes that wait for one slow subscriber. A partly sent message does not count: it is never dropped."""

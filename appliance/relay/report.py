@@ -2,7 +2,7 @@
 
 - Equal refusals within `report_every` become one message with a count, and at most `refusals` different ones are
   sent, so a flood of unknown hosts can neither grow the relay nor fill the link.
-- Without a link, at most `_KEPT` limits and `_KEPT` ended connections are kept; further ones are only counted.
+- Without a link, at most `_KEPT` limits and `_KEPT` ended connections are kept; the rest are only counted.
 """
 
 from collections.abc import Callable, Mapping

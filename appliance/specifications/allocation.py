@@ -178,7 +178,7 @@ class Allocation:
 
 
 def groups_of(checked: CheckedSpecifications) -> list[FileGroup]:
-    """Return the groups of files, the largest first."""
+    """Return the groups of files, largest first."""
     touched: dict[str, set[Resource]] = {file: set() for file in checked.monitors.values()}
     for name, file in checked.monitors.items():
         touched[file] |= {(TOPIC, topic) for topic in checked.topics[name]}

@@ -1,4 +1,4 @@
-"""Keep the ends of tokens over restarts, although the system clock may be set back while the appliance is off."""
+"""Keep the ends of tokens across restarts, even if the system clock is set back while the appliance is off."""
 
 import asyncio
 import contextlib

@@ -85,7 +85,7 @@ class IsolationWatchdog:
         return messages.TunnelsEnclosed(esp)
 
     async def open_own_network(self, network: str, ports: list[int]) -> str:
-        """Open the network, and return the reason of a failure, or an empty text."""
+        """Open the network, and return the reason for a failure, or an empty string."""
         try:
             async with self._one_at_a_time:
                 await in_thread(lambda: self.isolation.open_own_network(network, ports))

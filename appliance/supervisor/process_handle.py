@@ -31,7 +31,7 @@ _log = structlog.get_logger()
 
 
 class ProgramOutput:
-    """The output of a program, read until it and all that it started have ended."""
+    """The output of a program, read until the program and all its children have ended."""
 
     def __init__(self, role: str, output: IO[bytes], loop: asyncio.AbstractEventLoop) -> None:
         self._role = role
@@ -76,10 +76,10 @@ class ProcessCallbacks:
 
 
 def is_hanging(silent: float, *, starting: bool, still: float) -> bool:
-    """Return whether a process that has been silent for some seconds hangs.
+    """Return whether a process that has been silent for some seconds is hanging.
 
-    During a start, they count from its beginning. A start may take long while it progresses: `still` are the seconds
-    without progress.
+    During a start, the silence counts from the beginning. A start may take a long time while it makes progress:
+    `still` is the number of seconds without progress.
     """
     if starting:
         return silent > LONGEST_START_SECONDS or (silent > FIRST_ANSWER_SECONDS and still > ANSWER_SECONDS)

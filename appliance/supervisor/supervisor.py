@@ -442,7 +442,8 @@ class Supervisor:
     def _suspend(self) -> bool:
         """Stop the processes that serve the robot; return False if any of them is only starting.
 
-        A control that stood by does not count, so a lapse soon after the activation does not end the appliance.
+        A control that was on standby does not count as starting, so a lapse soon after the activation does not end
+        the appliance.
         """
         serving = [(slot, slot.process) for slot in self.slots if slot.role.serves_robot]
         if any(slot.is_starting for slot, process in serving if process is not None):

@@ -1,7 +1,7 @@
 """Make and keep the self-signed certificate of REST.
 
-Clients may trust exactly this certificate, so it is replaced only when it ends, or when the configuration gives
-the appliance another name. Each recreated container has a new name of the machine, which changes nothing.
+Clients may trust exactly this certificate, so it is replaced only before it expires, or when the configuration gives
+the appliance another name. The new host name of a recreated container is ignored.
 """
 
 import base64

@@ -3,8 +3,10 @@
 1. A connection is entered in the connection table before anything (such as TLS) is set up for it. If the table is
    full, it is closed at once.
 2. A peer is known if it recently sent a valid token or is on this machine. A connection of an unknown peer may be
-   closed at any time to admit another peer, that of a known peer only for another known peer, after a second.
-3. Connections are opened in the order of the processor time that their peers used. Unknown peers count as one.
+   closed at any time to admit another peer. A connection of a known peer is closed only for another known peer, after
+   a second.
+3. Connections are opened in the order of the processor time that their peers used. All unknown peers together count
+   as one peer.
 4. The deadline for the head of the next request starts with the first byte after an answer, so neither an empty line
    nor the rest of a body keeps a connection open.
 """

@@ -25,7 +25,7 @@ class Finding(msgspec.Struct, frozen=True):
 
 
 class BadInput(msgspec.Struct, frozen=True):
-    """One part of a request that makes no sense."""
+    """One invalid part of a request."""
 
     where: Annotated[str, doc("for example `query.limit` or `body.revision`")]
     text: str

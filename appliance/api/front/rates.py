@@ -1,7 +1,7 @@
 """Limit the rate of each peer with token buckets. No I/O; the time is a parameter.
 
-A further bucket replaces the least recently used, so a flood from many addresses gains at most one burst for
-each. An IPv6 peer is its /64 network, because one host can use all addresses of that network.
+A new bucket replaces the least recently used one, so a flood from many addresses gains at most one burst for each. An
+IPv6 peer counts by its /64 network, because one host can use all addresses of that network.
 """
 
 import ipaddress

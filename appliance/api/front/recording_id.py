@@ -18,4 +18,4 @@ class _RecordingId(StringConvertor):
 
 register_url_convertor("recording", _RecordingId())
 CONVERTORS = {"{recording_id}": "{recording_id:recording}"}
-"""The same path in the contract and as Starlette matches it."""
+"""The name of each converter in the contract, and as Starlette matches it."""

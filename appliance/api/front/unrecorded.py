@@ -10,7 +10,7 @@ CATEGORIES = (*Category, "monitor", "parameter", "publication", "rest", "service
 
 
 def unrecorded(wanted: Filter) -> list[str]:
-    """Return a sentence with the nearest known name for each unknown one; globs are not checked."""
+    """Return a sentence for each unknown name, with the nearest known one. Globs are not checked."""
     return [
         f"this version records no {what} {name!r}{meant(name, known)}"
         for what, name, known in (("event", wanted.event, EVENTS), ("category", wanted.category, CATEGORIES))

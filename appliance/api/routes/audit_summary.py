@@ -1,4 +1,4 @@
-"""`/v1/audit/summary`: the denials by host. A summary may read much of the log, so one is made at a time."""
+"""`/v1/audit/summary`: the denials by host. A summary may read much of the log, so only one is made at a time."""
 
 import asyncio
 from typing import Annotated

@@ -56,7 +56,7 @@ class Monitor(MonitorState, frozen=True, kw_only=True):
 
 
 class History(msgspec.Struct, frozen=True):
-    """The latest actions of a monitor, the newest first."""
+    """The latest actions of a monitor, newest first."""
 
     name: str
     happened: list[Happened]

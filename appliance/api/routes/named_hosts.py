@@ -1,4 +1,4 @@
-"""Hosts by their names: what a search for a name means, and the labels of addresses, by the policy in force."""
+"""Names of hosts by the policy in force: resolve the names in a search, and label addresses."""
 
 import ipaddress
 from functools import partial

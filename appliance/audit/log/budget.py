@@ -79,7 +79,7 @@ class Budget:
         self._left = left
 
     def shut_out(self, host: str) -> str:
-        """Return why a nearly full disk blocks this host, or an empty text."""
+        """Return why a nearly full disk blocks this host, or an empty string."""
         left = self._left
         if left is None or left >= self._kept or self._kept_for(host):
             return ""
@@ -89,7 +89,7 @@ class Budget:
         )
 
     def owing(self, host: str) -> str:
-        """Return why calls of this host must wait, or an empty text."""
+        """Return why calls of this host must wait, or an empty string."""
         if self._left is None and not self._changes and self._is_usual(host):
             return ""
         self._pay()

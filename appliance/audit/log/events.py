@@ -33,7 +33,7 @@ EVENTS: dict[str, str] = {
     "approval given": "An operator approved a held call (rosrv approve), once or for some time.",
     "approval refused": "An operator refused a held call.",
     "approval used": "A host made the one call that an operator approved.",
-    "approval wanted": "A host behind `ask` in the policy made a call that needs an approval; `detail.approval` is its"
+    "approval wanted": "A host after `ask` in the policy made a call that needs an approval; `detail.approval` is its"
     " number.",
     "motion not stopped": "A host lost the right to command a motion, and no guard has a safe message that stops it.",
     "motion stopped": "A host lost the right to command a motion, and guards send their safe messages.",

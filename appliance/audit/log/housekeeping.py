@@ -98,7 +98,7 @@ class Housekeeping:
         self._signatures.ask(writer)
 
     def attempt(self, action: Callable[[], None]) -> None:
-        """Run a step; after a failed one, skip all steps for a while."""
+        """Run a step. After a failure, skip all steps for a while."""
         if self._now() < self._paused_until:
             return
         try:

@@ -181,7 +181,7 @@ class AuditLog:
 
     @property
     def degraded(self) -> str | None:
-        """Return why other work than writing is behind, or that the disk is nearly full."""
+        """Return which work besides writing is behind, or that the disk is nearly full."""
         return self.housekeeping.degraded or self._room.scarce
 
     @property

@@ -73,11 +73,11 @@ class Remover:
         return False
 
     def ask_again(self) -> None:
-        """Forget earlier requests, which a new signer may have lost."""
+        """Forget earlier requests, because a new signer may not have got them."""
         self._wanted, self._aged, self._refused, self.due = None, 0.0, 0.0, 0.0
 
     def sealed(self) -> None:
-        """Search for old records again: after a new checkpoint, the previous one may be removed."""
+        """Search for old records again, because after a new checkpoint the previous one may be removed."""
         self._aged = self.due = 0.0
 
     def approved(self, writer: ChainWriter, number: int, text: bytes, signature: bytes, key: bytes) -> bool:

@@ -41,7 +41,7 @@ class Elsewhere(msgspec.Struct, frozen=True, kw_only=True):
     """The comparison with checkpoints kept on another machine.
 
     `checkpoints` is the number that agree with the chain. `through` and `time` are the sequence and time (nanoseconds
-    since the epoch) of the last of them; `other_logs` are the ids of the logs that further checkpoints belong to.
+    since the epoch) of the last of them; `other_logs` are the ids of the logs to which the other checkpoints belong.
     """
 
     checkpoints: int

@@ -59,7 +59,7 @@ def stored_line(columns: StoredColumns, chain: ChainProof) -> bytes:
 
 
 def _placed(path: Path, entries: list[LogEntry], *, whole: bool) -> Iterator[tuple[LogEntry, ChainProof]]:
-    """Yield entries with their proofs, without the last one unless these are the `whole` rest of the export."""
+    """Yield entries with their proofs; leave out the last entry unless the export ends with it (`whole`)."""
     following = [entry.sequence for entry in entries[1:]] + ([0] if whole else [])
     with reading(path) as connection:
         connection.execute("BEGIN")

@@ -171,8 +171,8 @@ class _Verifier:
     def _check_removal(self, removed: RemovedRange | None) -> str:
         """Return "signed", "unsigned", or "" without a removal.
 
-        Only versions that did not sign removals made unsigned ones; then no signed statement has a smaller
-        `removed`.
+        Only versions that never signed removals made unsigned ones. So with a signed statement that has a smaller
+        `removed`, an unsigned removal is a finding.
         """
         if removed is None:
             return ""

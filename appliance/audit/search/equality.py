@@ -38,7 +38,7 @@ class EqualKey(NamedTuple):
 
 @dataclass(slots=True)
 class EqualRecords:
-    """A row of equal records: how many they are, and how often the event happened."""
+    """A row of equal records: how many there are, and how often the event happened."""
 
     first: LogEntry
     last: LogEntry
@@ -103,7 +103,7 @@ def grouped(entries: Iterable[LogEntry]) -> list[EqualRecords]:
 
 
 def equality_of(record: AuditRecord) -> dict[str, Any]:
-    """Return all that a client needs to make the rows of `grouped` itself.
+    """Return everything that a client needs to make the rows of `grouped` itself.
 
     Equal records have equal keys, and equal reasons unless one is empty. A record joins one of the last `reach`
     rows.

@@ -90,7 +90,7 @@ FILTER = OptionGroup(filter_given)
 
 
 class FilteredCommand(GroupedCommand):
-    """A verb with the filter options before its own; `FILTER` makes a filter of the call's parameters."""
+    """A command whose help lists the filter options before its own; `FILTER` makes a filter from them."""
 
     def __init__(self, *args: Any, **settings: Any) -> None:
         super().__init__(*args, before=FILTER.options, **settings)

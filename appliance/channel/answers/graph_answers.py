@@ -1,4 +1,4 @@
-"""The graph: connections between nodes, through the appliance or past it, and their traffic."""
+"""The graph: the connections between nodes, whether through the appliance or not, and their traffic."""
 
 from typing import Annotated, Any, Literal
 

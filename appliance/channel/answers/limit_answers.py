@@ -8,7 +8,7 @@ from appliance.channel.answers.field_docs import doc
 
 
 class LimitUse(msgspec.Struct, frozen=True):
-    """A finite resource: how much all hosts use together, and the host that uses most of its own quota."""
+    """A finite resource: how much all hosts together use, and the host that uses most of its own quota."""
 
     resource: Annotated[str, doc("the resource with its unit")]
     used: Annotated[int, doc("by all hosts together")]

@@ -167,7 +167,7 @@ class MonitorRevision(msgspec.Struct, frozen=True):
 
 
 class MonitorRevisionList(msgspec.Struct, frozen=True):
-    """The kept revisions, the newest first."""
+    """The kept revisions, newest first."""
 
     revisions: list[MonitorRevision]
 

@@ -19,7 +19,7 @@ class PolicyRevision(msgspec.Struct, frozen=True):
 
 
 class PolicyRevisionList(msgspec.Struct, frozen=True):
-    """The kept revisions, the newest first."""
+    """The kept revisions, newest first."""
 
     revisions: list[PolicyRevision]
 
@@ -50,7 +50,7 @@ class PolicyInForce(RevisionText, frozen=True, kw_only=True):
 
 
 class PolicyKnown(PolicyInForce, frozen=True):
-    """A revision, with all data for the comparison with another text.
+    """A revision, with everything needed to compare it with another text.
 
     `cases` are the policy's tests, or None; `cases_error` is the reason if they cannot be read.
     """

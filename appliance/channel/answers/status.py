@@ -79,7 +79,7 @@ class IpsecState(msgspec.Struct, frozen=True):
 
     esp: Annotated[Literal["kernel", "user space"] | None, doc("where ESP runs; null: no tunnels are open")]
     key_exchange: Annotated[
-        list[str], doc("key exchanges offered and accepted, the best first; empty: not known yet")
+        list[str], doc("key exchanges offered and accepted, best first; empty: not known yet")
     ]
     post_quantum: Annotated[bool | None, doc("whether ML-KEM is among them; null: not known yet")]
     charon: Annotated[str | None, doc("its version")]

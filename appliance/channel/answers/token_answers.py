@@ -38,7 +38,7 @@ class Token(msgspec.Struct, frozen=True):
 
 
 class Tokens(msgspec.Struct, frozen=True):
-    """All tokens that were made, the oldest first."""
+    """All tokens that were made, oldest first."""
 
     tokens: list[Token]
     uses_since: Annotated[

@@ -468,7 +468,7 @@ class OwnServiceAnswered(Message):
 class ApprovalWanted(Message):
     """A client's service request waits for `ApprovalAnswered`.
 
-    `digest` is the SHA-256 of the request, `shown` its first bytes, and `size` the number of all.
+    `digest` is the SHA-256 of the request, `shown` its first bytes, and `size` its length.
     """
 
     number: int
@@ -590,7 +590,7 @@ class LookWanted(Message):
 
 
 class LookEnded(Message):
-    """The tap of the topic is over."""
+    """The tap of the topic has ended."""
 
     number: int
 

@@ -73,7 +73,7 @@ class TunnelChanged(Message):
 
 
 class TunnelRefused(Message):
-    """A request for a tunnel was refused or, if not 0, this number of `packets` in a tunnel.
+    """A request for a tunnel was refused or, if `packets` is not 0, that number of packets in a tunnel.
 
     The source address of a tunnel's packet is not verified.
     """

@@ -64,8 +64,8 @@ def search(
 ) -> None:
     """Find records, newest first.
 
-    On a terminal, equal consecutive records are one row with their number, the first and last time, the number of the
-    first record and the last value. In a pipe and with --json, each record is one line.
+    On a terminal, equal consecutive records share a row, which shows how many there are, the first and last time, the
+    first record's sequence and the last value. In a pipe and with --json, each record is one line.
 
     Example: rosrv audit search --deny --since 1h --topic '/cmd_*'
     """

@@ -45,7 +45,7 @@ def read_to_send(files: Sequence[Path], folders: Sequence[Path]) -> Sources:
 
 
 def _sendable(text: str, place: str) -> str:
-    """Replace invalid UTF-8 in comments of definitions, and reject it elsewhere."""
+    """Replace invalid UTF-8 in a definition's comments, and reject it elsewhere."""
     lines = text.split("\n")
     for number, line in enumerate(lines):
         if line.isascii() or not _NOT_UTF_8.search(line):

@@ -26,7 +26,7 @@ def show(
         typer.Argument(help="A kept revision (default: the one in force)"),
     ] = None,
 ) -> None:
-    """Print the text of the policy in force, or of a revision; on standard error who loaded it, and when.
+    """Print the policy in force, or a revision; on standard error, print who loaded it, and when.
 
     Example: rosrv policy show > policy.ini
     """

@@ -22,7 +22,7 @@ from appliance.store.writer_thread import StoreError
 from appliance.telemetry.audit_trail import AuditTrail
 
 STATE_ERRORS = (StateError, PolicyRefusedError, SpecificationsRefusedError, StoreError, OSError)
-"""The errors of a stored state or an own file that control cannot start with."""
+"""The errors of the stored state, or of one of the appliance's files, with which control cannot start."""
 
 
 class ActiveRole:
@@ -42,7 +42,7 @@ class ActiveRole:
 
     @property
     def before_answer(self) -> Callable[[], Awaitable[None]] | None:
-        """Return the wait until changes may be answered; None: no answer waits."""
+        """Return the wait until changes may be answered, or None if answers need not wait."""
         return None
 
     def inherit(self, store: StateStore, age: Callable[[], int]) -> None:
@@ -60,7 +60,7 @@ class ActiveRole:
         return False
 
     def on_end_of_gap(self, ended: Callable[[], None]) -> None:
-        """Call `ended` when computers of the robot stop refusing connections."""
+        """Call `ended` when the robot's computers no longer refuse connections."""
 
     def close(self) -> None:
         """End the role; a change that is not answered yet gets no answer."""

@@ -8,7 +8,7 @@ T = TypeVar("T")
 
 
 class Current(Generic[T]):
-    """A value that is set after its readers are made. Calls before raise `RuntimeError`."""
+    """A value that is set after its readers are made. An earlier call raises `RuntimeError`."""
 
     def __init__(self) -> None:
         self._values: list[T] = []

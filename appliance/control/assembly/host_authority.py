@@ -1,4 +1,4 @@
-"""Make the authority of hosts' certificates, and the table of the appliances at which hosts open their tunnels."""
+"""Make the authority of hosts' certificates, and the table of the appliances to which hosts open their tunnels."""
 
 from typing import NamedTuple
 

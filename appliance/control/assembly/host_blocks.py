@@ -46,7 +46,7 @@ class BlockTable:
         return self._now + clock.since_boot_ns() - self._seen
 
     def until(self, row: HostBlockRow) -> float | None:
-        """Return the end by the present system clock; None: the block has no end."""
+        """Return the end by the present system clock, or None if the block has no end."""
         return None if row.ends is None else self._wall + (row.ends - self._now) / _SECOND
 
     def put(self, address: Address, *, seconds: float | None, who: str, note: str) -> HostBlockRow:

@@ -156,8 +156,8 @@ def class_of(
 ) -> str:
     """Return the class that is charged for a host's processor time, and that shares turns.
 
-    A host can have many addresses, so the hosts that only `*` names share one class, those with a registration
-    another.
+    A host can have many addresses. So all hosts that only `*` names share one class, and those of them with a
+    registration another.
     """
     standing = policy().standing(host)
     if host.is_loopback or standing.named:

@@ -110,7 +110,7 @@ class Policies(Revisions[RevisionRow]):
         self._labelled: Policy | None = None  # whose labels are kept
         self._labels: list[tuple[Network, str]] = []
         self.file_refused = store.settings().get(_REFUSED, "")
-        """Why the file was refused at the last start or reload, in a line; empty if it was accepted."""
+        """Why the file was refused at the last start or reload, in one line; empty if it was accepted."""
 
     @property
     def current(self) -> Policy:
@@ -276,7 +276,7 @@ class Policies(Revisions[RevisionRow]):
     async def _prepared(
         self, read: Callable[[], tuple[str, str]], file: str, who: str, cases: PolicyCases | None = None
     ) -> tuple[Policy, str]:
-        """Work in a thread, without delay for nodes; return the policy with its signature."""
+        """Prepare in a thread, so that nodes are not delayed; return the policy with its signature."""
         before = self.revision
         try:
             while True:

@@ -41,8 +41,8 @@ class Surroundings:
 class ControlLifeline:
     """Control's end of the lifeline.
 
-    `links` has a function for each process that the start of control may wait for, and the messages accepted from it.
-    Other messages are queued until `hear` is called.
+    `links` has a function for each process for which the start of control may wait, with the messages accepted from
+    it. Other messages are queued until `hear` is called.
     """
 
     def __init__(

@@ -53,7 +53,7 @@ class ClockCheck:
             await asyncio.sleep(_LOOK_SECONDS)
 
     def look(self) -> None:
-        """Record steps of the clock; a step back only once, until the clock has caught up with the last record."""
+        """Record steps of the clock, but a step back only once, until the clock catches up with the last record."""
         before, self._seen = self._seen, self._started()
         ahead = self._seen - before
         if ahead > _STEP_SECONDS:

@@ -1,8 +1,8 @@
-"""Keep which alarms operators have acknowledged or silenced, over restarts and takeovers.
+"""Keep the alarms that operators have acknowledged or silenced, across restarts and takeovers.
 
 1. An acknowledgement ends with its alarm, so the same condition is a new alarm when it comes back.
-2. A silence ends at its time, even without its alarm. It ends early if the clock was set back before its beginning,
-   so a wrong clock never extends it.
+2. A silence ends at its time, even without its alarm. It ends early if the clock is set back to before its start, so
+   a wrong clock never extends it.
 """
 
 import msgspec

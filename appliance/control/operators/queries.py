@@ -49,7 +49,7 @@ LONGEST_LOOK = 10.0
 """The longest time in seconds that a query waits for messages."""
 
 ONE_LOOK = 60.0
-"""The seconds in which all queries of one token for one topic make only one audit record."""
+"""The seconds for which all queries of one token for one topic make only one audit record."""
 
 _TOPIC = (Kind.PUBLICATION, Kind.SUBSCRIPTION)
 

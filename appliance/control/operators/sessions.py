@@ -12,7 +12,8 @@ from appliance.store.access_tokens import TokenRow
 class Session(NamedTuple):
     """A person who is signed in.
 
-    `subject` is the provider's permanent identifier, and `mail` empty unless it is verified. `groups` are for doors.
+    `subject` is the provider's permanent identifier, and `mail` empty unless it is verified. `groups` select the
+    person's door.
     """
 
     id: str
@@ -28,7 +29,7 @@ class Sessions(Protocol):
     """The sessions of this control process; they end with it."""
 
     def rows(self) -> list[TokenRow]:
-        """Return the usable sessions, in the form of tokens."""
+        """Return the usable sessions as rows of tokens."""
 
     def of(self, session_id: str) -> Session | None:
         """Return the session, or None if it has ended."""

@@ -1,7 +1,7 @@
 """List switched-off protection: monitors that are disabled or in shadow mode, and audit-only sections of the policy.
 
-A monitor that is to come back automatically ages only if it is still off after that time. Ages count the running time
-of the appliance, so they do not depend on the system clock.
+A monitor that is due to come back ages only if it is still off after that time. Ages count the running time of the
+appliance, so they do not depend on the system clock.
 """
 
 import asyncio

@@ -2,8 +2,8 @@
 
 A flooded or compromised api cannot block RVMaster:
 
-1. At most `_MOST_WAITING` requests wait; further ones are answered `busy` at once. Between two requests, the event
-   loop serves nodes.
+1. At most `_MOST_WAITING` requests wait; the rest are answered `busy` at once. Between two requests, the event loop
+   serves nodes.
 2. Requests that wait for another process (`WaitingRequest`, at most `_MOST_SLOW`) do not delay other requests.
 3. The link ends if the api sends an invalid message or does not read its answers.
 4. REST requests cannot make access tokens, and RVMaster's decisions do not depend on the api.

@@ -7,7 +7,7 @@ Browsers and scripts connect to the api process, so it may be compromised.
 2. A change must equal the order that control derives from the client's HTTP request (`channel/rest_meaning.py`).
 3. A change by a reading key needs a proof: a signature of the HTTP request by the token's signing key, with a
    challenge that is valid once. A compromised api can drop such an order, but cannot change, repeat or forge it.
-4. A bare token authorises requests of anyone who has seen it, but no changes if `api_require_proof` is set.
+4. A bare token authorises requests of anyone who has seen it, but never changes if `api_require_proof` is set.
 """
 
 import asyncio

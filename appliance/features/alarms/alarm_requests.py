@@ -40,7 +40,7 @@ class AlarmsWanted(AdminRequest[AlarmList], frozen=True, tag="alarms"):
     problems={404: "There is no such alarm now."},
 )  # fmt: skip
 class AlarmAcknowledge(AdminRequest[AlarmList], frozen=True, tag="alarm acknowledge"):
-    """Record who takes care of an alarm. It remains an alarm, with that name, until its condition is over."""
+    """Record who takes care of an alarm. It remains an alarm, with that name, until its condition ends."""
 
     kind: str
     note: str = ""

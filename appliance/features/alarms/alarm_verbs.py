@@ -25,7 +25,7 @@ _Note = Annotated[str, typer.Option(help="Why, for other operators")]
 
 @speaks
 def list_alarms(appliance: Appliance) -> None:
-    """List the present alarms with their names, the most severe first.
+    """List the present alarms with their names, most severe first.
 
     Example: rosrv alarm list
     """
@@ -34,8 +34,7 @@ def list_alarms(appliance: Appliance) -> None:
 
 @speaks
 def acknowledge(appliance: Appliance, kind: _Kind, *, note: _Note = "") -> None:
-    """Record that you take care of an alarm. It remains an alarm, with your name, until its condition is
-    over.
+    """Record that you take care of an alarm. It remains an alarm, with your name, until its condition ends.
 
     Example: rosrv alarm acknowledge audit-not-forwarded --note "the receiver is being replaced"
     """

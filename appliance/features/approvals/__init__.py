@@ -1,1 +1,1 @@
-"""Approvals: an operator permits calls that the policy lists behind `ask`, once or for some time."""
+"""Approvals: an operator permits calls of hosts that the policy lists after `ask`, once or for some time."""

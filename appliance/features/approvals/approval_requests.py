@@ -14,7 +14,7 @@ Number = Annotated[int, parameter("number of the held call", ge=1, examples=[482
 
 
 class LeaseSeconds(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How long the approval lasts; null: one call of a service, 60 s for a topic or a parameter."""
+    """How long the approval lasts; by default one call of a service, or 60 s for a topic or a parameter."""
 
     seconds: Annotated[
         Annotated[float, msgspec.Meta(ge=SHORTEST_LEASE, le=LONGEST_LEASE)] | None,
@@ -56,7 +56,7 @@ class Approvals(msgspec.Struct, frozen=True):
 
 @rest("viewer", "GET", "/v1/approvals", name="approvals")
 class ApprovalsWanted(AdminRequest[Approvals], frozen=True, tag="approvals"):
-    """The calls that wait for an approval, and the approvals that last."""
+    """The calls that wait for an approval, and the valid approvals."""
 
 
 @rest(

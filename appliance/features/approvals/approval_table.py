@@ -63,7 +63,7 @@ class ApprovalEntry:
     caller_id: str
     type: str
     arguments: bytes
-    """The first bytes of the arguments, which have `size` bytes."""
+    """The first bytes of the arguments; `size` is the length of all of them."""
     size: int
     since: float
     until: float

@@ -19,7 +19,7 @@ _METRICS = (
 
 
 class ApprovalCounts(msgspec.Struct, frozen=True):
-    """How many calls wait, and how many approvals last."""
+    """The numbers of waiting calls and of valid approvals."""
 
     waiting: Annotated[int, doc("calls that wait for an operator")]
     oldest_seconds: Annotated[float, doc("how long the oldest of them has waited")]

@@ -131,7 +131,7 @@ class DriveOrders:
                 await asyncio.sleep(CHECK_SECONDS)
 
     async def check(self) -> None:
-        """End each authority that is over. All of them end before the first wait for a relay."""
+        """End each authority whose lease has expired, all of them before the first wait for a relay."""
         groups = self._policy().authority
         if gone := self._groups.forget_others(frozenset(groups)):
             self._decide_again()
@@ -185,8 +185,8 @@ class DriveOrders:
     ) -> None:
         """Cut the holder off on all relays, then let the next host hold the group, and record both as one event.
 
-        Without `to`, the first waiting host that may take the group follows. With `stop`, the group's guards stop the
-        robot in between. If a relay is not ready in the end, the group stays free.
+        Without `to`, the first waiting host that may take the group is next. With `stop`, the group's guards stop the
+        robot in between. If a relay is still not ready at the end, the group stays free.
         """
         if to is not None and not self._relays_ready():
             raise UnavailableError(f"a relay starts, so {group.name} cannot be handed over: try again")

@@ -21,7 +21,7 @@ class GroupHost(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class GroupGift(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The host that gets the group next; empty: the first waiting host."""
+    """The host that gets the group next, or empty for the first waiting host."""
 
     to: Annotated[Annotated[str, msgspec.Meta(max_length=300)], doc("address or name of a host")] = ""
 

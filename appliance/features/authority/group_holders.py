@@ -1,7 +1,7 @@
 """Keep the holder of each group, and the hosts that wait for it. No I/O; times are monotonic seconds.
 
 1. `free` and `hold` are separate steps, so that the caller can cut the earlier holder off in between.
-2. The first waiting host that may take the group follows. A host that may only ask never follows.
+2. The first waiting host that may take the group is next. A host that may only ask never is.
 """
 
 from collections.abc import Callable

@@ -15,7 +15,7 @@ from appliance.supervisor.state_directory import StateDirectory, foreign
 
 
 def purge(state: Path) -> tuple[int, int]:
-    """Return the numbers of removed and overwritten files."""
+    """Erase the state directory; return how many files were removed, and how many of them were overwritten."""
     state = state.absolute()
     try:
         reason = foreign(state)

@@ -1,4 +1,4 @@
-"""Block hosts, and lift blocks by order or when their time is over. Withdrawn registrations then return."""
+"""Block hosts, and lift blocks on order or when their time ends. Withdrawn registrations then return."""
 
 import asyncio
 import contextlib
@@ -76,7 +76,7 @@ async def inherit(base: Foundation, parts: Parts) -> FeaturePart:
 
 
 class BlockOrders:
-    """Answers operators, and ends each block when its time is over."""
+    """Answers operators, and ends each block when its time ends."""
 
     def __init__(
         self,

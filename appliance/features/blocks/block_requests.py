@@ -37,7 +37,7 @@ class BlockedHost(msgspec.Struct, frozen=True):
 
 
 class BlockedHosts(msgspec.Struct, frozen=True):
-    """The blocked hosts, the earliest block first."""
+    """The blocked hosts, earliest block first."""
 
     blocks: Annotated[list[BlockedHost], doc("the blocked hosts")]
 
@@ -99,7 +99,7 @@ class HostUnblock(AdminRequest[HostUnblocked], frozen=True, tag="host unblock"):
 
 @rest("viewer", "GET", "/v1/blocks", name="host_blocks", tag="hosts")
 class HostBlocks(AdminRequest[BlockedHosts], frozen=True, tag="host blocks"):
-    """The hosts that operators block, the earliest block first."""
+    """The hosts that operators block, earliest block first."""
 
 
 REQUESTS = (HostBlock, HostUnblock, HostBlocks)

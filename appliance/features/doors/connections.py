@@ -1,6 +1,6 @@
 """Serve the connections of one door, which arrive as descriptors, and limit their number and rate.
 
-An agent that makes a connection for each call is normal; a client that connects in a loop is not. Beyond its first
+Agents normally make a connection for each call; a client that connects in a loop is limited. Beyond its first
 connection, a host gets only a part of the present and of the new ones (`host_shares.py`).
 """
 

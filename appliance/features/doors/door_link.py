@@ -52,11 +52,11 @@ class AgentListener(Message, frozen=True):
 
     descriptors: ClassVar[int] = 1
     source: str
-    """Only this address or network may connect; empty: any host."""
+    """Only this address or network may connect, or any host if it is empty."""
 
 
 class ViewerGiven(Message, frozen=True):
-    """A person's connection, from the address `peer`, which showed this ticket."""
+    """A connection from the address `peer`, opened with this ticket."""
 
     descriptors: ClassVar[int] = 1
     peer: str
@@ -64,7 +64,7 @@ class ViewerGiven(Message, frozen=True):
 
 
 class TicketEnded(Message, frozen=True):
-    """The ticket is over, so its connections end."""
+    """The ticket has ended, and its connections end with it."""
 
     ticket: str
 
@@ -84,7 +84,7 @@ class SocketGiven(Message, frozen=True):
 
 
 class SocketRefused(Message, frozen=True):
-    """Control has no socket for request `number`, for this reason."""
+    """Control cannot provide the socket of request `number`."""
 
     number: int
     reason: str
@@ -132,7 +132,7 @@ class ClientShown(msgspec.Struct, frozen=True):
 
 
 class ClientsShown(Message, frozen=True):
-    """The present connections, the oldest first."""
+    """The present connections, oldest first."""
 
     clients: list[ClientShown]
 

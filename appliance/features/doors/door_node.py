@@ -268,7 +268,7 @@ class DoorNode:
         known.publish(request.values, client.memory)
 
     async def _check_granted(self, known: _Publication) -> None:
-        """Raise the master's refusal if the publication is no longer granted, such as after an approval's end.
+        """Raise the master's refusal if the publication is no longer granted, for example after an approval ended.
 
         The master does not notify publishers, so it is asked again soon after the last subscriber left.
 

@@ -53,7 +53,7 @@ class DoorState(msgspec.Struct, frozen=True, kw_only=True):
     dropped: Annotated[int, doc("messages for clients that read too slowly")]
     refused: Annotated[int, doc("connections in excess of the limits")]
     tickets: Annotated[list[Ticket], doc("that can be used now")]
-    clients: Annotated[list[ConnectedClient], doc("that are connected, the oldest first, at most 50")]
+    clients: Annotated[list[ConnectedClient], doc("that are connected, oldest first, at most 50")]
 
 
 class OwnDoor(msgspec.Struct, frozen=True, kw_only=True):
@@ -67,7 +67,7 @@ class OwnDoor(msgspec.Struct, frozen=True, kw_only=True):
 class DoorList(msgspec.Struct, frozen=True):
     """All doors."""
 
-    doors: Annotated[list[DoorState], doc("the oldest first")]
+    doors: Annotated[list[DoorState], doc("oldest first")]
 
 
 class NewTicket(Ticket, frozen=True, kw_only=True):

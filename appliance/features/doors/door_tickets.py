@@ -22,7 +22,7 @@ LONGEST_SECONDS = 30 * 86_400.0
 
 
 class DoorTickets:
-    """All tickets that are not over."""
+    """All tickets that have not ended."""
 
     def __init__(self, store: StateStore, ends: Deadlines) -> None:
         self._store = store

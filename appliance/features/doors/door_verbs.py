@@ -97,7 +97,7 @@ def ticket(
 ) -> None:
     """Make a ticket: a URL with which a person's browser or viewer opens the door. It is shown only here.
 
-    Anyone who has the URL has the rights of the door until the ticket is over.
+    Anyone who has the URL has the rights of the door until the ticket ends.
 
     Example: rosrv door ticket alice --for 8h
     """

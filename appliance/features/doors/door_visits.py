@@ -56,7 +56,7 @@ class DoorVisits:
         return [one.row for one in self._visits.values() if one.row.door == door and not one.over]
 
     def ended(self) -> list[TicketRow]:
-        """Remove and return the visits that are over."""
+        """Remove and return the visits that have ended."""
         if not self._visits:
             return []
         bearers = self._bearers()

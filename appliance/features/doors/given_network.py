@@ -21,7 +21,7 @@ class GivenNetwork:
         self._number = 0
 
     async def connect(self, host: str, port: int) -> tuple[asyncio.StreamReader, ByteWriter]:
-        """Return a connection to a port of the appliance, whatever `host` is."""
+        """Return a connection to a port of the appliance; `host` is ignored."""
         del host
         connection = await self._socket(port)
         return await asyncio.open_connection(sock=connection, limit=BUFFER_BYTES)

@@ -20,7 +20,7 @@ Form = TypeVar("Form", bound=Hashable)
 _FRAME_OVERHEAD = 500  # bytes that a shared frame takes besides its own and those of its message
 
 _MOST_CHARACTERS = 500_000
-"""The size of all kept definitions together. A codec takes up to 140 bytes for each character of its definition."""
+"""The most characters of all kept definitions. A codec takes up to 140 bytes for each character of one."""
 
 
 @dataclass(eq=False, slots=True)  # a frozen one takes twice as long to make, for each message

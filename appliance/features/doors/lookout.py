@@ -1,7 +1,7 @@
 """Find the topics and services that a door's identity may see, with definitions and types.
 
-Viewers need a definition before they subscribe. If it is unknown, the door itself subscribes for a moment. A result
-is kept until the nodes of the topic or service change, and a denial at most until the policy changes.
+Viewers need a definition before they subscribe. If it is unknown, the door itself subscribes briefly. A result is
+kept until the nodes of the topic or service change, and a denial at most until the policy changes.
 """
 
 import asyncio
@@ -26,7 +26,7 @@ _Thing = tuple[Literal["topic", "service"], str]
 
 
 class _Asked(NamedTuple):
-    """The nodes that were asked about a topic or service, and the time when they are asked again."""
+    """The nodes that were queried about a topic or service, and the time of the next query."""
 
     nodes: tuple[str, ...]
     again: float = math.inf

@@ -1,6 +1,6 @@
 """Encode texts as PNG images, for rosbridge's compression `png`.
 
-The compression of a large text takes long, so it is divided into steps, between which a door serves its other
+Compressing a large text takes a long time, so it is divided into steps, between which a door serves its other
 clients.
 """
 

@@ -37,7 +37,7 @@ class Sight(Protocol):
     async def service_uri(self, service: str) -> str: ...
 
     async def parameter(self, call: str, *arguments: Value) -> Value:
-        """Make a call of the parameter API, except `setParam`."""
+        """Make a call of the parameter API other than `setParam`."""
 
     async def set_parameter(self, name: str, value: Value) -> None: ...
 

@@ -5,13 +5,13 @@
    ones.
 3. Frames are sent only as fast as the client reads. In the meantime, its queue keeps the newest messages of each
    topic, and its requests are carried out: a stop does not wait for images.
-4. A client that sends nothing, and does not answer pings, is disconnected; within seconds if it has a will, which the
-   door publishes when the client is gone.
-5. Once the session disconnects a client, it carries out no further request, and drops the frames that the client does
+4. A client that sends nothing, and does not answer pings, is disconnected; this happens within seconds if it has a
+   will, which the door then publishes.
+5. Once the session disconnects a client, it carries out no more requests, and drops the frames that the client does
    not take.
 6. A client that holds memory which all clients share (`door_memory.py`) must take frames: `_LEAST_TAKEN` bytes in
-   `_TAKING_SECONDS`. Otherwise it is disconnected, because large messages of others may find no room.
-7. A client must finish what it has begun (`unfinished.py`), also if it answers pings. Its handshake takes at most
+   `_TAKING_SECONDS`. Otherwise it is disconnected, because large messages for other clients may find no space.
+7. A client must finish what it has begun (`unfinished.py`), even if it answers pings. Its handshake takes at most
    `handshake_seconds`.
 """
 

@@ -57,7 +57,7 @@ _METRICS: Mapping[str, Metric] = {
     ),
     "restarts": counter("rosrv_door_restarts_total", "unexpected ends of the process of the door", "door"),
 }  # fmt: skip
-"""All except the restarts begin at zero when the door's process starts."""
+"""All counters except that of restarts begin at zero when the door's process starts."""
 
 
 def _alarms(state: DoorsState) -> Iterator[Trouble]:

@@ -4,7 +4,7 @@
 2. The manifest has the hash of every member except itself and `proof.json`, which is the audit record of the export
    with the hash of the manifest. A signed checkpoint seals that record before the first byte is sent.
 3. Records are exported as they are stored, so `verify.py` computes their hashes without the appliance's code.
-4. A run of records is complete between its ends.
+4. Between the first and the last record of a run, none is missing.
 """
 
 import hashlib

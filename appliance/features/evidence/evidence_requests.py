@@ -21,10 +21,10 @@ class LogSealed(WaitingRequest[Sealed], frozen=True, tag="audit seal"):
 
 @rest("viewer")
 class EvidenceExported(WaitingRequest[Sealed], frozen=True, tag="evidence exported"):
-    """Record that a bundle was made whose manifest has this hash, and seal the record.
+    """Record the export of the bundle whose manifest has this hash, and seal the record.
 
-    The bundle has `records` records from `since` until before `until` (nanoseconds since the epoch), and the
-    recording with the id `recording`.
+    The bundle has `records` records from `since` (inclusive) to `until` (exclusive), in nanoseconds since the epoch,
+    and the recording with the id `recording`.
     """
 
     manifest: Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]

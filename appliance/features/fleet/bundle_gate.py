@@ -1,12 +1,12 @@
 """Bring verified bundles of the fleet into force, through the same gate as local loads.
 
-1. Before the first change, `BundleRecord.trial` is on the disk, with the way back. If control or the appliance ends
-   during a trial, the next start rolls back.
+1. Before the first change, `BundleRecord.trial` is on the disk, with everything that a rollback needs. If control or
+   the appliance ends during a trial, the next start rolls back.
 2. The bundle in force changes in one write, at the end of a trial in which the robot stayed healthy.
 3. A rollback never undoes a change that an operator made during the trial.
 4. A refused bundle changes nothing; the last good one stays in force.
-5. A bundle whose monitors would hold topics that carry messages waits: the robot would get no command, not even a
-   stop.
+5. A bundle whose monitors would hold topics with traffic is not loaded yet: the robot would get no command, not even
+   a stop.
 """
 
 import asyncio
@@ -300,7 +300,7 @@ class BundleGate:
         )
 
     async def _put_in_force(self, trial: Trial, contents: BundleContents) -> None:
-        """Load all parts of a bundle. If one of `_REFUSALS` is raised, the parts before it are in force."""
+        """Load all parts of a bundle, in order. If one of `_REFUSALS` is raised, the earlier parts are in force."""
         await self._monitors.take_bundle(_sources(contents), trial.who, "of the bundle")
         load = admin.PolicyLoad(contents.policy, "of the bundle", signature=contents.policy_signature)
         await self._policies.load_with(load, trial.who, _cases(contents))

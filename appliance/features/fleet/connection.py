@@ -1,6 +1,6 @@
 """Connect to the collector over HTTPS with the robot's certificate. The collector and the network are not trusted.
 
-1. Only the configured collector is asked. httpcore follows no redirect, uses no proxy and expands nothing.
+1. Requests go only to the configured collector. httpcore follows no redirect, uses no proxy and expands nothing.
 2. An exchange has one deadline for all its parts. Answers have a size limit, and compressed ones are rejected.
 3. Each new connection reads the certificate files again, so replaced files apply.
 """

@@ -92,7 +92,7 @@ def join(
 
 
 def leave(state: State = DEFAULT_STATE, as_json: Json = False) -> None:
-    """Forget the collector of `rosrv fleet join`. The collector keeps all that it received.
+    """Forget the collector of `rosrv fleet join`. The collector keeps everything that it received.
 
     Example: sudo rosrv fleet leave
     """
@@ -151,7 +151,7 @@ def prepare_membership(folder: Path, invitation: Invitation) -> str:
 
 
 def _is_for(folder: Path, token: str) -> bool:
-    """Return whether the folder was made with this token and its certificate is valid now.
+    """Return whether the folder was made with this token, and its certificate is now valid.
 
     An invalid certificate was made before the clock was corrected, so no collector has enrolled it.
     """

@@ -1,4 +1,4 @@
-"""Find whether a new policy takes a right from a host, by deciding sample names for each rule."""
+"""Find the rights that a new policy takes from a host, by deciding sample names for each rule."""
 
 from collections.abc import Iterator
 from dataclasses import replace

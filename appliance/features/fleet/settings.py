@@ -64,7 +64,7 @@ class Bundles:
 
 @section
 class Fleet(FeatureSection):
-    """A collector of many appliances: it gets the audit log's segments, and gives bundles; off by default.
+    """A collector of many appliances: it receives the audit log's segments, and provides bundles. Off by default.
 
     `rosrv fleet join` gives `collector`, `robot` and the files; keys here override them.
     """

@@ -2,8 +2,8 @@
 
 1. A monitor withholds only motions, once, and at most for the given time, whatever happens to control. A stop by a
    guard, an operator or a node passes, and ends the check.
-2. Control removes the monitor after its line in the log, when a relay was replaced, when the client stops asking, and
-   at the start of control. If all of this fails, the load is rolled back as unconfirmed.
+2. Control removes the monitor after the monitor's line in the log, when a relay is replaced, when the client no
+   longer polls, and when control starts. If all of this fails, the load is rolled back as unconfirmed.
 """
 
 import asyncio

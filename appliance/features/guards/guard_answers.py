@@ -93,7 +93,7 @@ class GuardPlan(msgspec.Struct, frozen=True):
 
 
 class Suggestion(msgspec.Struct, frozen=True):
-    """A guard that fits the graph. `measured` are values from present rates; check all others."""
+    """A guard that fits the graph. The values in `measured` come from present rates; check all others."""
 
     preset: Annotated[str, doc("the preset")]
     name: Annotated[str, doc("the name of the guard")]

@@ -121,7 +121,7 @@ class GuardTry(WaitingRequest[GuardPlan], frozen=True, tag="guard try"):
     "admin", "POST", "/v1/guards/driver-check", name="check_driver", body=NewDriverCheck, seconds=40.0,
 )  # fmt: skip
 class DriverCheckBegin(AdminRequest[DriverCheck], frozen=True, tag="driver check"):
-    """Withhold the motions of a slowly driven base once, to measure how long its driver takes to stop it.
+    """Withhold the motions of a slowly driven base once, to measure how long its driver takes to stop the base.
 
     The appliance loads a monitor that acts once, and removes it afterwards. The client asks for the outcome
     at least every three seconds; otherwise the check ends.

@@ -18,14 +18,14 @@ class TypeRow:
 
     paths: Mapping[str, str] = field(default_factory=dict)
     stops: bool = True
-    """Whether a message can stop the robot. Otherwise a command is dropped and all its action's goals are
+    """Whether a message can stop the robot. Otherwise a command is dropped, and all goals of its action are
     cancelled.
     """
     parameters: str = ""
     """The event's parameters if a value is made of several fields. `local` then makes the value."""
     local: str = ""
     element: str = ""
-    """The type of the elements of `values`, in variables that keep them; empty: the type in the text."""
+    """The type of the elements of `values`, in variables that keep them, or empty for the type in the text."""
 
 
 def _twist(before: str = "") -> TypeRow:

@@ -1,4 +1,4 @@
-"""Presets: reviewed texts in `monitors/guards`, their parameters, and the texts that are made from them.
+"""Read presets (the reviewed texts in `monitors/guards`) with their parameters, and make guards from them.
 
 The first line of a guard names the preset, its version, the topics and their types.
 """

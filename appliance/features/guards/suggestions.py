@@ -33,7 +33,7 @@ class Proposal:
     name: str
     topics: Mapping[str, str]
     measured: Mapping[str, str] = field(default_factory=dict)
-    """Values from present rates; `values` are others that fit the topics."""
+    """The values that come from present rates; `values` has the others that fit the topics."""
     values: Mapping[str, str] = field(default_factory=dict)
 
     @property

@@ -132,7 +132,7 @@ def new(
 ) -> None:
     """Make a guard from a preset and load it. Its text is also written into the folder of specifications.
 
-    A topic that the robot lacks, or of a type that the preset does not know, is refused. `rosrv guard list` prints the
+    A topic is refused if the robot lacks it, or if the preset does not know its type. `rosrv guard list` prints the
     presets with their parameters.
 
     Example: rosrv guard new deadman /cmd_vel --shadow silent=0.5

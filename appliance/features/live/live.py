@@ -61,7 +61,7 @@ def routes(services: Services) -> Routes:
 
     @router.get("/whoami")
     async def whoami(bearer: Viewer) -> Holder:
-        """Return the name and role of the token that asks, and its end."""
+        """Return the name, the role and the expiry of the caller's token."""
         return Holder(bearer.name, bearer.role, bearer.expires)
 
     @router.get("/history", operation_id="history", dependencies=[VIEWER])

@@ -118,5 +118,5 @@ DENIALS: dict[str, str | Callable[[AuditRecord], DecidedRequest]] = {
 }
 """By event, the function that derives the request from a record, or the reason why no policy would allow it.
 
-Every event that can be a denial has a row.
+Every event that can be a denial has an entry.
 """

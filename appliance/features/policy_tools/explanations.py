@@ -34,7 +34,7 @@ _GRANTED = (
 def granted(record: AuditRecord, current: PolicyKnown, *, whole_tool: bool = False) -> Granted:
     """Return the change that would allow a denied request, or raise `UngrantableError`.
 
-    With `whole_tool`, the change also has all other rights that the stock tool of the record needs.
+    With `whole_tool`, the change also grants all other rights that the stock tool of the record needs.
     """
     known, asked = PolicyContext.of(msgspec.structs.asdict(current)), asked_of(record)
     tool = stock_tool(asked.request.caller_id)

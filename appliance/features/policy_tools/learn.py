@@ -9,7 +9,7 @@ needs them:
 3. The key of a parameter becomes the key of its namespace (`/arm` becomes `/arm/**`), because a call on a
    namespace needs the right on every parameter in it.
 
-A host that used a right with approvals only is written behind `ask`.
+A host that used a right only with approvals is written after `ask`.
 """
 
 from collections import Counter

@@ -60,7 +60,7 @@ class Question(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
 
 class Draft(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The text on which the tests run; null: the policy in force."""
+    """The text on which the tests run, or null for the policy in force."""
 
     text: Text | None = None
 

@@ -125,8 +125,8 @@ def _of_records(services: Services) -> Routes:
     async def grant_of_record(record_id: OneRecord, bearer: Viewer, *, tool: bool = False) -> Granted:
         """Return the smallest change of the policy in force that grants the denied request of this record.
 
-        `tool`: the change also has all other rights that the stock tool of the record needs, such as
-        rostopic.
+        With `tool`, the change also grants all other rights that the stock tool of the record (such as rostopic)
+        needs.
         """
         shown = await desk.record(bearer, record_id, 0)
         known = await ask(services.control, PolicyWanted(), bearer)

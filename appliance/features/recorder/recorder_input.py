@@ -138,7 +138,7 @@ def _cover(
 
 
 def gaps(parts: Sequence[Span], span: Span) -> Iterator[Span]:
-    """Yield the periods of `span` that no part covers. The parts must be in order."""
+    """Yield the periods of `span` that no piece covers. The pieces must be in order."""
     at = span.since
     for part in parts:
         if part.since > at:

@@ -19,7 +19,7 @@ _NOTHING = memoryview(b"")
 
 
 class RecorderRing:
-    """Continues after the data of the previous process.
+    """Writes one relay's messages, after the data that the previous process left.
 
     A message gets the time at which monitors judged it, so that a replay judges it at the same time.
     """

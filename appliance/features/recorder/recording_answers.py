@@ -8,7 +8,7 @@ from appliance.base.actors import APPLIANCE
 from appliance.channel.answers.field_docs import NanoMoment, doc
 
 OPERATORS = "operators"
-"""The payer of recordings that operators order; others are charged as `charged_to` of control returns."""
+"""The payer of recordings that operators order. Other recordings are charged as control's `charged_to` decides."""
 
 TriggerKind = Literal["drop", "change", "verdict", "denial", "alarm", "fault", "service", "order"]
 EventKind = Literal["drop", "change", "verdict", "denial", "alarm", "fault", "notice"]
@@ -94,7 +94,7 @@ class RecordingBegun(msgspec.Struct, frozen=True):
 
 
 class Recordings(msgspec.Struct, frozen=True):
-    """All stored recordings, the oldest first, and the topics that are recorded."""
+    """All stored recordings, oldest first, and the topics that are recorded."""
 
     recordings: list[Recording]
     topics: Annotated[list[str], doc("names of topics that are recorded; `*` matches anything")] = []

@@ -171,7 +171,7 @@ class RecordingPlan:
             del self._ended[next(iter(self._ended))]
 
     def missed(self, charged_to: str, recording_id: str, why: str, now: int) -> None:
-        """End a recording that the recorder could not make. Acts in the next minute get the same reason."""
+        """End a recording that the recorder could not make. For a minute, no recording is made for this reason."""
         self._close(recording_owner(charged_to), recording_id)
         self._obstacle = why, now + 60 * _SECOND
 

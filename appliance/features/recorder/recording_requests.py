@@ -39,7 +39,7 @@ class MemorySpan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @rest("viewer", "GET", "/v1/recordings", name="recordings", problems=_NO_RECORDING)
 class RecordingsWanted(WaitingRequest[Recordings], frozen=True, tag="recordings"):
-    """All stored recordings, the oldest first."""
+    """All stored recordings, oldest first."""
 
 
 @rest("viewer", "GET", "/v1/recordings/{recording_id}", name="recording", problems=_NO_RECORDING)

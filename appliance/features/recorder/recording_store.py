@@ -4,9 +4,10 @@ A removed recording stays as `.ID.gone/`, without its bag, until its removal is 
 garbage.
 
 1. A folder is renamed to its recording's id only when its whole content is on disk.
-2. Recordings never exceed `disk` bytes: room for the largest possible recording is made before it begins. Hosts other
-   than the robot have at most three quarters, each a quarter, and never replace recordings of the robot or of
-   operators. The first to be removed is the oldest of the kind of trigger that uses the most bytes.
+2. Recordings never exceed `disk` bytes: room for the largest possible recording is made before it begins. Recordings
+   of hosts other than the robot use at most three quarters of it, and those of one host a quarter; they never replace
+   recordings of the robot or of operators. The first to be removed is the oldest of the kind of trigger that uses the
+   most bytes.
 3. The file `noted` marks a recording that is in the audit log. Other recordings are reported again.
 4. The file `lent` marks a temporary recording, which does not count in `disk`. A new one replaces the oldest of
    `MOST_TEMPORARY`, unless its reader may not have opened it yet.
@@ -184,8 +185,8 @@ class RecordingStore:
     def in_the_way(self, charged_to: str, making: Sequence[str] = ()) -> tuple[Recording | None, str]:
         """Return the next recording to remove in favour of a new one of this host, and the reason.
 
-        A reason without a recording means that none may be removed. Without either there is room. `making` has the
-        hosts of the recordings in progress.
+        A reason without a recording means that none may be removed. If both are empty, there is space. `making` has
+        the hosts of the recordings in progress.
         """
         held = self._sizes(lambda found: found.charged_to)
         held.update({name: number * self.largest for name, number in Counter((*making, charged_to)).items()})

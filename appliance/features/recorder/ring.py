@@ -9,11 +9,11 @@ which may span blocks: number of frames, size in bytes, time, number of the firs
    the reader ignores.
 2. Before a block is reused, its `birth` is set to 0. The reader discards a copy if `birth` has changed.
 3. Without a free block, the first of these is reused: the oldest block, if it is too old; the oldest of the writing
-   topic or host, if that has used its quota; the oldest of a topic or host above its quota; the oldest of all. A
-   block that an active stream is filling counts as new.
+   topic or host, if that topic or host has used its quota; the oldest of a topic or host above its quota; the oldest
+   of all. A block that an active stream is filling counts as new.
 4. The reader trusts no content: it bounds every number by the memory's own size.
 5. Header blocks take at most a quarter of the memory, and of the quota of a host. A new header replaces closed
-   streams, the oldest first. Streams without room are counted (`REFUSED`), and so are messages in a record larger
+   streams, oldest first. Streams without room are counted (`REFUSED`), and so are messages in a record larger
    than its topic's quota (`MISSED`).
 
 `used` and `birth` are aligned words of 64 bits. If the processor reorders stores (ARM), the reader may see a record's
@@ -82,7 +82,7 @@ class BlockRow(NamedTuple):
 
     @property
     def sound(self) -> bool:
-        """Return whether the numbers are possible: those of a compromised writer must not overflow a word."""
+        """Return whether the numbers are possible: a compromised writer's numbers must not overflow a word."""
         return (
             0 < self.birth < _MOST_NUMBER
             and 0 < self.stream < _MOST_NUMBER
@@ -225,7 +225,7 @@ class RingWriter:
         self._topics: dict[str, _Share] = {}
         self._hosts: dict[str, _Share] = {}
         self._chains: dict[int, _Chain] = {}
-        # Data blocks, the oldest first, each with its stream and time.
+        # Data blocks, oldest first, each with its stream and time.
         self._order: OrderedDict[int, tuple[int, int]] = OrderedDict()
         self._beyond: dict[_Share, None] = {}
         self._headers = 0

@@ -25,7 +25,7 @@ def sign(
     """Sign policies, specifications and message definitions; the signature of FILE is written to FILE.sig.
 
     Add the public key (KEY.pub) to `site_keys` of appliance.yaml: from then on, only signed files come into force.
-    `ssh-keygen -Y sign -n rosrv -f KEY FILE` makes the same signature, also with a passphrase or an agent.
+    `ssh-keygen -Y sign -n rosrv -f KEY FILE` makes the same signature, and supports passphrases and agents.
 
     Example: rosrv sign policies/default.ini --key site
     """

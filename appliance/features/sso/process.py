@@ -1,7 +1,7 @@
 """Run the client of the provider as a process of the appliance: lifeline, link to control, and sign-ons.
 
 Only this process has the client's secret. The firewall lets only this process reach the provider, and lets it reach
-nothing else. Control relies on this process for who a person is.
+nothing else. Control relies on this process to identify people.
 """
 
 import asyncio

@@ -28,7 +28,7 @@ class _Kept(NamedTuple):
 
 
 class SessionTable:
-    """All sessions, the oldest first."""
+    """All sessions, oldest first."""
 
     def __init__(self) -> None:
         self._kept: dict[str, _Kept] = {}

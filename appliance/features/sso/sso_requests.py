@@ -34,9 +34,9 @@ class SignedOn(msgspec.Struct, frozen=True):
 
 
 class SignedOnList(msgspec.Struct, frozen=True):
-    """The sessions of all people, the oldest first."""
+    """The sessions of all people, oldest first."""
 
-    sessions: Annotated[list[SignedOn], doc("the oldest first")]
+    sessions: Annotated[list[SignedOn], doc("oldest first")]
 
 
 @rest(None, seconds=EXCHANGE_SECONDS)
@@ -60,7 +60,7 @@ class SignOnComplete(WaitingRequest[SignedOn], frozen=True, tag="sso complete"):
 
 @rest("admin", "GET", "/v1/sso/sessions", name="sso_sessions", tag="tokens")
 class SessionsWanted(AdminRequest[SignedOnList], frozen=True, tag="sso list"):
-    """The sessions of people who signed in at the provider; for admins."""
+    """The sessions of people who signed in at the provider. For admins."""
 
 
 @rest(
@@ -78,7 +78,7 @@ class SignOut(AdminRequest[SignedOn], frozen=True, tag="sso sign out"):
     problems={404: "No person of this name is signed in."},
 )  # fmt: skip
 class SessionsEnd(AdminRequest[SignedOnList], frozen=True, tag="sso end"):
-    """End all sessions of a person now. They can sign in again unless the provider refuses it; for admins."""
+    """End all sessions of a person now. They can sign in again unless the provider refuses it. For admins."""
 
     name: Annotated[
         str, parameter("name of the person", min_length=1, max_length=140, examples=["sso:alice@example.org"])

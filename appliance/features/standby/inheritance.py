@@ -4,8 +4,9 @@ The replicated setting `active appliance` names the appliance and epoch whose re
 is stored only after all relays have taken the inherited state, so a control that dies before repeats the
 inheritance.
 
-At an unplanned takeover, a copy is used only if it is of the last epoch and fresh. Otherwise monitors that act by
-their state hold their topics. So do those with the modifier `hold`, because a copy lacks the last moment.
+At an unplanned takeover, a copy is used only if it is fresh and from the last epoch. Otherwise monitors whose actions
+depend on their state hold their topics. Monitors with the modifier `hold` always do, because a copy lacks the last
+messages.
 """
 
 import asyncio

@@ -65,7 +65,7 @@ class WitnessAnswer:
 
 @dataclass(frozen=True)
 class PromiseRequest:
-    """A request not to claim for one expiry."""
+    """A request to promise not to claim the lease for one expiry."""
 
     epoch: int
     session: str

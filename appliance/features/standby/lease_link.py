@@ -17,7 +17,7 @@ class LeaseState(Message):
     """The lease, after each change and at least once a second; times are seconds of CLOCK_BOOTTIME."""
 
     until: float
-    """The end of this appliance's right to answer; 0: it is passive."""
+    """The end of this appliance's right to answer, or 0 if it is passive."""
     epoch: _Epoch
     alone: bool
     """Whether the witness has removed the other appliance from the in-sync set."""

@@ -46,7 +46,7 @@ class LeaseWatch(ServiceGate):
                 self.lapsed() if renewable else self.ended()
 
     def died(self, role: str, *, serves_robot: bool) -> None:
-        """End a lapse if the process that could end it in order is gone."""
+        """End a lapse if the process `lease`, which could renew in the same epoch, has died."""
         if role == "lease":
             self.not_renewable()
         elif self.suspended and serves_robot:

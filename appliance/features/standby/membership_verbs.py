@@ -156,8 +156,8 @@ def leave(state: State = DEFAULT_STATE, as_json: Json = False) -> None:
 def repair(state: State = DEFAULT_STATE, as_json: Json = False) -> None:
     """Forget the stored epoch, so that this appliance takes the witness's at its next start. Stop it first.
 
-    For a pair whose witness reports a smaller epoch although its disk was not restored. Run it on both
-    appliances. Exit status: 0 done, 1 the appliance runs, 2 it is not one of two.
+    Use it if the witness reports a smaller epoch although its disk was not restored. Run it on both appliances. Exit
+    status: 0 done, 1 the appliance runs, 2 it is not one of two.
 
     Example: rosrv standby repair
     """

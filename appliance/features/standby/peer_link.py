@@ -1,7 +1,7 @@
 """The datagrams between two appliances, each authenticated with a shared key.
 
-A promise repeats the nonce and the number of its request. An active appliance uses one nonce in an epoch, so a
-request is new only if its epoch is greater, or its number at the same nonce.
+A promise repeats the nonce and the number of its request. An active appliance uses one nonce per epoch, so a request
+is new only if it has a greater epoch, or the same nonce and a greater number.
 """
 
 import msgspec

@@ -1,4 +1,4 @@
-"""Run the lease as a process of the appliance: the witness, the other appliance, the supervisor and control.
+"""Run the lease as a process, which talks to the witness, the other appliance, the supervisor and control.
 
 It does nothing else, so neither a busy nor a restarted control loses the lease. The epoch is on the disk before
 it is used.

@@ -1,7 +1,7 @@
 """Keep the replica of a standby on the disk, and notice that a power cut may have taken its last changes.
 
 After a reboot, this appliance takes over only once it has followed the active one again, or after `WAIT_SECONDS`
-without one: then both lost their power together.
+without an active one, because then both lost power together.
 """
 
 import asyncio

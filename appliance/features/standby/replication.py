@@ -81,7 +81,7 @@ class Pair(NamedTuple):
     """Whether this process stood by before, and then opened the links `api` and `tunnels`."""
     tunnels: StandbyTunnels
     away_seconds: float | None = None
-    """At the takeover, the seconds since this process last followed the other appliance; None: it never did."""
+    """At the takeover, the seconds since this process last followed the other appliance, or None if it never did."""
     copy_age: float | None = None
     """The age of the copies of monitors' state at the takeover."""
 
@@ -180,7 +180,8 @@ class Replication:
     def begin(self) -> None:
         """Serve the standby. After a takeover, request the removal of the earlier active appliance.
 
-        Otherwise the first answers would wait for it in vain. Before this call it may take the lease back.
+        Otherwise the first answers would wait for that appliance in vain. Before this call, it may take the lease
+        back.
         """
         self._lease.present()
         self._absent, self._taken_over = self._taken_over, False

@@ -38,7 +38,7 @@ class Stored(msgspec.Struct, frozen=True, array_like=True, tag="stored"):
 
 
 class SwitchoverWanted(msgspec.Struct, frozen=True, array_like=True, tag="switchover"):
-    """An operator of the standby wants it to take over."""
+    """An operator on the standby ordered it to take over."""
 
 
 class SwitchoverRefused(msgspec.Struct, frozen=True, array_like=True, tag="switchover refused"):
@@ -55,11 +55,11 @@ class Introduction(msgspec.Struct, frozen=True, array_like=True, tag="introducti
     endpoint: Annotated[str, msgspec.Meta(pattern=r"^[0-9A-Za-z.:-]{1,253}\Z")]
     """The address or name at which hosts reach the standby."""
     pin: Annotated[str, msgspec.Meta(pattern=r"^(sha256//[A-Za-z0-9+/]{43}=)?\Z")]
-    """The pin of the standby's REST server; empty: REST is off."""
+    """The pin of the standby's REST server, or empty if REST is off."""
 
 
 class ObstacleFound(msgspec.Struct, frozen=True, array_like=True, tag="obstacle"):
-    """The standby could not serve after a takeover, for this reason; empty: it could again."""
+    """Why the standby could not serve after a takeover, or empty once it could."""
 
     reason: Annotated[str, msgspec.Meta(max_length=_LONGEST_REASON)]
 

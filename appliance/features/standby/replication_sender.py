@@ -1,6 +1,7 @@
 """Send the changes of the active appliance's state to its standby, and wait until the standby has them.
 
-A standby whose next change is no longer in memory gets a snapshot: rows, because it would have to trust a file.
+A standby whose next change is no longer in memory gets a snapshot, as rows: a database file is input that it would
+have to trust.
 
 1. A change counts as acknowledged only if it was sent on this link, and the standby has reported it stored.
 2. While the standby is away, at most `room` bytes of changes are kept; while it is connected, four times as many,

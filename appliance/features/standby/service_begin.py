@@ -1,4 +1,4 @@
-"""Begin the service of an appliance in control: the orders of operators, and the work of the active one of two."""
+"""Begin the service in control: answer operators, and on one of two appliances report that it serves."""
 
 import asyncio
 from collections.abc import Awaitable, Callable

@@ -1,4 +1,4 @@
-"""Prepare the tunnels on a standby: the firewall of the pool, and the process that runs charon, without charon.
+"""Prepare the tunnels on a standby: close the pool in the firewall, and start the process that will run charon.
 
 That process makes its own key, for which the active appliance stores a certificate, so a takeover needs neither
 the authority's key nor the start of this process.

@@ -1,6 +1,6 @@
 """Record takeovers of a pair of appliances, and replicate the newest signed checkpoint of this appliance's log.
 
-A record names no checkpoint that is not valid, or not of the other chain.
+A record names only a valid checkpoint of the other appliance's chain.
 """
 
 import asyncio

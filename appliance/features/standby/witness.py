@@ -1099,7 +1099,7 @@ def serve(settings: WitnessSettings, backend: str, lease: LeaseFile) -> None:
 
 
 def _note_trouble(witness: Witness, lease: LeaseFile, disk: DiskCheck, log: BoundedLog) -> None:
-    """Let answers carry the reason why the next change would not be saved. If the file has no room, try to make it."""
+    """Put into answers why the next change could not be saved. If the file lacks space, try to get it."""
     if witness.record is not None and not lease.has_room():
         with contextlib.suppress(WitnessError):  # reported as the trouble
             lease.write(witness.record)

@@ -1,4 +1,4 @@
-"""The commands `rosrv topic echo|info|publishers`, for the present and the past."""
+"""The commands `rosrv topic echo|info|publishers`; the last also answers for a time in the past."""
 
 import re
 from collections.abc import Iterator, Mapping
@@ -105,7 +105,7 @@ def publishers(
 ) -> None:
     """Show the nodes that were registered as publishers of a topic now or in the past, from the audit log.
 
-    Print also what the log does not show. The appliance may be stopped. Exit status 1 if no publisher is found.
+    The output also names gaps in the log. The appliance may be stopped. Exit status 1 if no publisher is found.
 
     Example: rosrv topic publishers /cmd_vel --at 10:32
     """
@@ -173,7 +173,7 @@ def _show(message: TopicMessage, field: str | None, *, as_json: bool) -> None:
 
 
 def part_of(fields: Any, path: str) -> Any:
-    """Exit with status 2 if the field is neither there nor left out."""
+    """Exit with status 2 if the message has no such field, not even one that was left out."""
     value = fields
     for name in path.split("."):
         if isinstance(value, Mapping) and name in value:

@@ -198,7 +198,7 @@ class Certification:
         return True
 
     def each_hour(self) -> None:
-        """Take renewed certificates once the earlier ones have ended, and record each certificate that ends soon."""
+        """Adopt renewed certificates once the earlier ones have ended, and record each certificate that ends soon."""
         now = clock.wall()
         self.table.revoked.forget_ended()
         for row in self.table.enrolled():

@@ -140,8 +140,8 @@ def _add_renewal(router: Routes, services: Services) -> None:
         status_code=204,
     )
     async def renewed(name: OneName, request: Request) -> None:
-        """Note that a host in its tunnel has its new certificate. The one before ends, and the tunnel is built
-        again.
+        """Note that a host in its tunnel has its new certificate. The previous certificate ends, and the tunnel is
+        built again.
         """
         await _ask(services, host_requests.HostRenewed(name, peer_of(request)))
 

@@ -224,7 +224,7 @@ class HostEnrolment(TunnelHosts):
         await self.reload(host_requests.HostsReload(), who)
 
     async def take_bundle(self, text: str, who: str) -> answers.Reloaded:
-        """Put a bundle's hosts into force. An empty text stands for hosts.yaml."""
+        """Put a bundle's hosts into force. An empty string stands for hosts.yaml."""
         declared = self._table.declared
         return await self._declare(partial(declared.take, text) if text else declared.reload, who)
 

@@ -64,7 +64,7 @@ class LookupCalls:
         return [1, "current system state", list(shown.values())]
 
     async def get_published_topics(self, _caller: Caller, subgraph: str) -> Answer:
-        """`getPublishedTopics(caller_id, subgraph)` → `[topic, type]` of what is published below it."""
+        """`getPublishedTopics(caller_id, subgraph)` → `[[topic, type], …]`: the published topics below it."""
         below = f"{subgraph.rstrip('/')}/" if subgraph else ""
         topics: list[Value] = [
             [topic, self.registry.type_of(topic)]
@@ -78,7 +78,7 @@ class LookupCalls:
         return [1, "current system state", [[topic, told] for topic, told in self.registry.types()]]
 
     async def get_uri(self, caller: Caller) -> Answer:
-        """`getUri(caller_id)` → RVMaster's own, at the address the caller knows it by."""
+        """`getUri(caller_id)` → RVMaster's own URI, at the address by which the caller knows it."""
         return [1, "", node_uri(self.addresses.address_for(caller.peer), self.port)]
 
     async def get_pid(self, _caller: Caller) -> Answer:

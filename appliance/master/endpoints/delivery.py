@@ -112,7 +112,7 @@ class _List:
 
 @dataclass(frozen=True, slots=True)
 class _Taken:
-    """A list on its way to a node, with the publishers whose removal it tells (None: all)."""
+    """A list on its way to a node, with the publishers whose removal it announces (None: all)."""
 
     list: _List
     publishers: tuple[str, ...]
@@ -137,7 +137,7 @@ def _without(publishers: tuple[str, ...], removed: frozenset[str] | None) -> tup
 
 @dataclass(slots=True)
 class _Queue:
-    """The calls and lists that wait for a node, the oldest first, and the sum of their weights."""
+    """The calls and lists that wait for a node, oldest first, and the sum of their weights."""
 
     incarnation: Incarnation
     calls: deque[NodeCall | _List] = field(default_factory=deque)
@@ -198,7 +198,7 @@ class Delivery:
         self._put(self._queue(incarnation), one)
 
     def answered(self, incarnation: Incarnation, topic: str, publishers: tuple[str, ...]) -> None:
-        """The answer to a registration has this list: it replaces one that waits, which may be older."""
+        """Note that the answer to a registration had this list. It replaces a waiting list, which may be older."""
         self._list(incarnation, topic).want(publishers)
 
     def remove_first(self, incarnation: Incarnation, topic: str, publishers: frozenset[str]) -> None:

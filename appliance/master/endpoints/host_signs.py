@@ -10,7 +10,7 @@ from appliance.policy.model import Address
 
 @dataclass(frozen=True, slots=True)
 class HostSigns:
-    """The signs of a host's life. `live(host)`: it has a live node; `moved(host, names)`: last publication, or 0."""
+    """A host's signs of life: `live` returns whether it has a live node, `moved` the last publication's time or 0."""
 
     live: Callable[[Address], bool]
     moved: Callable[[Address, frozenset[str]], float]

@@ -196,7 +196,7 @@ class RelayTraffic:
         return subscriber
 
     def refused(self, message: messages.ConnectionRefused) -> None:
-        """Record a refused connection, but not as an attack if an own node connected too late."""
+        """Record a refused connection, but not as an attack if one of the appliance's nodes connected too late."""
         own = self._is_own(message.host, message.caller_id, message.resource)
         self._trail.happened(
             "connection refused",

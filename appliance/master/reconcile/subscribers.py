@@ -95,7 +95,7 @@ class Subscribers:
         return uris
 
     def remind_all(self, concerned: Callable[[str], bool] = lambda _topic: True) -> None:
-        """Send the lists of all `concerned` topics again, after a rebuild, for a new relay or control.
+        """Send the lists of all `concerned` topics again: after a rebuild, or when a relay or control is new.
 
         The empty list of a revoked topic is sent again, because control may have died before it was delivered.
         """

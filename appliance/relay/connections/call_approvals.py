@@ -16,7 +16,7 @@ MOST_OF_HOST = 2
 _SHOWN = 4096
 
 Answered = Callable[[str], None]
-"""Called with the reason for a refusal, or with an empty text if the request is approved."""
+"""Called with the reason for a refusal, or with an empty string if the request is approved."""
 
 
 class CallApprovals:
@@ -28,7 +28,7 @@ class CallApprovals:
         self._connected = False
         self._open: dict[int, tuple[str, Answered]] = {}  # by number: the host, and who waits
         self._sent: dict[str, set[int]] = {}  # by host
-        self._unsent: dict[str, dict[int, ApprovalWanted]] = {}  # by host, the oldest first
+        self._unsent: dict[str, dict[int, ApprovalWanted]] = {}  # by host, oldest first
         self._number = 0
 
     def ask(self, caller: tuple[str, str, str], type_: str, body: bytes, answered: Answered) -> int:

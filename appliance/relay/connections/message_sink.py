@@ -17,7 +17,7 @@ class MessageStream(Protocol):
         """
 
     def close(self) -> None:
-        """Take the end of the connection."""
+        """Note that the connection has ended."""
 
 
 class MessageSink(Protocol):

@@ -5,13 +5,13 @@ to an address that closed its connection, and roscpp waits up to 20 s. They are 
 another header (`_identity`), which they must read.
 
 A guard's stop comes over another connection, so it can overtake motions that wait in this publisher's connection, in
-the queue or in the kernel. Therefore subscribers also get the stop behind these motions, and a later subscriber gets
+the queue or in the kernel. Therefore subscribers also get the stop after these motions, and a later subscriber gets
 it instead of them (`supersede`).
 
-If the publisher's host has no memory left, a latched message is not kept. Once memory is free, a later subscriber
-makes the relay reconnect to the publisher; the other subscribers then get the message twice. A latched command (a
-message of a topic that had a guard, or a goal) is never requested again: it would begin a motion long after it was
-refused.
+If the publisher's host has no memory left, a latched message is not kept. When memory is free again, a later
+subscriber makes the relay reconnect to the publisher; the other subscribers then get the message twice. A latched
+command (a message of a topic that had a guard, or a goal) is never requested again: it would begin a motion long after
+it was refused.
 
 While *all* subscribers are behind, the relay stops reading the publisher for at most `queue_grace`, so a subscriber
 that the scheduler paused for some milliseconds loses nothing.
@@ -72,7 +72,7 @@ class Upstream:
         """If `silent`, close the connection at once and take no message; otherwise connect if the topic is wanted."""
 
     def check_stall(self) -> None:
-        """Cut a publisher that holds memory for a message and sends nothing of it."""
+        """Cut a publisher that holds memory for a message and no longer sends any of it."""
 
     def close(self) -> None:
         """Close everything, because the publication is withdrawn."""
@@ -377,7 +377,7 @@ class RelayedTopic:
         self._pass_on(batch, divided=False)
 
     def supersede(self, data: bytes | None) -> None:
-        """Send a guard's stop behind all messages of this publisher, and repeat none of them to later subscribers.
+        """Send a guard's stop after all messages of this publisher, and repeat none of them to later subscribers.
 
         If `data` is None, send nothing: a monitor has published another command.
         """

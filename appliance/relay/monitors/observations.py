@@ -4,7 +4,7 @@
   without its numbers), but at most `_DISTINCT` distinctions are separate.
 - A count has the last text, if the texts differ at most in numbers.
 - Counters are sent after the events that they count.
-- Without a link to control, at most `_KEPT` events wait; only the number of further events is reported.
+- Without a link to control, at most `_KEPT` events wait; of the rest, only the number is reported.
 """
 
 from collections import deque

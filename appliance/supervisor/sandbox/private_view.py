@@ -1,9 +1,10 @@
-"""Show a process the program where its user may not reach it, such as a checkout in a home of mode 0700.
+"""Make the program visible to a process whose user may not reach it, such as a checkout in a home of mode 0700.
 
 1. The view is a mount namespace of the process: no other process sees a difference, and no file is changed.
 2. Each closed folder is covered by an empty, read-only folder with only the program and the state, so the process
    reaches less of a home than if it could pass through.
-3. The program is mounted read-only. If umask 077 closed its files, its owner is mapped to the process's user.
+3. The program is mounted read-only. If its files are readable only by their owner (umask 077), the owner is mapped to
+   the process's user.
 """
 
 import contextlib
@@ -125,7 +126,7 @@ def _closed_above(path: Path) -> Path | None:
 
 
 def _is_open(folder: Path) -> bool:
-    """Return whether other users may read the folder; of the program, every file counts: pulls may use other umasks."""
+    """Return whether others may read the folder. All files of the program count: a pull may use another umask."""
     if folder.name not in _PARTS:
         return _permits(folder, _ENTER | _READ)
     return all(
