@@ -1,9 +1,9 @@
 """Measure a robot's delays under attack: `python -m benchmarks.attacks [--only loop,flood] [--busy N] [--seconds S]`.
 
 The robot publishes a topic without a monitor at 100 Hz, and makes 20 calls a second on new connections and 20 on a
-kept one. Guests, and hosts that no rule names, run one attack after the other, then combinations. Rows have the
-delays in milliseconds, the lost messages, the unanswered calls and the restarted relays. `--busy N` adds N processes
-that only compute. The probes run at real-time priority, which requires root.
+kept one. Guests, and hosts that no rule names, run the attacks one after the other, then in combinations. Rows have
+the delays in milliseconds, the lost messages, the unanswered calls and the restarted relays. `--busy N` adds N
+processes that only compute. The probes run at real-time priority, which requires root.
 """
 
 import argparse

@@ -4,9 +4,9 @@ A roscpp node publishes strings, and WebSocket clients on another host of a lab 
 The servers take turns, with messages of 200 bytes and of 1 MB, the size of a camera's frame:
 
 - *paced*: one client and a fixed rate; the delay from `publish` to the client, and the processor time of a message.
-- *most*: one client, then several of the same topic, as dashboards are; the most frames a second that all received
-  while the publisher's rate grows. The processor time of each process shows whether the publisher or a client is the
-  limit, as all of them share the cores.
+- *most*: one client, then several on the same topic, like dashboards; the most frames a second that all clients
+  received while the publisher's rate grew. The processor time of each process shows whether the publisher or a client
+  is the limit, as all of them share the cores.
 - *flooded*: a client sends messages to the door as fast as it can, while a node of the robot listens to another one.
   The client has the lowest priority, because a real flood comes from another machine.
 
@@ -177,7 +177,7 @@ class Heard(NamedTuple):
 
 
 class Carried(NamedTuple):
-    """The frames a second to all clients, and the microseconds that each process spends on one of them."""
+    """The frames a second to all clients, and the microseconds that each process spends on a frame."""
 
     rate: float
     publisher_us: float

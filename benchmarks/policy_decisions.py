@@ -1,8 +1,8 @@
 """Decisions per second against the number of rules: `python benchmarks/policy_decisions.py`.
 
 Seven of ten rules have exact names, and three have patterns. Each ten rules have a group, which has an address, a
-network and another group. *Warm*: the requests were asked before, as most are on a robot. *Cold*: the names are new,
-so nothing is remembered. The ratio is to 10 rules, and should stay near 1. Times are medians of the rounds.
+network and another group. *Warm* requests were decided before, as most are on a robot. *Cold* ones have new names, so
+no decision is cached. The ratio is to 10 rules, and should stay near 1. Times are medians of the rounds.
 """
 
 import argparse

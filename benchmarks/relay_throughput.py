@@ -1,4 +1,4 @@
-"""The relay beside `topic_tools relay` and nothing at all: `python -m benchmarks.relay_throughput`.
+"""The relay beside `topic_tools relay` and a direct connection: `python -m benchmarks.relay_throughput`.
 
 `relay_load.cpp` is the load, on one topic over the loopback. *window* keeps 64 messages on their way, *flat* sends as
 fast as possible and shows the loss, *paced* sends 1,000 messages a second and shows the delay. Systems take turns.

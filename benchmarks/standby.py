@@ -175,7 +175,7 @@ def print_pauses(pauses: dict[str, list[float]], title: str) -> None:
 
 
 def one_takeover(site: StandbySite, robot: StandbyRobot, *, planned: bool) -> dict[str, float]:
-    """Return the longest pause of each thing, once both appliances are in sync again."""
+    """Return the longest pause of each measured service, once both appliances are in sync again."""
     active, passive = site.pair()
     with Watch(robot) as watch:
         if planned:

@@ -2,7 +2,7 @@
 
     python -m benchmarks.standby_faults interruptions|follower|stalls|link|robot [--number 20] [--load 0] [--seed 1]
 
-| fault | is |
+| fault | effect |
 |---|---|
 | `interruptions` | no packet passes between the robot's computers and both appliances, for 2 to 8 s |
 | `follower` | the cable of the robot's second computer, a follower, is unplugged for 2 to 8 s |

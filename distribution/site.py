@@ -1,4 +1,4 @@
-"""`make site`: build dist/rosrv-site_VERSION_ARCH.tar, which has all that a site without a network needs.
+"""`make site`: build dist/rosrv-site_VERSION_ARCH.tar, which has everything that a site without a network needs.
 
     python -m distribution.site [OPTIONS OF docker build …]
 

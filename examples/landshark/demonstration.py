@@ -72,7 +72,7 @@ _NODE_PACKAGES = (
 
 
 class Show:
-    """The demonstration, act by act. `results` collects the outcomes for the summary."""
+    """The acts of the demonstration, in order. `results` collects the outcomes for the summary."""
 
     def __init__(self, stage: Stage, door: Doorway, console: Console) -> None:
         self.stage, self.door, self.console = stage, door, console

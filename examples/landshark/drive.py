@@ -1,4 +1,4 @@
-"""A drive of the simulated LandShark in no time, without ROS: `python -m examples.landshark.drive`.
+"""A drive of the simulated LandShark, computed without ROS: `python -m examples.landshark.drive`.
 
     --bag FILE   record what the robot's nodes and its operator publish, as `rosbag record -a` would
     --svg FILE   draw the drive without monitors and the same commands with the monitors of `monitors/`

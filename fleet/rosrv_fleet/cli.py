@@ -1,4 +1,4 @@
-"""The command `rosrv-fleet`: run the collector, enrol robots, make tokens, search, verify, roll out bundles."""
+"""The command `rosrv-fleet`: run the collector, enrol robots, make tokens, search, verify and roll out bundles."""
 
 import errno
 import json

@@ -31,7 +31,7 @@ def join_router(collector: Collector) -> APIRouter:
 
     @router.post(JOIN_PATH)
     async def join(request: Request) -> Response:
-        """Enrol the robot that the token names; no certificate and no other token is needed."""
+        """Enrol the robot that the token names. No certificate or other token is needed."""
         address = request.client.host if request.client else ""
         wrong.require_patience(address)
         body = await read_body(request, _LONGEST)

@@ -94,7 +94,7 @@ def move_robot(
     group: Annotated[str, typer.Argument(metavar="SITE/GROUP", help="Its robot group, for bundles")],
     config: Config = DEFAULT_CONFIG,
 ) -> None:
-    """Move a robot to a group: the robot then gets the bundles, and counts in the rollouts, of this group only.
+    """Move a robot to a group: from then on it gets the bundles of this group only, and counts in its rollouts.
 
     Example: rosrv-fleet robot group arm7 site-a/arms
     """

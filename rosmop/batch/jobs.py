@@ -1,6 +1,6 @@
 """Jobs on one recording, and `work`, the pure function that executes them.
 
-A job has all that its result depends on, except the messages. The size of the result does not depend on the
+A job has everything on which its result depends, except the messages. The size of the result does not depend on the
 recording's length.
 """
 
@@ -173,9 +173,9 @@ def definitions_by_type(texts: dict[str, str]) -> Definitions:
 
 @contextmanager
 def local_file(recording: RecordingName) -> Iterator[Path]:
-    """Open a block with the path of a recording, which is fetched if it is remote.
+    """Yield the path of a recording, which is fetched if it is remote.
 
-    Raises `RecordingError`, also after the block if a local file has changed since the command listed it.
+    Raises `RecordingError`, even after the block if a local file has changed since the command listed it.
     """
     with ExitStack() as opened:
         if recording.uri.startswith(SCHEME):

@@ -1,4 +1,4 @@
-"""Keep the results of finished jobs in a journal, so that an interrupted command can continue, or temporarily.
+"""Keep results of finished jobs: in a journal, with which an interrupted command continues, or in a temporary file.
 
 The key of a result is the hash of its job, which has the specifications, the options, the version, and the
 recording's name, size and time of change. Each line has a checksum: a job with a damaged result runs again,

@@ -1,4 +1,4 @@
-"""State machines, as written: `state [ event -> state, default state, timeout 2s -> state ]`."""
+"""Follow state machines as written: `state [ event -> state, default state, timeout 2s -> state ]`."""
 
 from collections.abc import Sequence
 

@@ -1,7 +1,7 @@
 """Order the specifications of a set by their `order` statements.
 
-Without a statement they keep the order of the text. A statement moves a specification behind those that it names
-before it, and no further than necessary.
+Without a statement they keep the order of the text. A statement moves a specification after those that it names
+before it, no further than necessary.
 """
 
 from collections.abc import Iterator, Sequence

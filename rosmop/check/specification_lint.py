@@ -107,7 +107,7 @@ def _for_good(compiled: CompiledProperty) -> set[str]:
 
 
 def unused_events(specification: tree.Specification, properties: Sequence[_HasProperty]) -> list[Diagnostic]:
-    """Find unused events. `default` is a use of every event, and without properties nothing is reported."""
+    """Find unused events. A `default` counts as a use of every event, and without properties nothing is reported."""
     if not properties:
         return []
     named = {word for code in properties for word in _WORD.findall(code.property.formula)}

@@ -8,9 +8,9 @@ low 32 bits), the number of effects (the next 24 bits), and `LEFT` if that frame
 After a trap, that message begins at the address stored at `POSITION` (0: no message had begun).
 - A dropped or replaced message does not change the states of properties that suppress it
 (`nodes.Advance.suppresses`).
-- The options at `Cells.source` are: the sender; *told*, the events (by bit) whose drops are left, and with `LOUD`
-also all changes; *enabled*, the topic's specifications; *counted*, the verdicts that are only counted. A message with
-any other verdict is left.
+- At `Cells.source` are four options: the sender; *told*, a bit for each event whose drops are left, and `LOUD` if all
+changes are left as well; *enabled*, a bit for each specification of the topic; and *counted*, a bit for each verdict
+that is only counted. A message with any other verdict is left.
 - An effect is 16 bytes: a set of events (i64) and the number (i64) of consecutive messages that they changed. For
 dropped frames it is -1 and their start and end (i32, i32).
 - If a message gives a property a deadline before the time at `Cells.until`, the loop ends after it with `SOONER`.

@@ -11,7 +11,7 @@ from rosmop.types import value_types
 from rosmop.types.value_types import Type
 
 LINES = 64 << 10
-"""A message whose line does not fit in these bytes is left."""
+"""The bytes for lines of output. A message whose line does not fit is left."""
 
 
 class NotCompiledError(Exception):

@@ -5,7 +5,7 @@
 - The state of specifications that share topics or variables is in one place at a time: in the module's memory from
   the first batch on (`ModuleState.prepare`), in Python whenever Python reads it (`ModuleState.leave`).
 - Frames in the module's memory (`Lanes.area`) are changed in place. The beginning of any other frame is copied to the
-  module, and back if it was changed; code that reads further leaves the message to the engine.
+  module, and back if it was changed; code that reads beyond it leaves the message to the engine.
 """
 
 import struct

@@ -213,7 +213,7 @@ class Compiled:
         return self.part({one.name for one in self.specifications} - gone)
 
     def part(self, names: Collection[str]) -> "Compiled":
-        """`names` must include all that share variables with one of them."""
+        """`names` must include all specifications that share variables with one of them."""
         return replace(
             self,
             specifications=tuple(one for one in self.specifications if one.name in names),

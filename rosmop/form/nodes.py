@@ -55,7 +55,7 @@ class Assign(FormNode, frozen=True):
 
 
 class Convert(FormNode, frozen=True):
-    """A number converted to another type. Integers wrap, and every number except zero is true.
+    """A number converted to another type. Integers wrap, and every number except zero converts to true.
 
     Floats are rounded to the width of the type, or truncated to an integer within its limits (NaN is 0).
     """

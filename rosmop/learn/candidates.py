@@ -1,7 +1,7 @@
 """Propose conditions on a topic's messages and on their order, each with a bound that the recordings support.
 
-All bounds of the file together are expected to be exceeded once in `QUIET_HOURS` (`extremes`). Conditions
-that exclude nothing are left out, such as a rate that allows any change.
+All bounds of the file together are expected to be exceeded once in `QUIET_HOURS` (`extremes`). Conditions that
+exclude nothing, such as a rate that allows any change, are left out.
 """
 
 import math

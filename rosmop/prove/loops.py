@@ -59,7 +59,7 @@ class Cut:
 class Loops:
     """The loops of one side. With `unrolled`, each has at most that many iterations.
 
-    `again` is the condition that an iteration begins that is not followed any further.
+    `again` is the condition under which an iteration begins that the translation no longer follows.
     """
 
     unrolled: int = 0

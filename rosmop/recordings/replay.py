@@ -24,7 +24,7 @@ _OWN = "/rosrv"  # caller id of messages that monitors publish; monitors do not 
 class ReplayStep:
     """The outcome of a message, or of a tick or deadline if there is no topic.
 
-    A message without an index was published by the monitor `publisher`, and judged by the monitors behind it.
+    A message without an index was published by the monitor `publisher`, and judged by the monitors after it.
     """
 
     outcome: Outcome

@@ -1,9 +1,9 @@
 """Process one message, tick or deadline: events, properties, handlers, faults.
 
-For formulas (`CompiledProperty.suppresses`) a dropped message does not count: in all specifications they undo
-their steps, so that their trace has only messages that subscribers saw. Variables, output and other
-properties keep the effects. `STOP;`, and a fault of a monitor with a safe message on the topic, replace the
-message: formulas undo their steps, and the events behind this one process the safe message.
+For formulas (`CompiledProperty.suppresses`) a dropped message does not count: in all specifications they undo their
+steps, so that their trace has only messages that subscribers saw. Variables, output and other properties keep the
+effects. `STOP;`, and a fault of a monitor with a safe message on the topic, replace the message: formulas undo their
+steps, and the events after this one process the safe message.
 """
 
 import struct

@@ -1,4 +1,4 @@
-"""The definition of the intermediate form (`form/nodes.py`), with which every faster implementation is compared.
+"""Define the intermediate form (`form/nodes.py`) by running it. Faster implementations are compared with this one.
 
 Each expression becomes a Python function of a call's variables. Each statement becomes a function that
 returns how the block ends, or None if the block goes on. Strings are bytes, vectors and messages are lists,

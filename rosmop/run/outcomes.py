@@ -145,7 +145,7 @@ class Outcome:
     began_holding: Sequence[str] = ()
     """The monitors that a fault made hold their topics."""
     judged: Mapping[int, "Outcome"] = MappingProxyType({})
-    """The outcomes of published messages after the monitors behind their publisher, by index."""
+    """The outcomes of published messages in the monitors after their publisher, by index."""
     sites: Sequence[Site] = ()
     overwritten: Sequence[tuple[int, bytes]] = ()
     """For a dropped message, the original bytes that actions overwrote (position and bytes, in order)."""

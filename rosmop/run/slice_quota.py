@@ -21,8 +21,8 @@ def no_holder(_source: int) -> Holder:
 class Quota(Generic[Thing]):
     """The holdings of a bounded resource, oldest first.
 
-    A holder may have at most as much as is still free, so a later holder finds room and no other one loses anything.
-    The holder None is limited only by the total.
+    A holder may have at most as much as is still free, so later holders find room and earlier ones lose nothing. The
+    holder None is limited only by the total.
     """
 
     def __init__(self, whole: int) -> None:

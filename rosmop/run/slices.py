@@ -9,7 +9,7 @@ separate specification.
    also known. Slices that lack a parameter (`seeds`) only provide such start states, without output.
 2. Each slice has its own clocks, and one valid entry in the heap of deadlines (`Slice.due`), whose time may be too
    early, but never too late.
-3. A slice ends when no event and no deadline leads to a handler any more, and its actions only change its own
+3. A slice ends when no event or deadline can lead to a handler any more, and its actions only change its own
    variables. Its binding is remembered, so that it does not start again. A slice in its initial state is forgotten at
    once if any relevant event would create it again.
 4. No host (*holder*) has more slices than are left for all other hosts (`slice_quota.py`), and none causes the
@@ -199,7 +199,7 @@ class Slices:
     def step(self, event: int, key: Key) -> bool | None:
         """Step the slice of an event that binds all parameters, if that only changes states; else return None.
 
-        Return False if the slice is over, so that the event does not happen.
+        Return False if the slice has ended, so that the event does not happen.
         """
         if key not in self._whole:
             return None

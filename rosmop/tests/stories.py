@@ -3,12 +3,12 @@
     # The title of a story, which names its test
     % on_fault=pass shadows=a slices=2        how the set is made
     a() { … }                                the specifications; `--- b.rv` begins another file
-    > start                                  what comes of the beginning, where a story asks for it
+    > start                                  the outcome of the start, if the story lists it
     > 1s /t data=5 header.seq=1              a message: its time, its topic, and its fields that are not zero
     > 1s request /set data=True              a request, or a response
     > 1500ms                                 time passes without a message
     > 2s switch a off | 2s resume a | 2s restart | value a n | due | give | 2s shadows
-    > 2s load                                the set is replaced by the lines with `+` behind it
+    > 2s load                                the set is replaced by the following lines with `+`
     + a() { … }
 
 The lines of its outcome (`lines_of`) follow each step. Interpreter, engine and module must have the same outcome.

@@ -35,7 +35,7 @@ PROGRAMS = Path(__file__).parent / "programs.txt"
 @FEW
 @given(seed=st.integers(0, 1 << 30), wild=st.lists(st.binary(max_size=80), max_size=4))
 def test_random_specifications_and_messages(seed: int, wild: list[bytes]) -> None:
-    """How close comparisons came is also the same, if it is recorded."""
+    """Margins of comparisons are also the same, if they are recorded."""
     try:
         both = BothWays(
             *Specifications(seed).texts(), on_fault=("drop", "pass")[seed % 2], margins=seed % 4 > 1

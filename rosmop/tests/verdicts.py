@@ -1,12 +1,12 @@
 """Compare verdicts with the definitions of the logics, on all short traces and on random ones, of random properties.
 
-    .venv/bin/python -m rosmop.tests.verdicts [TRACES] [--seed SEED] [--logic LOGIC]   # a million, unless said
+    .venv/bin/python -m rosmop.tests.verdicts [TRACES] [--seed SEED] [--logic LOGIC]   # default: a million
 
 The tests of each logic define the meaning of a property, from the definition alone (`rosmop/tests/logics`);
 parametric specifications are one specification for each binding (`rosmop/tests/test_slices.py`). For each property
 all short traces and some random ones are judged, with every verdict on the way. Each logic has the same share of the
-random traces; parametric specifications a hundredth of it more, for each of theirs is judged once for each binding.
-Differences are printed with property and trace, and the exit status is 1.
+random traces. Parametric specifications have a hundredth of it, because each of their traces is judged once for each
+binding. Differences are printed with property and trace, and the exit status is 1.
 """
 
 import argparse
@@ -264,7 +264,7 @@ LOGICS: dict[str, Callable[[Random], Drawn]] = {
 def differing(
     logic: str, count: int, seed: int, *, each: int = _EACH, short: int | None = None
 ) -> Iterator[tuple[int, str]]:
-    """Yield, for each property, how many traces were judged and the first difference, or an empty text.
+    """Yield, for each property, how many traces were judged and the first difference, or an empty string.
 
     Properties are drawn until `count` random traces are judged: `each` of a property, with `short` of its short
     traces (all by default).

@@ -1,4 +1,4 @@
-"""Advise on constructs of C++, roscpp, other MOPs and Python that the language lacks."""
+"""Advise authors who use constructs of C++, roscpp, other MOPs or Python that the language lacks."""
 
 import re
 from collections.abc import Callable, Sequence

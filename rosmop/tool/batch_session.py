@@ -65,7 +65,7 @@ class BatchSession:
             yield from self.runner.in_order(jobs, done)
 
     def require(self, failures: Sequence[Failure]) -> None:
-        """Exit if all recordings failed for the same errors of specifications, or if the only one failed."""
+        """Exit if all recordings failed with the same errors of specifications, or if the only one failed."""
         if len(failures) < len(self.recordings):
             return
         findings = [failure.findings for failure in failures]

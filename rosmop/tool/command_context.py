@@ -33,7 +33,7 @@ class CommandContext:
         return data
 
     def read_text(self, path: Path) -> str:
-        """Read a text, with LF as line ends and surrogates for bytes outside UTF-8. Raises `OSError`."""
+        """Read a text file. Line ends become LF, and bytes that are not UTF-8 become surrogates. Raises `OSError`."""
         with io.TextIOWrapper(io.BytesIO(self.read(path)), "utf-8", "surrogateescape") as text:
             return text.read()
 

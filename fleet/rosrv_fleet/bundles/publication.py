@@ -99,7 +99,7 @@ def next_timestamp(
 
 
 def _signed_before(last: bytes | None, root: Root) -> Timestamp | None:
-    """Return None also if the present root does not accept the timestamp: robots then discard it as well."""
+    """Return the last timestamp, or None if the present root does not accept it: robots then discard it too."""
     if last is None:
         return None
     try:

@@ -57,7 +57,7 @@ def list_evidence(
         bool, typer.Option("--json", metavar="", help="One JSON object a line (NDJSON)")
     ] = False,
 ) -> None:
-    """List the evidence bundles, the latest first.
+    """List the evidence bundles, latest first.
 
     Example: rosrv-fleet evidence list --robot arm7
     """

@@ -39,7 +39,7 @@ def evidence_router(collector: Collector) -> APIRouter:
 
     @router.get("", dependencies=viewer)
     def stored(robot: RobotName = "") -> Response:
-        """Return the bundles of a robot or of all, the latest first."""
+        """Return the bundles of a robot or of all, latest first."""
         return Response(msgspec.json.encode(collector.evidence.all(robot)), media_type="application/json")
 
     @router.get("/{evidence}")

@@ -105,7 +105,7 @@ class EvidenceStore:
             return None
 
     def all(self, robot: str = "") -> list[StoredEvidence]:
-        """Return the bundles of a robot or of all, the latest first. Damaged ones are left out, and logged once."""
+        """Return the bundles of a robot or of all, latest first. Damaged ones are left out, and logged once."""
         names = {path.name for path in self._folder.iterdir() if _ID.fullmatch(path.name)}
         for name in names - self._known.keys():
             try:

@@ -59,7 +59,7 @@ def status(collector: Url, ca: Authority = None, token_file: Token = NO_TOKEN, a
 
 @rollout.command()
 def stop(place: Place, collector: Url, ca: Authority = None, token_file: Token = NO_TOKEN) -> None:
-    """Stop a running rollout: no further robot gets the bundle; those that have it keep it.
+    """Stop a running rollout: no other robot gets the bundle, and robots that have it keep it.
 
     Example: rosrv-fleet rollout stop site-a/arms
     """

@@ -8,7 +8,7 @@ from rosrv_fleet.rollouts.machine import BundleRollout, HealthGates, RobotSeen, 
 
 
 class ConditionKind(enum.StrEnum):
-    """The conditions of a robot, the most severe first."""
+    """The conditions of a robot, most severe first."""
 
     UNHEALTHY = "unhealthy"
     SILENT = "silent"

@@ -94,7 +94,7 @@ def operator_routes(service: BundleService, may_read: Authorize, may_change: Aut
 
     @router.post("/{site}/{group}/stop")
     async def stop(site: str, group: str, who: changer) -> dict[str, Any]:
-        """Stop the running rollout: no further robot gets the bundle."""
+        """Stop the running rollout: no other robot gets the bundle."""
         place = _group(service, site, group)
         await _answered(service.stop(place, who))
         return group_state(service, place)

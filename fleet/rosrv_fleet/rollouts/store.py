@@ -90,7 +90,7 @@ class RolloutStore:
     def begin(
         self, group: RobotGroup, last: StoredRollout | None, rollout: BundleRollout, now: float
     ) -> int | None:
-        """Store a new rollout and return its number, or None if `last` is not the last one any more or still runs."""
+        """Store a new rollout and return its number, or None if `last` is no longer the last one or still runs."""
         newest = """
             SELECT id, document = %s::jsonb FROM rollout WHERE site = %s AND robot_group = %s
             ORDER BY id DESC LIMIT 1

@@ -2,7 +2,7 @@
 
     ltl: a => <> b ==> b -> validation                  the verdict after each event; `-` is none
     mtl: once[5ns,inf] a ==> 3ns a, 9ns -> 3ns …        with times: each verdict with its own; the last time is the end
-    pattern: until a: no b ==> deadlines bring          the categories that a passing bound may bring
+    pattern: until a: no b ==> deadlines bring          the categories that may follow a passed bound
     fsm: s [ a -> s ==> 7:21: expected …                the findings; the formula begins at 7:11
 
 The events are a, b and c, or those of a line with `+` before the formula; in `facts.txt` it has the handled
