@@ -2,9 +2,9 @@
 
 Every module is loaded with all its mutants inside, each switched on by a number. A first run records which tests
 reach which mutant; then a fork for each mutant runs only those tests, until one fails. `--all` adds tests outside the
-gate; `--module master` changes the modules whose path contains `master` instead of the kernel. A seed chooses the
-same mutants whatever the tests reach, so that two states of the tests can be compared. Changes without an effect are
-left out: None instead of False, another step of a version, a `zip` that is not strict.
+gate; `--module master` changes the modules whose path contains `master` instead of the kernel. A seed always chooses
+the same mutants, whichever the tests reach, so that two versions of the tests can be compared. Changes without an
+effect are left out, such as None instead of False, or a `zip` that is not strict.
 """
 
 import argparse

@@ -2,9 +2,8 @@
 
 It never stops at a failure. `build/nightly/results.json` has passes, failures and seconds of each test, and the
 commit, start, end and load average of each run. Runs of the same commit add up. If a robot's start
-(`benchmarks/launch.py`) differs by more than 20 % from the table in `benchmarks/RESULTS.md`, that is a finding for
-people to look at. The exit status is 1 if a test failed that `tests/unsteady.txt` does not list, or if the robot did
-not start.
+(`benchmarks/launch.py`) differs by more than 20 % from the table in `benchmarks/RESULTS.md`, that is printed as a
+finding. The exit status is 1 if a test failed that `tests/unsteady.txt` does not list, or if the robot did not start.
 """
 
 import argparse

@@ -51,7 +51,7 @@ def ros(appliance: Appliance, hosts: tuple[Host, Host], tmp_path: Path) -> Itera
 
 
 def seconds_for(listener: Process, count: int, since: float) -> float:
-    """Return the seconds from `since`, before the first message: a busy machine can only make them more."""
+    """Return the seconds since `since`, a time before the first message: a busy machine can only increase them."""
     listener.wait_for_count(count, event="received")
     return time.monotonic() - since
 

@@ -1,4 +1,4 @@
-"""Keep a test from everything that chance can decide: threads, processes, sockets, pauses and real clocks.
+"""Forbid a test everything whose result depends on chance: threads, processes, sockets, pauses and real clocks.
 
 An audit hook of Python sees processes and sockets, even in libraries. The rest has no hook in Python 3.11, so
 functions are replaced. Only our own code's reads of a clock count.

@@ -1,7 +1,7 @@
 """Decide whether a list of events is an execution of the model of the lease (`proofs/lease.pml`).
 
 An event is a line. X and Y are the names of the two appliances, P is one of them or `witness`, E is the epoch of the
-witness. The lines are in the order in which the events happened; a program may leave out none of them.
+witness. The lines are in the order in which the events happened; a program must not leave out any.
 
     granted X E          the witness has granted the lease, and its firewall admits X
     renewed X E          the witness has renewed the lease of the holder

@@ -83,7 +83,7 @@ class RosSession:
         return process
 
     def talker(self, client: Client, topic: str, *options: str, name: str | None = None) -> Process:
-        """Publish std_msgs/String `hello N` ten times a second; `--latch` once, latched; `--text T`."""
+        """Publish std_msgs/String `hello N` (or `--text`) ten times a second; with `--latch`, once and latched."""
         return self.node(client, "talker", topic, *options, name=name)
 
     def listener(self, client: Client, topic: str, *options: str, name: str | None = None) -> Process:

@@ -1,6 +1,6 @@
 """Transcripts of the command line: text files with commands, their output and their exit status.
 
-    # A title says the promise of the lines below it
+    # A title states the promise of the lines below
 
     file p.ini
         [Nodes]

@@ -1,4 +1,4 @@
-"""No regular expression holds the interpreter for long, whatever text it gets.
+"""No regular expression blocks the interpreter for long, whatever its input.
 
 No other thread runs during a match. So a pattern that backtracks over text from a peer stops the appliance for all
 hosts, even if its time is linear: 8 MB of spaces took a second.

@@ -103,7 +103,7 @@ class PairWorld(World):
         self.appliance = appliance
 
     async def find_out(self) -> None:
-        """A takeover may still change the policy in force."""
+        """Do nothing, because a takeover may still change the policy in force."""
 
     def control_ready(self, appliance: Appliance) -> None:
         self.loop.outside.start(self._check_policy(appliance))

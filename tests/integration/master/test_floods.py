@@ -1,4 +1,4 @@
-"""Floods of a rogue to which the policy grants everything, so that only limits protect the other hosts."""
+"""Floods from a rogue host to which the policy grants everything, so that only limits protect the other hosts."""
 
 import contextlib
 import threading

@@ -1,5 +1,5 @@
 """Malformed requests at the real port. `tests/unit/rpc/test_refused_requests.py` and
-`tests/unit/roswire/test_xmlrpc.py` have all of them.
+`tests/unit/roswire/test_xmlrpc.py` have the complete list.
 """
 
 import re

@@ -1,4 +1,4 @@
-"""Work with parameters by orders on standard input, one JSON object per line.
+"""Carry out orders about parameters from standard input, one JSON object per line.
 
     {"do": "set", "key": K, "value": V}
     {"do": "get" | "has" | "delete" | "search", "key": K}

@@ -52,7 +52,7 @@ def browser(chromium: str, playwright: Playwright) -> Iterator[Browser]:
 
 
 def launch(playwright: Playwright, program: str, *options: str) -> Browser:
-    """Start the browser, as root without its own sandbox, which it cannot have then."""
+    """Start the browser. As root it has no sandbox, because Chromium's sandbox does not run as root."""
     arguments = ["--no-sandbox"] if os.geteuid() == 0 else []
     return playwright.chromium.launch(executable_path=program, args=[*arguments, *options])
 

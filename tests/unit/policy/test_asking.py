@@ -63,7 +63,7 @@ def test_a_host_behind_ask_passes_only_while_its_approval_lasts() -> None:
 
 
 def test_a_denial_goes_before_a_missing_approval() -> None:
-    """Operators are not asked for requests that would be denied anyway, for example because of a parameter below."""
+    """Operators are not asked about requests that would be denied anyway, such as for a parameter below the key."""
     nameless = policy(TEXT.replace("default = operator agent-1", "default = operator", 1))
     assert verdict(nameless, Category.PUBLISH, "/cmd_vel") == ("deny", False)
     below = Right(Request(AGENT, "/it", Category.WRITE, "/arm"), namespace=True)

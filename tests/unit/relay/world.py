@@ -44,7 +44,7 @@ LIMITS = replace(
     connections_per_host=15,
 )
 IMPATIENT = replace(LIMITS, header_seconds=0.3, grant_seconds=0.1, connect_seconds=1.0, service_seconds=1.0)
-"""Limits only for tests of these limits: a busy machine may take longer for any step."""
+"""Short limits, only for tests of these limits: on a busy machine any step may take longer."""
 UNHURRIED = replace(LIMITS, linger=3600.0)
 HEADER = {
     "callerid": "/talker",

@@ -1,4 +1,4 @@
-"""Orders about monitors as text, for a control and the controls that follow it, with a relay that takes everything.
+"""Orders about monitors as text, for a control and the controls that follow it, with a relay that accepts everything.
 
 Orders (`Dialogue.say`): `b` is the file b.rv with the text `b` of `TEXTS`, `c.rv:u` the file c.rv with the text `u`.
 

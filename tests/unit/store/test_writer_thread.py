@@ -259,7 +259,7 @@ def test_a_file_that_is_not_a_database_is_an_error_with_a_remedy(tmp_path: Path)
 
 
 def test_a_file_that_lost_all_it_had_is_not_taken_for_a_new_one(tmp_path: Path) -> None:
-    """Tokens, hosts and revocations would be lost silently. A file that is empty before the first start is new."""
+    """Otherwise tokens, hosts and revocations would be lost silently. Only before the first start may it be empty."""
     path = tmp_path / "state.db"
     path.touch()
     Database(path, SCHEMA, failed=print, drive=ByHand).close()

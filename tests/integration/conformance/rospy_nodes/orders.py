@@ -1,4 +1,4 @@
-"""Work with topics by orders on standard input, one JSON object per line.
+"""Carry out orders about topics from standard input, one JSON object per line.
 
     {"do": "subscribe" | "unsubscribe" | "advertise" | "unadvertise" | "publish" | "abandoned",
      "topic": T, "text": X, "latch": B}
@@ -38,7 +38,7 @@ class Orders:
         self.subscribers.pop(told["topic"]).unregister()
 
     def abandoned(self, told):
-        """Wait until the old connection is gone: rospy would take a publisher that returns before for the old one."""
+        """Wait until the old connection is gone; otherwise rospy would mistake a new publisher for the old one."""
         subscriber = self.subscribers[told["topic"]]
         for _ in range(3000):
             if not subscriber.get_num_connections():

@@ -1,4 +1,4 @@
-"""Some random faults of the pair, others each night, so that each edge, process, disk and order has its turn."""
+"""Random faults of the pair, new ones each night, so that each link, process, disk and order has its turn."""
 
 import datetime
 

@@ -1,6 +1,6 @@
 """When the standby could not serve, both appliances report it, and the standby does not claim until it recovers.
 
-The standby `b` has keys of the site, which `a` does not know. Each test puts the policy in force that it needs.
+The standby `b` has keys of the site, which `a` does not know. Each test brings the policy into force that it needs.
 """
 
 from collections.abc import Iterator
@@ -68,8 +68,8 @@ def make_ready(site: StandbySite) -> None:
 
 
 def test_other_site_keys(site: StandbySite) -> None:
-    """A switchover is refused with the reason, and after a power cut the active one is waited for. The first signed
-    policy makes the standby ready.
+    """A switchover is refused with the reason, and after a power cut the standby waits for the active appliance. The
+    first policy that it accepts makes it ready.
     """
     load(site, f"{OPEN_POLICY}# unsigned\n", "")
     until_obstacle(site, NO_SIGNATURE, "a", "b")

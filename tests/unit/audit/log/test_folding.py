@@ -218,7 +218,7 @@ def test_zero_seconds_records_everything() -> None:
 
 
 def test_would_deny_is_never_folded() -> None:
-    """Like allowed calls, these records must stay complete so that a policy can be learned from them."""
+    """These records must stay complete, so that a policy can be learned from them."""
     folder = RecordFolder(FoldSettings(), lambda: "0" * 20, lambda: 0)
     record = denial(decision="would deny")
     assert [list(folder.offer(record, 0.0)) for _ in range(3)] == [[record]] * 3

@@ -69,7 +69,7 @@ class Pairs:
 
 
 class Relays:
-    """Relays with these copies of the state. A relay with None does not answer."""
+    """Relays that return these copies of the state. A relay whose copy is None does not answer."""
 
     def __init__(self, *contents: bytes | None) -> None:
         self.contents = contents

@@ -40,7 +40,7 @@ def control(tmp_path: Path) -> Control:
 
 
 def test_a_full_disk_is_an_obstacle(control: Control, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Hosts already wait, and a standby with this disk could not take over."""
+    """Hosts are already waiting, and a standby with such a disk could not take over."""
     report = control.report()
     monkeypatch.setattr("os.statvfs", lambda _folder: SimpleNamespace(f_bavail=1023, f_frsize=4096))
     assert "4190208 bytes are free" in report.now().obstacle

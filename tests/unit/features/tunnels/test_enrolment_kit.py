@@ -98,7 +98,7 @@ def test_the_firewall_of_a_host_names_the_appliance_in_the_tunnel() -> None:
 
 
 def test_the_script_removes_the_rule_that_does_not_apply() -> None:
-    """The right rule depends on where ESP runs, and a kernel without IPsec cannot even load the other one."""
+    """The correct rule depends on where ESP runs, and a kernel without IPsec cannot even load the other rule."""
     files = unpack(KIT)
     script, text = files["rosrv-ocu-1/join.sh"][0], files["rosrv-ocu-1/protect.nft"][0]
     patterns = re.findall(r"""^    never=(?:'(.*)'|"(.*)")$""", script, re.MULTILINE)

@@ -1,4 +1,4 @@
-"""Nodes get the lists that they lack after control died during a change, and after they were disconnected."""
+"""Nodes get the lists that they missed because control died during a change, or because they were disconnected."""
 
 from typing import Any, cast
 
