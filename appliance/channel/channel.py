@@ -154,7 +154,7 @@ class Channel:
             if flags & socket.MSG_CTRUNC:
                 raise msgspec.DecodeError("descriptors were lost: this process has too many files open")
             if len(self._descriptors) > _MAX_UNCLAIMED:
-                raise msgspec.DecodeError(f"more than {_MAX_UNCLAIMED} descriptors that no message speaks of")
+                raise msgspec.DecodeError(f"more than {_MAX_UNCLAIMED} descriptors that no message claims")
             if not data:
                 closed = True
                 break
@@ -250,7 +250,7 @@ class Channel:
             self._discard_outgoing()
             if self._socket.fileno() >= 0:
                 self._watch_writable()
-                # End the stream also after an error that does not mean its end.
+                # End the stream even after an error that does not mean its end.
                 with contextlib.suppress(OSError):
                     self._socket.shutdown(socket.SHUT_RDWR)
 

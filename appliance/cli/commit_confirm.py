@@ -22,7 +22,7 @@ _Done = TypeVar("_Done")
 ConfirmWithin = Annotated[
     str | None,
     typer.Option(
-        help="Commit-confirm: roll back after this time (30s, 5m, 1h) unless the verb confirm is run"
+        help="Commit-confirm: roll back after this time (30s, 5m, 1h) unless you run the command `confirm`"
     ),
 ]
 

@@ -100,9 +100,7 @@ def _checked_endpoint(text: str | None) -> str | None:
                 f"{text!r} is neither an address nor a name (no port, no brackets), {example}"
             ) from None
         if is_loopback(text):
-            raise ValueError(
-                f"{text} is this machine only, where no other host reaches it, {example}"
-            ) from None
+            raise ValueError(f"{text} means this machine only: no other host reaches it, {example}") from None
         return text
     if address.is_loopback or address.is_unspecified or address.is_multicast or address.is_link_local:
         raise ValueError(f"{text} is not an address at which other hosts reach the appliance, {example}")

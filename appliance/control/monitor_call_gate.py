@@ -54,7 +54,7 @@ class MonitorCallGate:
 
     async def _refused(self, service: str) -> str:
         request = request_of(_CALL, ipaddress.ip_address(self.host), self.name, service)
-        # A guard stops the robot also if another host holds the group (`[Authority]`).
+        # A guard stops the robot even if another host holds the group (`[Authority]`).
         policy = replace(self.policy(), authority={}) if self.policy().authority else self.policy()
         decision = decide(policy, rights_of_call(request, _CALL))
         asker = Asker(self.host, self.name, clock.now_ns(), None)

@@ -96,7 +96,7 @@ class HostTable:
         row = self.rows.get(name)
         if row is None or row.revoked is not None:
             known = ", ".join(host.name for host in self.enrolled()[:20]) or "none"
-            raise UnknownHostError(f"no host {name[:80]!r} is enrolled; enrolled are: {known}")
+            raise UnknownHostError(f"no host {name[:80]!r} is enrolled; the enrolled hosts: {known}")
         return row
 
     def at(self, address: str) -> HostRow | None:

@@ -1,4 +1,4 @@
-"""Approve removals of old audit records that follow from the settings and the signer's own memory.
+"""Approve removals of old audit records if the settings and the signer's own memory justify them.
 
 Without approval, a process that can write the log could remove recent records and call them old.
 

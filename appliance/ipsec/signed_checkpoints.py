@@ -97,14 +97,14 @@ class CheckpointMemory:
         if wanted.removed is None:
             if approved is not None:
                 raise CheckpointRefusedError(
-                    f"checkpoint {wanted.number} does not say how many records are removed"
+                    f"checkpoint {wanted.number} does not state how many records are removed"
                 )
             return
         if approved is None and wanted.number > 1:
             self.remember_removed(wanted.log, wanted.removed)
         elif wanted.removed > (approved or 0):
             raise CheckpointRefusedError(
-                f"checkpoint {wanted.number} says that records up to {wanted.removed} are removed; only removal"
+                f"checkpoint {wanted.number} states that records up to {wanted.removed} are removed; only removal"
                 f" up to {approved or 0} was approved"
             )
         elif approved is None:

@@ -267,12 +267,12 @@ class Isolation:
         name, link = self.settings.name, self.settings.link
         if self.namespace.exists():
             raise NetworkError(
-                f"a network namespace {name} exists that this appliance did not create: "
+                f"the network namespace {name} already exists, and this appliance did not create it: "
                 f"`sudo ip netns delete {name}` if it is unused, or give the appliance another name"
             )
         if link in interfaces.links(self._host):
             raise NetworkError(
-                f"an interface {link} exists that this appliance did not create: `ip link delete {link}`"
+                f"the interface {link} already exists, and this appliance did not create it: `ip link delete {link}`"
             )
         in_use = self._host.run(listening_ports)
         clashes = [
@@ -288,7 +288,7 @@ class Isolation:
 
     def _take_lock(self) -> None:
         if self._lock is not None:
-            raise NetworkError(f"isolation {self.settings.name} is up already")
+            raise NetworkError(f"isolation {self.settings.name} is already up")
         self.settings.directory.mkdir(mode=0o755, parents=True, exist_ok=True)
         lock = os.open(
             self.settings.directory / "isolation.lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600

@@ -70,7 +70,7 @@ def statement(
     parts = (_VERSION, challenge, method, target, if_match, content_type, hashlib.sha256(body).hexdigest())
     for part in parts:
         if not part.isascii() or (part and not part.isprintable()):
-            raise BadProofError(f"{part[:80]!r} has a character that no signed request has")
+            raise BadProofError(f"{part[:80]!r} has a character that a signed request must not have")
     return "\n".join(parts).encode("ascii")
 
 

@@ -183,7 +183,7 @@ class ProcessHandle:
     @property
     def is_hanging(self) -> bool:
         now = clock.now()
-        # A role of the appliance may answer once, and then take long to load policy and specifications.
+        # A role of the appliance may answer once, and then take a long time to load policy and specifications.
         starting = self.answered is None or not (self.ready or self.is_program)
         since = self.started if self.answered is None or starting else self.answered
         return is_hanging(now - since, starting=starting, still=self.stalled_seconds)

@@ -70,7 +70,7 @@ class RetentionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
 
     def __post_init__(self) -> None:
         if self.segment_days is not None and not (self.index_days and self.index_days <= self.segment_days):
-            raise ValueError(f"segment_days: {self.segment_days} needs index_days, of at most as many days")
+            raise ValueError(f"segment_days: {self.segment_days} needs index_days, which must not be larger")
 
     def oldest_day(self) -> date | None:
         return None if self.index_days is None else clock.utc_now().date() - timedelta(self.index_days)

@@ -29,7 +29,7 @@ _MOST_PROVEN = 10_000
 # Handshakes, or requests: of each proven address, behind which there may be many robots, and of all others together.
 _PROVEN_A_SECOND, _PROVEN_AT_ONCE = 200.0, 256.0
 _OTHERS_A_SECOND, _OTHER_AT_ONCE = 50.0, 32.0
-# All others together, also if each comes once: IPv6 has any number of addresses. A thousand robots may begin at once.
+# All others together, even if each comes once: IPv6 has any number of addresses. A thousand robots may begin at once.
 _ALL_OTHERS_A_SECOND, _ALL_OTHERS_AT_ONCE = 200.0, 1000.0
 _log = structlog.get_logger()
 

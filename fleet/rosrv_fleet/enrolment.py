@@ -127,7 +127,7 @@ def new_robot(name: str, made: RobotAppliance, group: str, appliance: str) -> Ro
 def with_appliance(robot: Robot, appliance: str, made: RobotAppliance) -> Robot:
     if len(robot.connecting) >= _MOST_APPLIANCES or len(robot.appliances) >= _MOST_KNOWN:
         raise EnrolmentError(
-            f"{robot.name} has the appliances {', '.join(robot.connecting)}; remove one before:"
+            f"{robot.name} has the appliances {', '.join(robot.connecting)}; remove one first:"
             f" rosrv-fleet robot remove {robot.name} --appliance NAME"
         )
     return msgspec.structs.replace(robot, others=robot.others | {appliance: made})
@@ -171,7 +171,7 @@ def check_name(name: str) -> None:
     """Raise `EnrolmentError` for a name that robots and appliances cannot have."""
     if _NAME.fullmatch(name) is None:
         raise EnrolmentError(
-            f"{name!a}: use 1 to 63 small letters, digits, '.', '_', '-'; first a letter or digit"
+            f"{name!a}: use 1 to 63 of a-z, 0-9, '.', '_' and '-'; begin with a letter or digit"
         )
 
 

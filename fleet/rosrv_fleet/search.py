@@ -45,10 +45,10 @@ class Searches:
         with self._lock:
             if self._running[token] >= max(1, self._most // 2):
                 raise TooManySearchesError(
-                    f"the token {token} has {self._running[token]} searches at work: wait for them"
+                    f"the token {token} has {self._running[token]} searches running: wait for them"
                 )
             if self._running.total() >= self._most:
-                raise TooManySearchesError(f"{self._most} searches are at work: try again")
+                raise TooManySearchesError(f"{self._most} searches are running: try again")
             self._running[token] += 1
         try:
             yield self.database

@@ -61,7 +61,7 @@ class OperatorTokens:
     def add(self, name: str, role: FleetRole) -> str:
         if _NAME.fullmatch(name) is None:
             raise TokenError(
-                f"{name!a}: use 1 to 63 small letters, digits, '.', '_', '-'; first a letter or digit"
+                f"{name!a}: use 1 to 63 of a-z, 0-9, '.', '_' and '-'; begin with a letter or digit"
             )
         text = secrets.token_urlsafe(32)
         digest = hashlib.sha256(text.encode()).hexdigest()

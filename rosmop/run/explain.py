@@ -1,4 +1,4 @@
-"""Explain a verdict by few past events that suffice for it.
+"""Explain a verdict by a few past events that suffice for it.
 
 Each explanation is tested: its events must give the verdict.
 

@@ -22,7 +22,7 @@ BagSets = Annotated[
     typer.Option(
         "--bags",
         metavar="DIR",
-        help="All recordings in a folder, of a pattern ('2026-*/*.bag'), or of s3://BUCKET/PREFIX (repeatable)",
+        help="All recordings in a folder, matching a pattern ('2026-*/*.bag'), or in s3://BUCKET/PREFIX (repeatable)",
     ),
 ]
 Workers = Annotated[
@@ -36,7 +36,8 @@ On = Annotated[
 Resume = Annotated[
     Path | None,
     typer.Option(
-        metavar="FILE", help="Keep the results of finished recordings in a file, and use those that it has"
+        metavar="FILE",
+        help="Keep the results of finished recordings in a file, and skip recordings whose results it has",
     ),
 ]
 ReportFile = Annotated[

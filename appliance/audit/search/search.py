@@ -52,7 +52,7 @@ def search(
 ) -> SearchPage:
     """Return a page of the records found. Raises `LogUnreadableError` and `FilterError`."""
     if not 1 <= limit <= LARGEST_PAGE:
-        raise FilterError(f"limit: not within 1 and {LARGEST_PAGE}")
+        raise FilterError(f"limit: must be 1 to {LARGEST_PAGE}")
     walk = _Walk(_sequence(cursor), newest_first)
     return _reading(path, lambda connection: _page(connection, wanted, walk, limit))
 

@@ -59,7 +59,7 @@ def search(
     oldest_first: Annotated[bool, typer.Option("--oldest-first", help="Start with the first record")] = False,
     cursor: Annotated[str | None, typer.Option("--cursor", help="Continue where a search ended")] = None,
     each: Annotated[
-        bool, typer.Option("--each", help="On a terminal: show each of several equal records in its own row")
+        bool, typer.Option("--each", help="On a terminal, show each of several equal records in its own row")
     ] = False,
 ) -> None:
     """Find records, newest first.

@@ -239,9 +239,9 @@ def set_given(
     name: Annotated[str, typer.Argument(metavar="MONITOR", autocompletion=completion.monitors)],
     values: Annotated[list[str] | None, typer.Argument(metavar="NAME=VALUE…", show_default=False)] = None,
 ) -> None:
-    """Set constants that are given to a monitor while it runs. Without values, print all that is given to it.
+    """Set constants that are given to a monitor while it runs. Without values, print everything given to it.
 
-    The text of the monitor and its state stay. A value outside of its range is refused. Topics are set by a load.
+    The monitor keeps its text and its state. A value outside its range is refused. Topics are set by a load.
 
     Example: rosrv monitor set speed vMax=0.3
     """

@@ -68,7 +68,7 @@ class ApprovalOrders:
         self._guards = guards
         self._table = ApprovalTable(first)
         self._unanswered: list[float] = []
-        self._moved: dict[int, float] = {}  # of leases: the last message, also after its publisher ended
+        self._moved: dict[int, float] = {}  # of leases: the last message, even after its publisher ended
         self._still: dict[
             int, float
         ] = {}  # of leases: the last message before a silence about which guards were asked
@@ -153,7 +153,9 @@ class ApprovalOrders:
                 f"{seconds:g} s is not a lease: give {requests.SHORTEST_LEASE:g}s to {requests.LONGEST_LEASE:g}s"
             )
         if self._ended(entry):
-            raise SenselessError(f"the policy no longer asks about {entry.call.resource}: approve nothing")
+            raise SenselessError(
+                f"the policy no longer asks about {entry.call.resource}: there is nothing to approve"
+            )
         take_effect()
         entry = self._table.approve(entry, seconds, who, clock.now())
         self._unanswered.clear()
@@ -288,7 +290,8 @@ class ApprovalOrders:
         entry = self._table.entry(number)
         if entry is None or entry.until <= clock.now():
             raise UnknownThingError(
-                f"no call has the approval number {number}, or its {WAIT_SECONDS:g} s are over: rosrv approve lists all"
+                f"no call has the approval number {number}, or its {WAIT_SECONDS:g} s have passed: rosrv approve"
+                " lists all"
             )
         return entry
 

@@ -73,7 +73,7 @@ class DriveOrders:
         to = self._host(request.to) if request.to else None
         if to is not None and self._claim(group, to) is None:
             raise SenselessError(
-                f"{to} has no claim to {group.name}: add it to ask {group.name} in [Authority]"
+                f"{to} has no claim to {group.name}: add it to the line `ask {group.name}` in [Authority]"
             )
         async with self._turn(group):
             if self._groups.holder(group.name) is None and to is None:
@@ -189,7 +189,7 @@ class DriveOrders:
         robot in between. If a relay is still not ready at the end, the group stays free.
         """
         if to is not None and not self._relays_ready():
-            raise UnavailableError(f"a relay starts, so {group.name} cannot be handed over: try again")
+            raise UnavailableError(f"a relay is starting, so {group.name} cannot be handed over: try again")
         take_effect()
         before = self._groups.free(group.name)
         try:

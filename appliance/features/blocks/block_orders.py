@@ -238,7 +238,7 @@ class BlockOrders:
         else:
             return
         raise HostRefusedError(
-            f"{address} {why}: to block it would end {in_words(held)}; to do it all the same, use --force"
+            f"{address} {why}: blocking it would end {in_words(held)}; to block it anyway, use --force"
             " (REST: `force`)"
         )
 

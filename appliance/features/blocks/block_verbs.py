@@ -43,7 +43,7 @@ def block(
     force: Annotated[
         bool,
         typer.Option(
-            "--force", help="Block even the robot's own host, or a host with most of all registrations"
+            "--force", help="Block even the robot's own host, or a host with most of the registrations"
         ),
     ] = False,
 ) -> None:

@@ -26,7 +26,7 @@ def demo(
         bool,
         typer.Option(
             "--standby",
-            help="Show two appliances instead: the active one loses its power while the operator drives",
+            help="Show two appliances instead; the active one loses its power while the operator drives",
         ),
     ] = False,
 ) -> None:

@@ -59,7 +59,7 @@ class DoorState(msgspec.Struct, frozen=True, kw_only=True):
 class OwnDoor(msgspec.Struct, frozen=True, kw_only=True):
     """The door of the caller; a token's door has its name, a person's door the name of a group in `sso.doors`."""
 
-    name: Annotated[str, doc("its name, also if it does not exist; empty: the caller can have none")]
+    name: Annotated[str, doc("its name, even if it does not exist; empty: the caller can have none")]
     door: Annotated[DoorState | None, doc("null: there is none")]
     reason: Annotated[str, doc("why there is none, and what to do; empty: there is one")]
 

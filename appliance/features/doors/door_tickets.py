@@ -41,7 +41,7 @@ class DoorTickets:
         if not 1 <= seconds <= LONGEST_SECONDS:
             raise SenselessError("a ticket is valid for one second to 30 days: write 8h or 7d")
         if len(self.valid()) >= _MOST:
-            raise SenselessError(f"there are {_MOST} tickets, the limit: wait until some are over")
+            raise SenselessError(f"there are {_MOST} tickets, the limit: wait until some end")
         row, text = new_ticket(door, seconds, who)
         self._rows[row.id] = row
         self._ends.passed(row.id, row.expires)

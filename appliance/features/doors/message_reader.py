@@ -46,7 +46,9 @@ class _Cursor:
     def take(self, size: int) -> Body:
         end = self.position + size
         if end > len(self.data):
-            raise MessageValueError(f"{size} bytes at byte {self.position} of a message of {len(self.data)}")
+            raise MessageValueError(
+                f"cannot read {size} bytes at byte {self.position} of a message of {len(self.data)} bytes"
+            )
         piece = self.data[self.position : end]
         self.position = end
         return piece

@@ -94,7 +94,9 @@ class SegmentPusher:
         while upto > 0:
             head = msgspec.json.decode(self.collector.get(f"v1/logs/{log}?upto={upto}"), type=StoredHead)
             if head.number > upto:
-                raise ValueError(f"the collector answers with checkpoint {head.number}, asked up to {upto}")
+                raise ValueError(
+                    f"the collector answers with checkpoint {head.number}, later than the requested {upto}"
+                )
             if head.number < lowest:  # the log has no such checkpoint (any more)
                 position = PushPosition(log, head.number, self._kept_sequence(log, head.number))
                 break
@@ -140,7 +142,9 @@ class SegmentPusher:
         if log != position.log:
             self._position = None
             self.progress = msgspec.structs.replace(self.progress, sequence=0, checkpoint=0)
-            raise LogUnreadableError(f"{self.log}: another log than before; the collector is asked for it")
+            raise LogUnreadableError(
+                f"{self.log}: the log was replaced; the collector is asked for its position"
+            )
         number = next_segment(self.log, position.number)
         if number is not None and not self.collector.is_open:
             position = self._begin()
@@ -240,7 +244,7 @@ class SegmentPusher:
         )
 
     def _failed(self, error: Exception) -> float:
-        """Return a pause that grows, with jitter, so that robots do not return together."""
+        """Note the failure, and return a pause that grows, with jitter, so that robots do not return together."""
         self.collector.close()
         self._position = None
         reason = str(error) or type(error).__name__

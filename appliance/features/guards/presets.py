@@ -71,7 +71,7 @@ class Parameter:
             if not form.fullmatch(value):
                 raise GuardError(f"{self.name}={value}: write it like {self.name}='{self.default}'")
             if self.kind == "corners" and (fault := fault_of(_corners(value))):
-                raise GuardError(f"{self.name}={value}: {fault}; give the corners in the order of the edge")
+                raise GuardError(f"{self.name}={value}: {fault}; give the corners in order along the edge")
             return " ".join(value.split())
         if not (_WHOLE if self.kind == "int" else _DECIMAL).fullmatch(value):
             noun = "a whole number" if self.kind == "int" else "a number"

@@ -35,7 +35,9 @@ _Name = Annotated[
     str, typer.Argument(metavar="GUARD", autocompletion=completion.monitors, show_default=False)
 ]
 _Values = Annotated[list[str] | None, typer.Argument(metavar="PARAMETER=VALUE…", show_default=False)]
-_DryRun = Annotated[bool, typer.Option("--dry-run", help="Only say what would be loaded, changed and held")]
+_DryRun = Annotated[
+    bool, typer.Option("--dry-run", help="Only report what would be loaded, changed and held")
+]
 _Hold = Annotated[
     bool,
     typer.Option("--hold", help="Load even if monitors then hold topics with traffic until they are resumed"),
@@ -163,7 +165,7 @@ def set_values(
         bool,
         typer.Option(
             "--dry-run",
-            help="Only say what would be loaded, changed and held, and what it would have stopped, from the flight"
+            help="Only report what would be loaded, changed and held, and what it would have stopped, from the flight"
             " recorder",
         ),
     ] = False,

@@ -74,7 +74,7 @@ def grant(
     ] = None,
     tool: Annotated[
         bool,
-        typer.Option("--tool", help="Grant all that the denied stock tool needs, such as rostopic"),
+        typer.Option("--tool", help="Grant everything that the denied stock tool (such as rostopic) needs"),
     ] = False,
     load: Annotated[bool, typer.Option("--load", help="Bring the changed policy into force")] = False,
     confirm_within: ConfirmWithin = None,

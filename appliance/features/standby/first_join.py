@@ -59,8 +59,8 @@ def join_first(options: JoinOptions, *, as_json: bool) -> None:
     if earlier is not None and not options.again:
         raise refused(
             [
-                f"{_VERB}: this appliance is {earlier.name}, and the other one is {earlier.other}"
-                f" ({earlier.other_address}) already; --again makes new keys, and all machines are set up again"
+                f"{_VERB}: this appliance is already {earlier.name} of a pair with {earlier.other}"
+                f" ({earlier.other_address}); --again makes new keys, and all machines must be set up again"
             ]
         )
     plan = _plan(options, _settings(options))

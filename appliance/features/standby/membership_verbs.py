@@ -40,14 +40,14 @@ def join(
     witness: Annotated[str | None, typer.Option(help="Address of the robot's computer")] = None,
     fixed: Annotated[
         str | None,
-        typer.Option(help="Unused address of the robot's network, at which nodes reach the active appliance"),
+        typer.Option(help="Unused address in the robot's network, at which nodes reach the active appliance"),
     ] = None,
     name: Annotated[str, typer.Option(help="Name of this appliance")] = "a",
     other_name: Annotated[str, typer.Option(help="Name of the other appliance")] = "b",
     follower: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="NAME=ADDRESS", help="Further computer that uses the fixed address. Repeatable."
+            metavar="NAME=ADDRESS", help="Another computer that uses the fixed address. Repeatable."
         ),
     ] = None,
     ports: Annotated[

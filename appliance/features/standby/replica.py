@@ -102,7 +102,7 @@ class Replica:
             case SnapshotEnd(rows) if self._snapshot is not None:
                 if rows != self._rows:
                     raise ReplicationError(
-                        f"the snapshot has {counted(self._rows, 'row')}, and should have {rows}"
+                        f"the snapshot has {counted(self._rows, 'row')}, but should have {rows}"
                     )
                 begin = self._snapshot
                 self._commit(Stored(begin.epoch, begin.history, begin.number))

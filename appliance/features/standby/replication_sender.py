@@ -243,7 +243,7 @@ class ReplicationSender:
     def take(self, stored: Stored) -> None:
         if stored.number > self._sent:
             raise ReplicationError(
-                f"the standby acknowledged change {stored.number}, and was sent only {counted(self._sent, 'change')}"
+                f"the standby acknowledged change {stored.number}, but was sent only {counted(self._sent, 'change')}"
             )
         if stored.number < self._acknowledged:
             raise ReplicationError(

@@ -16,7 +16,7 @@ from appliance.ipsec.certificate_authority import CERTIFICATE_FILE, KEY_FILE
 
 
 class SealedAuthority(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """An authority's certificate (PEM), and its private key as PEM that a passphrase encrypts."""
+    """An authority's certificate, and its private key encrypted with a passphrase (both PEM)."""
 
     certificate: str
     key: str

@@ -75,8 +75,8 @@ def _join(membership: Membership, state: Path, *, again: bool) -> Path | None:
     if earlier is not None and not again:
         raise refused(
             [
-                f"{_VERB}: this appliance is {earlier.name} of {earlier.name} and {earlier.other} already; leave that"
-                " pair first (rosrv standby leave), or give --again"
+                f"{_VERB}: this appliance is already {earlier.name} of the pair {earlier.name} and {earlier.other};"
+                " leave that pair first (rosrv standby leave), or give --again"
             ]
         )
     backup = None

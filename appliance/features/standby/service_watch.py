@@ -47,8 +47,8 @@ class ServiceWatch:
         self._obstacle = obstacle
 
     def fault(self, now: float, *, active: bool, present: bool = True) -> str:
-        """Return why the lease is to be given away, or an empty string. `present` is whether control stands by or
-        serves.
+        """Note whether the lease is held (`active`), and whether control stands by or serves (`present`); return why
+        to give the lease away, or an empty string.
         """
         if active and not self._active:
             self._served, self._cold = now, not present

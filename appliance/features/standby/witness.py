@@ -526,7 +526,7 @@ class WitnessFollower:
         epoch: int,  # the greatest saved; no smaller one, of a witness restored from an old disk, is accepted
         save: Callable[[int], None],
         admit: Callable[[str], None],
-        clock: Callable[[], float],  # runs also while the computer sleeps
+        clock: Callable[[], float],  # runs even while the computer sleeps
     ) -> None:
         self.epoch = epoch
         self.refusal = ""
@@ -1293,7 +1293,7 @@ def main(arguments: List[str]) -> int:
         else:
             backend = chosen.backend or chosen_backend(platform.release(), shutil.which)
         if chosen.command == "remove":
-            remove_rules(backend)  # also if the settings are damaged
+            remove_rules(backend)  # even if the settings are damaged
             return 0
         settings = read_settings(chosen.settings)
         lease = LeaseFile(settings.state, tuple(sorted(settings.appliances)))

@@ -107,7 +107,7 @@ class LogForwarder:
         _first, head, log_id = _extent(self.log)
         if log_id != position.log or head < position.sequence:
             self._position = None
-            raise LogUnreadableError(f"{self.log}: another log than before; it is looked at afresh")
+            raise LogUnreadableError(f"{self.log}: the log was replaced; its position is determined again")
         entries = search(self.log, Filter(), str(position.sequence), _BATCH, newest_first=False).entries
         checkpoints = signed_checkpoints(self.log, position.checkpoint, _BATCH)
         missed = entries[0].sequence - position.sequence - 1 if entries else 0

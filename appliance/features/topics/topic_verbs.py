@@ -35,7 +35,7 @@ def _resolved(topic: str) -> str:
     try:
         return resolve(topic, "")
     except InvalidNameError as error:
-        raise usage_error(f"{error}; a topic's name is such as /cmd_vel", "rosrv topic") from None
+        raise usage_error(f"{error}; write it like /cmd_vel", "rosrv topic") from None
 
 
 _Topic = Annotated[

@@ -57,7 +57,9 @@ _Out = Annotated[
 ]
 _Open = Annotated[list[str] | None, typer.Option("--open", help="Services of the host to keep open: tcp/22")]
 _Ports = Annotated[str, typer.Option(help="The host's local port range, where ROS nodes listen")]
-_Within = Annotated[str, typer.Option(help="With --token: how long the token is valid: 30m, 1h, 7d")]
+_Within = Annotated[
+    str, typer.Option(help="With --token, how long the token is valid, such as 30m, 1h or 7d")
+]
 
 
 @speaks

@@ -31,7 +31,7 @@ _TOGETHER_BYTES = 256 << 10  # the most bytes of values in one request to the RO
 
 
 class ParameterWrite(NamedTuple):
-    """A write of a parameter. `value` None deletes it."""
+    """A write of a parameter; a `value` of None deletes it."""
 
     caller: Caller
     key: str

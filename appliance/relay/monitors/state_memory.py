@@ -187,7 +187,7 @@ def _read(view: memoryview, at: int, room: int, cells: int) -> tuple[bytes, byte
 
 def _part(view: memoryview, at: int, size: int) -> memoryview:
     if at + size > len(view):
-        raise ValueError("a state ends behind the memory")
+        raise ValueError("a state ends beyond the memory")
     return view[at : at + size]
 
 

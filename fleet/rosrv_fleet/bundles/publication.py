@@ -120,7 +120,7 @@ def _newest(metadata: Path, names: re.Pattern[str]) -> int:
 def _load(path: Path, kind: type[S]) -> Metadata[S]:
     document = Metadata.from_file(str(path))
     if not isinstance(document.signed, kind):
-        raise ValueError(f"{path.name} has other metadata than its name says")
+        raise ValueError(f"{path.name} contains metadata of another role or version")
     return document
 
 

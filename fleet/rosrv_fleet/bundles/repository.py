@@ -239,7 +239,7 @@ class BundleRepository:
             raise RepositoryError(f"{self.folder} is not a repository of bundles: rosrv-fleet bundle init")
         signed = Metadata.from_file(str(self.metadata / f"{version}.{role}.json")).signed
         if not isinstance(signed, kind):
-            raise RepositoryError(f"{version}.{role}.json has other metadata than its name says")
+            raise RepositoryError(f"{version}.{role}.json contains metadata of another role or version")
         return signed
 
     def _newest(self, role: str) -> int:

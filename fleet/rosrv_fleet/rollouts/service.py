@@ -187,7 +187,7 @@ class BundleService:
             raise RolloutRefusedError(fault)
         number = await asyncio.to_thread(self.store.begin, group, last, rollout, now)
         if number is None:
-            raise RolloutRefusedError(f"a rollout of {path.site}/{path.group} runs: stop it first")
+            raise RolloutRefusedError(f"a rollout of {path.site}/{path.group} is running: stop it first")
         await self.tick()
         return self.rollouts[group]
 

@@ -83,7 +83,7 @@ def test_a_checkpoint_claims_only_approved_removals(tmp_path: Path) -> None:
     desk = Desk(tmp_path, RetentionLimits(days=5))
     with pytest.raises(CheckpointRefusedError, match="only removal up to 0 was approved"):
         desk.sign(removed=_STEP)
-    with pytest.raises(CheckpointRefusedError, match="does not say how many records are removed"):
+    with pytest.raises(CheckpointRefusedError, match="does not state how many records are removed"):
         desk.sign(removed=None)
     desk.approve(3)
     with pytest.raises(CheckpointRefusedError, match="only removal up to 300 was approved"):

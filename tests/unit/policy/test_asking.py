@@ -71,7 +71,7 @@ def test_a_denial_goes_before_a_missing_approval() -> None:
     open_below = policy(TEXT.replace("secret = operator", "secret = * "), ("10.0.0.7", "write", "/arm"))
     assert decide(open_below, [below]).allowed, "an approval of a namespace covers what asks below it"
     plain = policy(open_below.text + "write /arm = agent-1\n", ("10.0.0.7", "write", "/arm"))
-    assert decide(plain, [below]).asks is not None, "it asks also while it is approved"
+    assert decide(plain, [below]).asks is not None, "it asks even while it is approved"
 
 
 def test_each_right_that_asks_needs_its_own_approval() -> None:

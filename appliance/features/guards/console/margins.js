@@ -15,7 +15,7 @@ export function constant(guard, name) {
   return typeof value === "number" ? value : null;
 }
 
-/** The positions of a fence's robot, the oldest first. @param {any} guard @param {Record<string, any[]>} seen */
+/** The positions of a fence's robot, oldest first. @param {any} guard @param {Record<string, any[]>} seen */
 export function trailOf(guard, seen) {
   const origin = { lat0: constant(guard, "lat0") ?? 0, lon0: constant(guard, "lon0") ?? 0 };
   return (seen[guard.topics.by] ?? []).map((one) => positionIn(one.fields, origin)).filter((one) => one !== null);

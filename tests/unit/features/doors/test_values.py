@@ -197,7 +197,7 @@ def test_invalid_utf_8_is_an_error_in_words() -> None:
     [
         ("int32 a", b"\0\0", "ends inside a field"),
         ("int32 a", b"\0\0\0\0\0", "a message of 5 bytes, of which its definition describes 4"),
-        ("string a", b"\xff\xff\xff\xffabc", "4294967295 bytes at byte 4 of a message of 7"),
+        ("string a", b"\xff\xff\xff\xffabc", "4294967295 bytes at byte 4 of a message of 7 bytes"),
         ("float64[] a", b"\xff\xff\xff\xff", "34359738360 bytes"),
         ("string[] a", struct.pack("<I", 3000) + bytes(12_000), "too many values"),
         ("std_msgs/Empty[] a", b"\xff\xff\xff\xff", "too many values"),

@@ -118,7 +118,7 @@ def test_an_active_appliance_that_lies_changes_nothing(
 @pytest.mark.parametrize(
     ("messages", "reason"),
     [
-        ([SnapshotRows([thing("a")]), SnapshotEnd(2)], "the snapshot has 1 row, and should have 2"),
+        ([SnapshotRows([thing("a")]), SnapshotEnd(2)], "the snapshot has 1 row, but should have 2"),
         ([SnapshotRows([thing("a")]), changes(thing("b"))], "Changes is out of order"),
         ([SnapshotRows([thing("a")]), BEGIN], "SnapshotBegin is out of order"),
         ([SnapshotRows([thing("a"), Put("thing", [("b",)])])], "a row of thing has 3 values"),

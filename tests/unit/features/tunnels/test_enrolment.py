@@ -287,7 +287,7 @@ async def test_a_revoked_host_leaves_the_policy_first(bench: Bench) -> None:
     assert bench.order == ["policy []", "expel 10.113.11.2"]
     assert body.taken_back == 3
     assert [row.serial for row in bench.store.hosts.revoked()] == [body.serial]
-    with pytest.raises(HostRefusedError, match="enrolled are: none"):
+    with pytest.raises(HostRefusedError, match="the enrolled hosts: none"):
         await bench.revoke("a")
 
 
@@ -617,7 +617,7 @@ async def test_scanned_ports_of_a_host_are_kept(bench: Bench) -> None:
     bench.machines = {"10.0.0.7": 3, "127.0.0.1": 1, "10.113.11.2": 2}
     assert (await bench.hosts.ports.tell(HostPorts("10.113.11.2", "open", [40001], 5.0), "eve")).name == "a"
     await bench.hosts.ports.tell(HostPorts("10.0.0.7", "closed", [], 6.0), "eve")
-    with pytest.raises(HostRefusedError, match="enrolled are: a"):
+    with pytest.raises(HostRefusedError, match="the enrolled hosts: a"):
         await bench.hosts.ports.tell(HostPorts("nobody", "open", [], 5.0), "eve")
     with pytest.raises(HostRefusedError, match="a day in the future"):
         await bench.hosts.ports.tell(HostPorts("a", "closed", [], 4e9), "eve")

@@ -10,7 +10,7 @@ const PAUSE = 500; // milliseconds between queries of a topic
 const MOST = 1200; // messages that are kept of a topic
 
 /**
- * `seen`: the messages of each topic, the oldest first; messages are missed before one that is the `first` of a query. `turn` begins and ends the query.
+ * `seen`: the messages of each topic, oldest first; messages are missed before one that is the `first` of a query. `turn` begins and ends the query.
  * @param {string[]} topics
  * @returns {{looking: boolean, turn: () => void, seen: Record<string, any[]>, error: unknown}}
  */

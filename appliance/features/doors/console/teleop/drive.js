@@ -41,7 +41,7 @@ export class Drive {
       if (refused) return; // of the commands behind the first refusal
       refused = true;
       this.stop();
-      this.#told(false, why); // also if the pad was released before
+      this.#told(false, why); // even if the pad was released before
     });
     this.#publish();
     this.#timers = [setInterval(() => this.#publish(), EVERY), setInterval(() => this.#probe(), PROBE)];
