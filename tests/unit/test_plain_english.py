@@ -56,6 +56,11 @@ HABITS = (
     Habit(r"\b[Ww]hoever\b", "any host that, anyone who", "Whoever reaches it may call."),
     Habit(r"(?:^|[.:;|]\s+)(?:Who|That of|Those of|Of)\s(?![^.]*\?)", "the noun", "Who asks is recorded."),
     Habit(r", too\b(?! \w+ly)", "also", "It is recorded, too."),
+    Habit(r"(?<!and )\balso (?:if|when|while|not)\b", "even if, not even", "It holds also if control dies."),
+    Habit(
+        r", the (?:oldest|newest|latest|most severe) first\b", "oldest first", "All doors, the oldest first."
+    ),
+    Habit(r"\btakes? long\b", "takes a long time", "A start may take long."),
     Habit(
         r"\b(?:nobody|everybody|anybody|somebody)\b",
         "the host, process or person",
