@@ -242,7 +242,7 @@ class RelayedTopic:
         """Pass messages `through` monitors from the next batch on (None: bypass them).
 
         With `wanted`, the topic stays connected even without a subscriber. `call` is for the pump. A topic that was
-        `guarded` once carries commands, also when the guard is off.
+        `guarded` once carries commands, even when the guard is off.
         """
         self._is_command |= guarded
         before, self._monitoring = self._monitoring, _Monitoring(through, call, wanted)
