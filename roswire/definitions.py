@@ -7,7 +7,7 @@ bounded work.
 import difflib
 import hashlib
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Self, TypeVar
 
 from roswire.errors import DefinitionError
@@ -15,7 +15,6 @@ from roswire.message_layout import LayoutBuilder, LayoutTooLargeError, MessageLa
 from roswire.message_text import (
     BUILTINS,
     PRIMITIVES,
-    Field,
     MessageDefinition,
     ServiceDefinition,
     parse_message,
@@ -45,6 +44,7 @@ class Definitions:
         for service in self._services.values():
             self._messages[service.request.name] = service.request
             self._messages[service.response.name] = service.response
+        self._depths: dict[str, int] = {}
         self._md5sums: dict[str, str] = {}
         self._layouts: dict[str, MessageLayout] = {}
 
@@ -103,14 +103,18 @@ class Definitions:
         return _lookup(name, self._services, "service")
 
     def md5sum(self, name: str) -> str:
-        return self._md5sum(name, ())
+        self._depth(name, ())
+        return self._md5sum(name)
 
     def service_md5sum(self, name: str) -> str:
         service = self.service(name)
-        return _fingerprint(self._md5_text(service.request, ()) + self._md5_text(service.response, ()))
+        parts = (service.request, service.response)
+        for part in parts:
+            self._depth(part.name, ())
+        return _fingerprint("".join(map(self._md5_text, parts)))
 
     def full_text(self, name: str) -> str:
-        self.md5sum(name)  # raises if a type is missing or contains itself
+        self._depth(name, ())
         order: dict[str, MessageDefinition] = {}
         waiting = [name]
         while waiting:
@@ -123,35 +127,56 @@ class Definitions:
         return "\n".join([own.text, *(f"{_RULE}\nMSG: {part.name}\n{part.text}" for part in parts)])
 
     def layout(self, name: str) -> MessageLayout:
-        return self._layout(name, ())
+        self._depth(name, ())
+        return self._layout(name)
 
-    # `outer` always lists the types that contain this type, outermost first.
+    def _depth(self, name: str, outer: tuple[str, ...]) -> int:
+        """Return how many levels a type has, at least 1. Raise `DefinitionError` if it cannot be used inside `outer`.
 
-    def _md5sum(self, name: str, outer: tuple[str, ...]) -> str:
+        `outer` lists the types that contain this type, outermost first. A type keeps its depth, which counts
+        wherever another type contains it, so the readers of a type may follow its nested types recursively.
+        """
+        if name in outer:
+            raise DefinitionError(" contains ".join([*outer[outer.index(name) :], name]), name)
+        if len(outer) + self._depths.get(name, 1) > MAX_DEPTH:
+            raise DefinitionError(f"messages nested deeper than {MAX_DEPTH}", outer[0] if outer else name)
+        if name not in self._depths:
+            message, inside = self.message(name), (*outer, name)
+            nested = [field for field in message.fields if field.type not in BUILTINS]
+            for field in nested:
+                if field.type not in self._messages:
+                    raise DefinitionError(
+                        f"field {field.name} has the type {field.type}, which is not defined", name
+                    )
+            self._depths[name] = 1 + max((self._depth(field.type, inside) for field in nested), default=0)
+        return self._depths[name]
+
+    # `_depth` has checked the types below.
+
+    def _md5sum(self, name: str) -> str:
         if name not in self._md5sums:
-            self._md5sums[name] = _fingerprint(self._md5_text(self.message(name), _inside(outer, name)))
+            self._md5sums[name] = _fingerprint(self._md5_text(self._messages[name]))
         return self._md5sums[name]
 
-    def _md5_text(self, message: MessageDefinition, outer: tuple[str, ...]) -> str:
+    def _md5_text(self, message: MessageDefinition) -> str:
         lines = [f"{constant.type} {constant.name}={constant.text}" for constant in message.constants]
         for field in message.fields:
-            nested = self._nested(message, field, outer, self._md5sum)
-            lines.append(f"{nested or field.notation} {field.name}")
+            kind = field.notation if field.type in BUILTINS else self._md5sum(field.type)
+            lines.append(f"{kind} {field.name}")
         return "\n".join(lines).strip()
 
-    def _layout(self, name: str, outer: tuple[str, ...]) -> MessageLayout:
+    def _layout(self, name: str) -> MessageLayout:
         if name not in self._layouts:
-            message = self.message(name)
             try:
-                self._layouts[name] = self._build_layout(message, _inside(outer, name))
+                self._layouts[name] = self._build_layout(self._messages[name])
             except LayoutTooLargeError as error:
                 raise DefinitionError(str(error), name) from None
         return self._layouts[name]
 
-    def _build_layout(self, message: MessageDefinition, outer: tuple[str, ...]) -> MessageLayout:
+    def _build_layout(self, message: MessageDefinition) -> MessageLayout:
         builder = LayoutBuilder()
         for field in message.fields:
-            nested = self._nested(message, field, outer, self._layout)
+            nested = None if field.type in BUILTINS else self._layout(field.type)
             if field.type in PRIMITIVES and (field.length is not None or not field.is_array):
                 builder.add_primitive(field.name, field.type, field.length)
             elif field.is_array:
@@ -161,29 +186,6 @@ class Definitions:
             else:
                 builder.add_string(field.name)
         return builder.finish()
-
-    def _nested(
-        self,
-        owner: MessageDefinition,
-        field: Field,
-        outer: tuple[str, ...],
-        ask: Callable[[str, tuple[str, ...]], _Answer],
-    ) -> _Answer | None:
-        if field.type in BUILTINS:
-            return None
-        if field.type not in self._messages:
-            raise DefinitionError(
-                f"field {field.name} has the type {field.type}, which is not defined", owner.name
-            )
-        return ask(field.type, outer)
-
-
-def _inside(outer: tuple[str, ...], name: str) -> tuple[str, ...]:
-    if name in outer:
-        raise DefinitionError(" contains ".join([*outer[outer.index(name) :], name]), name)
-    if len(outer) >= MAX_DEPTH:
-        raise DefinitionError(f"messages nested deeper than {MAX_DEPTH}", outer[0])
-    return (*outer, name)
 
 
 def _lookup(name: str, types: Mapping[str, _Answer], what: str) -> _Answer:

@@ -89,7 +89,6 @@ class _Reader:
         if kind == "string":
             return None
         if kind not in self._sizes:
-            self._sizes[kind] = None  # a type that contains itself has no size
             size: int | None = 0
             for field in self._definitions.message(kind).fields:
                 inner = self._size(field.type)
@@ -144,6 +143,7 @@ def _more(count: int) -> str:
 
 def read_fields(definitions: Definitions, name: str, data: bytes) -> dict[str, Any] | None:
     try:
+        definitions.md5sum(name)  # raises if a type is missing, contains itself, or is nested too deep
         return _Reader(definitions, data).message(name)
     except _CutError as cut:
         fields: dict[str, Any] = cut.value
@@ -178,5 +178,5 @@ def _definitions(kind: str, header: Mapping[str, str]) -> Definitions:
     if not text.strip() and header.get("md5sum") != _OF_NOTHING:
         raise DefinitionError("there is none", kind[:200])
     definitions = Definitions.from_full_text(kind, text)
-    definitions.md5sum(kind)  # raises if a type is missing or contains itself
+    definitions.md5sum(kind)  # raises if a type cannot be used
     return definitions

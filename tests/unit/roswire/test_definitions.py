@@ -96,6 +96,25 @@ def test_nesting_is_bounded() -> None:
     assert definitions.layout("a/T1").size == 1
 
 
+def test_nesting_is_bounded_across_types_that_are_known_already() -> None:
+    """The root names its deepest parts first, so each part is short when it is read."""
+    levels = 300
+    parts = {f"a/T{level}.msg": f"T{level + 1} x" for level in range(levels)} | {
+        f"a/T{levels}.msg": "string x"
+    }
+    root = "".join(f"T{level} f{level}\n" for level in [*range(levels - 40, 0, -40), 0])
+    definitions = Definitions.from_files(parts | {"a/Root.msg": root, "a/S.srv": f"{root}---\n{root}"})
+    for ask in (definitions.md5sum, definitions.layout, definitions.full_text):
+        with pytest.raises(DefinitionError, match="a/Root: messages nested deeper than 64"):
+            ask("a/Root")
+    with pytest.raises(DefinitionError, match="a/SRequest: messages nested deeper than 64"):
+        definitions.service_md5sum("a/S")
+    assert definitions.md5sum(f"a/T{levels - 63}")
+    for ask in (definitions.md5sum, definitions.layout, definitions.full_text):
+        with pytest.raises(DefinitionError, match=f"a/T{levels - 64}: messages nested deeper than 64"):
+            ask(f"a/T{levels - 64}")
+
+
 def test_layouts_do_not_explode() -> None:
     files = {f"a/T{level}.msg": f"T{level + 1} x\nT{level + 1} y" for level in range(40)} | {
         "a/T40.msg": "int8 x"

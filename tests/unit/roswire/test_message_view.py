@@ -1,6 +1,6 @@
 import struct
 
-from roswire.definitions import Definitions
+from roswire.definitions import MAX_DEPTH, Definitions
 from roswire.message_view import CUT, MOST_BYTES, MOST_CHARACTERS, MOST_ELEMENTS, read_fields
 
 DEFINITIONS = Definitions.from_files(
@@ -99,3 +99,20 @@ def test_large_counts_of_unknown_hosts_take_no_time() -> None:
     assert empty == {"values": [{}] * MOST_ELEMENTS + [f"{CUT} {2**32 - 1 - MOST_ELEMENTS} more"], "last": 7}
     many = read_fields(LONG, "a/Texts", struct.pack("<I", 100_000) + b"\0" * 400_001)
     assert many == {"values": [""] * MOST_ELEMENTS + [f"{CUT} {100_000 - MOST_ELEMENTS} more"], "last": CUT}
+
+
+def test_only_types_of_bounded_depth_are_read() -> None:
+    """A definition of an operator or a publisher does not decide how deep the reader recurses."""
+    levels = {f"a/T{level}.msg": f"T{level + 1}[2] x" for level in range(MAX_DEPTH)} | {
+        f"a/T{MAX_DEPTH}.msg": "uint8 x",
+        "a/Self.msg": "Self[] x",
+        "a/Strays.msg": "Missing[] x",
+    }
+    definitions = Definitions.from_files(levels)
+    fields = read_fields(definitions, "a/T1", bytes(4))
+    for _ in range(MAX_DEPTH - 1):
+        assert fields is not None
+        fields = fields["x"][0]
+    assert fields == {"x": 0}
+    for name in ("a/T0", "a/Self", "a/Strays"):
+        assert read_fields(definitions, name, bytes(4)) is None

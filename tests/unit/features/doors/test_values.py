@@ -15,7 +15,8 @@ from rosbags.typesys.store import Typestore
 from appliance.features.doors.cbor_frames import MOST_DEPTH, MOST_ITEMS, MOST_NUMBERS, json_of_cbor
 from appliance.features.doors.message_reader import MessageValueError
 from appliance.features.doors.values import MessageCodec, ValueLimits, cbor
-from roswire.definitions import Definitions
+from roswire.definitions import MAX_DEPTH, Definitions
+from roswire.errors import DefinitionError
 from roswire.message_text import Field
 from roswire.standard import standard_definitions
 
@@ -296,3 +297,20 @@ def test_numbers_of_typed_arrays_are_bounded() -> None:
     with pytest.raises(MessageValueError, match=f"more than {MOST_NUMBERS} numbers"):
         json_of_cbor(cbor2.dumps({"op": "publish", "msg": {"data": array}}))
     assert json_of_cbor(cbor2.dumps({"data": cbor2.CBORTag(64, bytes(MOST_NUMBERS + 1))}))
+
+
+def test_a_codec_serves_the_deepest_permitted_types() -> None:
+    """Deeper types cannot be used, however their definition orders them; so no publisher exhausts the stack."""
+    levels = 300
+    parts = {f"t/D{level}.msg": f"D{level + 1}[] x" for level in range(levels)} | {
+        f"t/D{levels}.msg": "uint8 x",
+        "t/Root.msg": "".join(f"D{level} f{level}\n" for level in [*range(levels - 40, 0, -40), 0]),
+    }
+    definitions = Definitions.from_files(parts)
+    with pytest.raises(DefinitionError, match="deeper than 64"):
+        MessageCodec(definitions, "t/Root", LIMITS)
+    deepest = MessageCodec(definitions, f"t/D{levels - MAX_DEPTH + 1}", LIMITS)
+    json = '{"x":[' * (MAX_DEPTH - 1) + '{"x":7}' + "]}" * (MAX_DEPTH - 1)
+    data = deepest.writer.from_json(json.encode(), NOW)
+    assert bytes(deepest.json(data)) == json.encode()
+    assert cbor2.loads(deepest.cbor(data)) == msgspec.json.decode(json)
