@@ -12,6 +12,9 @@ from roswire.message_text import PRIMITIVES
 MAX_ITEMS = 20_000
 """The limit of leaves, strings and arrays in a layout. Nested definitions can multiply exponentially."""
 
+MAX_CHARACTERS = 1 << 20
+"""The limit of characters in the paths of a layout and of the layouts in it, each of which copies the paths below."""
+
 MAX_SIZE = 1 << 32
 """The limit of bytes in a fixed part or a fixed array: a TCPROS message is never longer."""
 
@@ -77,16 +80,18 @@ class MessageLayout:
     """The layout of a message. `size` is None if it varies; `minimum` is the size of the shortest message.
 
     `places` finds items by path (`pose.position.x`). Elements of an array are in the layout of the array.
+    `characters` counts those of `MAX_CHARACTERS`.
     """
 
     parts: tuple[Part, ...]
     size: int | None
     minimum: int
     places: Mapping[str, FieldLocation] = field(repr=False, compare=False)
+    characters: int = field(default=0, repr=False, compare=False)
 
 
 class LayoutTooLargeError(Exception):
-    """The layout would have more items or bytes than the limits allow."""
+    """The layout would have more items, characters or bytes than the limits allow."""
 
 
 class LayoutBuilder:
@@ -97,6 +102,7 @@ class LayoutBuilder:
         self._leaves: list[FixedField] = []  # the leaves of the open fixed part
         self._offset = 0
         self._items = 0
+        self._characters = 0
 
     def add_primitive(self, path: str, type_name: str, count: int | None) -> None:
         """Add a scalar, or with `count` an array of fixed length."""
@@ -110,12 +116,14 @@ class LayoutBuilder:
         size = PRIMITIVES[type_name][1] if type_name in PRIMITIVES else None
         if layout is not None:
             size = layout.size
+            self._charge(layout.characters)
         if count is not None and size is not None:
             self._add_leaf(FixedField(path, type_name, self._offset, size * count, count, layout))
         else:
             self._add_part(ArrayPart(path, type_name, count, size, layout))
 
     def add_message(self, path: str, layout: MessageLayout) -> None:
+        self._charge(layout.characters)
         for part in layout.parts:
             if isinstance(part, FixedPart):
                 for leaf in part.leaves:
@@ -131,26 +139,35 @@ class LayoutBuilder:
                 places[item.path] = FieldLocation(index, item)
         minimum = sum(map(_minimum, self._parts))
         fixed = all(isinstance(part, FixedPart) for part in self._parts)
-        return MessageLayout(tuple(self._parts), minimum if fixed else None, minimum, places)
+        size = minimum if fixed else None
+        return MessageLayout(tuple(self._parts), size, minimum, places, self._characters)
 
     def _add_leaf(self, leaf: FixedField) -> None:
-        self._count()
+        self._count(leaf.path)
         self._leaves.append(leaf)
         self._offset += leaf.size
         if self._offset > MAX_SIZE:
             raise LayoutTooLargeError(f"more than {MAX_SIZE} bytes")
 
     def _add_part(self, part: StringPart | ArrayPart) -> None:
-        self._count()
+        self._count(part.path)
         self._close()
         self._parts.append(part)
         if _minimum(part) > MAX_SIZE:
             raise LayoutTooLargeError(f"more than {MAX_SIZE} bytes")
 
-    def _count(self) -> None:
+    def _count(self, path: str) -> None:
         self._items += 1
         if self._items > MAX_ITEMS:
             raise LayoutTooLargeError(f"more than {MAX_ITEMS} fields, those of nested messages included")
+        self._charge(len(path))
+
+    def _charge(self, characters: int) -> None:
+        self._characters += characters
+        if self._characters > MAX_CHARACTERS:
+            raise LayoutTooLargeError(
+                f"the names of its fields, with those of nested messages, have more than {MAX_CHARACTERS} characters"
+            )
 
     def _close(self) -> None:
         if self._leaves:

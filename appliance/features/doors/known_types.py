@@ -20,7 +20,7 @@ Form = TypeVar("Form", bound=Hashable)
 _FRAME_OVERHEAD = 500  # bytes that a shared frame takes besides its own and those of its message
 
 _MOST_CHARACTERS = 500_000
-"""The most characters of all kept definitions. A codec takes up to 140 bytes for each character of one."""
+"""The most characters of all kept definitions and layouts. A codec takes up to 140 bytes for each of its own."""
 
 
 @dataclass(eq=False, slots=True)  # a frozen one takes twice as long to make, for each message
@@ -141,7 +141,8 @@ class KnownTypes:
     def _keep(self, name: str, md5sum: str, definitions: Definitions) -> MessageCodec:
         codec = MessageCodec(definitions, name, self._limits)
         self._codecs[name, md5sum] = codec, definitions
-        self._sizes[name, md5sum] = len(definitions.full_text(name))
+        # A short definition can have a large layout.
+        self._sizes[name, md5sum] = len(definitions.full_text(name)) + definitions.layout(name).characters
         self._latest[name] = md5sum
         while sum(self._sizes.values()) > _MOST_CHARACTERS and len(self._codecs) > 1:
             (oldest, oldest_md5sum), _ = self._codecs.popitem(last=False)

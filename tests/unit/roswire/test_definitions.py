@@ -120,15 +120,35 @@ def test_layouts_do_not_explode() -> None:
         "a/T40.msg": "int8 x"
     }
     definitions = Definitions.from_files(files)
-    with pytest.raises(DefinitionError, match="more than 20000 fields"):
+    with pytest.raises(DefinitionError, match="more than 1048576 characters"):
         definitions.layout("a/T0")
     assert len(definitions.md5sum("a/T0")) == 32
+    part = "".join(f"int8 f{number}\n" for number in range(6_000))
+    wide = Definitions.from_files({"a/B.msg": "C a\nC b\nC c\nC d", "a/C.msg": part})
+    with pytest.raises(DefinitionError, match="more than 20000 fields"):
+        wide.layout("a/B")
     huge = Definitions.from_files(
         {"a/B.msg": "C[9999999999] c", "a/C.msg": "int64[999] x", "a/D.msg": "string[9999999999] s"}
     )
     for name in ("a/B", "a/D"):
         with pytest.raises(DefinitionError, match="more than 4294967296 bytes"):
             huge.layout(name)
+
+
+@pytest.mark.parametrize("brackets", ["", "[]", "[1]"])
+def test_layouts_do_not_copy_the_same_fields_at_each_level(brackets: str) -> None:
+    """A definition of 10 KB would make layouts of 600,000 fields, each with a path of a kilobyte."""
+    levels = 50
+    files = {f"a/T{level}.msg": f"T{level + 1} {'x' * 20}" for level in range(levels)} | {
+        f"a/T{levels}.msg": "".join(f"int8 f{number}\n" for number in range(2_000))
+    }
+    files |= {f"a/A{number}.msg": f"T{levels - 4} x" for number in range(100)}
+    files["a/Arrays.msg"] = "".join(f"A{number}{brackets} x{number}\n" for number in range(100))
+    definitions = Definitions.from_files(files)
+    for name in ("a/T0", "a/Arrays"):
+        with pytest.raises(DefinitionError, match="more than 1048576 characters"):
+            definitions.layout(name)
+    assert definitions.layout(f"a/T{levels - 4}").size == 2_000
 
 
 @given(

@@ -66,6 +66,16 @@ def test_many_large_definitions_are_forgotten_in_order(types: KnownTypes) -> Non
     assert types.learn(header("own/Large0", large)) is types.message("own/Large0")[0]
 
 
+def test_short_definitions_with_large_layouts_are_forgotten_in_order(types: KnownTypes) -> None:
+    parts = [f"Part{level} a\nPart{level} b" for level in range(1, 12)] + ["int8 x"]
+    text = "".join(f"\n{'=' * 80}\nMSG: own/Part{level}\n{part}" for level, part in enumerate(parts))
+    for number in range(3):
+        types.learn(header(f"own/Large{number}", f"Part0 a{text}"))
+    assert len(text) < 2_000 and types.message("own/Large2")
+    with pytest.raises(DefinitionError):
+        types.message("own/Large0")
+
+
 def test_the_operators_files_define_types_until_they_change(types: KnownTypes) -> None:
     types.learn(header("own/Heard", "int8 x"))
     with pytest.raises(DefinitionError, match="rosrv monitor reload"):
