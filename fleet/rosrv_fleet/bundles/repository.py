@@ -77,18 +77,19 @@ class BundleRepository:
     # --- commands ---
 
     def init(self) -> None:
-        if self.metadata.exists():
+        """Make the keys and the first metadata. The root comes last: without it, the folder is not a repository."""
+        if self._newest("root"):
             raise RepositoryError(f"{self.folder} has a repository: use it, or choose another folder")
-        self.metadata.mkdir(parents=True)
         root = Root(consistent_snapshot=True)
         for role in ("root", "targets", "snapshot"):
             root.add_key(self.keys.make(role), role)
+        self.metadata.mkdir(parents=True, exist_ok=True)
         root.add_key(make_online_key(self.folder / TIMESTAMP_KEY), "timestamp")
-        self._save_root(root, root)
         targets = Targets()
         targets.delegations = Delegations({}, {})
-        self._save("targets", targets)
-        self.snapshot()
+        self._save("targets", targets, root.roles["targets"].keyids)
+        self.snapshot(root.roles["snapshot"].keyids)
+        self._save_root(root, root)
 
     def delegate(self, site: str, group: str) -> None:
         role = role_of(site, group)
@@ -100,9 +101,12 @@ class BundleRepository:
         delegated = DelegatedRole(role, [], 1, terminating=True, paths=[f"{site}/{group}/*.tar"])
         assert top.delegations is not None and top.delegations.roles is not None  # noqa: S101  made by `init`
         top.delegations.roles[role] = delegated
-        top.add_key(self.keys.make(role), role)
+        key = self.keys.make(role)
+        top.add_key(key, role)
+        self._save(
+            role, Targets(), [key.keyid]
+        )  # before it is delegated, so that each delegated role has metadata
         self._save("targets", top)
-        self._save(role, Targets())
         self.snapshot()
 
     def add(
@@ -195,13 +199,13 @@ class BundleRepository:
 
     # --- signing ---
 
-    def snapshot(self) -> None:
+    def snapshot(self, keyids: Iterable[str] | None = None) -> None:
         try:
             snapshot = self._open("snapshot", Snapshot)
         except RepositoryError:
             snapshot = Snapshot()
         snapshot.meta = {f"{role}.json": MetaFile(self._newest(role)) for role in ("targets", *self.roles())}
-        self._save("snapshot", snapshot)
+        self._save("snapshot", snapshot, keyids)
 
     def _save_root(self, root: Root, before: Root) -> None:
         """Sign a root with its own keys and those of the root before it. Write `root.json` for new robots."""

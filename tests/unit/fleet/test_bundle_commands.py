@@ -1,10 +1,12 @@
 from pathlib import Path
 
 import pytest
+from rosrv_fleet.bundles import repository as repository_module
 from rosrv_fleet.bundles.commands import bundle
 from rosrv_fleet.bundles.publication import PublicationError, read_publication
 from typer.testing import CliRunner, Result
 
+from appliance.base.atomic_files import write_whole
 from tests.support.bundle_site import PASSPHRASE, POLICY
 from tests.support.unreadable_folders import make_unreadable
 
@@ -95,6 +97,49 @@ def test_mistakes_are_explained(desk: Desk, words: tuple[str, ...], reason: str)
     done = desk.run(*given)
     assert done.exit_code == 1
     assert reason in done.output
+
+
+def test_an_aborted_init_leaves_no_repository(tmp_path: Path) -> None:
+    desk = Desk(tmp_path)
+    short = tmp_path / "short"
+    short.write_text("short\n")
+    assert "at least 8 characters" in desk.run("init", secret=short).output
+    assert "not a repository of bundles: rosrv-fleet bundle init" in desk.run("list").output
+    desk.good("init")
+    assert "has a repository" in desk.run("init").output
+    desk.good("delegate", "site-a/arms")
+
+
+@pytest.mark.parametrize("writes", range(6))
+def test_a_killed_command_is_completed_by_the_next(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, writes: int
+) -> None:
+    """`init` or `delegate` ends after some files; then the same command, or the next, leads to a whole repository."""
+
+    def killed_after(files: int) -> None:
+        left = iter(range(files))
+
+        def write(path: Path, data: bytes, mode: int) -> None:
+            if next(left, None) is None:
+                raise OSError("killed")
+            write_whole(path, data, mode)
+
+        monkeypatch.setattr(repository_module, "write_whole", write)
+
+    desk = Desk(tmp_path)
+    for words in (("init",), ("delegate", "site-a/arms")):
+        killed_after(writes)
+        done = desk.run(*words)
+        monkeypatch.undo()
+        again = desk.run(*words)
+        assert (
+            again.exit_code == 0 or "has a repository" in again.output or "delegated already" in again.output
+        )
+        assert done.exit_code == 1 or again.exit_code == 1
+    desk.good("sign", "--root")
+    desk.good("add", "site-a/arms", str(desk.robot))
+    desk.good("publish", str(tmp_path / "served"))
+    assert list(read_publication(tmp_path / "served").bundles) == ["site-a/arms/1.tar"]
 
 
 def test_a_wrong_passphrase_signs_nothing(desk: Desk) -> None:
