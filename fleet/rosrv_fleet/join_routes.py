@@ -1,7 +1,7 @@
 """Enrol robots that send an invitation's token, the key of their log and their certificate.
 
 The certificate is self-signed, which proves that the sender has its private key. Every wrong token gets the same
-answer, and an address that sends many of them has to wait.
+answer, and an address (in IPv6 its /64 network) that sends many of them has to wait.
 """
 
 from collections import deque
@@ -14,6 +14,7 @@ from starlette.concurrency import run_in_threadpool
 from appliance.base import clock
 from appliance.formats.fleet_membership import JOIN_PATH, JoinRequest
 from rosrv_fleet.collector import Collector
+from rosrv_fleet.connections import owner_of
 from rosrv_fleet.enrolment import EnrolmentError, Robot, require_own_signature
 from rosrv_fleet.invitations import InvalidInvitationError, Invitations
 from rosrv_fleet.request_body import read_body
@@ -27,12 +28,12 @@ _log = structlog.get_logger()
 def join_router(collector: Collector) -> APIRouter:
     router = APIRouter()
     invitations = Invitations(collector.config.data / "invitations")
-    wrong = _WrongTokens()
+    wrong = WrongTokens()
 
     @router.post(JOIN_PATH)
     async def join(request: Request) -> Response:
         """Enrol the robot that the token names. No certificate or other token is needed."""
-        address = request.client.host if request.client else ""
+        address = request.client.host if request.client else "127.0.0.1"
         wrong.require_patience(address)
         body = await read_body(request, _LONGEST)
         try:
@@ -70,8 +71,8 @@ def _enrol(collector: Collector, invitations: Invitations, given: JoinRequest) -
         )
 
 
-class _WrongTokens:
-    """The wrong tokens of the last minute, by address."""
+class WrongTokens:
+    """The wrong tokens of the last minute, by address or /64 network."""
 
     def __init__(self) -> None:
         self._sent: deque[tuple[float, str]] = deque(maxlen=_MOST_WRONG)
@@ -80,8 +81,9 @@ class _WrongTokens:
         """Raise `HTTPException` (429) if this address must wait."""
         while self._sent and clock.now() - self._sent[0][0] > 60.0:
             self._sent.popleft()
-        if sum(sender == address for _time, sender in self._sent) >= _WRONG_PER_MINUTE:
+        owner = owner_of(address)
+        if sum(sender == owner for _time, sender in self._sent) >= _WRONG_PER_MINUTE:
             raise HTTPException(429, "too many wrong invitations were sent", {"Retry-After": "60"})
 
     def add(self, address: str) -> None:
-        self._sent.append((clock.now(), address))
+        self._sent.append((clock.now(), owner_of(address)))

@@ -204,9 +204,12 @@ class SegmentStore:
         return None if found is None else (arrived, _place(robot, found))
 
     def settle(self, place: SegmentPlace, header: SegmentHeader) -> None:
-        """Complete the work of `keep` that a killed collector left, except for `newest`."""
+        """Complete the work of `keep` that a killed collector left."""
         with self._lock(place.robot):
             self._settle(place, header)
+            newest = self.newest(place.robot)
+            if newest is None or newest[0] < self.received(place):
+                self._note_newest(place)
 
     def _settle(self, place: SegmentPlace, header: SegmentHeader) -> None:
         sync(self.path(place).parent)
