@@ -1,17 +1,20 @@
 """The path, commit and time of the checkout from which releases are built."""
 
 import json
-import subprocess
 from datetime import UTC, datetime
 from pathlib import Path
 
 from appliance import __version__
+from distribution.programs import run
 
 ROOT = Path(__file__).parents[1]
 
 
 def time_of_commit() -> int:
-    """Return the time of the newest commit in seconds since the epoch. All files of a build get this time."""
+    """Return the time of the newest commit in seconds since the epoch, which all files of a build get.
+
+    Raise `BuildError`, as `revision` does.
+    """
     return int(_git("log", "-1", "--format=%ct"))
 
 
@@ -31,4 +34,7 @@ def facts(kind: str, architecture: str, commit: str, moment: int, **more: str) -
 def _git(*arguments: str) -> str:
     # Root may build a checkout that belongs to another user.
     command = ["git", "-c", f"safe.directory={ROOT}", *arguments]
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout.strip()
+    failed = f"build in a clone of the repository, not in {ROOT}"
+    return run(
+        command, missing="sudo apt-get install git", failed=failed, cwd=ROOT, capture_output=True
+    ).strip()

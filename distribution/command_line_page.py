@@ -47,10 +47,7 @@ def _section(one: _Command, shared: set[tuple[str, str]]) -> str:
 
 
 def _table(options: list[tuple[str, str]]) -> str:
-    rows = (
-        f"| `{flags}` | {text.replace('|', chr(92) + '|')} |\n".replace("` |", "` |")
-        for flags, text in options
-    )
+    rows = (f"| `{flags}` | {text.replace('|', chr(92) + '|')} |\n" for flags, text in options)
     return "| option | effect |\n|---|---|\n" + "".join(rows)
 
 

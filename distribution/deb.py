@@ -22,6 +22,7 @@ from distribution.checkout import ROOT, facts, revision, time_of_commit
 from distribution.environment import ARCHITECTURES, INTERPRETERS, Architecture, make_environment
 from distribution.extension import IN_PLACE, ExtensionError
 from distribution.man import write_pages
+from distribution.programs import BuildError, run
 
 HERE = ROOT / "distribution"
 VERSION = __version__.replace(".dev", "~dev")  # dpkg sorts 0.3.0~dev0 before 0.3.0
@@ -48,7 +49,10 @@ main()
 
 
 def build(architecture: Architecture, *, moment: int) -> Path:
-    """Build the package. All its files get the time `moment` (seconds since the epoch)."""
+    """Build the package, or raise `BuildError` or `ExtensionError`.
+
+    All its files get the time `moment` (seconds since the epoch).
+    """
     work = ROOT / "build/package" / architecture.debian
     shutil.rmtree(work, ignore_errors=True)
     source = work / "source"
@@ -58,16 +62,18 @@ def build(architecture: Architecture, *, moment: int) -> Path:
     for path in source.rglob("*"):  # dpkg lowers later times, but keeps earlier times
         os.utime(path, (moment, moment), follow_symlinks=False)
     environment = {"SOURCE_DATE_EPOCH": str(moment), "DEB_BUILD_OPTIONS": "nocheck", "LC_ALL": "C.UTF-8"}
-    subprocess.run(
-        # Nothing is compiled, so nothing of the other architecture is needed (-d).
-        ["dpkg-buildpackage", "--build=binary", "-us", "-uc", "-d", f"--host-arch={architecture.debian}"],
-        cwd=source,
-        env=os.environ | environment,
-        stdin=subprocess.DEVNULL,
-        stdout=(work / "build.log").open("wb"),
-        stderr=subprocess.STDOUT,
-        check=True,
-    )
+    log = work / "build.log"
+    with log.open("wb") as output:
+        run(
+            # Nothing is compiled, so nothing of the other architecture is needed (-d).
+            ["dpkg-buildpackage", "--build=binary", "-us", "-uc", "-d", f"--host-arch={architecture.debian}"],
+            missing=f"sudo apt-get install {_TOOLS['dpkg-buildpackage']}",
+            failed=f"the reason is in {log.relative_to(ROOT)}",
+            cwd=source,
+            env=os.environ | environment,
+            stdout=output,
+            stderr=subprocess.STDOUT,
+        )
     made = work / f"rosrv_{VERSION}_{architecture.debian}.deb"
     dist = ROOT / "dist" / made.name
     dist.parent.mkdir(exist_ok=True)
@@ -114,14 +120,14 @@ def _gather(source: Path, architecture: Architecture, work: Path, moment: int) -
     write_pages(root / "usr/share/man/man1", " ".join(date.split()[1:4]))
     _documentation(root / "usr/share/doc/rosrv")
     for shell, place in COMPLETIONS.items():
-        shown = subprocess.run(
-            [ROOT / ".venv/bin/rosrv"],
+        shown = run(
+            [str(ROOT / ".venv/bin/rosrv")],
+            missing="scripts/setup",
             env=os.environ | {"_ROSRV_COMPLETE": f"source_{shell}"},
-            capture_output=True,
-            check=True,
+            stdout=subprocess.PIPE,
         )
         (root / place).parent.mkdir(parents=True)
-        (root / place).write_bytes(shown.stdout)
+        (root / place).write_text(shown)
 
 
 def _make_virtual(library: Path) -> None:
@@ -184,17 +190,17 @@ def main(arguments: list[str]) -> int:
         return 1
     if "DEBEMAIL" not in os.environ:
         sys.stderr.write(f"package: DEBEMAIL is not set: the maintainer's address is {_NO_ADDRESS}\n")
-    moment = time_of_commit()
-    for name in arguments:
-        sys.stderr.write(
-            f"package: building for {name}; dpkg's output is in build/package/{name}/build.log\n"
-        )
-        try:
+    try:
+        moment = time_of_commit()
+        for name in arguments:
+            sys.stderr.write(
+                f"package: building for {name}; dpkg's output is in build/package/{name}/build.log\n"
+            )
             made = build(ARCHITECTURES[name], moment=moment)
-        except ExtensionError as error:
-            sys.stderr.write(f"package: {error}\n")
-            return 1
-        sys.stdout.write(f"{made.relative_to(ROOT)}  {made.stat().st_size >> 20} MB\n")
+            sys.stdout.write(f"{made.relative_to(ROOT)}  {made.stat().st_size >> 20} MB\n")
+    except (BuildError, ExtensionError, OSError) as error:
+        sys.stderr.write(f"package: {error}\n")
+        return 1
     return 0
 
 

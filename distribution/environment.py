@@ -12,11 +12,11 @@ import filecmp
 import os
 import re
 import shutil
-import subprocess
 from dataclasses import dataclass
 from pathlib import Path
 
 from distribution.checkout import ROOT
+from distribution.programs import BuildError, run
 
 UV = ROOT / ".venv/bin/uv"
 PIP = ROOT / ".venv/bin/pip"
@@ -44,7 +44,7 @@ ARCHITECTURES = {
 
 
 def make_environment(target: Path, architecture: Architecture, work: Path) -> None:
-    """Make the environment in the new folder `target`. Raise `subprocess.CalledProcessError` or `ValueError`."""
+    """Make the environment in the new folder `target`. Raise `BuildError`."""
     wheels, source = _split_lock((ROOT / "requirements.lock").read_text(), work)
     trees = [target / f"lib/python{version}/site-packages" for version in INTERPRETERS]
     for version, tree in zip(INTERPRETERS, trees, strict=True):
@@ -63,7 +63,7 @@ def _split_lock(lock: str, work: Path) -> tuple[Path, Path]:
     entries = re.split(r"\n(?=\S)", lock)
     own = [entry for entry in entries if entry.startswith(f"{_SOURCE_ONLY}==")]
     if len(own) != 1:
-        raise ValueError(f"requirements.lock has {len(own)} entries of {_SOURCE_ONLY}, not one")
+        raise BuildError(f"requirements.lock has {len(own)} entries of {_SOURCE_ONLY}, not one")
     wheels, source = work / "wheels.lock", work / "source.lock"
     wheels.write_text("\n".join(entry for entry in entries if entry not in own) + "\n")
     source.write_text(own[0] + "\n")
@@ -161,4 +161,4 @@ def _same(one: Path, other: Path) -> bool:
 
 
 def _run(*command: str, environment: dict[str, str] | None = None) -> None:
-    subprocess.run(command, check=True, env=os.environ | (environment or {}), stdin=subprocess.DEVNULL)
+    run(command, missing="scripts/setup --package", env=os.environ | (environment or {}))

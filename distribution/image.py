@@ -22,6 +22,7 @@ from typing import IO, Any
 
 from appliance import __version__
 from distribution.checkout import ROOT, facts, revision, time_of_commit
+from distribution.programs import BuildError, run
 from distribution.sbom import ImageFiles, make_sbom
 
 NAME = f"rosrv/appliance:{__version__}"
@@ -48,7 +49,7 @@ class Blob:
 def build(options: list[str], *, moment: int) -> tuple[Path, Path]:
     """Return the paths of the image and its list of parts. No time in them is later than `moment` (seconds).
 
-    Raise `subprocess.CalledProcessError`.
+    Raise `BuildError`.
     """
     # Without a cache, because older parts would keep their own times.
     pins = " ".join(line for line in LOCK.read_text().splitlines() if not line.startswith("#"))
@@ -66,7 +67,10 @@ def build(options: list[str], *, moment: int) -> tuple[Path, Path]:
 
 
 def lock(base: str, build_options: list[str]) -> None:
-    """Write the packages that the image has in addition to those of its base image to the lock file."""
+    """Write the packages that the image has in addition to those of its base image to the lock file.
+
+    Raise `BuildError`.
+    """
     options = ["--quiet", "--target", "appliance", str(ROOT)]
     listed = "dpkg-query --show --showformat '${Package}=${Version}\\n'"
     before, after = (
@@ -83,6 +87,7 @@ def _rewrite(saved: Path, work: Path, moment: int) -> tuple[Path, Path]:
         config = json.loads(_opened(archive, entry["Config"]).read())
         layers = []
         for number, name in enumerate(entry["Layers"]):
+            tree.begin_layer()
             with _opened(archive, name) as layer, tarfile.open(fileobj=layer) as members:
                 layers.append(_layer(work / f"layer{number}", _kept(members, tree, moment)))
     architecture = config["architecture"]
@@ -218,21 +223,15 @@ def _opened(archive: tarfile.TarFile, name: str) -> IO[bytes]:
 
 
 def _docker(*arguments: str) -> str:
-    done = subprocess.run(
-        ["docker", *arguments], stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True, check=True
-    )
-    return done.stdout
+    return run(["docker", *arguments], missing="sudo apt-get install docker.io", stdout=subprocess.PIPE)
 
 
 def attempt(options: list[str]) -> tuple[Path, ...]:
     """Build the image and print its files, or print the error and return an empty tuple."""
     try:
         made = build(options, moment=time_of_commit())
-    except FileNotFoundError:
-        sys.stderr.write("image: there is no docker: sudo apt-get install docker.io\n")
-        return ()
-    except subprocess.CalledProcessError as error:
-        sys.stderr.write(f"image: docker {error.cmd[1]} ended with status {error.returncode}\n")
+    except (BuildError, OSError) as error:
+        sys.stderr.write(f"image: {error}\n")
         return ()
     for path in made:
         sys.stdout.write(f"{path.relative_to(ROOT)}\n")
@@ -240,10 +239,17 @@ def attempt(options: list[str]) -> tuple[Path, ...]:
 
 
 def main(arguments: list[str]) -> int:
-    if arguments[:1] == ["lock"]:
+    if arguments[:1] != ["lock"]:
+        return 0 if attempt(arguments) else 1
+    if len(arguments) < 2 or arguments[1].startswith("-"):
+        sys.stderr.write("image: name the base image: python -m distribution.image lock BASE [OPTIONS …]\n")
+        return 2
+    try:
         lock(arguments[1], arguments[2:])
-        return 0
-    return 0 if attempt(arguments) else 1
+    except (BuildError, OSError) as error:
+        sys.stderr.write(f"image: {error}\n")
+        return 1
+    return 0
 
 
 if __name__ == "__main__":

@@ -15,12 +15,15 @@ import sys
 from datetime import UTC, datetime
 from pathlib import Path
 
+from cryptography.exceptions import UnsupportedAlgorithm
 from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.hazmat.primitives.asymmetric.types import PrivateKeyTypes
 from cryptography.hazmat.primitives.hashes import SHA256
 from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
 from appliance import __version__
 from distribution.checkout import ROOT, revision, time_of_commit
+from distribution.programs import BuildError
 
 _OWN = ("provenance.json", "SHA256SUMS", "SHA256SUMS.sig")
 _MATERIALS = (
@@ -34,8 +37,8 @@ _MATERIALS = (
 
 
 def release(folder: Path, key: Path) -> None:
-    """Sign the files in a folder. Raise `ValueError` for an unsuitable key or an empty folder."""
-    private = load_pem_private_key(key.read_bytes(), password=None)
+    """Sign the files in a folder. Raise `BuildError`, or `ValueError` for an unsuitable key or an empty folder."""
+    private = _private_key(key)
     if not isinstance(private, ec.EllipticCurvePrivateKey) or private.curve.name != "secp256r1":
         raise ValueError(f"{key} is not a private key on the curve P-256")
     files = {
@@ -53,6 +56,19 @@ def release(folder: Path, key: Path) -> None:
     (folder / "SHA256SUMS").write_text(sums)
     signature = private.sign(sums.encode(), ec.ECDSA(SHA256()))
     (folder / "SHA256SUMS.sig").write_text(base64.b64encode(signature).decode() + "\n")
+
+
+def _private_key(file: Path) -> PrivateKeyTypes:
+    try:
+        return load_pem_private_key(file.read_bytes(), password=None)
+    except TypeError as error:
+        raise ValueError(
+            f"{file} is encrypted: give a key without a passphrase (openssl pkey -in {file} -out FILE)"
+        ) from error
+    except (ValueError, UnsupportedAlgorithm) as error:
+        raise ValueError(
+            f"{file} is not a private key (openssl ecparam -name prime256v1 -genkey -noout -out FILE makes one)"
+        ) from error
 
 
 def _digest(path: Path) -> str:
@@ -86,7 +102,7 @@ def main(arguments: list[str]) -> int:
         return 2
     try:
         release(ROOT / "dist", Path(arguments[0]))
-    except (OSError, ValueError) as error:
+    except (BuildError, OSError, ValueError) as error:
         sys.stderr.write(f"release: {error}\n")
         return 1
     return 0

@@ -23,6 +23,8 @@ SYSTEM = "debian-12"
 _PYTHON = "opt/rosrv/lib/python3*/site-packages/"
 _DPKG = "var/lib/dpkg/status"
 _MANIFEST = f"{_PYTHON}appliance/api/console/vendor/manifest.json"
+_WHITEOUT = ".wh."
+_OPAQUE = f"{_WHITEOUT}{_WHITEOUT}.opq"
 _READ = (_DPKG, "usr/share/doc/*/copyright", f"{_PYTHON}*.dist-info/METADATA", _MANIFEST)
 
 
@@ -32,6 +34,10 @@ class ImageFiles:
     def __init__(self) -> None:
         self.texts: dict[str, str] = {}
         self._links: dict[str, str] = {}
+        self._own: set[str] = set()  # the names in this layer, to which its whiteouts do not apply
+
+    def begin_layer(self) -> None:
+        self._own.clear()
 
     def wants(self, name: str) -> bool:
         """Return whether `add` needs the content of this file."""
@@ -42,15 +48,22 @@ class ImageFiles:
         """Add an entry of a layer. `link` is the target of a symbolic link."""
         name = name.removeprefix("./")
         folder, _, last = name.rpartition("/")
-        if last.startswith(".wh."):
-            gone = f"{folder}/{last.removeprefix('.wh.')}"
-            self.texts = {
-                path: text for path, text in self.texts.items() if not f"{path}/".startswith(f"{gone}/")
-            }
+        self._own.add(name)
+        if last == _OPAQUE:
+            self._remove(folder)
+        elif last.startswith(_WHITEOUT):
+            self._remove(posixpath.join(folder, last.removeprefix(_WHITEOUT)))
         elif self.wants(name) and data:
             self.texts[name] = data.decode(errors="replace")
         elif link:
             self._links[name] = posixpath.normpath(posixpath.join(folder, link))
+
+    def _remove(self, gone: str) -> None:
+        """Remove a file or folder of earlier layers; "" is the root."""
+        for entries in (self.texts, self._links):
+            for path in [path for path in entries if f"{path}/".startswith(f"{gone}/" if gone else "")]:
+                if path not in self._own:
+                    del entries[path]
 
     def copyright(self, package: str) -> str:
         """Return the copyright file of a Debian package, or ""."""
