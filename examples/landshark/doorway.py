@@ -24,6 +24,7 @@ class Doorway:
         self._free = threading.Semaphore(CONNECTIONS)
         self._lock = threading.Lock()
         self._open: set[socket.socket] = set()
+        self._closed = False
         self._listener = socket.create_server(("127.0.0.1", 0))
         self.port: int = self._listener.getsockname()[1]
         self._thread = threading.Thread(target=self._serve, name="doorway", daemon=True)
@@ -33,7 +34,9 @@ class Doorway:
         with contextlib.suppress(OSError):
             self._listener.shutdown(socket.SHUT_RDWR)  # wakes `accept`
         self._listener.close()
+        self._free.release()  # wakes `_serve` if all connections are in use
         with self._lock:
+            self._closed = True
             for end in self._open:
                 with contextlib.suppress(OSError):
                     end.shutdown(socket.SHUT_RDWR)
@@ -62,6 +65,8 @@ class Doorway:
 
     def _both_ways(self, near: socket.socket, far: socket.socket) -> None:
         with self._lock:
+            if self._closed:
+                return
             self._open |= {near, far}
         try:
             back = threading.Thread(target=_pass_on, args=(far, near), name="doorway back", daemon=True)

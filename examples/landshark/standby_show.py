@@ -24,7 +24,6 @@ from examples.landshark.stage import APPLIANCE, OPERATOR, ROBOT, START_SECONDS, 
 OTHER, FIXED = "10.77.0.3", "10.77.0.100"
 LONGEST = 10.0  # seconds without the robot's odometry, on a machine that does much else
 _SEARCH_SECONDS = 30.0
-_PAUSE_SECONDS = 0.2
 
 
 class StandbyStage(Stage):
@@ -77,6 +76,7 @@ class StandbyStage(Stage):
         return found
 
     def until(self, state: Path, **wanted: object) -> None:
+        """Wait for this status; each query starts a process, so the loop needs no pause."""
         end = time.monotonic() + _SEARCH_SECONDS
         while time.monotonic() < end:
             seen = self.standby(state)

@@ -1,6 +1,7 @@
 import socket
 import threading
 from collections.abc import Iterator
+from typing import cast
 
 import pytest
 
@@ -70,6 +71,38 @@ def test_no_listener_behind_it(host: Host) -> None:
         for _ in range(CONNECTIONS + 1):  # none of them keeps its slot
             with socket.create_connection(("127.0.0.1", door.port), LIMIT) as client:
                 assert client.recv(1) == b""
+
+
+def test_closing_ends_as_many_connections_as_are_permitted(host: Host, echo: tuple[str, int]) -> None:
+    clients = []
+    with Doorway(host, echo) as door:
+        for _ in range(CONNECTIONS):
+            clients.append(socket.create_connection(("127.0.0.1", door.port), LIMIT))
+            clients[-1].sendall(b"hello")
+            assert clients[-1].recv(5) == b"hello"
+    for client in clients:
+        with client:
+            assert client.recv(1) == b""
+    assert "doorway" not in {thread.name for thread in threading.enumerate()}
+
+
+def test_a_doorway_at_its_limit_closes_while_the_target_does_not_answer() -> None:
+    """No connection to the target ends, and closing does not wait for one."""
+    silence, waiting = threading.Event(), threading.Semaphore(0)
+
+    class SilentHost:
+        def run(self, _connect: object) -> socket.socket:
+            waiting.release()
+            silence.wait(LIMIT)
+            raise OSError("no answer")
+
+    with Doorway(cast(Host, SilentHost()), ("192.0.2.1", 1)) as door:
+        clients = [socket.create_connection(("127.0.0.1", door.port), LIMIT) for _ in range(CONNECTIONS)]
+        assert all(waiting.acquire(timeout=LIMIT) for _ in clients)
+    assert "doorway" not in {thread.name for thread in threading.enumerate()}
+    silence.set()
+    for client in clients:
+        client.close()
 
 
 def test_closing_ends_open_connections(host: Host, echo: tuple[str, int]) -> None:
