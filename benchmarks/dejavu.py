@@ -3,7 +3,8 @@
 CHECKOUT is DejaVu's repository (github.com/havelund/dejavu). Its tests state the events of each trace at which a
 property fails; some of the traces are from the CRV benchmark challenge of 2018. The specifications here must report
 the same events; otherwise the exit status is 1. The time of an event is that of all specifications together, in
-microseconds of processor time. A trace that is not in the checkout is reported and skipped.
+microseconds of processor time. A trace that is not in the checkout is reported and skipped; without any, the exit
+status is 2.
 
 DejaVu quantifies over all values, whereas a slice has one binding. So a formula over two parameters that is a
 conjunction of formulas over one is split into two specifications here (otherwise each user with each file would be a
@@ -124,7 +125,7 @@ def failing(specifications: Sequence[str], trace: Sequence[tuple[str, bytes]]) -
 
 
 def main(checkout: Path) -> int:
-    wrong = 0
+    wrong = compared = 0
     for case in CASES:
         path = checkout / TESTS / case.trace
         if not path.is_file():
@@ -133,13 +134,17 @@ def main(checkout: Path) -> int:
         trace = messages(path)
         found, cost = failing(case.specifications, trace)
         same = found == list(case.fails)
+        compared += 1
         wrong += not same
         said = "as DejaVu" if same else f"DejaVu says {list(case.fails)}"
         print(f"{case.trace}: {len(trace)} events, fails at {found}: {said}; {cost:.1f} µs an event")
+    if not compared:
+        print(f"{checkout} has no trace in {TESTS}: give a clone of DejaVu's repository", file=sys.stderr)
+        return 2
     return int(wrong > 0)
 
 
 if __name__ == "__main__":
     if len(sys.argv) == 2:
         sys.exit(main(Path(sys.argv[1])))
-    print(f"Nothing is compared without a checkout.\n\n{__doc__}")
+    sys.exit(f"Nothing is compared without a checkout.\n\n{__doc__}")

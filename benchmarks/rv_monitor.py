@@ -4,9 +4,9 @@ CHECKOUT is RV-Monitor's repository (github.com/runtimeverification/rv-monitor),
 (Debian's package `javacc`: /usr/share/java/javacc.jar); `javac` and `java` are on the path. Its plugins, compiled
 without the parts that read and write XML, make automata of random expressions and formulas, some with `(*)`, `<*>`
 and `S` about the past. On random traces, both sides must report `match` and `violation` at the same events; otherwise
-the exit status is 1. RV-Monitor may report `fail` and `violation` later, because it does not always detect that no
-continuation matches. Where it is later for an `ltl` formula, the definition must give `violation` at the earlier
-event.
+the exit status is 1. It is 2 if there is no automaton of a logic. RV-Monitor may report `fail` and `violation` later,
+because it does not always detect that no continuation matches. Where it is later for an `ltl` formula, the definition
+must give `violation` at the earlier event.
 """
 
 import argparse
@@ -162,6 +162,12 @@ def main(arguments: list[str]) -> int:
     random, counts, wrong = seeded(options.seed), Counter[str](), 0
     formulas = list(drawn(random, options.formulas))
     made = automata(options.checkout, options.javacc, formulas)
+    for logic in ("ere", "ltl"):
+        if not any(automaton for one, automaton in zip(formulas, made, strict=True) if one.logic == logic):
+            sys.stderr.write(
+                f"RV-Monitor makes no automaton of any {logic} formula: is {options.checkout} its repository?\n"
+            )
+            return 2
     for one, automaton in zip(formulas, made, strict=True):
         counts[
             f"{one.logic}: {'formulas' if automaton else 'formulas of which RV-Monitor makes nothing'}"
