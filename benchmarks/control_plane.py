@@ -177,7 +177,7 @@ def await_port(port: int) -> None:
         with suppress(OSError), socket.create_connection(("127.0.0.1", port), timeout=1):
             return
         select.select([], [], [], 0.05)
-    raise TimeoutError(f"nobody listens on port {port}")
+    raise TimeoutError(f"no process listens on port {port}")
 
 
 def processor_seconds(pids: list[int]) -> float:

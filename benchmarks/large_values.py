@@ -71,7 +71,9 @@ def _call(method: str, *params: Any) -> bytes:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="What one host's large parameters cost the others")
+    parser = argparse.ArgumentParser(
+        description="Measure the delay that one host's large parameters cause for the others"
+    )
     parser.add_argument("--seconds", type=float, default=4.0, help="of each measurement")
     seconds = parser.parse_args().seconds
     table = Table("master", "a guest sets", "p50 ms", "p99 ms", "longest ms", "sets")

@@ -215,7 +215,7 @@ def main() -> None:
     )
     given = parser.parse_args()
     if given.snapshot is not None and not os.access(given.snapshot, os.X_OK):
-        parser.error(f"{given.snapshot} is no program")
+        parser.error(f"{given.snapshot} is not a program")
     subprocess.run([str(ROOT / "scripts" / "build-roscpp"), str(_SOURCE), str(_PROGRAM)], check=True)
     snapshot = ["snapshot"] if given.snapshot is not None else []
     for title, load in LOADS.items():

@@ -302,7 +302,7 @@ class Policy:
             reason = f"{may_not}: no line of {place_of(group.rule)} lets it take, override or ask"
             return Decision(False, group.rule, reason)
         holder = self.holder(group)
-        now = "" if self.holders is None else f"; now {holder or 'nobody'} holds it"
+        now = "" if self.holders is None else f"; now {holder or 'no host'} holds it"
         if request.category is Category.CALL and not self.may_command(request.resource, request.host):
             told = f"{may_not} while it does not hold {group.name}: rosrv drive take {group.name}"
             return Decision(False, group.rule, told + now, told=told)

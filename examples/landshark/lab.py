@@ -75,7 +75,7 @@ class Lab:
 
     def __init__(self, prefix: str) -> None:
         if not re.fullmatch(r"[a-z][a-z0-9-]{0,31}", prefix):
-            raise ValueError(f"{prefix!r} is no lab prefix: small letters, digits and - only")
+            raise ValueError(f"{prefix!r} is not a lab prefix: use small letters, digits and -")
         self.prefix = prefix
         self._mark = f"{prefix}.{os.getpid()}.{next(self._numbers)}"
         self.switch = Namespace(f"{self._mark}.switch")

@@ -410,7 +410,9 @@ def shown_habits(source: Source) -> Iterator[tuple[int, str]]:
             case ast.Constant(value=str(text)) if id(node) not in parts:
                 pass
             case ast.JoinedStr(values=values):
-                text = "".join(str(part.value) if isinstance(part, ast.Constant) else "X" for part in values)
+                text = "".join(
+                    str(part.value) if isinstance(part, ast.Constant) else _word(part) for part in values
+                )
             case _:
                 continue
         if text.count(" ") > 1 and not text.startswith("ROSMaster port "):  # the original ROSRV printed it so
@@ -438,6 +440,12 @@ def miscounted(source: Source) -> Iterator[tuple[int, str]]:
                 case ast.FormattedValue(value=value), ast.Constant(value=str(text)):
                     if MISCOUNTED.match(text) and not LIMIT.search(ast.unparse(value)):
                         yield node.lineno, f"{{{ast.unparse(value)}}}{text[:30]}"
+
+
+def _word(replaced: ast.expr) -> str:
+    """Return a word that replaces a field of an f-string, such as `nothing` of `{found or 'nothing'}`."""
+    words = (node.value for node in ast.walk(replaced) if isinstance(node, ast.Constant))
+    return next((word for word in words if isinstance(word, str) and word.isalpha()), "X")
 
 
 def foreign_imports(source: Source) -> Iterator[tuple[int, str]]:
@@ -498,8 +506,9 @@ RULES = {
     "messages": Rule(("appliance/",), printed, quoted),
     "English": Rule(FOLDERS, habits, forbid("plain English")),
     "English that is shown": Rule(
-        (*WITH_FLEET, "distribution/"), shown_habits, forbid("plain English"),
-        ["raise ValueError(f'{name} is no group of hosts')"], ["raise ValueError(f'{name} is not a group')"],
+        (*WITH_FLEET, "distribution/", "examples/", "benchmarks/"), shown_habits, forbid("plain English"),
+        ["raise ValueError(f'{name} is no group of hosts')", "say(f'{host or \"nobody\"} holds the group now')"],
+        ["raise ValueError(f'{name} is not a group')"],
     ),
     "counted": Rule(
         ("appliance/",), miscounted, forbid("counted(number, noun) of appliance/base/counted.py: there may be one"),

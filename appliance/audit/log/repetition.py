@@ -134,7 +134,7 @@ def summary(state: FoldState, record_id: str, time: int, *, recovered: bool = Fa
     if recovered:
         detail["recovered"] = True
     passed = state.folds
-    what = "further record{} of a host beyond its share" if passed else "further denial{} of many kinds"
+    what = "further record{} of a host beyond its quota" if passed else "further denial{} of many kinds"
     return AuditRecord(
         id=record_id, time=time, event="repetitions folded" if passed else "denials folded", severity=state.severity,
         decision=state.decision, host=None if state.scope in (ALL_UNKNOWN, ALL) else state.host,

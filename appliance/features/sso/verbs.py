@@ -22,7 +22,7 @@ def list_sessions(appliance: Appliance) -> None:
         say_json(body)
         return
     if not body.sessions:
-        say("Nobody is signed in at the provider.")
+        say("No person is signed in at the provider.")
     for one in body.sessions:
         groups = [f"doors {', '.join(one.groups)}"] if one.groups else []
         row = f"{one.name:<32} {one.role:<12} {one.id}"

@@ -324,7 +324,7 @@ def appliance_rules(settings: FirewallSettings) -> tuple[PacketRule, ...]:
         ),
         *_own_network(settings.own_network),
         *inner_port("ROS master port", settings.rosmaster_port, "control", settings.control_uid),
-        *inner_port("inner node face", settings.inner_port, "rosmaster", settings.rosmaster_uid),
+        *inner_port("master-side proxy endpoint", settings.inner_port, "rosmaster", settings.rosmaster_uid),
         *_rosmaster(settings),
         *_own_node(settings),
         *(rule for forwarder in settings.forwarders for rule in _forwarding(forwarder)),

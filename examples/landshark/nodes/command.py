@@ -56,7 +56,7 @@ def connected(publisher):
         if publisher.get_num_connections():
             return publisher
         rate.sleep()
-    sys.exit(f"command.py: nobody listens to {publisher.name}")
+    sys.exit(f"command.py: no node subscribes to {publisher.name}")
 
 
 def drive(forward, turn, seconds):

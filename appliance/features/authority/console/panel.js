@@ -35,9 +35,9 @@ function Group(/** @type {{group: any, again: () => void}} */ { group, again }) 
   const button = (/** @type {keyof typeof SAID} */ verb, /** @type {any} */ more = {}) => html`<${Button} small role="operator" ...${more} onClick=${() => setOpen(verb)}>${SAID[verb]}…</${Button}>`;
   return html`<tr data-group=${group.group}>
     <td class="first"><strong><${Given} value=${group.group} most=${64} /></strong><div class="muted small">${group.names.map((/** @type {string} */ name) => html`<div key=${name}><${Given} value=${name} mono most=${80} /></div>`)}</div></td>
-    <td data-label="Holder"><div>${group.holder ? html`<${Host} value=${group.holder} /><div class="muted small">for ${lasting(group.held_seconds)}; ends after ${lasting(group.lease)} of silence${group.left_seconds !== null && group.left_seconds < group.lease / 2 && html` <${Badge} word=${`silent: ${group.left_seconds.toFixed(1)} s left`} tone="warn" />`}</div>` : html`<${Badge} word="nobody" />`}</div></td>
+    <td data-label="Holder"><div>${group.holder ? html`<${Host} value=${group.holder} /><div class="muted small">for ${lasting(group.held_seconds)}; ends after ${lasting(group.lease)} of silence${group.left_seconds !== null && group.left_seconds < group.lease / 2 && html` <${Badge} word=${`silent: ${group.left_seconds.toFixed(1)} s left`} tone="warn" />`}</div>` : html`<${Badge} word="no host" />`}</div></td>
     <td data-label="Waits"><div>${group.waiting.length ? group.waiting.map((/** @type {string} */ host) => html`<div key=${host}><${Host} value=${host} /></div>`) : html`<span class="muted">–</span>`}</div></td>
-    <td><div class="row row-end">${button("take", { tone: group.holder ? "" : "primary" })}${button("give", { disabled: !group.holder, why: "Nobody holds it" })}${button("ask")}</div>
+    <td><div class="row row-end">${button("take", { tone: group.holder ? "" : "primary" })}${button("give", { disabled: !group.holder, why: "No host holds it" })}${button("ask")}</div>
       ${open && html`<${HandOver} verb=${open} group=${group} again=${again} close=${() => setOpen("")} />`}</td></tr>`;
 }
 
@@ -49,7 +49,7 @@ function HandOver(/** @type {{verb: keyof typeof SAID, group: any, again: () => 
   const go = async () => {
     try {
       const { body } = await ask("POST", `/v1/drive/${encodeURIComponent(group.group)}/${verb}`, { json: give ? { to: host } : { host }, match: "*" });
-      done(body.holder ? `${body.holder} holds ${body.group}` : `Nobody holds ${body.group}`, body.waiting.length ? `${body.waiting.length} waiting` : "");
+      done(body.holder ? `${body.holder} holds ${body.group}` : `No host holds ${body.group}`, body.waiting.length ? `${body.waiting.length} waiting` : "");
       close();
     } catch (failure) {
       failed(failure);

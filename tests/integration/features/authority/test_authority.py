@@ -88,7 +88,7 @@ def test_one_host_at_a_time_is_heard(site: Site) -> None:
     assert "success: True" in answer
     site.appliance.kill("control")
     eventually(lambda: site.state().holder == "", "nobody holds the group")
-    assert "nobody holds it" in site.explained()
+    assert "no host holds it" in site.explained()
     assert "success: True" in site.tablet.run("rosservice", "call", "/rosrv/drive/take").stdout
     assert site.heard("/pilot") == {"/pilot"}
     assert len(site.appliance.recorded("--event", "authority handed over", count=5)) >= 5

@@ -99,8 +99,8 @@ def test_the_reason_of_a_summary_counts_in_english() -> None:
     assert reasons == [
         "1 further denial of many kinds",
         "2 further denials of many kinds",
-        "1 further record of a host beyond its share",
-        "2 further records of a host beyond its share",
+        "1 further record of a host beyond its quota",
+        "2 further records of a host beyond its quota",
     ]
 
 

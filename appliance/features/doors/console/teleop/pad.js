@@ -44,7 +44,7 @@ function Authority(/** @type {{parts: any, group: any, held: boolean, name: stri
     }
     await again();
   };
-  const holder = group.holder ? html`<${parts.Given} value=${group.holder} mono /> holds` : "Nobody holds";
+  const holder = group.holder ? html`<${parts.Given} value=${group.holder} mono /> holds` : "No host holds";
   return html`<div class="row small"><span>${held ? "You hold" : holder} <strong><${parts.Given} value=${group.group} most=${64} /></strong>.</span>
     ${held ? html`<${parts.Button} small role="operator" onClick=${() => order("give", { to: "" })}>Give it up</${parts.Button}>` : html`<${parts.Button} small role="operator" tone="primary" onClick=${() => order("take", { host: `door:${name}` })}>Take it</${parts.Button}>`}</div>`;
 }
