@@ -50,20 +50,21 @@ class SliceParts:
         self._slices = slices
         self._parts: list[dict[Binding, tuple[int, bool, msgspec.Raw]]] = [{} for _ in range(BUCKETS)]
         self._number = 0
-        self._failed = ""
+        self._failed: list[dict[Binding, str]] = [{} for _ in range(BUCKETS)]
         slices.keep()
 
     def changed(self) -> dict[int, bytes]:
-        """Return the changed parts by number. Once a slice cannot be saved, each part is replaced by the reason."""
+        """Return the changed parts by number. A part with a slice that is too large to be saved is the reason."""
         bindings, dirty = self._slices.changed or {}, set()
         self._slices.changed = {}
         for binding, holder in bindings.items():
             number = hash(binding) % BUCKETS
             dirty.add(number)
+            self._failed[number].pop(binding, None)
             try:
                 self._take(self._parts[number], binding, None if holder is None else str(holder))
             except StateTooLargeError as error:
-                self._failed = str(error)
+                self._failed[number][binding] = str(error)
         return {number: self._encoded(number) for number in dirty}
 
     def all(self) -> list[bytes]:
@@ -90,8 +91,8 @@ class SliceParts:
         part[binding] = number, ended, msgspec.Raw(msgspec.msgpack.encode(record))
 
     def _encoded(self, number: int) -> bytes:
-        if self._failed:
-            return msgspec.msgpack.encode(self._failed)
+        for reason in self._failed[number].values():
+            return msgspec.msgpack.encode(reason)
         return msgspec.msgpack.encode(_Written([record for _, _, record in self._parts[number].values()]))
 
 

@@ -1,5 +1,6 @@
 """The state of a property outlives its process (for whole monitors: `relay/monitors/test_state_keeper.py`)."""
 
+from itertools import count
 from random import Random
 from typing import Any
 
@@ -7,7 +8,9 @@ import msgspec
 import pytest
 
 from rosmop.check.sources import compiled_from
+from rosmop.run import state_of_runs
 from rosmop.run.engine import MonitorSet
+from rosmop.run.state import states_of
 from rosmop.run.state_of_runs import MOST_PARTS, StateTooLargeError, kept, run_of
 from roswire.standard import standard_definitions
 
@@ -78,3 +81,38 @@ def test_a_deep_stack_is_too_large_to_keep() -> None:
         run.step(0, 0)
     with pytest.raises(StateTooLargeError):
         kept(run)
+
+
+def test_a_slice_that_is_too_large_loses_only_the_state_that_it_has(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Once the slice has ended, or is small again, all slices of its specification are kept."""
+    monkeypatch.setattr(state_of_runs, "MOST_PARTS", 50)
+    events = " ".join(
+        f"event {name}(std::string k) /{name} std_msgs/String '{{data:k}}' {{ }}"
+        for name in ("open", "close")
+    )
+    text = f"s(std::string k) {{ {events}\ncfg: S -> open S close | epsilon\n@fail {{ }} }}"
+    monitors = MonitorSet.of(compiled_from({"s.rv": text}, standard_definitions()))
+    monitors.start(0)
+    [group] = monitors.kept_groups()
+    sent, stored = count(1), dict(enumerate(group.parts()))
+
+    def send(name: str, key: str) -> None:
+        monitors.process(f"/{name}", len(key).to_bytes(4, "little") + key.encode(), next(sent))
+        stored.update(group.changed_parts())
+
+    def kept_slices() -> int | str:
+        rows = [([group.names[0]], group.layout, data, None) for data in (group.base(), *stored.values())]
+        _found, slices, lost = states_of(rows)
+        return lost.get("s") or len(slices["s"])
+
+    for key in ("a", "b", "c"):
+        send("open", key)
+    assert kept_slices() == 3
+    for _ in range(100):
+        send("open", "a")
+    send("open", "b")
+    assert kept_slices() == "a property has more than 50 parts"
+    for _ in range(102):
+        send("close", "a")
+    send("close", "c")
+    assert kept_slices() == 3
