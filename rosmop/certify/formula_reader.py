@@ -15,6 +15,7 @@ DEEPEST = 120
 _TOKEN = re.compile(
     r"(?:\s++|//[^\n]*+|/\*.*?\*/)*+(?:([A-Za-z_]\w*|\d+(?:\.\d+)?|\.\d+)|(.))?", re.DOTALL | re.ASCII
 )
+_NUMBER = re.compile(r"[0-9]*\.?[0-9]+")
 
 
 class UnsupportedFormulaError(Exception):
@@ -73,7 +74,10 @@ class WordReader:
             raise UnsupportedFormulaError(f"{self.word!r} where {word!r} is expected")
 
     def duration(self) -> int:
-        number = Decimal(self.take())
+        word = self.take()
+        if _NUMBER.fullmatch(word) is None:
+            raise UnsupportedFormulaError(f"{word!r} where a duration is expected")
+        number = Decimal(word)
         if self.word in _NANOSECONDS:
             return int(number.scaleb(_NANOSECONDS[self.take()]))
         return int((number * (_SECONDS[self.take()] if self.word in _SECONDS else 1)).scaleb(9))

@@ -8,6 +8,7 @@ import pytest
 
 import rosmop.certify
 from rosmop.certify.check import MOST_STEPS, AutomatonTables, certify
+from rosmop.certify.formula_reader import UnsupportedFormulaError, WordReader
 from rosmop.certify.properties import DEFECT, certificate_of, certificates_of
 from rosmop.check.sources import compiled_from
 from rosmop.form.findings import Position
@@ -296,3 +297,16 @@ def test_the_certifier_shares_no_code_with_the_compilers() -> None:
             assert all(module.startswith("rosmop.certify") for module in ours), file
             pure += bool(ours)
     assert pure > 3, "the rule looks at imports that there are"
+
+
+@pytest.mark.parametrize(
+    ("text", "nanoseconds"), [("0", 0), ("2s", 2 * 10**9), (".5 ms", 500_000), ("1.5m", 90 * 10**9)]
+)
+def test_durations(text: str, nanoseconds: int) -> None:
+    assert WordReader(text, ["."]).duration() == nanoseconds
+
+
+@pytest.mark.parametrize("text", ["", "a", "inf", "NaN", "Infinity", ".", ". 5"])
+def test_other_words_are_not_durations(text: str) -> None:
+    with pytest.raises(UnsupportedFormulaError, match="where a duration is expected"):
+        WordReader(text, ["."]).duration()
