@@ -25,8 +25,8 @@ LIMITS = ("confirm", "confirm monitors")
 def limit_moved(text: str, seconds: float) -> str:
     if not text:
         return text
-    back_to, deadline, *length = text.split()
-    return " ".join([back_to, str(float(deadline) + seconds), *length])
+    back_to, deadline, length = text.split()
+    return f"{back_to} {float(deadline) + seconds} {length}"
 
 
 def reloaded_by(who: str) -> str:
