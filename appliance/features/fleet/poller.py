@@ -122,11 +122,11 @@ def _fate_of(report: RobotReport) -> RobotReport:
 
 
 def _is_news(selected: SelectedBundle, stated: BundleStated) -> bool:
-    path, sha256 = str(selected.path), selected.sha256
-    if path in (stated.in_force, stated.trying):
+    """Return whether control has not yet decided about these bytes: a path can be signed again with others."""
+    bundle, refused = (str(selected.path), selected.sha256), stated.refused
+    if bundle[0] == stated.trying:  # other bytes of the same path wait for the end of the trial
         return False
-    refused = stated.refused
-    return refused is None or (refused.path, refused.sha256) != (path, sha256)
+    return bundle not in ((stated.in_force, stated.sha256), refused and (refused.path, refused.sha256))
 
 
 def _offered(bundle: VerifiedBundle) -> BundleOffered:
