@@ -35,7 +35,7 @@ class Robot:
 def test_a_repeated_upload_completes_the_work_of_a_killed_collector(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The health of a robot shows its newest segment, also if the collector was killed before it noted it."""
+    """The health of a robot shows its newest segment, even if the collector was killed before it noted it."""
     robot = Robot(tmp_path)
     places = {number: robot.push(number, 1_000 + number) for number in (1, 2)}
     os.utime(tmp_path / "newest" / "arm7", (1_010, 1_010))
