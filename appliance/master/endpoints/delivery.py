@@ -68,9 +68,10 @@ class _List:
     _removed: frozenset[str] | None = frozenset()  # None: all
     _free: float = 0.0
 
-    def want(self, publishers: tuple[str, ...]) -> None:
+    def want(self, publishers: tuple[str, ...], *, answered: bool = False) -> None:
+        """`answered`: the node has this list already."""
         if self._wanted is None:
-            self._untold = frozenset() if publishers else None
+            self._untold = frozenset() if publishers or answered else None
         else:
             self.remove(frozenset(self._wanted).difference(publishers))
         self._wanted = publishers
@@ -199,7 +200,7 @@ class Delivery:
 
     def answered(self, incarnation: Incarnation, topic: str, publishers: tuple[str, ...]) -> None:
         """Note that the answer to a registration had this list. It replaces a waiting list, which may be older."""
-        self._list(incarnation, topic).want(publishers)
+        self._list(incarnation, topic).want(publishers, answered=True)
 
     def remove_first(self, incarnation: Incarnation, topic: str, publishers: frozenset[str]) -> None:
         """Send the next list without these publishers first."""

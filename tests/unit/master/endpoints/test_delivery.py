@@ -144,6 +144,15 @@ async def test_the_answer_to_a_registration_replaces_a_list_that_waits() -> None
     assert [publishers for _topic, publishers in post.node.lists] == [["a"], ["b"], ["a", "b"]]
 
 
+async def test_the_first_publisher_after_an_empty_answer_is_sent_at_once() -> None:
+    post = Post()
+    post.node.answers.set()
+    post.delivery.answered(post.incarnation, "/t", ())
+    post.push("/t", publishers=["a"])
+    await asyncio.sleep(0.01)
+    assert post.node.lists == [("/t", ["a"])]
+
+
 async def test_a_list_that_did_not_arrive_told_no_removal() -> None:
     post = Post(tries=1)
     post.node.answers.set()
