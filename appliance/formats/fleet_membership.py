@@ -51,7 +51,7 @@ def settings_of(invitation: Invitation) -> dict[str, Any]:
 
 
 def joined_settings(state: Path) -> dict[str, Any]:
-    """Return the settings of the last join, with absolute paths; empty if there was none.
+    """Return the settings of the last join with absolute paths, or empty ones before the first join.
 
     Raises `OSError`, and `ValueError` for a file that is not JSON.
     """

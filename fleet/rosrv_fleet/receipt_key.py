@@ -19,7 +19,7 @@ class ReceiptKeyError(Exception):
 
 
 def make_receipt_key(folder: Path) -> Path:
-    """Make the key if there is none. Return the file of its public key, which robots need."""
+    """Make the key if it does not exist yet. Return the file of its public key, which robots need."""
     file, public = folder / "receipts.key", folder / "receipts.pub"
     if not file.exists():
         made = Ed25519PrivateKey.generate()

@@ -60,7 +60,7 @@ class RandomStates:
         self._names: Sequence[bytes] = ()
         self._now = self._length = 0
         self._zeros = 0.0
-        """The part of the numbers of a message that are 0, as those of a base that stands."""
+        """The fraction of a message's numbers that are 0, as in the messages of a standing base."""
         self._is_tame = self._is_exact = False
         self._fields: Any = None
 

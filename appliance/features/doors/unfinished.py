@@ -32,7 +32,7 @@ class Unfinished:
         self._checked.pop(key, None)
 
     def waited(self, seconds: float, *, shares: bool) -> str:
-        """Return the reason to disconnect the client; empty if there is none."""
+        """Return why the client must be disconnected, or an empty text."""
         self.left -= seconds
         if self.left > _EARLY:
             return ""

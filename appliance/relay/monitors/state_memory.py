@@ -151,7 +151,7 @@ def mapped(descriptor: int, *, writable: bool) -> memoryview:
 
 
 def read(memory: Memory) -> StoredState | None:
-    """Return the valid state, or None if there is none. Raises `ValueError` if the memory is malformed."""
+    """Return the valid state, or None without one. Raises `ValueError` if the memory is malformed."""
     if len(memory) < _START or bytes(memory[:_ROOT]) != MAGIC or memory[_ROOT] == 0:
         return None
     half = (len(memory) - _START) // 2

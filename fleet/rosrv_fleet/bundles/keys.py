@@ -45,7 +45,7 @@ class KeyFolder:
         return signer.public_key
 
     def signers(self, role: str, keyids: Collection[str]) -> list[CryptoSigner]:
-        """Return the role's keys with these ids. Raise `KeyFileError` if there are none."""
+        """Return the role's keys with these ids. Raises `KeyFileError` if the role has none of them."""
         found = []
         for path in sorted(self.folder.glob("*.pem")):
             name = _FILE.fullmatch(path.name)

@@ -124,7 +124,7 @@ class BundleService:
     # --- robots ---
 
     def selection(self, robot: str, group: RobotGroup) -> str:
-        """Return the bundle that a robot should have, or "" if there is none or it is no longer signed."""
+        """Return the bundle that a robot should have, or "" without a signed one."""
         stored = self.rollouts.get(group)
         if stored is None:
             return ""

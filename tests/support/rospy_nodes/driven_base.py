@@ -1,7 +1,7 @@
 """A base on /cmd_vel with odometry on /odom: driven_base.py TIMEOUT.
 
-It obeys a command for TIMEOUT seconds, or with 0 until the next command. It prints the events `moves` and `stands`
-when its speed changes, and `silent` after 0.3 s without a command.
+It obeys a command for TIMEOUT seconds. A TIMEOUT of 0 means until the next command. It prints the events `moves` and
+`stands` when its speed changes, and `silent` after 0.3 s without a command.
 """
 
 import sys

@@ -487,7 +487,7 @@ def roles_of(dependant: Any) -> Iterator[str | None]:
 
 
 def test_a_role_is_judged_before_the_request() -> None:
-    """An error of a request helps only those who may make it, and the first rejection is the final one."""
+    """Only those who may make a request learn what is wrong with it."""
     judged = 0
     for path, roles in routes().items():
         method, _, target = path.partition(" ")
