@@ -3,7 +3,7 @@
 import functools
 import inspect
 import pkgutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from difflib import get_close_matches
 from typing import Any
 
@@ -21,7 +21,7 @@ _HELP_OPTIONS = ["-h", "--help"]
 def application(
     verbs: Verbs,
     *,
-    further: Callable[[], Verbs] = dict,
+    further: Callable[[], Iterable[Verbs]] = tuple,
     callback: Callable[..., None] | None = None,
     **settings: Any,
 ) -> typer.Typer:
@@ -41,7 +41,7 @@ def _nothing() -> None:
     pass
 
 
-def _group_of(verbs: Verbs, further: Callable[[], Verbs]) -> type[TyperGroup]:
+def _group_of(verbs: Verbs, further: Callable[[], Iterable[Verbs]]) -> type[TyperGroup]:
     class _Lazy(TyperGroup):
         # click sets it
         commands = property(lambda self: self.all_commands, lambda _self, _given: None)
@@ -52,8 +52,8 @@ def _group_of(verbs: Verbs, further: Callable[[], Verbs]) -> type[TyperGroup]:
 
         @functools.cached_property
         def all_commands(self) -> dict[str, Any]:
-            own, table = self.own_commands, joined(verbs, further())
-            return {name: own.get(name) or _command_of(verb, name, dict) for name, verb in table.items()}
+            own, table = self.own_commands, joined(verbs, *further())
+            return {name: own.get(name) or _command_of(verb, name, tuple) for name, verb in table.items()}
 
         def get_params(self, ctx: Any) -> list[Any]:
             return _without_type_of_flags(super().get_params(ctx))
@@ -73,7 +73,7 @@ def _group_of(verbs: Verbs, further: Callable[[], Verbs]) -> type[TyperGroup]:
     return _Lazy
 
 
-def _command_of(verb: Verb | Group, name: str, further: Callable[[], Verbs]) -> Any:
+def _command_of(verb: Verb | Group, name: str, further: Callable[[], Iterable[Verbs]]) -> Any:
     match verb:
         case Group(help, inner):
             more = functools.partial(_inner, further, name)
@@ -82,11 +82,9 @@ def _command_of(verb: Verb | Group, name: str, further: Callable[[], Verbs]) -> 
             return _Deferred(verb, name)
 
 
-def _inner(further: Callable[[], Verbs], name: str) -> Verbs:
-    match further().get(name):
-        case Group(_help, verbs):
-            return verbs
-    return {}
+def _inner(further: Callable[[], Iterable[Verbs]], name: str) -> list[Verbs]:
+    groups = (verbs.get(name) for verbs in further())
+    return [group.verbs for group in groups if isinstance(group, Group)]
 
 
 def _named(command: Any, name: str) -> Any:

@@ -3,7 +3,6 @@ catch.
 """
 
 import errno
-import functools
 import os
 import sys
 import traceback
@@ -36,18 +35,6 @@ VERBS: Verbs = {
             "verify": Verb("audit.audit_verbs:verify"),
             "checkpoints": Verb("audit.audit_verbs:checkpoints"),
             "export": Verb("audit.audit_verbs:export"),
-        },
-    ),
-    "policy": Group(
-        "Check, explain, test, compare, learn and change access policies.",
-        {
-            "show": Verb("policy.live_verbs:show"),
-            "reload": Verb("policy.live_verbs:reload"),
-            "rollback": Verb("policy.live_verbs:rollback", "Return to an earlier revision of the policy."),
-            "confirm": Verb("policy.live_verbs:confirm", _CONFIRM),
-            "revisions": Verb(
-                "policy.live_verbs:revisions", "List the kept revisions of the policy, newest first."
-            ),
         },
     ),
     "monitor": Group(
@@ -100,14 +87,14 @@ VERBS: Verbs = {
 }
 
 
-def feature_verbs() -> Verbs:
+def feature_verbs() -> tuple[Verbs, ...]:
     from appliance.features.table import FEATURES  # noqa: PLC0415  most verbs of the core do not need it
 
-    return functools.reduce(joined, (feature.verbs for feature in FEATURES))
+    return tuple(feature.verbs for feature in FEATURES)
 
 
 def all_verbs() -> Verbs:
-    return joined(VERBS, feature_verbs())
+    return joined(VERBS, *feature_verbs())
 
 
 def _show_version(wanted: bool) -> None:

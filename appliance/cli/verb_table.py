@@ -1,6 +1,7 @@
 """The rows of the tables of verbs, without importing a verb."""
 
 import functools
+import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -44,9 +45,9 @@ FIRST = "(first)"
 _PACKAGES = Path(__file__).parents[2]
 
 
-def joined(core: Verbs, features: Verbs) -> Verbs:
+def joined(core: Verbs, *features: Verbs) -> Verbs:
     table = list(core.items())
-    for name, added in features.items():
+    for name, added in itertools.chain.from_iterable(verbs.items() for verbs in features):
         names = [known for known, _verb in table]
         if name in names:
             table[names.index(name)] = (name, _extended(name, dict(table)[name], added))

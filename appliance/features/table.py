@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from appliance.supervisor.service_gate import Pairing
 
 FEATURES: tuple[Feature, ...] = (
+    POLICY_TOOLS,
     ALARMS,
     LIMITS,
     BLOCKS,
@@ -50,7 +51,6 @@ FEATURES: tuple[Feature, ...] = (
     FLEET,
     DOORS,
     GUARDS,
-    POLICY_TOOLS,
     BACKUP,
     SELFTEST,
     DEMO,

@@ -37,7 +37,6 @@ LIMITED = {
     "appliance.configuration.inventory:_LICENCE": "the licence files of the installation",
     "appliance.ipsec.leftovers:_ENCAPSULATED": "the output of `ip xfrm`",
     "appliance.ipsec.leftovers:_POLICY": "the output of `ip xfrm`",
-    "appliance.policy.stock_tools:_ANONYMOUS": "a tool's name, 256 characters; `learn` on the command line: 1024",
     "appliance.signing.log_proof:_CHECKPOINT": "a newline ends each number, so no shorter one matches; for Python 3.8",
     "appliance.master.calls.request_peek:_METHOD": "4096 bytes, `_BEGINNING`",
     "roswire.xmlrpc.common_documents:_CALL": "32 KiB, `_LONGEST`",

@@ -50,7 +50,7 @@ DOORS = Feature(
                 "ticket": Verb(f"{_VERBS}:ticket"),
                 "remove": Verb(f"{_VERBS}:remove"),
             },
-            after="host",
+            after="fleet",
         )
     },
     operate=_operate,

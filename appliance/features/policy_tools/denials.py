@@ -9,8 +9,8 @@ from appliance.audit.log.record import AuditRecord
 from appliance.audit.log.record_format import rule_text
 from appliance.audit.log.repetition import KIND
 from appliance.channel.messages.relay_link import NO_GRANT
+from appliance.features.policy_tools.grant import DecidedRequest, UngrantableError, asked
 from appliance.policy.commands import CALLS
-from appliance.policy.grant import DecidedRequest, UngrantableError, asked
 from appliance.policy.model import Category
 from appliance.policy.policy_settings import AT_ONCE
 

@@ -12,18 +12,18 @@ from appliance.api.front.problems import ProblemError
 from appliance.api.routes.dry_run_policy import refused_text
 from appliance.audit.log.record import AuditRecord
 from appliance.audit.log.record_format import LogEntry
-from appliance.audit.search.why import lines_of
 from appliance.channel.answers.policy_answers import Granted, PolicyKnown, Why
+from appliance.features.policy_tools.decision_reasons import DecisionExplanation, explain
 from appliance.features.policy_tools.denials import asked_of, is_denial
+from appliance.features.policy_tools.grant import UngrantableError, grant
+from appliance.features.policy_tools.stock_tools import stock_tool
+from appliance.features.policy_tools.why import lines_of
 from appliance.policy.actions import BadWordError, check_resource, find_host
-from appliance.policy.decision_reasons import DecisionExplanation, explain
-from appliance.policy.grant import UngrantableError, grant
 from appliance.policy.host_names import HostInWords
 from appliance.policy.judgement import PolicyContext, PolicyJudgement, judge
 from appliance.policy.model import Category, Request
 from appliance.policy.policy_findings import PolicyError
 from appliance.policy.rights import needs_node
-from appliance.policy.stock_tools import stock_tool
 
 _GRANTED = (
     "the policy in force has every right that it needs: it was denied for its recorded reason, or before this"

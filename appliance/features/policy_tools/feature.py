@@ -1,8 +1,9 @@
-"""Define the feature policy tools."""
+"""Define the feature policy tools: `rosrv policy`, and the explanation of records."""
 
 from appliance.cli.verb_table import FIRST, Group, Verb
 from appliance.features.feature import Feature
 
+_CONFIRM = "Keep a change loaded with --confirm-within. Exit status 1 if there is nothing to confirm."
 _PLACE = "appliance.features.policy_tools."
 
 POLICY_TOOLS = Feature(
@@ -11,9 +12,18 @@ POLICY_TOOLS = Feature(
     verbs={
         "audit": Group("", {"why": Verb(f"{_PLACE}grant_verb:why", after=FIRST)}),
         "policy": Group(
-            "",
+            "Check, explain, test, compare, learn and change access policies.",
             {
-                "learn": Verb(f"{_PLACE}learn_verb:learn_policy", after=FIRST),
+                "learn": Verb(f"{_PLACE}learn_verb:learn_policy"),
+                "show": Verb(f"{_PLACE}live_verbs:show"),
+                "reload": Verb(f"{_PLACE}live_verbs:reload"),
+                "rollback": Verb(
+                    f"{_PLACE}live_verbs:rollback", "Return to an earlier revision of the policy."
+                ),
+                "confirm": Verb(f"{_PLACE}live_verbs:confirm", _CONFIRM),
+                "revisions": Verb(
+                    f"{_PLACE}live_verbs:revisions", "List the kept revisions of the policy, newest first."
+                ),
                 "grant": Verb(f"{_PLACE}grant_verb:grant"),
                 "check": Verb(f"{_PLACE}policy_verbs:check"),
                 "explain": Verb(f"{_PLACE}policy_verbs:explain_request"),
@@ -21,6 +31,7 @@ POLICY_TOOLS = Feature(
                 "test": Verb(f"{_PLACE}policy_verbs:test"),
                 "diff": Verb(f"{_PLACE}diff_verb:compare"),
             },
+            after="audit",
         ),
     },
 )

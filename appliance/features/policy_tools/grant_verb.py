@@ -17,7 +17,7 @@ from appliance.cli.commit_confirm import ConfirmWithin, seconds_within
 from appliance.cli.connection.admin_client import AdminSocket, NotRunningError
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.output import say_json, usage_error, write_told
-from appliance.cli.policy.live_verbs import say_loaded
+from appliance.features.policy_tools.live_verbs import say_loaded
 from rosmop.tool.terminal import counted, printable, say
 
 
@@ -140,7 +140,7 @@ def _granted(appliance: Appliance, record: str, *, tool: bool) -> Granted:
     if appliance.place is not None:
         return msgspec.convert(_over_rest(appliance, record, "grant", tool=tool), Granted)
     from appliance.features.policy_tools.explanations import granted  # noqa: PLC0415  not for every verb
-    from appliance.policy.grant import UngrantableError  # noqa: PLC0415  as above
+    from appliance.features.policy_tools.grant import UngrantableError  # noqa: PLC0415  as above
 
     with Errors():
         found = _entry(appliance, record).record

@@ -16,13 +16,13 @@ from collections import Counter
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, field
 
+from appliance.features.policy_tools.stock_tools import key_of
 from appliance.policy.actions import BadWordError, check_resource
 from appliance.policy.commands import ALIASES
 from appliance.policy.host_sets import Network, canonical_address
 from appliance.policy.model import Address, Category, Request
 from appliance.policy.rights import rights_of_call
 from appliance.policy.sections import ASK, ASKING, DECIDERS, PARAMETERS
-from appliance.policy.stock_tools import key_of
 from roswire.names import is_global_name, searched
 
 _SHOWN_NODES = 3

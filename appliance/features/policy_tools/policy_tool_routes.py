@@ -18,8 +18,10 @@ from appliance.api.routes.shown_records import readable_by
 from appliance.audit.search.search import recorded_in_full
 from appliance.channel.admin import PolicyWanted
 from appliance.channel.answers.policy_answers import Granted, Why
+from appliance.features.policy_tools.decision_reasons import DecisionExplanation
 from appliance.features.policy_tools.denials import asks_policy
 from appliance.features.policy_tools.explanations import explained, explanation, granted, judge_text
+from appliance.features.policy_tools.grant import UngrantableError
 from appliance.features.policy_tools.policy_models import (
     Case,
     Draft,
@@ -30,8 +32,6 @@ from appliance.features.policy_tools.policy_models import (
     Tested,
 )
 from appliance.policy.cases import CaseResult
-from appliance.policy.decision_reasons import DecisionExplanation
-from appliance.policy.grant import UngrantableError
 from appliance.policy.model import Category
 
 _NO_GRANT: Responses = {409: {"description": "No line of a policy grants it."}}

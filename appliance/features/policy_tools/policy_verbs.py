@@ -14,6 +14,9 @@ from appliance.base.owner_access import is_named_there
 from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.output import Json, by_host, say_json
+from appliance.features.policy_tools.decision_reasons import DecisionExplanation, explain, render
+from appliance.features.policy_tools.grant import DecidedRequest, UngrantableError
+from appliance.features.policy_tools.grant import grant as grant_of
 from appliance.features.policy_tools.policy_impact import PolicyImpact, cases_beside, impact_of
 from appliance.features.policy_tools.policy_input import (
     Enrolled,
@@ -25,9 +28,6 @@ from appliance.features.policy_tools.policy_input import (
     usage_error,
 )
 from appliance.policy.actions import BadWordError, check_resource
-from appliance.policy.decision_reasons import DecisionExplanation, explain, render
-from appliance.policy.grant import DecidedRequest, UngrantableError
-from appliance.policy.grant import grant as grant_of
 from appliance.policy.judgement import PolicyContext, PolicyJudgement, judge
 from appliance.policy.live_rights import Ending
 from appliance.policy.model import Category, Decision, Request

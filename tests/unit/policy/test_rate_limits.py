@@ -2,7 +2,6 @@ import ipaddress
 
 import pytest
 
-from appliance.policy.decision_reasons import explain, render
 from appliance.policy.diff import diff
 from appliance.policy.model import Category, Request
 from appliance.policy.policy_compiler import compile_policy
@@ -101,22 +100,6 @@ def test_hosts_share_as_the_policy_names_them() -> None:
     addresses = ("10.0.0.1", "10.1.0.1", "10.1.0.2", "10.9.0.1", "10.9.0.2")
     shared = [known.counted_as(ipaddress.ip_address(address)) for address in addresses]
     assert shared == ["10.0.0.1/32", "10.1.0.0/16", "10.1.0.0/16", "", ""]
-
-
-def test_explain_shows_the_limit_and_its_line() -> None:
-    limits = policy("/scan = publisher guests 20 Hz 1500 kB/s, topic 100 Hz, subscriber 5 Hz")
-    [publish, subscribe] = [
-        list(render(explain(limits, Request(GUEST, "/lidar", category, "/scan"))))
-        for category in (Category.PUBLISH, Category.SUBSCRIBE)
-    ]
-    line = "[Limits] /scan (p.ini:13)"
-    own, all_hosts = "for all its nodes together", "for all publishers together, in equal parts"
-    assert (
-        f"  limit: 20 Hz, 1.5 MB/s {own}; 100 Hz {all_hosts} for hosts that want more, by {line}" in publish
-    )
-    assert f"  limit: 5 Hz, by {line}" in subscribe
-    call = explain(limits, Request(GUEST, "/lidar", Category.COMMAND, "getPid"))
-    assert call.limit == ""
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from appliance.policy.policy import Policy
 from appliance.policy.policy_compiler import compile_policy
 from appliance.policy.rights import decide, rights_of, rights_of_call
 from roswire.xmlrpc import Value
-from tests.unit.master.test_rights import KEY_GIVEN, NAME, ROWS, deeds, gate_says
+from tests.unit.features.policy_tools.test_rights import KEY_GIVEN, NAME, ROWS, deeds, gate_says
 
 ROBOT = ipaddress.ip_address("192.0.2.10")
 HOSTS = [ipaddress.ip_address(text) for text in ("10.0.0.1", "10.0.0.2", "fd00::5", "192.0.2.10")]

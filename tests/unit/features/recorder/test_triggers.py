@@ -2,8 +2,8 @@ from typing import get_args, get_type_hints
 
 import pytest
 
+from appliance.audit.log.events import MONITOR_ACTIONS
 from appliance.audit.log.record import AuditRecord, Severity
-from appliance.audit.search.why import _ACTIONS
 from appliance.features.recorder.recording_answers import TriggerKind
 from appliance.features.recorder.settings import RecorderRules
 from appliance.features.recorder.triggers import _BY_EVENT, trigger_of
@@ -49,4 +49,4 @@ def test_all_kinds_but_orders_can_be_configured() -> None:
 
 
 def test_a_record_of_each_trigger_of_monitors_says_whether_it_was_recorded() -> None:
-    assert _BY_EVENT.keys() == _ACTIONS
+    assert _BY_EVENT.keys() == MONITOR_ACTIONS

@@ -5,17 +5,19 @@ from pathlib import Path
 
 import pytest
 
-from appliance.policy.grant import DecidedRequest, UngrantableError, asked, grant
+from appliance.features.policy_tools.grant import DecidedRequest, UngrantableError, asked, grant
+from appliance.features.policy_tools.stock_tools import stock_tool
 from appliance.policy.judgement import PolicyContext
 from appliance.policy.model import Category, Decision, Request
 from appliance.policy.policy import Policy
 from appliance.policy.policy_compiler import compile_policy
 from appliance.policy.rights import Right, decide, decide_right, rights_of, rights_of_call
-from appliance.policy.stock_tools import stock_tool
 from roswire.parameter_tree import Tree
 from roswire.xmlrpc import Value
+from tests.unit.policy.test_asking import AGENT
+from tests.unit.policy.test_asking import TEXT as ASKS
 
-POLICIES = sorted((Path(__file__).parents[3] / "policies").glob("*.ini"))
+POLICIES = sorted((Path(__file__).parents[4] / "policies").glob("*.ini"))
 ROBOT = ipaddress.ip_network("10.84.0.2/32")
 HOST, OTHER = ipaddress.ip_address("10.0.0.9"), ipaddress.ip_address("10.0.0.10")
 KNOWN = PolicyContext({"laptop": ipaddress.ip_address("10.0.0.77")}, [ROBOT])
@@ -221,3 +223,9 @@ def test_another_name_is_granted_alone(name: str) -> None:
     wanted = Request(HOST, name, Category.NODE, name)
     found = grant("[Nodes]\n/x = 10.0.0.1\n", "p.ini", KNOWN, DecidedRequest(wanted, rights_of(wanted)))
     assert found.added == (f"{name} = 10.0.0.9",)
+
+
+def test_a_grant_to_a_host_behind_ask_needs_no_approval() -> None:
+    wanted = Request(AGENT, "/it", Category.PUBLISH, "/cmd_vel")
+    granted = grant(ASKS, "site.ini", PolicyContext(), DecidedRequest(wanted, rights_of(wanted)))
+    assert "/cmd_vel = operator agent-1, ask agent-1" in granted.text

@@ -1,9 +1,12 @@
 import ipaddress
 
-from appliance.policy.decision_reasons import DecisionExplanation, explain, render
+from appliance.features.policy_tools.decision_reasons import DecisionExplanation, explain, render
 from appliance.policy.model import Category, Request
 from appliance.policy.policy_compiler import compile_policy
 from appliance.policy.rights import decide, rights_of
+from tests.unit.policy.test_asking import AGENT
+from tests.unit.policy.test_asking import policy as policy_that_asks
+from tests.unit.policy.test_rate_limits import GUEST, policy
 
 POLICY = compile_policy(
     """[Groups]
@@ -78,3 +81,24 @@ def test_dependence_on_a_namespace_is_explained() -> None:
     )
     lines = list(render(explain(policy, Request(host, "/ocu", Category.READ, "/leg"))))
     assert not any("namespace" in line for line in lines)
+
+
+def test_explain_shows_the_limit_and_its_line() -> None:
+    limits = policy("/scan = publisher guests 20 Hz 1500 kB/s, topic 100 Hz, subscriber 5 Hz")
+    [publish, subscribe] = [
+        list(render(explain(limits, Request(GUEST, "/lidar", category, "/scan"))))
+        for category in (Category.PUBLISH, Category.SUBSCRIBE)
+    ]
+    line = "[Limits] /scan (p.ini:13)"
+    own, all_hosts = "for all its nodes together", "for all publishers together, in equal parts"
+    assert (
+        f"  limit: 20 Hz, 1.5 MB/s {own}; 100 Hz {all_hosts} for hosts that want more, by {line}" in publish
+    )
+    assert f"  limit: 5 Hz, by {line}" in subscribe
+    call = explain(limits, Request(GUEST, "/lidar", Category.COMMAND, "getPid"))
+    assert call.limit == ""
+
+
+def test_a_missing_approval_is_explained() -> None:
+    request = Request(AGENT, "/it", Category.PUBLISH, "/cmd_vel")
+    assert [*render(explain(policy_that_asks(), request))][-1] == "together: needs an approval"

@@ -3,13 +3,11 @@
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
+from appliance.audit.log.events import MONITOR_ACTIONS
 from appliance.audit.log.record import AuditRecord
 from appliance.audit.log.record_format import LogEntry, rfc3339, rule_text
 from appliance.base.actors import actor
 from appliance.base.counted import counted
-
-_ACTIONS = frozenset({"message dropped", "message changed", "monitor verdict", "monitor fault"})
-"""The events of monitors that trigger recordings, if `recorder.triggers` has them."""
 
 _TALLIES = ("reasons", "hosts", "callers", "resources", "calls")
 """The counts by name in a summary of repetitions (`repetition.py`)."""
@@ -98,7 +96,7 @@ def _recorded(record: AuditRecord) -> Iterator[str]:
     elif "recording" in detail and "charged_to" in detail and not record.event.startswith("recording "):
         recording = detail["recording"]
         yield f"recorded: in {recording}; rosrv record messages {recording} --at {record.id}"
-    elif record.event in _ACTIONS:
+    elif record.event in MONITOR_ACTIONS:
         yield "not recorded: recorder.triggers did not list this kind of event"
 
 

@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Self
 
+from appliance.features.policy_tools.stock_tools import StockTool, key_of, stock_tool
 from appliance.policy.ini_reader import Entry, SectionText, Word, read
 from appliance.policy.judgement import PolicyContext, judge
 from appliance.policy.keys import levels
@@ -21,7 +22,6 @@ from appliance.policy.policy_findings import Findings, PolicyError
 from appliance.policy.policy_settings import TAKEOVERS
 from appliance.policy.rights import Right, decide_right, rights_of, rights_of_call
 from appliance.policy.sections import ASK, BY_CATEGORY, DEFAULT, GROUPS, OPTIONS, PARAMETERS
-from appliance.policy.stock_tools import StockTool, key_of, stock_tool
 
 _MOST_LINES = 8  # the most lines that one grant may change, besides one for each right
 

@@ -1,5 +1,6 @@
+from appliance.audit.log.events import MONITOR_ACTIONS
 from appliance.audit.log.record import AuditRecord, RuleReference, Severity
-from appliance.audit.search.why import _ACTIONS, lines_of
+from appliance.features.policy_tools.why import lines_of
 
 
 def test_a_verdict_is_explained() -> None:
@@ -79,5 +80,11 @@ def test_a_drop_says_whether_it_was_recorded() -> None:
 
 
 def test_every_monitors_trigger_says_whether_it_was_recorded() -> None:
-    for event in _ACTIONS:
+    for event in MONITOR_ACTIONS:
         assert any("not recorded: " in line for line in lines_of(AuditRecord(id="1", time=1, event=event)))
+
+
+def test_withheld_contents_are_named() -> None:
+    detail = {"monitor": "m", "at": ["m.rv:3"], "withheld": ["before", "conditions"]}
+    lines = list(lines_of(AuditRecord(id="1", time=0, event="message dropped", detail=detail)))
+    assert lines[-1] == "this role may not read contents of messages"

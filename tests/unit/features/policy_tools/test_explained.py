@@ -13,8 +13,8 @@ import pytest
 
 from appliance.audit.log.record import AuditRecord, Severity
 from appliance.audit.log.record_format import LogEntry, without_contents
-from appliance.audit.search.why import lines_of
 from appliance.channel.messages import MonitorEvent
+from appliance.features.policy_tools.why import lines_of
 from appliance.relay.monitors.observation_points import ObservationPoint
 from appliance.specifications.records import MonitorRecords
 from appliance.telemetry.audit_trail import AuditTrail

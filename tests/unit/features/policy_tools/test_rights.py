@@ -10,6 +10,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from appliance.features.policy_tools.decision_reasons import explain
+from appliance.features.policy_tools.grant import DecidedRequest, UngrantableError, grant
 from appliance.master.caller import ApiUri, Caller
 from appliance.master.calls.call import (
     CALLER_API,
@@ -32,9 +34,7 @@ from appliance.master.graph.revocation import CALLS
 from appliance.policy.actions import VERBS
 from appliance.policy.cases import run_cases
 from appliance.policy.commands import COMMANDS
-from appliance.policy.decision_reasons import explain
 from appliance.policy.diff import diff
-from appliance.policy.grant import DecidedRequest, UngrantableError, grant
 from appliance.policy.judgement import PolicyContext
 from appliance.policy.live_rights import LiveRight, may_keep
 from appliance.policy.model import Category, Decision, Request

@@ -1,1 +1,0 @@
-"""`rosrv policy`: check, test, learn and load policies."""
