@@ -1,4 +1,4 @@
-"""Define the feature metrics. Control measures; `telemetry/metrics.py` has the names."""
+"""Define the feature metrics. Control measures; `metric_table.py` has the names."""
 
 from appliance.features.feature import Feature
 

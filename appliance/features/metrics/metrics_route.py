@@ -24,8 +24,8 @@ from appliance.channel.answers.host_answers import Host
 from appliance.channel.answers.measures import Measures
 from appliance.channel.answers.status import ProcessInfo
 from appliance.channel.status_summary import no_relay, probe_failed, process_names
+from appliance.features.metrics.metric_table import METRICS
 from appliance.features.views import STATES, pair_view, states_of
-from appliance.telemetry.metric_table import METRICS
 
 _PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
 _Samples = Iterable[tuple[tuple[str, ...], Any]]

@@ -8,8 +8,8 @@ from prometheus_client.parser import text_string_to_metric_families
 from appliance.base import clock
 from appliance.base.metric import BOUNDS
 from appliance.channel.answers.measures import Measures
+from appliance.features.metrics.metric_table import METRICS, markdown
 from appliance.features.metrics.metrics_route import rendered
-from appliance.telemetry.metric_table import METRICS, markdown
 from appliance.telemetry.metrics import Meter
 from tests.support.answers import example
 
@@ -123,7 +123,9 @@ def test_tunnels_are_measured() -> None:
 
 
 def test_the_page_matches_the_code() -> None:
-    generated = PAGE.read_text().split("<!-- generated: python -m appliance.telemetry.metric_table -->\n")[1]
+    generated = PAGE.read_text().split(
+        "<!-- generated: python -m appliance.features.metrics.metric_table -->\n"
+    )[1]
     assert generated.startswith(markdown())
 
 

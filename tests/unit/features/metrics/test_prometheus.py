@@ -5,9 +5,9 @@ from typing import Any
 import yaml
 
 from appliance.audit.log.events import EVENTS
-from appliance.telemetry.metric_table import METRICS
+from appliance.features.metrics.metric_table import METRICS
 
-FOLDER = Path(__file__).parents[3] / "examples" / "prometheus"
+FOLDER = Path(__file__).parents[4] / "examples" / "prometheus"
 # tests/system/fleet/test_bundles.py compares the page with what the collector serves.
 COLLECTORS = set(
     re.findall(r"`(rosrv_fleet_\w+)`", (FOLDER.parents[1] / "docs/reference/fleet.md").read_text())

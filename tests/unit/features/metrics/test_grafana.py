@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 
-from appliance.telemetry.metric_table import METRICS
+from appliance.features.metrics.metric_table import METRICS
 
-ROOT = Path(__file__).parents[3]
+ROOT = Path(__file__).parents[4]
 DASHBOARD: dict[str, Any] = json.loads((ROOT / "examples/grafana/rosrv.json").read_text())
 PANELS = [panel for panel in DASHBOARD["panels"] if panel["type"] != "row"]
 KNOWN = {metric.name: metric for metric in METRICS}

@@ -1,4 +1,4 @@
-"""List every metric; `python -m appliance.telemetry.metric_table` makes the table of docs/reference/metrics.md.
+"""List every metric; `python -m appliance.features.metrics.metric_table` makes the table of docs/reference/metrics.md.
 
 Labels have few values; `control.operators.measurements` limits the number of topics and services.
 """
