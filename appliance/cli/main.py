@@ -75,15 +75,6 @@ VERBS: Verbs = {
         {"check": Verb("config_verbs:check"), "show": Verb("config_verbs:show")},
     ),
     "certificate": Verb("certificate_verb:certificate"),
-    "token": Group(
-        "Create, rotate, list and revoke access tokens for REST.",
-        {
-            "add": Verb("token:add"),
-            "rotate": Verb("token:rotate"),
-            "list": Verb("token:list_tokens"),
-            "revoke": Verb("token:revoke"),
-        },
-    ),
 }
 
 

@@ -29,6 +29,7 @@ from appliance.features.sign.feature import SIGN
 from appliance.features.sso.feature import SSO
 from appliance.features.standby.feature import STANDBY
 from appliance.features.syslog.feature import SYSLOG
+from appliance.features.tokens.feature import TOKENS
 from appliance.features.topics.feature import TOPICS
 from appliance.features.tunnels.feature import TUNNELS
 from appliance.supervisor.role import SharedMemory
@@ -52,6 +53,7 @@ FEATURES: tuple[Feature, ...] = (
     DOORS,
     GUARDS,
     BACKUP,
+    TOKENS,
     SELFTEST,
     DEMO,
     SSO,

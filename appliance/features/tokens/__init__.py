@@ -1,0 +1,1 @@
+"""Access tokens: `rosrv token`. Control keeps the tokens (`control/operators/token_orders.py`)."""
