@@ -18,7 +18,6 @@ from appliance.api.front.services import Services
 from appliance.api.routes import (
     audit,
     audit_summary,
-    monitor_routes,
     operation_routes,
     policy_routes,
 )
@@ -50,7 +49,7 @@ def build_app(services: Services) -> FastAPI:
             Exception: _defect,
         },
     )
-    answers = monitor_routes.ANSWERS | policy_routes.ANSWERS
+    answers = policy_routes.ANSWERS
     for feature in FEATURES:
         if feature.answers is not None:
             answers = answers | pkgutil.resolve_name(feature.answers)
@@ -58,7 +57,6 @@ def build_app(services: Services) -> FastAPI:
     for part in (
         health,
         policy_routes,
-        monitor_routes,
         audit_summary,  # before /v1/audit/{record_id}
         audit,
     ):

@@ -14,13 +14,10 @@ from appliance import __version__
 from appliance.base.user_errors import UserError
 from appliance.cli.lazy import application
 from appliance.cli.verb_table import Group, Verb, Verbs, joined
-from rosmop.tool.options import SUMMARIES
 from rosmop.tool.terminal import printable
 
 _OF_THE_MACHINE = (errno.EACCES, errno.EPERM, errno.ENOSPC, errno.EDQUOT, errno.EROFS)
 """Errors that an operator can remove, even where a verb does not expect them."""
-
-_CONFIRM = "Keep a change loaded with --confirm-within. Exit status 1 if there is nothing to confirm."
 
 VERBS: Verbs = {
     "up": Verb("up:up"),
@@ -35,38 +32,6 @@ VERBS: Verbs = {
             "verify": Verb("audit.audit_verbs:verify"),
             "checkpoints": Verb("audit.audit_verbs:checkpoints"),
             "export": Verb("audit.audit_verbs:export"),
-        },
-    ),
-    "monitor": Group(
-        "Check specifications, test them on recordings, and run them as monitors on the robot.",
-        {
-            "check": Verb("monitor.verbs:check", SUMMARIES["check"]),
-            "run": Verb("monitor.verbs:run", SUMMARIES["run"]),
-            "learn": Verb("monitor.verbs:learn", SUMMARIES["learn"]),
-            "replay": Verb("monitor.replay:replay_monitor"),
-            "coverage": Verb("monitor.verbs:coverage", SUMMARIES["coverage"]),
-            "list": Verb("monitor.in_force:list_monitors"),
-            "enable": Verb("monitor.in_force:enable"),
-            "promote": Verb("monitor.in_force:promote"),
-            "disable": Verb("monitor.in_force:disable"),
-            "load": Verb("monitor.in_force:load"),
-            "remove": Verb("monitor.in_force:remove"),
-            "reload": Verb("monitor.in_force:reload"),
-            "revisions": Verb(
-                "monitor.revision_verbs:revisions",
-                "List the kept revisions of the specifications, newest first.",
-            ),
-            "show": Verb("monitor.revision_verbs:show"),
-            "diff": Verb("monitor.revision_verbs:diff"),
-            "rollback": Verb(
-                "monitor.revision_verbs:rollback",
-                "Return to an earlier revision of the specifications and enable or disable monitors as they were then.",
-            ),
-            "confirm": Verb("monitor.revision_verbs:confirm", _CONFIRM),
-            "resume": Verb("monitor.in_force:resume"),
-            "set": Verb("monitor.in_force:set_given"),
-            "reset": Verb("monitor.offline:reset"),
-            "rvstate": Verb("monitor.in_force:rv_state", hidden=True),
         },
     ),
     "version": Verb("version:version"),

@@ -42,6 +42,8 @@ class Group:
 Verbs = Mapping[str, Verb | Group]
 FIRST = "(first)"
 """The value of `after` for a verb before all others."""
+CONFIRM = "Keep a change loaded with --confirm-within. Exit status 1 if there is nothing to confirm."
+"""The help of `rosrv policy confirm` and `rosrv monitor confirm`."""
 _PACKAGES = Path(__file__).parents[2]
 
 

@@ -7,6 +7,7 @@ import pkgutil
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from appliance.cli.verb_table import Group, Verb
 from appliance.configuration.sections import Sections
 from appliance.features.alarms.feature import ALARMS
 from appliance.features.approvals.feature import APPROVALS
@@ -22,6 +23,7 @@ from appliance.features.guards.feature import GUARDS
 from appliance.features.limits.feature import LIMITS
 from appliance.features.live.feature import LIVE
 from appliance.features.metrics.feature import METRICS
+from appliance.features.monitor_tools.feature import MONITOR_TOOLS
 from appliance.features.policy_tools.feature import POLICY_TOOLS
 from appliance.features.recorder.feature import RECORDER
 from appliance.features.selftest.feature import SELFTEST
@@ -39,6 +41,7 @@ if TYPE_CHECKING:
 
 FEATURES: tuple[Feature, ...] = (
     POLICY_TOOLS,
+    MONITOR_TOOLS,
     ALARMS,
     LIMITS,
     BLOCKS,
@@ -70,6 +73,13 @@ def memories(sections: Sections, relays: int) -> tuple[SharedMemory, ...]:
 
 def recorded_messages() -> Any:
     return next((pkgutil.resolve_name(one.recorded) for one in FEATURES if one.recorded is not None), None)
+
+
+def verb_function(group: str, name: str) -> Any:
+    """Return the function of a feature's verb, for another feature; None without that feature."""
+    verbs = (one.verbs[group] for one in FEATURES if group in one.verbs)
+    found = (one.verbs[name] for one in verbs if isinstance(one, Group) and name in one.verbs)
+    return next((pkgutil.resolve_name(one.path) for one in found if isinstance(one, Verb)), None)
 
 
 def pairing_in(state: Path) -> "Pairing | None":

@@ -10,7 +10,6 @@ from rosmop.tool import check_command, coverage_command, learn_command, run_comm
 from rosmop.tool.batch_session import RecordingsOptions
 from rosmop.tool.command_context import CommandContext
 from rosmop.tool.options import (
-    SUMMARIES,
     Bags,
     BagSets,
     Dot,
@@ -32,6 +31,7 @@ from rosmop.tool.options import (
     Workers,
 )
 from rosmop.tool.renamed_options import RenamedCommand
+from rosmop.tool.summaries import SUMMARIES
 
 
 def commands_of(program: CommandContext) -> dict[str, Callable[..., None]]:

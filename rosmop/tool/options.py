@@ -1,6 +1,5 @@
 """The arguments and options of the commands of `rosmop`, which `rosrv monitor` shares."""
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
@@ -92,9 +91,3 @@ HoldOut = Annotated[
 FailUnder = Annotated[
     float, typer.Option(min=0.0, max=100.0, metavar="PERCENT", help="Exit with 1 below this percentage")
 ]
-SUMMARIES: Mapping[str, str] = {
-    "check": "List all errors and warnings with line and column. Exit status 1 if there is an error.",
-    "run": "Run the monitors on recordings, by their clock, and report the result for each message or recording.",
-    "learn": "Propose specifications from recordings of a robot that behaves correctly, for you to edit.",
-    "coverage": "List the events, branches, handlers, states and transitions that the recordings covered or missed.",
-}

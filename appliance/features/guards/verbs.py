@@ -13,7 +13,7 @@ from appliance.channel.messages import GivenValue
 from appliance.cli import completion
 from appliance.cli.commit_confirm import ConfirmWithin, seconds_within
 from appliance.cli.connection.target import Appliance, speaks
-from appliance.cli.monitor.in_force import say_replaced, say_shadow_deadline
+from appliance.cli.monitor_changes import say_replaced, say_shadow_deadline
 from appliance.cli.output import moment, say_json
 from appliance.features.guards.guard_answers import GuardRow
 from appliance.features.guards.guard_facts import facts_of, preset_row
@@ -28,6 +28,7 @@ from appliance.features.guards.presets import (
     with_values,
 )
 from appliance.features.guards.suggestions import proposals
+from appliance.features.table import verb_function
 from rosmop.tool.tables import say_table, table_of
 from rosmop.tool.terminal import counted, say
 
@@ -351,13 +352,18 @@ def _plan(appliance: Appliance, request: GuardTry) -> None:
 
 
 def _replay(appliance: Appliance, row: MonitorState, text: str, since: str) -> None:
-    from appliance.cli.monitor.replay import replay_monitor  # noqa: PLC0415  slow to import
-
+    replay = verb_function("monitor", "replay")
+    if replay is None:
+        say(
+            "this appliance cannot replay recordings: messages that it would have stopped are not listed",
+            "yellow",
+        )
+        return
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / row.file
         path.write_text(text, encoding="utf-8")
         try:
-            replay_monitor.function(appliance, str(path), since=since)
+            replay.function(appliance, str(path), since=since)
         except typer.Exit as end:
             if (
                 end.exit_code != 1

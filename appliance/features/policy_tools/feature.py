@@ -1,9 +1,8 @@
 """Define the feature policy tools: `rosrv policy`, and the explanation of records."""
 
-from appliance.cli.verb_table import FIRST, Group, Verb
+from appliance.cli.verb_table import CONFIRM, FIRST, Group, Verb
 from appliance.features.feature import Feature
 
-_CONFIRM = "Keep a change loaded with --confirm-within. Exit status 1 if there is nothing to confirm."
 _PLACE = "appliance.features.policy_tools."
 
 POLICY_TOOLS = Feature(
@@ -20,7 +19,7 @@ POLICY_TOOLS = Feature(
                 "rollback": Verb(
                     f"{_PLACE}live_verbs:rollback", "Return to an earlier revision of the policy."
                 ),
-                "confirm": Verb(f"{_PLACE}live_verbs:confirm", _CONFIRM),
+                "confirm": Verb(f"{_PLACE}live_verbs:confirm", CONFIRM),
                 "revisions": Verb(
                     f"{_PLACE}live_verbs:revisions", "List the kept revisions of the policy, newest first."
                 ),

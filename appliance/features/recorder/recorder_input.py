@@ -12,7 +12,7 @@ from appliance.base import clock
 from appliance.base.timestamps import parse_timestamp
 from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.target import Appliance
-from appliance.cli.monitor.monitor_program import MONITOR
+from appliance.cli.monitor_program import MONITOR
 from appliance.cli.output import say_json
 from appliance.features.recorder import recording_requests
 from appliance.features.recorder.record_verbs import bag_of

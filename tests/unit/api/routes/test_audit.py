@@ -1,6 +1,5 @@
 import pytest
 
-from appliance.api.routes.monitor_routes import records_of
 from appliance.api.routes.shown_records import page_of
 from appliance.audit.search.query import Filter
 from tests.support.audit import decision, settle
@@ -72,17 +71,3 @@ def test_a_search_for_messages_says_that_they_are_never_recorded(make_log: MakeL
     ]
     for known in (Filter(event="message dropped", category="publish"), Filter(event="droped*")):
         assert "notes" not in page_of(log.path, known, None, 1, bearer("v"), newest_first=True)
-
-
-def test_a_viewer_learns_nothing_of_monitor_names_inside_messages(make_log: MakeLog) -> None:
-    log = make_log()
-    for number in range(600):
-        detail = {"monitor": "m" if number % 300 else "gun", "before_fields": {"data": "gun password"}}
-        log.record(decision(log, event="message dropped", category="monitor", detail=detail))
-    settle(log)
-    assert records_of(log.path, "password", None, 2) == []
-    assert [entry.record.detail["monitor"] for entry in records_of(log.path, "gun", None, 5)] == ["gun"] * 2
-    [last] = records_of(log.path, "gun", None, 1)
-    [first] = records_of(log.path, "gun", str(last.sequence), 5)
-    assert first.sequence < last.sequence
-    assert len(records_of(log.path, "m", None, 51)) == 51

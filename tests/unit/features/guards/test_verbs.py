@@ -154,11 +154,21 @@ def test_a_plan_holds_without_the_flight_recorder(
     def replay(*_given: Any, **_options: Any) -> None:
         raise typer.Exit(status)
 
-    monkeypatch.setattr("appliance.cli.monitor.replay.replay_monitor", SimpleNamespace(function=replay))
+    monkeypatch.setattr(verbs, "verb_function", lambda *_verb: SimpleNamespace(function=replay))
     robot = Robot(tmp_path, FENCE)
     robot.refused = []
     with pytest.raises(typer.Exit) if status == 2 else contextlib.nullcontext():
         run(verbs.set_values, robot, "fence", ["margin=0.5"], dry_run=True)
+
+
+def test_a_plan_holds_without_the_verb_for_replays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(verbs, "verb_function", lambda *_verb: None)
+    robot = Robot(tmp_path, FENCE)
+    robot.refused = []
+    run(verbs.set_values, robot, "fence", ["margin=0.5"], dry_run=True)
+    assert "this appliance cannot replay recordings" in capsys.readouterr().out
 
 
 def test_a_disabled_guard_is_not_planned_in_force(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

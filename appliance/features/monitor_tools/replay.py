@@ -9,7 +9,7 @@ import typer
 
 from appliance.channel import admin
 from appliance.cli.connection.target import Appliance, speaks
-from appliance.cli.monitor.monitor_program import MONITOR
+from appliance.cli.monitor_program import MONITOR
 from appliance.features.table import recorded_messages
 from rosmop.batch.replay_job import Specifications
 from rosmop.form.findings import SpecificationError

@@ -1,6 +1,5 @@
 """`rosrv monitor list|enable|promote|disable|load|remove|reload|resume`: monitors of the running appliance."""
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
@@ -10,15 +9,16 @@ from rich.table import Column
 from appliance.api.front.moments import in_full
 from appliance.channel import admin
 from appliance.channel.admin import AdminAnswer
-from appliance.channel.answers.monitor_answers import MonitorState, Replacement, Switched
+from appliance.channel.answers.monitor_answers import MonitorState, Switched
 from appliance.channel.messages import GivenValue
 from appliance.cli import completion
-from appliance.cli.commit_confirm import ConfirmWithin, say_deadline, seconds_within
+from appliance.cli.commit_confirm import ConfirmWithin, seconds_within
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.durations import span_given
+from appliance.cli.monitor_changes import say_held, say_replaced, say_shadow_deadline
 from appliance.cli.output import loaded_by, moment, say_json, usage_error
 from rosmop.tool.tables import say_table, table_of
-from rosmop.tool.terminal import counted, printable, say
+from rosmop.tool.terminal import printable, say
 
 _Names = Annotated[
     list[str], typer.Argument(metavar="MONITOR…", show_default=False, autocompletion=completion.monitors)
@@ -67,7 +67,7 @@ def list_monitors(appliance: Appliance) -> None:
         say("no monitors; load some: rosrv monitor load FILE…")
     if any(row.shadow for row in body.monitors):
         say("(in brackets: messages that a monitor in shadow mode would have dropped or changed)", "dim")
-    _say_held({row.name: row.why_held for row in body.monitors if row.held})
+    say_held({row.name: row.why_held for row in body.monitors if row.held})
     source = f" ({body.folder})" if body.folder else ""
     differs = (
         "; differs from the folder (load the folder's, removing no others: rosrv monitor reload)"
@@ -166,7 +166,7 @@ def load(
 
     Example: rosrv monitor load safe_zone.rv --shadow
     """
-    from appliance.cli.monitor.sources_to_send import read_to_send  # noqa: PLC0415  slow to import
+    from appliance.features.monitor_tools.sources_to_send import read_to_send  # noqa: PLC0415  slow to import
     from rosmop.form.findings import SpecificationError  # noqa: PLC0415  as above
 
     try:
@@ -319,11 +319,6 @@ def _switch(appliance: Appliance, order: admin.AdminRequest[Switched], word: str
     say_shadow_deadline(body.confirm_by)
 
 
-def say_shadow_deadline(confirm_by: float | None) -> None:
-    if confirm_by is not None:
-        say(f"back to shadow mode at {moment(confirm_by)} unless you run: rosrv monitor confirm", "yellow")
-
-
 def _state(row: MonitorState) -> str:
     if row.shadow:
         return f"shadow mode, {row.missed} missed" if row.missed else _SHADOW
@@ -338,34 +333,3 @@ def _state(row: MonitorState) -> str:
             else f"enabled until {moment(row.confirm_by)} unless confirmed"
         )
     return "disabled" if row.off_until is None else f"disabled until {moment(row.off_until)}"
-
-
-def say_replaced(body: Replacement, promote: str = "rosrv monitor promote") -> None:
-    for warning in body.warnings:
-        say(warning, "yellow")
-    parts = [
-        f"{word} {', '.join(files)}"
-        for word, files in (("added", body.added), ("changed", body.changed), ("removed", body.removed))
-        if files
-    ]
-    what = "; ".join(parts) or "no difference"
-    say(f"revision {body.revision} of the specifications is in force (was {body.replaced}): {what}")
-    if body.moved:
-        names = ", ".join(body.moved)
-        say(f"{names} started in the initial state in another relay process", "yellow")
-    if body.warnings:
-        say(counted(len(body.warnings), "warning"), "yellow")
-    say_deadline(body.confirm_by, "monitor")
-    for word, idle, command in (
-        ("disabled", body.disabled, "rosrv monitor enable"),
-        ("in shadow mode", body.shadow, promote),
-    ):
-        if idle:
-            say(f"{word}: {', '.join(idle)}; {command} {' '.join(idle)}", "yellow")
-    _say_held(body.held)
-
-
-def _say_held(held: Mapping[str, str]) -> None:
-    for name, why in held.items():
-        because = why or "its relay process was restarted"
-        say(f"{name} holds its topics: {because}; when it is safe: rosrv monitor resume {name}", "red")

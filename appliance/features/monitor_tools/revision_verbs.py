@@ -9,7 +9,7 @@ from appliance.channel.admin import MonitorConfirm, MonitorRevisions, MonitorRev
 from appliance.channel.answers.monitor_answers import RevisionTexts
 from appliance.cli.commit_confirm import verbs_of
 from appliance.cli.connection.target import Appliance, speaks
-from appliance.cli.monitor.in_force import say_replaced
+from appliance.cli.monitor_changes import say_replaced
 from appliance.cli.output import say_diff, say_json, usage_error
 from rosmop.tool.terminal import say
 

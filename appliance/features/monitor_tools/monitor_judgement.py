@@ -2,35 +2,15 @@
 
 from __future__ import annotations
 
-import re
 from typing import TYPE_CHECKING, NamedTuple
 
-from appliance.api.front.problems import Finding, ProblemError
-from appliance.api.routes.monitor_models import EventShown, PropertyShown
+from appliance.api.front.problems import Finding
+from appliance.api.routes.specification_findings import findings_of
 from appliance.channel.answers.monitor_answers import Monitors
+from appliance.features.monitor_tools.monitor_models import EventShown, PropertyShown
 
 if TYPE_CHECKING:
     from rosmop.run.engine import MonitorSet
-
-_PLACE = re.compile(r"(?s)([^:]*+):([0-9]{1,9}+):([0-9]{1,9}+): (error|warning): (.*+)")
-
-
-def findings_of(texts: list[str]) -> list[Finding]:
-    return [
-        Finding(file=file, line=int(line), column=int(column), severity=severity, text=text)
-        for file, line, column, severity, text in (
-            found.groups() for found in map(_PLACE.fullmatch, texts) if found is not None
-        )
-    ]
-
-
-def refusal(error: str, findings: list[str]) -> ProblemError:
-    return ProblemError(
-        422,
-        "specifications-refused",
-        "\n".join([error, *findings[:200]]),
-        findings=findings_of(findings) or None,
-    )
 
 
 class Described(NamedTuple):

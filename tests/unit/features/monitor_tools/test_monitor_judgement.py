@@ -1,23 +1,13 @@
 import msgspec
 import pytest
 
-from appliance.api.routes.monitor_judgement import Compiler, findings_of, refusal
-from appliance.api.routes.monitor_models import Replaced
 from appliance.channel.answers.monitor_answers import Monitors, Replacement, Tried
+from appliance.features.monitor_tools.monitor_judgement import Compiler
+from appliance.features.monitor_tools.monitor_models import Replaced
 from tests.support.answers import example
 
 A = "a() { int n; event said() /chatter std_msgs/String '{}' { } ere: said said @match { } }"
 TICK = "b() { event t() every 500ms { } event asked(bool on) service /set std_srvs/SetBool request '{data:on}' { } }"
-
-
-def test_findings_without_a_position_stay_in_the_detail() -> None:
-    problem = refusal(
-        "refused", ["a would also be removed: it is in the same file", "a.rv:1:2: error: odd: 1:2"]
-    )
-    assert problem.findings is not None
-    assert [(one.file, one.line, one.text) for one in problem.findings] == [("a.rv", 1, "odd: 1:2")]
-    assert "would also be removed" in problem.detail
-    assert findings_of(["nonsense", "a:b:c: error: x"]) == []
 
 
 @pytest.mark.parametrize("answer", [Replacement, Tried])

@@ -5,7 +5,7 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-from appliance.cli.monitor.monitor_program import MONITOR
+from appliance.cli.monitor_program import MONITOR
 from appliance.specifications.specification_files import Sources, signatures_of
 from rosmop.form.findings import Position, SpecificationError
 from rosmop.tool.specification_input import definition_folders, definition_texts, read_specifications

@@ -13,9 +13,8 @@ from appliance.api.front.route_roles import Viewer, ask, reads_contents
 from appliance.api.front.routing import Responses, Routes, Tagged, file, tagged
 from appliance.api.front.services import Services
 from appliance.api.routes.audit import LogReader
-from appliance.api.routes.monitor_judgement import Compiler, Described, findings_of
-from appliance.api.routes.monitor_models import Happened, History, Monitor, Replaced
 from appliance.api.routes.operation_routes import Answer, OperationCall
+from appliance.api.routes.specification_findings import findings_of
 from appliance.audit.log.record_format import LogEntry, rfc3339, without_contents
 from appliance.audit.search.query import Filter
 from appliance.audit.search.search import search
@@ -24,6 +23,8 @@ from appliance.channel.answers.monitor_answers import (
     Monitors,
     MonitorState,
 )
+from appliance.features.monitor_tools.monitor_judgement import Compiler, Described
+from appliance.features.monitor_tools.monitor_models import Happened, History, Monitor, Replaced
 
 UNKNOWN: Responses = {404: {"description": "There is no such monitor, or revision."}}
 _PICTURE = file("image/svg+xml", "OK")

@@ -3,7 +3,7 @@
 Exit status: 0 valid (also with warnings and verdicts), 1 a specification with errors, 2 usage.
 """
 
-from appliance.cli.monitor.monitor_program import MONITOR
+from appliance.cli.monitor_program import MONITOR
 from rosmop.tool.command import commands_of
 
 check, run, learn, coverage = commands_of(MONITOR).values()

@@ -1,1 +1,0 @@
-"""`rosrv monitor`: check, try, load and switch specifications."""

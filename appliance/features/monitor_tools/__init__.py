@@ -1,0 +1,1 @@
+"""Monitors for operators: `rosrv monitor` and the routes of `/v1/monitors`."""
