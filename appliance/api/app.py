@@ -16,8 +16,6 @@ from appliance.api.front.control import ControlAwayError
 from appliance.api.front.problems import REASON, BadInput, ProblemError, bad_input, defect
 from appliance.api.front.services import Services
 from appliance.api.routes import (
-    audit,
-    audit_summary,
     operation_routes,
     policy_routes,
 )
@@ -57,8 +55,6 @@ def build_app(services: Services) -> FastAPI:
     for part in (
         health,
         policy_routes,
-        audit_summary,  # before /v1/audit/{record_id}
-        audit,
     ):
         app.include_router(part.routes(services))
     for feature in FEATURES:

@@ -22,18 +22,6 @@ _OF_THE_MACHINE = (errno.EACCES, errno.EPERM, errno.ENOSPC, errno.EDQUOT, errno.
 VERBS: Verbs = {
     "up": Verb("up:up"),
     "status": Verb("status_verb:status"),
-    "audit": Group(
-        "Review the audit log and verify that it is complete.",
-        {
-            "search": Verb("audit.audit_verbs:search"),
-            "summary": Verb("audit.summary_verb:summarise"),
-            "tail": Verb("audit.audit_verbs:tail"),
-            "show": Verb("audit.audit_verbs:show"),
-            "verify": Verb("audit.audit_verbs:verify"),
-            "checkpoints": Verb("audit.audit_verbs:checkpoints"),
-            "export": Verb("audit.audit_verbs:export"),
-        },
-    ),
     "version": Verb("version:version"),
     "config": Group(
         "Check or show the configuration.",

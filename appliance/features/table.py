@@ -11,6 +11,7 @@ from appliance.cli.verb_table import Group, Verb
 from appliance.configuration.sections import Sections
 from appliance.features.alarms.feature import ALARMS
 from appliance.features.approvals.feature import APPROVALS
+from appliance.features.audit_tools.feature import AUDIT_TOOLS
 from appliance.features.authority.feature import AUTHORITY
 from appliance.features.backup.feature import BACKUP
 from appliance.features.blocks.feature import BLOCKS
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
     from appliance.supervisor.service_gate import Pairing
 
 FEATURES: tuple[Feature, ...] = (
+    AUDIT_TOOLS,
     POLICY_TOOLS,
     MONITOR_TOOLS,
     ALARMS,

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from appliance.audit.log.record_format import printable, rfc3339
 from appliance.cli.audit.audit_errors import fail
-from appliance.cli.audit.record_table import print_verification, write
+from appliance.cli.audit.verification_text import print_verification, write
 from appliance.features.standby.membership import MembershipError, load_membership, path_of
 from appliance.features.standby.takeover_verification import PairVerification, TakeoverProof
 

@@ -12,7 +12,6 @@ from typing import Annotated, Any, TextIO
 import msgspec
 import typer
 
-from appliance.api.front.unrecorded import unrecorded
 from appliance.api.routes.named_hosts import has_name, with_networks
 from appliance.audit.log.record_format import LogEntry, as_json, as_object, printable
 from appliance.audit.log.signatures import read_public_key
@@ -26,17 +25,13 @@ from appliance.channel.admin import PolicyWanted
 from appliance.channel.answers.policy_answers import PolicyKnown
 from appliance.cli.audit.audit_errors import Errors, fail, note
 from appliance.cli.audit.record_argument import RecordArgument
-from appliance.cli.audit.record_table import (
-    line,
-    print_entries,
-    print_shown,
-    print_verification,
-    write,
-)
+from appliance.cli.audit.verification_text import print_verification, write
 from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.audit_file import FileLog
 from appliance.cli.connection.audit_over_rest import RestLog
 from appliance.cli.connection.target import Appliance, speaks_with
+from appliance.features.audit_tools.record_table import line, print_entries, print_shown
+from appliance.features.audit_tools.unrecorded import unrecorded
 from appliance.features.views import pair_view
 from rosmop.tool.progress_bar import progress
 

@@ -5,8 +5,7 @@ import pytest
 
 from appliance.audit.log.record import AuditRecord
 from appliance.audit.log.record_format import LogEntry
-from appliance.audit.proof.chain_findings import Verification
-from appliance.cli.audit.record_table import print_entries, print_verification
+from appliance.features.audit_tools.record_table import print_entries
 
 _STYLE = re.compile(r"\x1b\[[\d;]*m")
 
@@ -15,25 +14,6 @@ def show_on_terminal(monkeypatch: pytest.MonkeyPatch, columns: int = 200) -> Non
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
     monkeypatch.setenv("TERM", "xterm" if columns > 80 else "dumb")
     monkeypatch.setenv("COLUMNS", str(columns))
-
-
-@pytest.mark.parametrize(
-    ("signed_through", "verdict"),
-    [
-        (0, "The log is consistent, but nothing is signed yet"),
-        (7, "The log is complete and unchanged."),
-    ],
-)
-def test_a_log_is_complete_only_once_something_is_signed(
-    capsys: pytest.CaptureFixture[str], signed_through: int, verdict: str
-) -> None:
-    print_verification(
-        Verification(
-            ok=True, log="one", first=1, last=9, records=9, removed=0, checkpoints=1, signed_checkpoints=1,
-            signed_through=signed_through, unsealed=2, key="", findings=[],
-        )
-    )  # fmt: skip
-    assert capsys.readouterr().out.splitlines()[-1].startswith(verdict)
 
 
 def test_a_table_of_records_has_their_numbers(

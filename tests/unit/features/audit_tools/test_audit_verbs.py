@@ -14,8 +14,8 @@ from pathlib import Path
 import pytest
 
 import appliance
-from appliance.api.front.unrecorded import CATEGORIES
-from appliance.cli.audit.audit_verbs import _new_file
+from appliance.features.audit_tools.audit_verbs import _new_file
+from appliance.features.audit_tools.unrecorded import CATEGORIES
 from appliance.master.graph.registry import Kind
 from appliance.policy.model import Category
 from appliance.specifications.allocation import SERVICE, TOPIC

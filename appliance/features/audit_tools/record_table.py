@@ -1,7 +1,6 @@
 """Print audit records as text: a table on a terminal, lines in a pipe. Text from the network is escaped."""
 
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import msgspec
@@ -11,11 +10,10 @@ from rich.text import Text
 
 from appliance.audit.log.record import AuditRecord, Severity
 from appliance.audit.log.record_format import LogEntry, fields_of, printable, requested, rfc3339, rule_text
-from appliance.audit.proof.chain_findings import Elsewhere, FindingKind, Verification
 from appliance.audit.search.equality import FOLDED, EqualRecords, grouped, time_span
 from appliance.audit.search.search import RecordInContext
 from appliance.base.actors import actor
-from appliance.base.counted import counted
+from appliance.cli.audit.verification_text import write
 from appliance.policy.host_names import HostInWords
 
 _STYLES = {"allow": "green", "deny": "bold red", "would deny": "yellow"}
@@ -77,60 +75,6 @@ def print_shown(shown: RecordInContext, host_in_words: HostInWords) -> None:
         )
         for entry in entries:
             write("  " + line(entry, host_in_words))
-
-
-def print_verification(result: Verification) -> None:
-    for finding in result.findings:
-        write(f"{finding.kind.value.upper()}: {printable(finding.message)}")
-    write(
-        f"{counted(result.records, 'record')} ({result.first} to {result.last}), log {printable(result.log)}"
-    )
-    if result.removed:
-        write(f"records up to {result.removed} were removed by retention, as recorded{_vouched(result)}")
-    write(
-        f"{result.signed_checkpoints} of {counted(result.checkpoints, 'checkpoint is', 'checkpoints are')}"
-        f" signed; records up to {result.signed_through} are proven by a signature,"
-        f" the {result.unsealed} after it by the chain only"
-    )
-    if result.elsewhere is not None:
-        for text in _elsewhere(result.elsewhere):
-            write(text)
-    write(f"key: {result.key or 'none (nothing was signed yet)'}")
-    write(_verdict(result))
-
-
-def _vouched(result: Verification) -> str:
-    if result.removal == "signed":
-        return "; the signer confirmed their removal"
-    return "; the signer did not confirm it: their removal is not proven"
-
-
-def _verdict(result: Verification) -> str:
-    if result.ok and not result.signed_through:
-        return "The log is consistent, but nothing is signed yet: its completeness is not proven. Verify again later."
-    if result.ok:
-        return "The log is complete and unchanged."
-    if all(finding.kind is FindingKind.PROVES_NOTHING for finding in result.findings):
-        return "The log itself is consistent, but the checkpoints kept elsewhere do not confirm it."
-    return "The log was tampered with or is damaged."
-
-
-def _elsewhere(found: Elsewhere) -> Iterator[str]:
-    if found.checkpoints:
-        agreeing = counted(
-            found.checkpoints, "checkpoint kept elsewhere agrees", "checkpoints kept elsewhere agree"
-        )
-        yield f"{agreeing}: records up to {found.through} are unchanged since {rfc3339(found.time)}"
-    else:
-        yield "no checkpoint kept elsewhere belongs to this log"
-    if found.other_logs:
-        yield f"checkpoints of other logs: {', '.join(found.other_logs)}"
-
-
-def write(text: str) -> None:
-    """Print a line; characters that the encoding of standard output lacks are escaped."""
-    encoding = sys.stdout.encoding or "ascii"
-    sys.stdout.write(text.encode(encoding, "backslashreplace").decode(encoding) + "\n")
 
 
 def _has_room(rows: list[tuple[Text, ...]], width: int) -> bool:

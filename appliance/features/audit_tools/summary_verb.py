@@ -10,7 +10,7 @@ from appliance.audit.search.denial_summary import LARGEST_SUMMARY, DenialSummary
 from appliance.audit.search.filter_options import Since, Until, times_given
 from appliance.audit.search.query import Filter
 from appliance.cli.audit.audit_errors import Errors
-from appliance.cli.audit.record_table import write
+from appliance.cli.audit.verification_text import write
 from appliance.cli.connection.target import Appliance, speaks_with
 from appliance.cli.output import say_json
 from appliance.policy.host_names import HostInWords

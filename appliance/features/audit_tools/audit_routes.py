@@ -5,41 +5,33 @@ import contextlib
 import itertools
 import json
 import pathlib
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Iterator
 from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
-from fastapi import Depends, Header, Path, Query, Request, Response
+from fastapi import Depends, Header, Query, Request, Response
 from sse_starlette import EventSourceResponse, ServerSentEvent
 from starlette.responses import JSONResponse, StreamingResponse
 
 from appliance.api.front.access import Bearer
 from appliance.api.front.moments import given
 from appliance.api.front.problems import ProblemError
-from appliance.api.front.route_roles import Operator, Viewer, ask, reads_contents
+from appliance.api.front.route_roles import Operator, Viewer, reads_contents
 from appliance.api.front.routing import Responses, Routes, file
 from appliance.api.front.services import Services
 from appliance.api.front.streams import StreamResponse, Streams, Work, in_thread, peer_of
-from appliance.api.routes.named_hosts import has_name, with_networks
-from appliance.api.routes.shown_records import (
-    PAGE,
-    RECORD_REFERENCE,
-    page_of,
-    readable,
-    readable_by,
-    streamed,
-)
-from appliance.audit.log.log_database import LogUnreadableError
+from appliance.api.routes.log_reader import UNKNOWN, LogReader, OneRecord
+from appliance.api.routes.shown_records import RECORD_REFERENCE, readable, readable_by
 from appliance.audit.log.record import Severity
 from appliance.audit.log.record_format import as_object
-from appliance.audit.log.signatures import KeyUnreadableError
 from appliance.audit.proof.chain_findings import Verification
 from appliance.audit.proof.chain_proofs import evidence, evidence_line
 from appliance.audit.proof.copies import SignedCheckpoint, signed_checkpoints
 from appliance.audit.proof.verification import verify
-from appliance.audit.search.query import Filter, FilterError
-from appliance.audit.search.search import Follower, RecordInContext, export, show
-from appliance.channel.admin import PolicyWanted
+from appliance.audit.search.query import Filter
+from appliance.audit.search.search import Follower, export
+from appliance.features.audit_tools.audit_summary import add_summary
+from appliance.features.audit_tools.record_pages import PAGE, page_of, streamed
 from appliance.quotas.table import REST_STREAM_PEERS, REST_STREAMS
 
 _T = TypeVar("_T")
@@ -123,52 +115,6 @@ def _wanted(
 Wanted = Annotated[Filter, Depends(_wanted)]
 Limit = Annotated[int, Query(ge=1, le=_LARGEST_PAGE)]
 WithEquality = Annotated[bool, Query(description="1: also what makes equal records one row")]
-OneRecord = Annotated[
-    str,
-    Path(
-        min_length=1,
-        max_length=20,
-        pattern="^[0-9a-f]+$",
-        description="id of a record, or its sequence",
-        examples=["812"],
-    ),
-]
-
-
-class LogReader:
-    """Reads the log in a limited number of threads."""
-
-    def __init__(self, services: Services) -> None:
-        self.path = services.audit_log
-        self._control = services.control
-        self._searches = services.searches
-
-    async def read(self, bearer: Bearer, function: Callable[..., _T], *arguments: Any, **named: Any) -> _T:
-        async with self._searches.turn(bearer):
-            return await self.in_thread(function, *arguments, **named)
-
-    async def named(self, bearer: Bearer, wanted: Filter) -> Filter:
-        if not has_name(wanted):
-            return wanted
-        return await self.in_thread(with_networks, wanted, await ask(self._control, PolicyWanted(), bearer))
-
-    async def record(self, bearer: Bearer, record_id: str, neighbours: int) -> RecordInContext:
-        """Return a record with its neighbours. Raises `ProblemError`."""
-        shown = await self.read(bearer, show, self.path, record_id, neighbours)
-        if shown is None:
-            raise ProblemError(404, "unknown", f"there is no record {record_id}")
-        return shown
-
-    async def in_thread(self, function: Callable[..., _T], *arguments: Any, **named: Any) -> _T:
-        try:
-            return await asyncio.to_thread(function, *arguments, **named)
-        except FilterError as error:
-            raise ProblemError(422, "bad-input", str(error)) from error
-        except (LogUnreadableError, KeyUnreadableError) as error:
-            raise ProblemError(503, "log-unreadable", str(error)) from error
-
-
-UNKNOWN: Responses = {404: {"description": "There is no such record."}}
 
 
 def _json(schema: dict[str, Any]) -> Responses:
@@ -178,6 +124,7 @@ def _json(schema: dict[str, Any]) -> Responses:
 def routes(services: Services) -> Routes:
     router = Routes(prefix="/v1/audit", tags=["audit"])
     desk = LogReader(services)
+    add_summary(router, services)  # before /v1/audit/{record_id}
     _add_searches(router, services, desk)
     _add_proofs(router, services, desk)
     _add_one(router, desk)

@@ -8,10 +8,11 @@ import pytest
 from starlette.responses import Response
 
 from appliance.api.front.access import Bearer
+from appliance.api.front.routing import Routes
 from appliance.api.front.services import Services
-from appliance.api.routes import audit_summary
 from appliance.audit.search.denial_summary import DenialSummary
 from appliance.audit.search.query import Filter
+from appliance.features.audit_tools import audit_summary
 from tests.unit.audit.conftest import key, make_log, notary, path
 
 pytestmark = pytest.mark.nightly
@@ -28,7 +29,9 @@ class _Log:
 
 
 def route(log: Path) -> Callable[..., Coroutine[Any, Any, Response]]:
-    [one] = audit_summary.routes(cast(Services, _Log(log))).routes
+    router = Routes()
+    audit_summary.add_summary(router, cast(Services, _Log(log)))
+    [one] = router.routes
     return cast(Callable[..., Coroutine[Any, Any, Response]], one.endpoint)  # type: ignore[attr-defined]  # an APIRoute
 
 

@@ -16,8 +16,7 @@ from appliance.audit.search.denial_summary import LARGEST_SUMMARY, DenialSummary
 from appliance.audit.search.query import Filter
 
 
-def routes(services: Services) -> Routes:
-    router = Routes(prefix="/v1/audit", tags=["audit"])
+def add_summary(router: Routes, services: Services) -> None:
     one = Work("summaries of the audit log", 1)
 
     @router.get("/summary")
@@ -38,5 +37,3 @@ def routes(services: Services) -> Routes:
                 )
             except LogUnreadableError as error:
                 raise ProblemError(503, "log-unreadable", str(error)) from error
-
-    return router

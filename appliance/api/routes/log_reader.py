@@ -1,0 +1,65 @@
+"""Read the audit log for routes, in a limited number of threads. The api cannot write the log."""
+
+import asyncio
+from collections.abc import Callable
+from typing import Annotated, Any, TypeVar
+
+from fastapi import Path
+
+from appliance.api.front.access import Bearer
+from appliance.api.front.problems import ProblemError
+from appliance.api.front.route_roles import ask
+from appliance.api.front.routing import Responses
+from appliance.api.front.services import Services
+from appliance.api.routes.named_hosts import has_name, with_networks
+from appliance.audit.log.log_database import LogUnreadableError
+from appliance.audit.log.signatures import KeyUnreadableError
+from appliance.audit.search.query import Filter, FilterError
+from appliance.audit.search.search import RecordInContext, show
+from appliance.channel.admin import PolicyWanted
+
+_T = TypeVar("_T")
+UNKNOWN: Responses = {404: {"description": "There is no such record."}}
+OneRecord = Annotated[
+    str,
+    Path(
+        min_length=1,
+        max_length=20,
+        pattern="^[0-9a-f]+$",
+        description="id of a record, or its sequence",
+        examples=["812"],
+    ),
+]
+
+
+class LogReader:
+    """Reads the log in a limited number of threads."""
+
+    def __init__(self, services: Services) -> None:
+        self.path = services.audit_log
+        self._control = services.control
+        self._searches = services.searches
+
+    async def read(self, bearer: Bearer, function: Callable[..., _T], *arguments: Any, **named: Any) -> _T:
+        async with self._searches.turn(bearer):
+            return await self.in_thread(function, *arguments, **named)
+
+    async def named(self, bearer: Bearer, wanted: Filter) -> Filter:
+        if not has_name(wanted):
+            return wanted
+        return await self.in_thread(with_networks, wanted, await ask(self._control, PolicyWanted(), bearer))
+
+    async def record(self, bearer: Bearer, record_id: str, neighbours: int) -> RecordInContext:
+        """Return a record with its neighbours. Raises `ProblemError`."""
+        shown = await self.read(bearer, show, self.path, record_id, neighbours)
+        if shown is None:
+            raise ProblemError(404, "unknown", f"there is no record {record_id}")
+        return shown
+
+    async def in_thread(self, function: Callable[..., _T], *arguments: Any, **named: Any) -> _T:
+        try:
+            return await asyncio.to_thread(function, *arguments, **named)
+        except FilterError as error:
+            raise ProblemError(422, "bad-input", str(error)) from error
+        except (LogUnreadableError, KeyUnreadableError) as error:
+            raise ProblemError(503, "log-unreadable", str(error)) from error

@@ -1,0 +1,62 @@
+"""Print the verification of an audit log."""
+
+import sys
+from collections.abc import Iterator
+
+from appliance.audit.log.record_format import printable, rfc3339
+from appliance.audit.proof.chain_findings import Elsewhere, FindingKind, Verification
+from appliance.base.counted import counted
+
+
+def print_verification(result: Verification) -> None:
+    for finding in result.findings:
+        write(f"{finding.kind.value.upper()}: {printable(finding.message)}")
+    write(
+        f"{counted(result.records, 'record')} ({result.first} to {result.last}), log {printable(result.log)}"
+    )
+    if result.removed:
+        write(f"records up to {result.removed} were removed by retention, as recorded{_vouched(result)}")
+    write(
+        f"{result.signed_checkpoints} of {counted(result.checkpoints, 'checkpoint is', 'checkpoints are')}"
+        f" signed; records up to {result.signed_through} are proven by a signature,"
+        f" the {result.unsealed} after it by the chain only"
+    )
+    if result.elsewhere is not None:
+        for text in _elsewhere(result.elsewhere):
+            write(text)
+    write(f"key: {result.key or 'none (nothing was signed yet)'}")
+    write(_verdict(result))
+
+
+def _vouched(result: Verification) -> str:
+    if result.removal == "signed":
+        return "; the signer confirmed their removal"
+    return "; the signer did not confirm it: their removal is not proven"
+
+
+def _verdict(result: Verification) -> str:
+    if result.ok and not result.signed_through:
+        return "The log is consistent, but nothing is signed yet: its completeness is not proven. Verify again later."
+    if result.ok:
+        return "The log is complete and unchanged."
+    if all(finding.kind is FindingKind.PROVES_NOTHING for finding in result.findings):
+        return "The log itself is consistent, but the checkpoints kept elsewhere do not confirm it."
+    return "The log was tampered with or is damaged."
+
+
+def _elsewhere(found: Elsewhere) -> Iterator[str]:
+    if found.checkpoints:
+        agreeing = counted(
+            found.checkpoints, "checkpoint kept elsewhere agrees", "checkpoints kept elsewhere agree"
+        )
+        yield f"{agreeing}: records up to {found.through} are unchanged since {rfc3339(found.time)}"
+    else:
+        yield "no checkpoint kept elsewhere belongs to this log"
+    if found.other_logs:
+        yield f"checkpoints of other logs: {', '.join(found.other_logs)}"
+
+
+def write(text: str) -> None:
+    """Print a line; characters that the encoding of standard output lacks are escaped."""
+    encoding = sys.stdout.encoding or "ascii"
+    sys.stdout.write(text.encode(encoding, "backslashreplace").decode(encoding) + "\n")
