@@ -335,7 +335,7 @@ class RelayedTopic:
         # Write after subscribers got the batch, to delay nothing; copy it first: monitors may change it in place.
         whole = batch
         if self._monitoring.through is not None and stream.keeps:
-            whole = Batch(memoryview(bytes(batch.view)), batch.messages, batch.last, stride=batch.stride)
+            whole = Batch(memoryview(bytes(batch.view)), batch.messages, batch.last)
             whole.first = batch.first
         passes = 0 if passing is None else passing.messages
         rest = None if passing is None else self._admit(passing, since)

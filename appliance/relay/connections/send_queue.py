@@ -6,11 +6,11 @@
 """
 
 from collections import deque
-from math import ceil
 
 from appliance.relay.relay_limits import RelayLimits
-from appliance.relay.transport.frames import LITTLE, boundary_at, equal_frames
+from appliance.relay.transport.frames import LITTLE
 from appliance.relay.transport.memory import HostMemory
+from appliance.relay.transport.pump import walk
 
 _VECTORS = 64
 _BEHIND = 1 << 20
@@ -63,10 +63,9 @@ class SendQueue:
         """Queue a batch whose first `sent` bytes are already sent. The batch, or its `rest`, must not change."""
         if sent:
             rest = view[sent:] if rest is None else rest
-            gone, end = boundary_at(view, sent)
+            end, gone, _ = walk(view, size=sent)
             if end > sent:
                 self.begin(rest[: end - sent])
-                gone += 1
             view, messages = rest[end - sent :], messages - gone
         if messages:
             self._waiting.append((view, messages))
@@ -97,10 +96,9 @@ class SendQueue:
             if sent >= len(view):
                 sent -= len(view)
                 continue
-            gone, end = boundary_at(view, sent)
+            end, gone, _ = walk(view, size=sent)
             if end > sent:
                 self.begin(view[sent:end])
-                gone += 1
             if messages > gone:
                 self._waiting.appendleft((view[end:], messages - gone))
                 self._count(messages - gone, len(view) - end)
@@ -114,19 +112,9 @@ class SendQueue:
             limit_messages = limit_size = 0
         while self._messages > limit_messages or self._size > limit_size:
             view, messages = self._waiting.popleft()
+            too_many, too_much = self._messages - limit_messages, self._size - limit_size
             self._count(-messages, -len(view))
-            dropped = end = 0
-            stride, count = equal_frames(view, len(view))
-            if stride and count == messages:
-                dropped = max(self._messages + messages - limit_messages, 0)
-                dropped = min(messages, max(dropped, ceil((self._size + len(view) - limit_size) / stride)))
-                end = dropped * stride
-            while dropped < messages and (
-                self._messages + messages - dropped > limit_messages
-                or self._size + len(view) - end > limit_size
-            ):
-                end += int.from_bytes(view[end : end + 4], "little") + 4
-                dropped += 1
+            end, dropped, _ = max(walk(view, too_many), walk(view, size=too_much))
             if dropped < messages:
                 self._waiting.appendleft((view[end:], messages - dropped))
                 self._count(messages - dropped, len(view) - end)

@@ -119,7 +119,7 @@ class ServedSubscribers:
         behind = False
         for number, member in enumerate(members):
             if divided and number and not number % _ROW and self._over():
-                kept = Batch(batch.keep(), batch.messages, batch.last, owned=True, stride=batch.stride)
+                kept = Batch(batch.keep(), batch.messages, batch.last, owned=True)
                 self._waits = kept, members[number:]
                 break
             if member in self._members:

@@ -170,33 +170,21 @@ class UpstreamReader:
             return
         if batch is not None:
             rest = self._topic.received(batch, since)
-            if rest is not None or self._receiver.more or self._topic.undelivered:
+            if rest is not None or self._topic.undelivered:
                 self._received_at = since
                 self._continue(rest)
 
     def _continue(self, rest: Batch | None) -> None:
-        receiver = self._receiver
-        while self._state is not _State.CLOSED:
-            over = receiver.more and (self._pause is not None or self._loop.over())
-            if rest is not None or over or self._topic.undelivered:
-                self._leave(rest)
-                return
-            if not receiver.more:
-                self._read_on()
-                return
-            try:
-                batch = receiver.following()
-            except PeerError as error:
-                self._lost(str(error), violation_of(error))
-                return
-            rest = None if batch is None else self._topic.received(batch, self._received_at)
-
-    def _leave(self, rest: Batch | None) -> None:
         if self._state is _State.CLOSED:
             return
+        if rest is not None or self._topic.undelivered:
+            self._leave(rest)
+        else:
+            self._read_on()
+
+    def _leave(self, rest: Batch | None) -> None:
         self._rest = rest
         self._held.set(self._topic.undelivered + (0 if rest is None else len(rest.view)))
-        self._receiver.set_aside()
         if self._state is _State.WATCHED:
             self._state = _State.LEFT
             self._loop.unwatch(self._socket.fileno())

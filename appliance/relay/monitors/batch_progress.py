@@ -3,6 +3,7 @@
 import struct
 
 from appliance.relay.transport.frames import Batch
+from appliance.relay.transport.pump import walk
 
 _LENGTH = struct.Struct("<I")
 _MOST_TURNS = 64
@@ -16,8 +17,7 @@ class BatchProgress:
     """
 
     __slots__ = (
-        "_batch", "_gone", "_turns", "end", "messages", "pieces", "position", "run", "stride", "time",
-        "view",
+        "_batch", "_gone", "_turns", "end", "messages", "pieces", "position", "run", "time", "view",
     )  # fmt: skip
 
     def __init__(self, batch: Batch, time: int) -> None:
@@ -26,7 +26,6 @@ class BatchProgress:
         self.view = batch.view
         self.end = len(batch.view)
         self.messages = batch.messages
-        self.stride = batch.stride
         self.time = time
         self.position = 0
         self.run = 0
@@ -34,13 +33,7 @@ class BatchProgress:
         self._turns = 1
 
     def number_at(self, position: int) -> int:
-        if self.stride:
-            return self._batch.first + position // self.stride
-        number, walked = self._batch.first, 0
-        while walked < position:
-            walked += 4 + _LENGTH.unpack_from(self.view, walked)[0]
-            number += 1
-        return number
+        return self._batch.first + walk(self.view, size=position)[1]
 
     def turns(self) -> int:
         """Return how many messages to take one by one; the number doubles until some can be taken together."""

@@ -9,12 +9,13 @@ LARGE: Final[int]
 BASE: Final[int]
 CELLS: Final[int]
 HAS_CELLS: Final[int]
-MOST: Final[int]
 UNARMED: Final = 0
 RECEIVED: Final = 1
 JUDGED: Final = 2
 SENT: Final = 3
 LITTLE: Final[float]
+
+def walk(frames: memoryview, messages: int = ..., size: int = ...) -> tuple[int, int, int]: ...
 
 class CellsPlace(Protocol):
     @property

@@ -36,6 +36,7 @@ from libc.stdint cimport int64_t, uint8_t, uint32_t, uint64_t, uintptr_t
 from libc.string cimport memcmp, memcpy
 from libc.time cimport time_t
 
+import sys
 from typing import NamedTuple
 
 from appliance.channel.messages import DELAY_BOUNDS
@@ -86,7 +87,7 @@ cdef enum:
     _SENT = 3
 
 SUBSCRIBERS = _SUBSCRIBERS
-SMALL, LARGE, MOST = _SMALL, _LARGE, _FRAMES
+SMALL, LARGE = _SMALL, _LARGE
 BASE, CELLS, HAS_CELLS = _BASE, _CELLS, _HAS_CELLS  # bits of a section's byte, explained in state_memory.py
 UNARMED, RECEIVED, JUDGED, SENT = _UNARMED, _RECEIVED, _JUDGED, _SENT
 LITTLE = 1e-4
@@ -94,6 +95,7 @@ LITTLE = 1e-4
 
 cdef int64_t _LITTLE = int(LITTLE * 1e9)
 cdef int64_t _NEVER = (1 << 63) - 1
+_ALL = sys.maxsize
 cdef int64_t _TOLD = 1 << 60  # this bit and the higher ones of an answer want more work (rosmop/fast/abi.py)
 cdef int64_t _ADDRESS = 0xFFFFFFFF
 cdef int64_t _BOUND[_BOUNDS]
@@ -121,6 +123,25 @@ cdef inline int64_t _now() noexcept nogil:
     cdef timespec now
     clock_gettime(CLOCK_MONOTONIC, &now)
     return <int64_t>now.tv_sec * 1_000_000_000 + now.tv_nsec
+
+
+def walk(const uint8_t[::1] frames, Py_ssize_t messages=_ALL, Py_ssize_t size=_ALL) -> tuple[int, int, int]:
+    """Walk over whole frames until there are this number of messages, or bytes, or no further whole frame.
+
+    Return the bytes and messages passed, and the offset of the last of these frames.
+    """
+    cdef Py_ssize_t at = 0, last = 0, passed = 0, need
+    cdef Span span
+    if frames.shape[0]:
+        span = Span(<uint8_t *>&frames[0], frames.shape[0])
+    while passed < messages and at < size and frames.shape[0] - at >= 4:
+        need = 4 + _word(span, at)
+        if need > frames.shape[0] - at:
+            break
+        last = at
+        at += need
+        passed += 1
+    return at, passed, last
 
 
 cdef class Version:

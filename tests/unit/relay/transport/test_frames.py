@@ -1,20 +1,12 @@
 import struct
 
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from appliance.relay.transport.frames import (
-    LARGE,
-    SCRATCH,
-    Batch,
-    FrameReceiver,
-    Scratch,
-    boundary_at,
-    equal_frames,
-    last_frame,
-)
+from appliance.relay.transport.frames import LARGE, SCRATCH, Batch, FrameReceiver, Scratch
 from appliance.relay.transport.memory import HostMemory
+from appliance.relay.transport.pump import walk
 from roswire.errors import LimitExceededError, PeerError
 from tests.support.examples import examples
 from tests.support.relay_memory import share
@@ -165,49 +157,37 @@ def test_for_little_of_a_large_frame_its_memory_is_not_kept() -> None:
     assert batch.rest(len(view) - 1000).obj is view.obj
 
 
-def test_boundary_at_finds_the_frame_a_send_stopped_in() -> None:
+def test_a_walk_to_a_byte_ends_behind_the_frame_with_that_byte() -> None:
     view = memoryview(frame(6) + frame(0) + frame(10))
-    equal = memoryview(frame(96) * 60)
-    assert [boundary_at(equal, offset) for offset in (5000, 5001)] == [(50, 5000), (50, 5100)]
-    assert [boundary_at(view, offset) for offset in (0, 3, 10, 11, 14, 15, 28)] == [
-        (0, 0),
-        (0, 10),
-        (1, 10),
-        (1, 14),
-        (2, 14),
-        (2, 28),
-        (3, 28),
+    assert [walk(view, size=offset) for offset in (-1, 0, 3, 10, 11, 14, 15, 28, 29)] == [
+        (0, 0, 0),
+        (0, 0, 0),
+        (10, 1, 0),
+        (10, 1, 0),
+        (14, 2, 10),
+        (14, 2, 10),
+        (28, 3, 14),
+        (28, 3, 14),
+        (28, 3, 14),
     ]
+    assert walk(memoryview(b"")) == walk(view, -1) == (0, 0, 0)
 
 
-@given(st.lists(st.sampled_from([0, 5, 5, 5, 252, 256, 65_536]), max_size=12), st.integers(0, 9))
-@example([5, 5, 5, 5, 0], 0)
-def test_equal_frames_are_seen_at_once_exactly_if_all_are_equal(lengths: list[int], torn: int) -> None:
+@given(st.lists(st.sampled_from([0, 5, 5, 252, 65_536]), max_size=12), st.integers(0, 9), st.integers(-1, 14))
+def test_a_walk_passes_exactly_the_whole_frames(lengths: list[int], torn: int, most: int) -> None:
     data = b"".join(frame(length) for length in lengths) + frame(20)[:torn]
-    stride, count = equal_frames(memoryview(data), len(data))
-    if count:
-        assert lengths[:count] == [stride - 4] * count
-        assert all(length + 4 > len(data) - stride * count for length in lengths[count:])
-    else:
-        assert stride == 0
-        assert len(lengths) < 4 or len(set(lengths)) > 1 or torn >= lengths[0] + 4
+    passed = lengths[: max(most, 0)]
+    size = sum(passed) + 4 * len(passed)
+    assert walk(memoryview(data), most) == (size, len(passed), size - passed[-1] - 4 if passed else 0)
 
 
-def test_a_batch_of_equal_frames_says_so() -> None:
-    one, _ = receiver()
-    data = frame(6) * 5 + frame(6)[:3]
-    one.buffer()[: len(data)] = data
-    equal = one.received(len(data))
-    rest = frame(6)[3:] + frame(6) * 3 + frame(7)
-    one.buffer()[: len(rest)] = rest
-    other = one.received(len(rest))
-    assert equal is not None
-    assert other is not None
-    assert (equal.messages, equal.stride, equal.last) == (5, 10, 40)
-    assert (other.messages, other.stride, other.last) == (5, 0, 40)
+def test_a_read_of_many_frames_is_one_batch() -> None:
+    one, budget = receiver()
+    data = (frame(0) + frame(1)) * 50_000
+    assert feed(one, data + frame(6)[:3], [SCRATCH]) == [(data, 100_000, len(data) - 5)]
+    assert budget.used == 3
 
 
 def test_the_last_frame_is_looked_for_where_it_is_not_known() -> None:
     view = memoryview(frame(6) + frame(0) + frame(10, 3))
-    assert last_frame(view) == 14
     assert bytes(Batch(view, 3, None).keep_last().view) == frame(10, 3)

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from appliance.relay.transport.frames import LARGE, MOST, SMALL, Scratch
+from appliance.relay.transport.frames import LARGE, SMALL, Scratch
 from appliance.relay.transport.pump import (
     RECEIVED,
     SENT,
@@ -22,6 +22,7 @@ from appliance.relay.transport.pump import (
 pytestmark = pytest.mark.nightly
 
 READ = select.EPOLLIN
+MOST = 4096  # frames of a step
 _ROOM = 64
 
 

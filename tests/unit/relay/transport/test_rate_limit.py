@@ -72,7 +72,7 @@ def test_the_first_of_a_batch_pass() -> None:
     flow = alone(FlowLimit(messages=20, bytes=200))
     assert flow.room(frames(*[4] * 30), 30, 0.0) == 10
     assert flow.room(frames(50, 30, 30, 4), 4, 0.0) == 3
-    equal = Batch(memoryview((struct.pack("<I", 46) + bytes(46)) * 8), 8, None, stride=50)
+    equal = Batch(memoryview((struct.pack("<I", 46) + bytes(46)) * 8), 8, None)
     assert flow.room(equal, 8, 0.0) == 2
     assert (equal.head(2).messages, len(equal.head(2).view), equal.head(2).last) == (2, 100, 50)
 
