@@ -18,9 +18,10 @@ from appliance.relay.connections.headers import size_of
 from appliance.relay.connections.introductions import Introductions
 from appliance.relay.connections.named_subscribers import NamedSubscribers
 from appliance.relay.connections.relayed_topic import RelayedTopic, Upstream
-from appliance.relay.connections.upstream_reader import UpstreamReader, header_refusal, violation_of
+from appliance.relay.connections.upstream_reader import UpstreamReader, violation_of
 from appliance.relay.context import RelayContext
 from appliance.relay.loop import LoopTimer
+from appliance.relay.transport.frames import SMALL
 from appliance.relay.transport.sockets import BufferedSocket, begin_connect
 from roswire.errors import PeerError
 from roswire.tcpros import HeaderParser, encode_header
@@ -213,8 +214,10 @@ class PublisherConnection(Upstream):
         self._flow(header, attempt)
 
     def _no_room(self, header: Mapping[str, str]) -> tuple[str, Violation] | None:
-        reason = header_refusal(self._context, self._topic.host, size_of(header))
-        return (reason, "limit exceeded") if reason else None
+        size = size_of(header)
+        if size > SMALL and self._context.memory.frames.of(self._topic.host).refusal(size):
+            return "the relay has no memory left for headers of this host", "limit exceeded"
+        return None
 
     def _object(self, reason: str) -> None:
         """Disconnect and retry: the publisher may return with another message definition."""

@@ -15,7 +15,7 @@ from appliance.relay.connections.headers import size_of
 from appliance.relay.connections.relayed_topic import RelayedTopic
 from appliance.relay.context import RelayContext
 from appliance.relay.loop import READ, LoopTimer
-from appliance.relay.transport.frames import SMALL, Batch, FrameReceiver
+from appliance.relay.transport.frames import Batch, FrameReceiver
 from appliance.relay.transport.memory import HeldBytes, StallDetector
 from appliance.relay.transport.pump import JUDGED, RECEIVED, UNARMED, Left
 from roswire.errors import LimitExceededError, PeerError
@@ -61,15 +61,16 @@ class UpstreamReader:
         self._pause: LoopTimer | None = None
         self._received_at = 0.0  # of the data that is left
         self._rest: Batch | None = None
-        self._early = b""  # data that arrived with the header
         self._held = HeldBytes(memory)
         self._held_header = HeldBytes(memory)
         self._held_header.set(size_of(header))
         self._watch()
 
     def start(self, early: bytes) -> None:
-        self._early = early
-        self._take_early()
+        """Take the data that came with the header, if any: they fit into an unused buffer."""
+        if early and self._state is _State.WATCHED:
+            self._buffer()[: len(early)] = early
+            self._received(len(early))
 
     def pause(self, seconds: float) -> None:
         if self._pause is None:
@@ -105,7 +106,7 @@ class UpstreamReader:
         if self._pause is not None:
             self._pause.cancel()
         self._loop.discard(self._socket)
-        self._rest, self._early = None, b""
+        self._rest = None
         self._held.set(0)
         self._held_header.set(0)
         self._pumped.disarm()
@@ -125,9 +126,8 @@ class UpstreamReader:
             except BlockingIOError:
                 return
             except OSError as error:
-                self._received(-(error.errno or 0))
-            else:
-                self._received(count)
+                count = -(error.errno or 0)
+            self._received(count)
         elif left.kind == RECEIVED:
             self._received(left.end)
         else:
@@ -135,33 +135,10 @@ class UpstreamReader:
         self._arm()
 
     def _received(self, count: int) -> None:
-        if count > 0:
-            self._take(count)
-        elif count:
-            self._lost(f"the connection to the publisher broke: {os.strerror(-count)}", "")
-        else:
-            self._lost("the publisher closed the connection", "")
-
-    def _go_on_behind(self, left: Left) -> None:
-        batch = self._receiver.found(left.size, left.end, left.messages)
-        batch.judged, batch.answer = left.judged, left.answer
-        if left.kind == JUDGED:
-            rest = self._topic.received(batch, left.since)
-        else:
-            rest = None
-            self._topic.sent(batch, left.since, left.number, left.sent)
-        self._received_at = left.since
-        self._continue(rest)
-
-    def _arm(self) -> None:
-        if self._state is not _State.WATCHED or self._early or not self._receiver.small:
+        if count <= 0:
+            broke = f"the connection to the publisher broke: {os.strerror(-count)}"
+            self._lost(broke if count else "the publisher closed the connection", "")
             return
-        simple = self._topic.simple()
-        if simple is not None:
-            torn = self._receiver.hand_over()
-            self._pumped.arm(self._socket.fileno(), self._topic, *simple, torn=torn)
-
-    def _take(self, count: int) -> None:
         since = self._loop.clock()
         try:
             batch = self._receiver.received(count)
@@ -169,26 +146,42 @@ class UpstreamReader:
             self._lost(str(error), violation_of(error))
             return
         if batch is not None:
-            rest = self._topic.received(batch, since)
-            if rest is not None or self._topic.undelivered:
-                self._received_at = since
-                self._continue(rest)
+            self._continue(self._topic.received(batch, since), since)
 
-    def _continue(self, rest: Batch | None) -> None:
+    def _go_on_behind(self, left: Left) -> None:
+        batch = self._receiver.found(left.size, left.end, left.messages)
+        batch.judged, batch.answer = left.judged, left.answer
+        rest = None
+        if left.kind == JUDGED:
+            rest = self._topic.received(batch, left.since)
+        else:
+            self._topic.sent(batch, left.since, left.number, left.sent)
+        self._continue(rest, left.since)
+
+    def _arm(self) -> None:
+        if self._state is not _State.WATCHED or not self._receiver.small:
+            return
+        simple = self._topic.simple()
+        if simple is not None:
+            torn = self._receiver.hand_over()
+            self._pumped.arm(self._socket.fileno(), self._topic, *simple, torn=torn)
+
+    def _continue(self, rest: Batch | None, since: float) -> None:
+        """Leave the frames that are left for the next turn, or read on."""
         if self._state is _State.CLOSED:
             return
         if rest is not None or self._topic.undelivered:
-            self._leave(rest)
-        else:
-            self._read_on()
-
-    def _leave(self, rest: Batch | None) -> None:
-        self._rest = rest
-        self._held.set(self._topic.undelivered + (0 if rest is None else len(rest.view)))
-        if self._state is _State.WATCHED:
+            self._rest, self._received_at = rest, since
+            self._held.set(self._topic.undelivered + (0 if rest is None else len(rest.view)))
+            if self._state is _State.WATCHED:
+                self._loop.unwatch(self._socket.fileno())
             self._state = _State.LEFT
-            self._loop.unwatch(self._socket.fileno())
-        self._queue()
+            self._queue()
+        elif self._state is not _State.WATCHED:
+            self._state, self._rest = _State.WATCHED, None
+            self._held.set(0)
+            if self._pause is None:
+                self._watch()
 
     def _queue(self) -> None:
         if self._pause is None and self._state is _State.LEFT:
@@ -202,35 +195,10 @@ class UpstreamReader:
         if self._pause is not None:
             return
         self._topic.hand_out()
-        if self._topic.undelivered or self._pause is not None:
-            self._leave(self._rest)
-            return
-        rest, self._rest = self._rest, None
-        self._held.set(0)
-        if rest is not None:
+        rest = self._rest
+        if rest is not None and self._pause is None and not self._topic.undelivered:
             rest = self._topic.go_on(self._context.scratch.hold(rest), self._received_at)
-        self._continue(rest)
-
-    def _read_on(self) -> None:
-        if self._state is not _State.WATCHED:
-            self._state = _State.WATCHED
-            if self._pause is None:
-                self._watch()
-            self._take_early()
-
-    def _take_early(self) -> None:
-        while self._early and self._state is _State.WATCHED:
-            buffer = self._buffer()
-            count = min(len(self._early), len(buffer))
-            buffer[:count] = self._early[:count]
-            self._early = self._early[count:]
-            self._take(count)
-
-
-def header_refusal(context: RelayContext, host: str, size: int) -> str:
-    if size > SMALL and context.memory.frames.of(host).refusal(size):
-        return "the relay has no memory left for headers of this host"
-    return ""
+        self._continue(rest, self._received_at)
 
 
 def violation_of(error: PeerError) -> Violation:
