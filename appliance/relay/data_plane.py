@@ -162,7 +162,7 @@ class DataPlane:
         self._reporter.repeat_connections()
         for topic in self.topics.values():
             topic.upstream.ask_again()
-            topic.repeat()
+            topic.latch.repeat()
         self.interceptor.observations.repeat()
 
     def _withdrawn(self, message: messages.Message) -> None:
@@ -281,10 +281,10 @@ class DataPlane:
         while share.refusal(size):
             greatest, held = max(latched.holders(), key=lambda holder: holder[1], default=("", 0))
             of_greatest = (topic for topic in self.topics.values() if topic.host == greatest)
-            largest = max(of_greatest, key=lambda topic: topic.latched, default=None)
-            if held <= share.used + size or largest is None or not largest.latched:
+            largest = max(of_greatest, key=lambda topic: topic.latch.size, default=None)
+            if held <= share.used + size or largest is None or not largest.latch.size:
                 return
-            largest.give_up_latched()
+            largest.latch.give_up()
 
     def _attach_monitors(self, relayed: RelayedTopic) -> None:
         interceptor, topic = self.interceptor, relayed.topic

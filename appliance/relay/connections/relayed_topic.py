@@ -91,7 +91,6 @@ class TopicState(Enum):
 
     UNKNOWN = auto()
     OPEN = auto()
-    PAUSED = auto()
     LOST = auto()
 
 
@@ -142,7 +141,7 @@ class RelayedTopic:
         self.plain = Version()
         """Changes whenever the pump may have to leave the next frames to Python (see `simple`)."""
         self.counters = Traffic()
-        self._latch = LatchedMessage(share, make_room, lambda size: refused(LatchRefused(key, topic, size)))
+        self.latch = LatchedMessage(share, make_room, lambda size: refused(LatchRefused(key, topic, size)))
         self._served = ServedSubscribers(over)
         self._state = TopicState.UNKNOWN
         self._header: dict[str, str] | None = None  # as subscribers get it; None while UNKNOWN
@@ -184,8 +183,8 @@ class RelayedTopic:
         """Call `tap` with each batch, first (if `latched`) with the latched message. The tap must not keep a batch."""
         self._taps += (tap,)
         self.differs()
-        if latched and self._latch.batch is not None:
-            tap(self._latch.batch)
+        if latched and self.latch.batch is not None:
+            tap(self.latch.batch)
         self.upstream.connect()
 
     def untap(self, tap: Callable[[Batch], None]) -> None:
@@ -201,9 +200,9 @@ class RelayedTopic:
 
         The answer holds until `plain` or the monitors' preparation changes.
         """
-        if self._latch.is_latching or self._taps or self.flow.limits or len(self._served) > SUBSCRIBERS:
+        if self.latch.is_latching or self._taps or self.flow.limits or len(self._served) > SUBSCRIBERS:
             return None
-        if self._served.masked or self._superseded:
+        if self._served.mask is not None or self._superseded:
             return None
         if self._stream is not None or self._startup_replay.keeps or self._served.undelivered:
             return None
@@ -258,19 +257,19 @@ class RelayedTopic:
 
         The latched message is the present value of the topic: a host gets it once the topic is withheld no longer.
         """
-        self._served.withhold(mask)
+        self._served.mask = mask
         self.differs()
 
     def upstream_opened(self, header: Mapping[str, str]) -> None:
         header = to_subscriber(header, self.name, self.topic)
         before, self._header = self._header, header
-        self._latch.is_latching = header.get("latching", "0") == "1"
+        self.latch.is_latching = header.get("latching", "0") == "1"
         self._state = TopicState.OPEN
         self.differs()
         self._end_stream()
         if self._sink is not None:
             self._stream = self._sink.open(self.topic, self.host, header)
-        alone = self._monitoring.wanted and not (self._latch.is_latching or self._waiting or self._served)
+        alone = self._monitoring.wanted and not (self.latch.is_latching or self._waiting or self._served)
         self._startup_replay.opened(self._clock(), alone=alone)
         if before is not None and _identity(before) != _identity(header):
             self._forget_stop()
@@ -285,13 +284,13 @@ class RelayedTopic:
 
     @property
     def lacks_latched(self) -> bool:
-        return self._latch.is_lacking and not self._is_command
+        return self.latch.is_lacking and not self._is_command
 
     def upstream_closed(self) -> None:
         self._end_stream()
         self.hand_out(divided=False)
         if not self._superseded:
-            self._latch.forget()
+            self.latch.forget()
         self.flow.forget()
         self._state = TopicState.LOST
         self._startup_replay.forget()
@@ -310,7 +309,7 @@ class RelayedTopic:
         self._reported = False
         passing: Batch | None = batch
         if self.flow.limits:
-            passing = self.flow.passing(batch, self._clock(), latching=self._latch.is_latching)
+            passing = self.flow.passing(batch, self._clock(), latching=self.latch.is_latching)
         return self._take(batch, passing, since)
 
     def sent(self, batch: Batch, since: float, number: int, sent: int) -> None:
@@ -352,7 +351,7 @@ class RelayedTopic:
         return rest
 
     def _admit(self, batch: Batch, since: float, *, divided: bool = True) -> Batch | None:
-        if self._served.masked and batch.messages > 1:  # a message may withhold the next one
+        if self._served.mask is not None and batch.messages > 1:  # a message may withhold the next one
             first = batch.head(1)
             self._admit(first, since, divided=False)
             batch.judged = first.judged
@@ -361,7 +360,7 @@ class RelayedTopic:
         left = batch if through is None else through(batch)
         rest = batch.tail(batch.left) if batch.left else None
         if left is None:
-            self._latch.withheld = True
+            self.latch.withheld = True
         else:
             self._pass_on(left, divided=divided)
             if self._served:
@@ -387,14 +386,14 @@ class RelayedTopic:
         elif not self._superseded:
             self._superseded = True
             stop = Batch(memoryview(encode_frame(data)), 1, 0, owned=True)
-            self._latch.keep(stop)
+            self.latch.keep(stop)
             self.differs()
             if self._served.send(stop, divided=False):
                 self._pause_or_trim()
 
     def _forget_stop(self) -> None:
         self._superseded = False
-        self._latch.forget()
+        self.latch.forget()
         self.differs()
 
     def _pass_on(self, batch: Batch, *, divided: bool) -> None:
@@ -402,11 +401,11 @@ class RelayedTopic:
             tap(batch)
         if self._superseded:
             self._forget_stop()
-        if self._latch.is_latching:
-            self._latch.keep(batch)
+        if self.latch.is_latching:
+            self.latch.keep(batch)
         if self._startup_replay.keeps:
             self._startup_replay.add(batch, self._clock())
-        if self._served.send(batch, divided=divided and not self._served.masked):
+        if self._served.send(batch, divided=divided and self._served.mask is None):
             self._pause_or_trim()
 
     @property
@@ -418,9 +417,7 @@ class RelayedTopic:
             self._pause_or_trim()
 
     def relieve(self) -> None:
-        if self._state is TopicState.PAUSED:
-            self._state = TopicState.OPEN
-            self.upstream.resume()
+        self.upstream.resume()
 
     def cut_all(self, reason: str) -> None:
         self._end_stream()
@@ -433,32 +430,23 @@ class RelayedTopic:
         if waiting is not None:
             self._admit(waiting, now, divided=False)
         self._startup_replay.expire(now)
-        if self._latch.batch is not None:
+        if self.latch.batch is not None:
             for member in self._served.row:
                 if member.missed:
-                    self._served.deliver(self._latch.batch, member)
+                    self._served.deliver(self.latch.batch, member)
         self._served.trim(stalled=True)
 
-    @property
-    def latched(self) -> int:
-        return self._latch.size
-
-    def give_up_latched(self) -> None:
-        self._latch.give_up()
-
-    def repeat(self) -> None:
-        self._latch.repeat()
-
     def traffic(self) -> TopicTraffic | None:
-        if self._reported and not self.counters.messages and not self._served.has_dropped:
+        if self._reported and not self.counters.messages and not self._served.dropped:
             return None
         messages, size, counts, seconds = self.counters.take()
+        dropped, self._served.dropped = self._served.dropped, 0
         row = TopicTraffic(
             self.key,
             self.topic,
             messages,
             size,
-            self._served.take_dropped(),
+            dropped,
             len(self._served),
             counts,
             seconds,
@@ -474,10 +462,10 @@ class RelayedTopic:
         self.differs()
         self.announce()
         self._reported = False
-        if self._latch.batch is not None:
-            self._served.deliver(self._latch.batch, member)
-        elif self._latch.is_refused:
-            if self._latch.is_asked_again and not self._is_command:
+        if self.latch.batch is not None:
+            self._served.deliver(self.latch.batch, member)
+        elif self.latch.is_refused:
+            if self.latch.is_asked_again and not self._is_command:
                 self.upstream.request_latched()
         elif self._startup_replay.keeps:
             for batch in self._startup_replay.give(member.caller_id, self._clock()):
@@ -506,8 +494,6 @@ class RelayedTopic:
         if since and len(since) == len(self._served):
             left = max(since) + self._grace - self._clock()
             if left > 0:
-                if self._state is TopicState.OPEN:
-                    self._state = TopicState.PAUSED
                 self.upstream.pause(left)
                 return
         self._served.trim()

@@ -27,7 +27,7 @@ class TopicSubscriber(Protocol):
     def deliver(self, batch: Batch) -> int:
         """Send or queue the batch; return how many messages are dropped."""
 
-    def accepted(self, batch: Batch, sent: int) -> int:
+    def accepted(self, batch: Batch, sent: int) -> None:
         """Like `deliver`, after the pump has sent `sent` bytes (negative: the number of an error)."""
 
     @property
@@ -63,15 +63,10 @@ class ServedSubscribers:
         self._members: dict[TopicSubscriber, None] = {}
         self._row: tuple[TopicSubscriber, ...] | None = None
         self._waits: tuple[Batch, tuple[TopicSubscriber, ...]] | None = None
-        self._mask: Callable[[str], bool] | None = None
-        self._dropped = 0
-
-    @property
-    def masked(self) -> bool:
-        return self._mask is not None
-
-    def withhold(self, mask: Callable[[str], bool] | None) -> None:
-        self._mask = mask
+        self.mask: Callable[[str], bool] | None = None
+        """Whether messages are withheld from a host, at each delivery."""
+        self.dropped = 0
+        """The messages that were dropped for slow subscribers since the last report."""
 
     def __len__(self) -> int:
         return len(self._members)
@@ -97,9 +92,9 @@ class ServedSubscribers:
         return 0 if self._waits is None else len(self._waits[0].view)
 
     def deliver(self, batch: Batch, member: TopicSubscriber) -> None:
-        member.missed = self._mask is not None and self._mask(member.host)
+        member.missed = self.mask is not None and self.mask(member.host)
         if not member.missed:
-            self._dropped += member.deliver(batch)
+            self.dropped += member.deliver(batch)
 
     def send(self, batch: Batch, *, divided: bool) -> bool:
         behind = self.hand_out(divided=False)
@@ -109,7 +104,7 @@ class ServedSubscribers:
     def go_on_behind(self, batch: Batch, number: int, sent: int) -> bool:
         row = self.row
         self._waits = batch, row[number + 1 :]
-        self._dropped += row[number].accepted(batch, sent)
+        row[number].accepted(batch, sent)
         return self.hand_out(divided=True) or row[number].behind_since is not None
 
     def hand_out(self, *, divided: bool) -> bool:
@@ -130,14 +125,6 @@ class ServedSubscribers:
     def trim(self, *, stalled: bool = False) -> None:
         for member in self.row:
             if member.full:
-                self._dropped += member.trim()
+                self.dropped += member.trim()
             if stalled:
                 member.check_stall()
-
-    @property
-    def has_dropped(self) -> bool:
-        return bool(self._dropped)
-
-    def take_dropped(self) -> int:
-        dropped, self._dropped = self._dropped, 0
-        return dropped

@@ -76,18 +76,11 @@ class Subscriber:
         self._number = self._reporter.opened(
             self.topic.key, self.topic.topic, "topic", self.host, self.caller_id
         )
-        data = encode_header(header)
-        try:
-            sent = self._send(data)
-        except BlockingIOError:
-            sent = 0
-        except OSError as error:
-            self._cut_by(error, "cannot be written to")
-            return False
-        if sent < len(data):
-            self._queue.begin(memoryview(data)[sent:])
+        self._queue.begin(memoryview(encode_header(header)))
+        self._flush()
+        if self._queue:
             self._write(True)
-        return True
+        return self._live
 
     def deliver(self, batch: Batch) -> int:
         """Send or queue the batch; drop a large one while the host has no memory: its rest could not be kept."""
@@ -96,33 +89,27 @@ class Subscriber:
             if passing is None:
                 return 0
             batch = passing
-        queue = self._queue
-        if self._writing:
-            queue.append(batch.keep(), batch.messages)
-        else:
-            view = batch.view
+        sent, view = 0, batch.view
+        if not self._writing:
             if len(view) > LARGE and self.exhausted:
                 return batch.messages
             try:
                 sent = self._send(view)
             except BlockingIOError:
-                sent = 0
+                pass
             except OSError as error:
                 self._cut_by(error, "cannot be written to")
                 return 0
             if sent == len(view):
                 return 0
-            self._queue_rest(batch, sent)
-        self._note_behind()
+        self._queue_rest(batch, sent)
         return 0
 
-    def accepted(self, batch: Batch, sent: int) -> int:
+    def accepted(self, batch: Batch, sent: int) -> None:
         if sent < 0 and -sent not in {errno.EAGAIN, errno.EWOULDBLOCK}:
             self._cut_by(OSError(-sent, os.strerror(-sent)), "cannot be written to")
-            return 0
-        self._queue_rest(batch, max(sent, 0))
-        self._note_behind()
-        return 0
+        else:
+            self._queue_rest(batch, max(sent, 0))
 
     @property
     def descriptor(self) -> int:
@@ -133,13 +120,8 @@ class Subscriber:
         self.topic.differs()
 
     def _queue_rest(self, batch: Batch, sent: int) -> None:
-        if sent:
-            self._queue.append(batch.view, batch.messages, sent, batch.rest(sent))
-        else:
-            self._queue.append(batch.keep(), batch.messages)
+        self._queue.append(batch, sent)
         self._write(True)
-
-    def _note_behind(self) -> None:
         if self.behind_since is None and self._queue.behind:
             self.behind_since = self._loop.clock()
 
@@ -173,7 +155,7 @@ class Subscriber:
 
     def check_stall(self) -> None:
         """Cut a subscriber that stalls within a message while its host's memory is exhausted."""
-        begun = self._queue.begun if self._queue.short else 0
+        begun = self._queue.begun if self.exhausted else 0
         if self._stall.seen(begun, self._loop.clock()):
             self.cut("its host has no memory left in the relay, and it does not accept the rest of a message")
 
@@ -213,9 +195,10 @@ class Subscriber:
             self.topic.relieve()
 
     def _write(self, on: bool) -> None:
-        self._writing = on
-        self.topic.differs()
-        self._loop.change(self._socket.fileno(), READ | WRITE if on else READ)
+        if on != self._writing:
+            self._writing = on
+            self.topic.differs()
+            self._loop.change(self._socket.fileno(), READ | WRITE if on else READ)
 
     def _listen(self) -> None:
         try:

@@ -97,11 +97,12 @@ class HeldBytes:
 
     def __init__(self, share: HostMemory) -> None:
         self.share = share
-        self._size = 0
+        self.size = 0
 
     def set(self, size: int) -> None:
-        self.share.add(size - self._size)
-        self._size = size
+        if size != self.size:
+            self.share.add(size - self.size)
+            self.size = size
 
 
 class StallDetector:

@@ -27,6 +27,7 @@ class RecordedUpstream(Upstream):
     def __init__(self) -> None:
         self.asked: list[str] = []
         self.announced: tuple[list[str], str] = ([], "")
+        self.paused = False
 
     def connect(self) -> None:
         self.asked.append("want")
@@ -36,9 +37,12 @@ class RecordedUpstream(Upstream):
 
     def pause(self, seconds: float) -> None:
         self.asked.append(f"pause {seconds:.2f}")
+        self.paused = True
 
     def resume(self) -> None:
-        self.asked.append("resume")
+        if self.paused:
+            self.asked.append("resume")
+        self.paused = False
 
     def announce(self, names: Callable[[], frozenset[str]], type_name: str) -> None:
         self.announced = (sorted(names()), type_name)
@@ -68,9 +72,8 @@ class RecordedMember:
         self.received += bytes(batch.view)
         return 0
 
-    def accepted(self, batch: Batch, sent: int) -> int:
+    def accepted(self, batch: Batch, sent: int) -> None:
         self.received += bytes(batch.view[sent:])
-        return 0
 
     @property
     def exhausted(self) -> bool:
@@ -486,7 +489,7 @@ def test_a_latched_message_beyond_the_quota_is_not_kept() -> None:
     assert story.refused == [LatchRefused("k", "/chatter", 64)]
     assert (story.join().received, story.share.used) == (b"", 50)
     assert "give again" not in story.upstream.asked
-    story.topic.repeat()
+    story.topic.latch.repeat()
     assert len(story.refused) == 2
     story.share.add(-50)
     late = story.join()
@@ -494,7 +497,7 @@ def test_a_latched_message_beyond_the_quota_is_not_kept() -> None:
     story.receive(batch(bytes(60)))
     assert (late.received, story.share.used) == (bytes(batch(bytes(60)).view), 64)
     assert story.join().received == late.received
-    story.topic.repeat()
+    story.topic.latch.repeat()
     assert len(story.refused) == 2
 
 

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from appliance.relay.connections.send_queue import SendQueue
 from appliance.relay.relay_limits import RelayLimits
-from appliance.relay.transport.frames import LITTLE
+from appliance.relay.transport.frames import LITTLE, Batch
 from tests.support.examples import examples
 from tests.support.relay_memory import share
 
@@ -64,7 +64,7 @@ def test_the_outbox_does_what_a_list_of_frames_does(script: list[list[int] | flo
             number += len(frames)
             data = b"".join(frames)
             sent = number % (len(data) + 1) if not queue else 0
-            queue.append(memoryview(data), len(frames), sent)
+            queue.append(Batch(memoryview(data), len(frames), None), sent)
             naive.append(frames, sent)
         assert b"".join(queue.vectors()) == naive.started + b"".join(naive.frames)
         assert queue.messages == len(naive.frames)
@@ -77,7 +77,7 @@ def test_the_outbox_does_what_a_list_of_frames_does(script: list[list[int] | flo
 
 def test_the_memory_of_a_message_that_is_nearly_sent_is_given_back() -> None:
     queue, whole = SendQueue(LIMITS, share(1 << 30)), frame(1 << 20)
-    queue.append(memoryview(whole), 1, 1)
+    queue.append(Batch(memoryview(whole), 1, None), 1)
     while queue:
         [view] = queue.vectors()
         assert bytes(view) == whole[-queue.begun :]
@@ -87,7 +87,7 @@ def test_the_memory_of_a_message_that_is_nearly_sent_is_given_back() -> None:
 
 def test_a_message_that_has_been_started_is_never_dropped() -> None:
     queue = SendQueue(LIMITS, share(1 << 30))
-    queue.append(memoryview(b"".join(frame(4, index) for index in range(20))), 20, 3)
+    queue.append(Batch(memoryview(b"".join(frame(4, index) for index in range(20))), 20, None), 3)
     assert queue.full
     assert queue.trim() == 14
     assert b"".join(queue.vectors()) == frame(4, 0)[3:] + b"".join(frame(4, index) for index in range(15, 20))
@@ -95,7 +95,7 @@ def test_a_message_that_has_been_started_is_never_dropped() -> None:
 
 def test_one_message_larger_than_the_queue_is_dropped_whole() -> None:
     queue = SendQueue(LIMITS, share(1 << 30))
-    queue.append(memoryview(frame(500)), 1)
+    queue.append(Batch(memoryview(frame(500)), 1, None))
     assert queue.trim() == 1
     assert not queue
 
@@ -103,7 +103,7 @@ def test_one_message_larger_than_the_queue_is_dropped_whole() -> None:
 def test_nothing_is_queued_when_the_process_is_out_of_memory() -> None:
     budget = share(10)
     queue = SendQueue(LIMITS, budget)
-    queue.append(memoryview(frame(4) + frame(4)), 2)
+    queue.append(Batch(memoryview(frame(4) + frame(4)), 2, None))
     assert queue.trim() == 2
     assert budget.used == 0
 
@@ -111,6 +111,6 @@ def test_nothing_is_queued_when_the_process_is_out_of_memory() -> None:
 def test_the_rest_of_a_connection_header_goes_first() -> None:
     queue = SendQueue(LIMITS, share(1 << 30))
     queue.begin(memoryview(b"header"))
-    queue.append(memoryview(frame(4)), 1)
+    queue.append(Batch(memoryview(frame(4)), 1, None))
     assert b"".join(queue.vectors()) == b"header" + frame(4)
     assert queue.messages == 1
