@@ -10,7 +10,7 @@ subscriber and then sends one message would send it to the monitor alone.
 """
 
 from appliance.relay.transport.frames import Batch
-from appliance.relay.transport.memory import HostMemory
+from appliance.relay.transport.memory import HeldBytes, HostMemory
 
 APPEARED = 5.0
 """The seconds after which a publisher no longer counts as new."""
@@ -25,7 +25,7 @@ class StartupReplay:
     """The first messages of one topic, whose publisher is new until `fresh_until`, in seconds of the relay's clock."""
 
     def __init__(self, share: HostMemory, fresh_until: float) -> None:
-        self._share = share
+        self._held = HeldBytes(share)
         self._fresh_until = fresh_until
         self.keeps = False
         """Whether messages are kept, as of the last call of a method with `now`."""
@@ -33,7 +33,6 @@ class StartupReplay:
         self._first: float | None = None
         self._batches: list[Batch] = []
         self._messages = 0
-        self._bytes = 0
         self._given: set[str] = set()
 
     def opened(self, now: float, *, alone: bool) -> None:
@@ -56,14 +55,13 @@ class StartupReplay:
         if (
             now > self._first + SPEECH
             or self._messages > _MESSAGES
-            or self._bytes + size > _BYTES
-            or self._share.refusal(size)
+            or self._held.size + size > _BYTES
+            or self._held.share.refusal(size)
         ):
             self.forget()
             return
         self._batches.append(Batch(batch.keep(), batch.messages, batch.last, owned=True))
-        self._bytes += size
-        self._share.add(size)
+        self._held.set(self._held.size + size)
 
     def give(self, caller_id: str, now: float) -> list[Batch]:
         self.expire(now)
@@ -73,5 +71,5 @@ class StartupReplay:
         return [] if again else self._batches
 
     def forget(self) -> None:
-        self._share.add(-self._bytes)
-        self.keeps, self._batches, self._bytes = False, [], 0
+        self.keeps, self._batches = False, []
+        self._held.set(0)

@@ -85,10 +85,10 @@ class Subscriber:
     def deliver(self, batch: Batch) -> int:
         """Send or queue the batch; drop a large one while the host has no memory: its rest could not be kept."""
         if self._flow is not None:
-            passing = self._limited(self._flow, batch)
-            if passing is None:
+            batch = self._flow.cut(batch, self._loop.clock(), self._limited)
+            self._flow.take(batch)
+            if not batch.messages:
                 return 0
-            batch = passing
         sent, view = 0, batch.view
         if not self._writing:
             if len(view) > LARGE and self.exhausted:
@@ -125,22 +125,12 @@ class Subscriber:
         if self.behind_since is None and self._queue.behind:
             self.behind_since = self._loop.clock()
 
-    def _limited(self, flow: RateAllowance, batch: Batch) -> Batch | None:
-        count = flow.room(batch, batch.messages, self._loop.clock())
-        self.missed = count < batch.messages
-        if self.missed:
-            part = batch.head(count)
-            topic, gone = self.topic, len(batch.view) - len(part.view)
-            self._reporter.limited(
-                (topic.key, topic.topic, "subscriber", self.host, self.caller_id),
-                batch.messages - count,
-                gone,
-            )
-            batch = part
-        if not count:
-            return None
-        flow.take(batch)
-        return batch
+    def _limited(self, messages: int, size: int) -> None:
+        topic = self.topic
+        self._reporter.limited(
+            (topic.key, topic.topic, "subscriber", self.host, self.caller_id), messages, size
+        )
+        self.missed = True
 
     @property
     def exhausted(self) -> bool:

@@ -15,7 +15,7 @@ import mmap
 import struct
 from math import ceil
 
-from appliance.relay.transport.memory import HostMemory
+from appliance.relay.transport.memory import HeldBytes, HostMemory
 from appliance.relay.transport.pump import LARGE as _LARGE
 from appliance.relay.transport.pump import SMALL as _SMALL
 from appliance.relay.transport.pump import Pump, walk
@@ -138,8 +138,7 @@ class FrameReceiver:
     def __init__(self, scratch: Scratch, limit: int, share: HostMemory) -> None:
         self._scratch = scratch
         self._limit = limit
-        self._share = share
-        self._counted = 0
+        self._held = HeldBytes(share)
         self._torn = b""
         self._area: memoryview | None = None
         self._filled = 0
@@ -151,7 +150,7 @@ class FrameReceiver:
         if self._area is not None:
             if self._delivered is not None and self._delivered.kept:
                 self._area = _new_area(self._target)
-                self._count(0)  # the keeper of the batch counts it
+                self._held.set(0)  # the keeper of the batch counts it
             self._delivered = None
             return self._area[self._filled : self._target]
         torn, scratch = self._torn, self._scratch.area
@@ -173,7 +172,7 @@ class FrameReceiver:
 
     def hand_over(self) -> bytes:
         torn, self._torn = self._torn, b""
-        self._count(0)
+        self._held.set(0)
         return torn
 
     def resume(self, torn: bytes) -> None:
@@ -182,7 +181,7 @@ class FrameReceiver:
     def found(self, size: int, end: int, messages: int) -> Batch:
         area = self._scratch.area
         self._idle, self._torn = False, bytes(area[size:end])
-        self._count(len(self._torn))
+        self._held.set(len(self._torn))
         return Batch(area[:size], messages, None)
 
     @property
@@ -200,13 +199,8 @@ class FrameReceiver:
         self._idle = True
 
     def abandon(self) -> None:
-        self._count(0)
+        self._held.set(0)
         self._area, self._delivered, self._filled, self._torn = None, None, 0, b""
-
-    def _count(self, size: int) -> None:
-        if size != self._counted:
-            self._share.add(size - self._counted)
-            self._counted = size
 
     def _walk(self, buffer: memoryview, end: int, *, owned: bool) -> Batch | None:
         position, messages, last = walk(buffer[:end])
@@ -216,10 +210,10 @@ class FrameReceiver:
             if need - 4 > self._limit:
                 raise _too_long(need - 4, self._limit)
             self._begin_area(need, buffer[position:end])
-        elif position < end or self._counted:
+        elif position < end or self._held.size:
             self._torn = bytes(buffer[position:end])
-            self._count(len(self._torn))
-            if len(self._torn) > SMALL and self._share.exhausted:
+            self._held.set(len(self._torn))
+            if len(self._torn) > SMALL and self._held.share.exhausted:
                 raise _no_memory()
         return Batch(buffer[:position], messages, last, owned=owned) if messages else None
 
@@ -227,27 +221,27 @@ class FrameReceiver:
         area = _new_area(need)
         area[: len(start)] = start
         self._area, self._target, self._filled = area, need, len(start)
-        self._count(len(start))
+        self._held.set(len(start))
 
     def _received_in_area(self, area: memoryview, count: int) -> Batch | None:
         """Receive one frame at a time: a read ends with the frame, or where a next frame of equal length would end."""
         self._filled += count
-        if self._filled > self._counted:  # memory that was once filled stays allocated with the area
-            self._count(self._filled)
+        if self._filled > self._held.size:  # memory that was once filled stays allocated with the area
+            self._held.set(self._filled)
         if self._filled < 4:
             return None
         need = _unpack_length(area, 0)[0] + 4
         if self._filled < need:
             if need - 4 > self._limit:
                 raise _too_long(need - 4, self._limit)
-            if self._share.exhausted:
+            if self._held.share.exhausted:
                 raise _no_memory()
             if need > len(area):
                 self._begin_area(need, area[: self._filled])
             else:
                 self._target = need
             return None
-        if self._filled > need or need <= LARGE or need > _KEEP_AREA or not self._share.plenty:
+        if self._filled > need or need <= LARGE or need > _KEEP_AREA or not self._held.share.plenty:
             end = self._filled
             self.abandon()
             return self._walk(area, end, owned=True)

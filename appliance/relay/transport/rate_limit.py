@@ -11,14 +11,15 @@ admits large messages and keeps the average.
    until it is paid, so reconnecting does not help.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from functools import partial
 from math import ceil
 from typing import Literal
 from weakref import WeakValueDictionary
 
 from appliance.channel.messages import UNLIMITED, FlowLimit
 from appliance.relay.transport.frames import Batch
-from appliance.relay.transport.memory import HostMemory
+from appliance.relay.transport.memory import HeldBytes, HostMemory
 
 Part = Literal["publisher", "subscriber", "topic"]
 
@@ -106,7 +107,7 @@ class SharedRateLimit:
 
     def __init__(self, limit: FlowLimit, now: float) -> None:
         self._limit = limit
-        self._messages, self._bytes = _Store(limit.messages, 1.0), _Store(limit.bytes, 0.0)
+        self.messages, self.bytes = _Store(limit.messages, 1.0), _Store(limit.bytes, 0.0)
         self._filled = now
         self._shares: WeakValueDictionary[str, RateAllowance] = WeakValueDictionary()
         self._holders = 0
@@ -114,10 +115,10 @@ class SharedRateLimit:
     def set(self, limit: FlowLimit, now: float) -> None:
         """Change the limit; the unused amount carries over."""
         if limit != self._limit:
-            self._fill(now)
+            self.fill(now)
             self._limit = limit
-            self._messages.set(limit.messages)
-            self._bytes.set(limit.bytes)
+            self.messages.set(limit.messages)
+            self.bytes.set(limit.bytes)
 
     def of(self, name: str) -> "RateAllowance":
         """Return the allowance of a name, which counts as a holder while the allowance is referenced."""
@@ -127,40 +128,28 @@ class SharedRateLimit:
             self._hold()
         return share
 
-    def room(self, name: str, batch: Batch, most: int, now: float) -> int:
-        self._fill(now)
-        if self._limit.messages:
-            most = min(most, max(0, ceil(self._messages.left(name))))
-        return batch.within(self._bytes.left(name), most) if self._limit.bytes else most
-
-    def take(self, name: str, batch: Batch) -> None:
-        if self._limit.messages:
-            self._messages.take(name, batch.messages)
-        if self._limit.bytes:
-            self._bytes.take(name, len(batch.view))
-
     @property
     def held(self) -> bool:
         return bool(self._shares)
 
     def paid(self, now: float) -> bool:
         """Return whether everything used has been refilled, so that a new limit would not differ."""
-        self._fill(now)
-        return self._messages.full and self._bytes.full
+        self.fill(now)
+        return self.messages.full and self.bytes.full
 
-    def _fill(self, now: float) -> None:
+    def fill(self, now: float) -> None:
         if len(self._shares) != self._holders:
             self._hold()
         passed = now - self._filled
         if passed >= self._holders * _FILL_SECONDS:
             self._filled = now
-            self._messages.fill(passed)
-            self._bytes.fill(passed)
+            self.messages.fill(passed)
+            self.bytes.fill(passed)
 
     def _hold(self) -> None:
         self._holders = len(self._shares)
-        self._messages.hold(self._shares)
-        self._bytes.hold(self._shares)
+        self.messages.hold(self._shares)
+        self.bytes.hold(self._shares)
 
 
 class RateAllowance:
@@ -172,11 +161,28 @@ class RateAllowance:
         self._flow = flow
         self._name = name
 
-    def room(self, batch: Batch, most: int, now: float) -> int:
-        return self._flow.room(self._name, batch, most, now)
+    def room(self, batch: Batch, now: float) -> int:
+        """Return how many messages of a batch may pass now."""
+        flow, most = self._flow, batch.messages
+        flow.fill(now)
+        if flow.messages.rate:
+            most = min(most, max(0, ceil(flow.messages.left(self._name))))
+        return batch.within(flow.bytes.left(self._name), most) if flow.bytes.rate else most
+
+    def cut(self, batch: Batch, now: float, dropped: Callable[[int, int], None]) -> Batch:
+        """Return the messages that may pass now; `dropped` gets the number of the others, and their bytes."""
+        count = self.room(batch, now)
+        if count == batch.messages:
+            return batch
+        head = batch.head(count)
+        dropped(batch.messages - count, len(batch.view) - len(head.view))
+        return head
 
     def take(self, batch: Batch) -> None:
-        self._flow.take(self._name, batch)
+        if self._flow.messages.rate:
+            self._flow.messages.take(self._name, batch.messages)
+        if self._flow.bytes.rate:
+            self._flow.bytes.take(self._name, len(batch.view))
 
 
 class RateLimits:
@@ -220,66 +226,43 @@ class PublicationRateLimit:
     """
 
     def __init__(self, share: HostMemory, dropped: Callable[[Part, int, int], None]) -> None:
-        self._share = share
+        self._held = HeldBytes(share)
         self._dropped = dropped
-        self._own: RateAllowance | None = None
-        self._together: RateAllowance | None = None
         self._waiting: Batch | None = None
-        self.limits = False
+        self.limits: dict[Part, RateAllowance] = {}
 
     def set(self, own: RateAllowance | None, together: RateAllowance | None) -> None:
-        self._own = own
-        self._together = together
-        self.limits = self._own is not None or together is not None
+        limits: dict[Part, RateAllowance | None] = {"publisher": own, "topic": together}
+        self.limits = {part: limit for part, limit in limits.items() if limit is not None}
 
     def passing(self, batch: Batch, now: float, *, latching: bool) -> Batch | None:
         self.forget()
         part = batch
-        for name, flow in self._flows():
-            count = flow.room(part, part.messages, now)
-            if count < part.messages:
-                part = self._cut(part, count, name)
+        for name, limit in self.limits.items():
+            part = limit.cut(part, now, partial(self._dropped, name))
         if part.messages < batch.messages and latching:
             self._wait(batch)
-        if not part.messages:
-            return None
-        self._take(part)
-        return part
+        return self._take(part) if part.messages else None
 
     def later(self, now: float) -> Batch | None:
         waiting = self._waiting
-        if waiting is None:
-            return None
-        if not all(flow.room(waiting, 1, now) for _, flow in self._flows()):
+        if waiting is None or not all(limit.room(waiting, now) for limit in self.limits.values()):
             return None
         self.forget()
-        self._take(waiting)
-        return waiting
+        return self._take(waiting)
 
     def forget(self) -> None:
-        if self._waiting is not None:
-            self._share.add(-len(self._waiting.view))
-            self._waiting = None
+        self._waiting = None
+        self._held.set(0)
 
-    def _cut(self, batch: Batch, count: int, part: Part) -> Batch:
-        head = batch.head(count)
-        self._dropped(part, batch.messages - count, len(batch.view) - len(head.view))
-        return head
-
-    def _take(self, batch: Batch) -> None:
-        for _, flow in self._flows():
-            flow.take(batch)
-
-    def _flows(self) -> Iterator[tuple[Part, RateAllowance]]:
-        if self._own is not None:
-            yield "publisher", self._own
-        if self._together is not None:
-            yield "topic", self._together
+    def _take(self, batch: Batch) -> Batch:
+        for limit in self.limits.values():
+            limit.take(batch)
+        return batch
 
     def _wait(self, batch: Batch) -> None:
         size = len(batch.view) - batch.find_last()
-        if not self._share.refusal(size):
-            self._share.add(size)
-            last = batch.keep_last()
-            last.first = batch.first + batch.messages - 1
-            self._waiting = last
+        if not self._held.share.refusal(size):
+            self._held.set(size)
+            self._waiting = batch.keep_last()
+            self._waiting.first = batch.first + batch.messages - 1

@@ -31,7 +31,7 @@ def alone(limit: FlowLimit) -> RateAllowance:
 def sent(flow: RateAllowance, *batches: tuple[float, Batch]) -> int:
     passed = 0
     for now, batch in batches:
-        count = flow.room(batch, batch.messages, now)
+        count = flow.room(batch, now)
         flow.take(batch.head(count))
         passed += count
     return passed
@@ -70,10 +70,10 @@ def test_a_message_that_is_larger_than_the_limit_passes_and_is_made_up_for() -> 
 
 def test_the_first_of_a_batch_pass() -> None:
     flow = alone(FlowLimit(messages=20, bytes=200))
-    assert flow.room(frames(*[4] * 30), 30, 0.0) == 10
-    assert flow.room(frames(50, 30, 30, 4), 4, 0.0) == 3
+    assert flow.room(frames(*[4] * 30), 0.0) == 10
+    assert flow.room(frames(50, 30, 30, 4), 0.0) == 3
     equal = Batch(memoryview((struct.pack("<I", 46) + bytes(46)) * 8), 8, None)
-    assert flow.room(equal, 8, 0.0) == 2
+    assert flow.room(equal, 0.0) == 2
     assert (equal.head(2).messages, len(equal.head(2).view), equal.head(2).last) == (2, 100, 50)
 
 
@@ -223,7 +223,7 @@ def test_a_leaving_holder_gives_its_amount_to_all() -> None:
     limit = SharedRateLimit(FlowLimit(messages=8), 0.0)
     first, second = limit.of("/a"), limit.of("/b")
     assert sent(second, (0.0, frames(*[8] * 20))) == 3  # its own, and all in common
-    assert first.room(frames(8), 1, 0.0) == 1
+    assert first.room(frames(8), 0.0) == 1
     del first
     third = limit.of("/c")
     assert (sent(third, (0.0, frames(*[8] * 20))), sent(second, (0.0, frames(8)))) == (1, 0)
