@@ -4,15 +4,16 @@ The section only restricts: a host that holds a group still needs its rights in 
 """
 
 import re
+from collections.abc import Hashable
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
 from appliance.base.validation_messages import meant
 from appliance.policy.groups import HostGroups
 from appliance.policy.host_sets import Atom
-from appliance.policy.ini_reader import Entry, SectionText
+from appliance.policy.ini_reader import Entry, SectionText, is_repeated
 from appliance.policy.model import Rule
-from appliance.policy.policy_findings import Findings, quoted
+from appliance.policy.policy_findings import Findings, Place, quoted
 from appliance.policy.sections import AUTHORITY
 from roswire.names import is_global_name
 
@@ -59,15 +60,12 @@ def read_authority(
 ) -> dict[str, AuthorityGroup]:
     found: dict[str, AuthorityGroup] = {}
     options: list[tuple[str, str, Entry]] = []
-    first_lines: dict[str, int] = {}
+    first_lines: dict[Hashable, int] = {}
     for entry in section.entries if section is not None else ():
         word, words = entry.key, entry.key.text.split()
-        first = first_lines.setdefault(" ".join(words), word.line)
-        if first != word.line:
-            findings.error(
-                word.line, word.column, f"the key {quoted(word.text)} is already defined at line {first}"
-            )
-        elif len(words) == 2:
+        if is_repeated(" ".join(words), word, first_lines, findings):
+            continue
+        if len(words) == 2:
             options.append((words[0], words[1], entry))
         else:
             _define(entry, file, found, findings)
@@ -76,13 +74,11 @@ def read_authority(
             found[name] = _with_option(found[name], option, entry, groups, findings)
         else:
             guess = meant(name, found) or ": define it first, such as base = /cmd_vel"
-            findings.error(
-                entry.key.line, entry.key.column, f"no group {quoted(name)} is in [Authority]{guess}"
-            )
+            findings.error(entry.key, f"no group {quoted(name)} is in [Authority]{guess}")
     for group in found.values():
         if not any(claim is not Claim.ASK for claim, _hosts in group.hosts):
             text = f"only an operator can give {group.name} to a host: if a host may take it, add take {group.name} ="
-            findings.warn(group.rule.line, 1, text)
+            findings.warn(Place(group.rule.line), text)
     return found
 
 
@@ -90,24 +86,22 @@ def _define(entry: Entry, file: str, found: dict[str, AuthorityGroup], findings:
     word = entry.key
     if not _NAME.fullmatch(word.text) or word.text in _OPTIONS:
         text = f"{quoted(word.text)} is not the name of a group: letters, digits and _ . - after a letter"
-        findings.error(word.line, word.column, text)
+        findings.error(word, text)
         return
     if len(found) >= _MOST:
-        findings.error(word.line, word.column, f"more than {_MOST} groups")
+        findings.error(word, f"more than {_MOST} groups")
         return
     names: set[str] = set()
     taken = {name: group.name for group in found.values() for name in group.names}
     for value in entry.values:
         if not is_global_name(value.text):
             text = f"{quoted(value.text)} is not a resolved name (/cmd_vel) without patterns"
-            findings.error(value.line, value.column, text)
+            findings.error(value, text)
         elif value.text in taken:
-            findings.error(
-                value.line, value.column, f"{value.text} is already in the group {taken[value.text]}"
-            )
+            findings.error(value, f"{value.text} is already in the group {taken[value.text]}")
         names.add(value.text)
     if not names:
-        findings.error(word.line, word.column, "name the topics and services of the group, such as /cmd_vel")
+        findings.error(word, "name the topics and services of the group, such as /cmd_vel")
     found[word.text] = AuthorityGroup(
         word.text, frozenset(names), Rule(AUTHORITY, word.text, file, word.line)
     )
@@ -124,12 +118,12 @@ def _with_option(
             fault = (
                 f"{quoted(text)} is not a lease: give {SHORTEST_LEASE:g}s to {LONGEST_LEASE:g}s, such as 5s"
             )
-            findings.error(word.line, word.column, fault)
+            findings.error(word, fault)
             return group
         return replace(group, lease=float(number[1]))
     if option not in _OPTIONS:
         guess = meant(option, _OPTIONS) or f"; {', '.join(_OPTIONS)}"
-        findings.error(word.line, word.column, f"unknown option {quoted(option)} of a group{guess}")
+        findings.error(word, f"unknown option {quoted(option)} of a group{guess}")
         return group
     atoms = frozenset(atom for _text, atom in groups.read(entry.values))
     return replace(group, hosts=(*group.hosts, (Claim(option), atoms)))

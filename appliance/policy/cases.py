@@ -16,7 +16,7 @@ from appliance.policy.host_sets import canonical_address
 from appliance.policy.model import Address, Decision, Request
 from appliance.policy.policy import Policy
 from appliance.policy.policy_compiler import compile_policy
-from appliance.policy.policy_findings import Findings, FindingSeverity, PolicyFinding, quoted
+from appliance.policy.policy_findings import Findings, FindingSeverity, Place, PolicyFinding, quoted
 from appliance.policy.rights import decide, needs_node, rights_of
 from roswire.names import is_global_name
 
@@ -64,25 +64,25 @@ def run_cases(policy: Policy, text: str, file: str) -> list[CaseResult]:
     reader = _CaseReader(policy, findings)
     results = list(reader.results(_compose(text, findings)))
     if not results:
-        findings.error(1, 1, "there is no case in this file: add one below cases:")
+        findings.error(Place(), "there is no case in this file: add one below cases:")
     findings.raise_errors()
     return results
 
 
 def _compose(text: str, findings: Findings) -> _Node | None:
     if len(text) > MAXIMUM_CHARACTERS:
-        findings.error(1, 1, f"the file has {len(text)} characters; the limit is {MAXIMUM_CHARACTERS}")
+        findings.error(Place(), f"the file has {len(text)} characters; the limit is {MAXIMUM_CHARACTERS}")
         return None
     try:
         return yaml.compose(text, Loader=yaml.SafeLoader)
     except RecursionError:
-        findings.error(1, 1, "the file is nested too deep")
+        findings.error(Place(), "the file is nested too deep")
     except yaml.MarkedYAMLError as fault:
         mark = fault.problem_mark or fault.context_mark
-        line, column = (mark.line + 1, mark.column + 1) if mark else (1, 1)
-        findings.error(line, column, not_yaml(fault.problem or fault.context).removeprefix("is "))
+        place = Place(mark.line + 1, mark.column + 1) if mark else Place()
+        findings.error(place, not_yaml(fault.problem or fault.context).removeprefix("is "))
     except yaml.YAMLError as fault:
-        findings.error(1, 1, f"not YAML: {quoted(str(fault), 120)}")
+        findings.error(Place(), f"not YAML: {quoted(str(fault), 120)}")
     return None
 
 
@@ -202,4 +202,4 @@ class _CaseReader:
         return ""
 
     def _error(self, node: _Node, text: str) -> None:
-        self._findings.error(node.start_mark.line + 1, node.start_mark.column + 1, text)
+        self._findings.error(Place(node.start_mark.line + 1, node.start_mark.column + 1), text)

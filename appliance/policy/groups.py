@@ -62,18 +62,18 @@ class HostGroups:
         first = self.groups.get(word.text)
         if word.text == ROBOT:
             text = 'the group "robot" is predefined (the machine next to the appliance): use another name'
-            self._findings.error(word.line, word.column, text)
+            self._findings.error(word, text)
         elif word.text == ASK:
             text = (
                 'the word "ask" is reserved for hosts that need an approval: use another name for the group'
             )
-            self._findings.error(word.line, word.column, text)
+            self._findings.error(word, text)
         elif first is not None and first.word is not None:
             text = f"the group {quoted(word.text)} is already defined at line {first.word.line}"
-            self._findings.error(word.line, word.column, text)
+            self._findings.error(word, text)
         elif not _GROUP_NAME.fullmatch(word.text):
             text = f"{quoted(word.text)} is not a group name: letters, digits and _ . - after a letter"
-            self._findings.error(word.line, word.column, text)
+            self._findings.error(word, text)
         else:
             self.groups[word.text] = HostGroup(self._table.group(), word, entry.values)
 
@@ -84,7 +84,7 @@ class HostGroups:
                 break
             atom = self._atom(word)
             if atom in atoms:
-                self._findings.warn(word.line, word.column, f"{quoted(word.text)} is listed twice")
+                self._findings.warn(word, f"{quoted(word.text)} is listed twice")
             elif atom is not None:
                 atoms[atom] = word.text
         return tuple((text, atom) for atom, text in atoms.items())
@@ -113,14 +113,14 @@ class HostGroups:
                 meant(text, self.groups)
                 or "; a value is a group, an address, a network, host:NAME, door:NAME or *"
             )
-            self._findings.error(word.line, word.column, f"no group {quoted(text)} is defined{wanted}")
+            self._findings.error(word, f"no group {quoted(text)} is defined{wanted}")
             return None
         try:
             network = canonical_network(ipaddress.ip_network(text))
         except ValueError:
             network = None
         if network is None or "%" in text:
-            self._findings.error(word.line, word.column, _address_fault(text))
+            self._findings.error(word, _address_fault(text))
             return None
         if (
             network.is_loopback
@@ -128,9 +128,7 @@ class HostGroups:
             and not any(member.is_loopback for member in self.robot)
         ):
             self._warned_loopback = True
-            self._findings.warn(
-                word.line, word.column, f"{text} is the appliance itself {self._robot_instead()}"
-            )
+            self._findings.warn(word, f"{text} is the appliance itself {self._robot_instead()}")
         return network
 
     def _robot_instead(self) -> str:
@@ -148,7 +146,7 @@ class HostGroups:
         door = word.text.startswith(DOOR)
         if not _HOST_NAME.fullmatch(name.removeprefix(DOOR)):
             form = "door:NAME with the name of a door" if door else "host:NAME with the name of a certificate"
-            self._findings.error(word.line, word.column, f"{quoted(word.text)} is not {form}")
+            self._findings.error(word, f"{quoted(word.text)} is not {form}")
         elif name not in self._warned_hosts:
             self._warned_hosts.add(name)
             guess = meant(name, [one for one in self._hosts if one.startswith(DOOR) is door])
@@ -156,7 +154,7 @@ class HostGroups:
             if door:
                 text = f"there is no door {quoted(name.removeprefix(DOOR))}: {name} matches no host until it is added"
                 text += guess
-            self._findings.warn(word.line, word.column, text)
+            self._findings.warn(word, text)
         return None
 
     def _find_cycles(self) -> None:
@@ -184,7 +182,7 @@ class HostGroups:
         if word is not None:
             shown = cycle if len(cycle) < 8 else [*cycle[:6], "…"]
             text = f"the group contains itself: {' = '.join([*shown, cycle[0]])}"
-            self._findings.error(word.line, word.column, text)
+            self._findings.error(word, text)
 
     def shown(self, words: Iterable[Word]) -> str:
         parts: list[str] = []
@@ -217,11 +215,7 @@ class HostGroups:
 def _as_network(member: Address | Network) -> Network:
     if isinstance(member, ipaddress.IPv4Network | ipaddress.IPv6Network):
         return canonical_network(member)
-    return canonical_network(
-        ipaddress.ip_network(int(member))
-        if member.version == 4
-        else ipaddress.IPv6Network((int(member), 128))
-    )
+    return canonical_network(ipaddress.ip_network((int(member), member.max_prefixlen)))
 
 
 def _address_fault(text: str) -> str:

@@ -4,9 +4,10 @@ There are no continuation lines, no interpolation and no quotes; comments go fro
 """
 
 import re
+from collections.abc import Hashable, MutableMapping
 from dataclasses import dataclass, field
 
-from appliance.policy.policy_findings import Findings, quoted
+from appliance.policy.policy_findings import Findings, Place, quoted
 
 MAXIMUM_CHARACTERS = 2 * 1024 * 1024
 """The most characters of a policy; one with 10,000 rules has about 600,000."""
@@ -17,12 +18,10 @@ _FOREIGN = re.compile(r"[^\t\x20-\x7e]")
 
 
 @dataclass(frozen=True, slots=True)
-class Word:
-    """A word of the text; `line` and `column` count from 1."""
+class Word(Place):
+    """A word of the text."""
 
-    text: str
-    line: int
-    column: int
+    text: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,10 +40,24 @@ class SectionText:
     entries: list[Entry] = field(default_factory=list)
 
 
+def is_repeated(
+    key: Hashable,
+    word: Word,
+    first_lines: MutableMapping[Hashable, int],
+    findings: Findings,
+    remedy: str = "",
+) -> bool:
+    """Return whether an earlier line of the section has this key, which is an error."""
+    first = first_lines.setdefault(key, word.line)
+    if first != word.line:
+        findings.error(word, f"the key {quoted(word.text)} is already defined at line {first}{remedy}")
+    return first != word.line
+
+
 def read(text: str, findings: Findings) -> list[SectionText]:
     """Return the sections; skip unreadable lines, and report them in `findings`."""
     if len(text) > MAXIMUM_CHARACTERS:
-        findings.error(1, 1, f"the file has {len(text)} characters; the limit is {MAXIMUM_CHARACTERS}")
+        findings.error(Place(), f"the file has {len(text)} characters; the limit is {MAXIMUM_CHARACTERS}")
         return []
     sections: list[SectionText] = []
     for number, raw in enumerate(text.removeprefix("\ufeff").split("\n"), start=1):
@@ -53,9 +66,8 @@ def read(text: str, findings: Findings) -> list[SectionText]:
             continue
         if foreign := _FOREIGN.search(line):
             shown = quoted(foreign.group())
-            findings.error(
-                number, foreign.start() + 1, f"unexpected character {shown}: rules are plain ASCII"
-            )
+            place = Place(number, foreign.start() + 1)
+            findings.error(place, f"unexpected character {shown}: rules are plain ASCII")
         elif line.lstrip().startswith("["):
             _begin_section(line, number, sections, findings)
         else:
@@ -74,28 +86,26 @@ def _begin_section(line: str, number: int, sections: list[SectionText], findings
     start = line.index("[")
     inside, bracket, rest = line[start + 1 :].partition("]")
     name = inside.strip()
+    word = Word(number, start + 1, name)
     if not bracket:
-        findings.error(number, start + 1, f'the section {quoted(line.strip())} is not closed: add "]"')
+        findings.error(word, f'the section {quoted(line.strip())} is not closed: add "]"')
     elif rest.strip():
         column = start + 1 + len(inside) + 1 + len(rest) - len(rest.lstrip()) + 1
-        findings.error(number, column, f"unexpected text after the section: {quoted(rest.strip())}")
+        findings.error(Place(number, column), f"unexpected text after the section: {quoted(rest.strip())}")
     # Keep the section in spite of the error, so that its entries are not added to the section before.
-    sections.append(SectionText(Word(name, number, start + 1)))
+    sections.append(SectionText(word))
 
 
 def _add_entry(line: str, number: int, sections: list[SectionText], findings: Findings) -> None:
     left, equals, right = line.partition("=")
-    column = len(left) - len(left.lstrip()) + 1
-    key = " ".join(left.split())
+    key = Word(number, len(left) - len(left.lstrip()) + 1, " ".join(left.split()))
     if not equals:
-        findings.error(number, column, f"expected key = value, found {quoted(key)}")
-    elif not key:
-        findings.error(number, column, 'expected a key before "="')
+        findings.error(key, f"expected key = value, found {quoted(key.text)}")
+    elif not key.text:
+        findings.error(key, 'expected a key before "="')
     elif not sections:
-        findings.error(
-            number, column, f"{quoted(key)} is before the first section: add one, such as [Groups]"
-        )
+        findings.error(key, f"{quoted(key.text)} is before the first section: add one, such as [Groups]")
     else:
         words = _WORD.finditer(right)
-        values = tuple(Word(m.group(), number, len(left) + 1 + m.start() + 1) for m in words)
-        sections[-1].entries.append(Entry(Word(key, number, column), values))
+        values = tuple(Word(number, len(left) + 1 + m.start() + 1, m.group()) for m in words)
+        sections[-1].entries.append(Entry(key, values))

@@ -10,6 +10,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
+from appliance.policy.ini_reader import Word
+from appliance.policy.policy_findings import Findings, quoted
 from roswire.errors import InvalidNameError
 from roswire.names import is_global_name, resolve_parameter
 
@@ -95,6 +97,18 @@ def parse_key(text: str, *, parameter: bool = False) -> Key:
     if not (is_parameter_key(name) if parameter else is_global_name(name)):
         raise BadKeyError("is not a ROS name: letters, digits and _ between single slashes")
     return Key(text, steps, subtree)
+
+
+def ties(key: Key, word: Word, earlier: list[tuple[Key, int]], findings: Findings) -> bool:
+    """Return whether the key ties with an earlier one, which is an error; add it to the earlier ones."""
+    for other, line in earlier:
+        if key.ties_with(other):
+            both = f"{quoted(word.text)} and {quoted(other.text)} (line {line})"
+            text = f"{both} are equally specific and match the same names: change one of them"
+            findings.error(word, text)
+            return True
+    earlier.append((key, word.line))
+    return False
 
 
 def command_key(name: str) -> Key:

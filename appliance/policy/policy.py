@@ -10,18 +10,19 @@
 import ipaddress
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 from appliance.policy import commands
 from appliance.policy.authority import AuthorityGroup
 from appliance.policy.host_sets import Atom, HostSets, Network, canonical_address
 from appliance.policy.keys import Key, KeyTree, is_parameter_key
 from appliance.policy.model import Address, Category, Decision, Request, Rule
-from appliance.policy.policy_findings import PolicyFinding, quoted
+from appliance.policy.policy_findings import Place, PolicyFinding, quoted
 from appliance.policy.rate_limits import NO_LIMIT, LimitRule, LimitScope, LimitTable, Rate
 from appliance.policy.sections import BY_CATEGORY, PARAMETERS
 from roswire.names import is_global_name
 
+K = TypeVar("K")
 DEFAULT_PORTS = range(19001, 26001)
 
 _LIMITED = {Category.PUBLISH: LimitScope.PUBLISHER, Category.SUBSCRIBE: LimitScope.SUBSCRIBER}
@@ -48,7 +49,7 @@ class CompiledRule:
     words: tuple[tuple[str, Atom], ...]
     shown: str
     place: str
-    column: int
+    where: Place
     asked: frozenset[Atom] = frozenset()
 
     @property
@@ -132,10 +133,7 @@ class Policy:
         decision = self.kept.get(key)
         if decision is None:
             decision = self._decide(request)
-            if len(request.resource) <= _KEPT_NAME:
-                if len(self.kept) >= _KEPT_DECISIONS:
-                    self.kept.clear()
-                self.kept[key] = decision
+            _keep(self.kept, key, request, decision)
         return decision
 
     def decide_parameter(self, request: Request, *, namespace: bool = False) -> Decision:
@@ -152,10 +150,7 @@ class Policy:
         kept = self._kept_below.get(key)
         if kept is None:
             kept = self._decide_below(request, namespace) or decision
-            if len(request.resource) <= _KEPT_NAME:
-                if len(self._kept_below) >= _KEPT_DECISIONS:
-                    self._kept_below.clear()
-                self._kept_below[key] = kept
+            _keep(self._kept_below, key, request, kept)
         return kept
 
     def _decide_below(self, request: Request, namespace: bool) -> Decision | None:
@@ -363,6 +358,13 @@ class Policy:
             f"{self._what(request, 'may not')}: the policy has no [{decider.name}] section, so no host may"
         )
         return _decided(False, None, reason, table.audit_only)
+
+
+def _keep(decisions: dict[K, Decision], key: K, request: Request, decision: Decision) -> None:
+    if len(request.resource) <= _KEPT_NAME:
+        if len(decisions) >= _KEPT_DECISIONS:
+            decisions.clear()
+        decisions[key] = decision
 
 
 def _not_a_command(name: str) -> str:

@@ -80,14 +80,14 @@ def _by_name(found: list[SectionText], findings: Findings) -> dict[str, SectionT
         if name is None:
             guess = meant(place.text, sections.NAMES)
             known = "" if guess else f"; sections are {', '.join(sections.NAMES)}"
-            findings.error(place.line, place.column, f"unknown section {quoted(place.text)}{guess}{known}")
+            findings.error(place, f"unknown section {quoted(place.text)}{guess}{known}")
             name = nearest(place.text, sections.NAMES)
             if name is not None and name.casefold() not in there:
                 by_name.setdefault(name, section)  # use the intended name: one mistake causes one error
         elif name in by_name:
             first = by_name[name]
             text = f"the section [{name}] is already defined at line {first.name.line}: move its lines there"
-            findings.error(place.line, place.column, text)
+            findings.error(place, text)
             first.entries.extend(section.entries)
         else:
             by_name[name] = section

@@ -18,6 +18,14 @@ class FindingSeverity(enum.StrEnum):
     WARNING = "warning"
 
 
+@dataclass(frozen=True, slots=True)
+class Place:
+    """A place in the file; `line` and `column` count from 1."""
+
+    line: int = 1
+    column: int = 1
+
+
 @dataclass(frozen=True, slots=True, order=True)
 class PolicyFinding:
     """A finding; `line` and `column` count from 1, `text` describes the mistake and the remedy."""
@@ -49,15 +57,15 @@ class Findings:
         self._errors: list[PolicyFinding] = []
         self._uncounted = 0
 
-    def error(self, line: int, column: int, text: str) -> None:
+    def error(self, at: Place, text: str) -> None:
         if len(self._errors) < MAXIMUM_FINDINGS:
-            self._errors.append(PolicyFinding(self.file, line, column, FindingSeverity.ERROR, text))
+            self._errors.append(PolicyFinding(self.file, at.line, at.column, FindingSeverity.ERROR, text))
         else:
             self._uncounted += 1
 
-    def warn(self, line: int, column: int, text: str) -> None:
+    def warn(self, at: Place, text: str) -> None:
         if len(self.warnings) < MAXIMUM_FINDINGS:
-            self.warnings.append(PolicyFinding(self.file, line, column, FindingSeverity.WARNING, text))
+            self.warnings.append(PolicyFinding(self.file, at.line, at.column, FindingSeverity.WARNING, text))
 
     @property
     def full(self) -> bool:

@@ -11,7 +11,7 @@ from appliance.policy.host_sets import EVERYONE, Atom, HostSets, Network
 from appliance.policy.ini_reader import SectionText
 from appliance.policy.model import Category
 from appliance.policy.policy import CompiledRule, RuleTable
-from appliance.policy.policy_findings import Findings, quoted
+from appliance.policy.policy_findings import Findings, Place, quoted
 
 Tables = Mapping[Category, RuleTable]
 _NODE_CATEGORIES = (Category.PUBLISH, Category.SUBSCRIBE, Category.OFFER)
@@ -39,7 +39,7 @@ def _shadowed_defaults(tables: Tables, findings: Findings) -> None:
         if everything and table.default:
             line = everything[0].rule.line
             text = f"never decides: {everything[0].rule.key} at line {line} matches every name before it"
-            findings.warn(table.default.rule.line, table.default.column, text)
+            findings.warn(table.default.where, text)
 
 
 def _dead_rules(tables: Tables, table: HostSets, findings: Findings) -> None:
@@ -56,7 +56,7 @@ def _dead_rules(tables: Tables, table: HostSets, findings: Findings) -> None:
         shown = str(host).removesuffix("/32").removesuffix("/128")
         more = f" ({count} rules)" if count > 1 else ""
         text = f"{shown} may not use any node name ([Nodes]), so {rule.rule.key} grants it nothing{more}"
-        findings.warn(rule.rule.line, rule.column, text)
+        findings.warn(rule.where, text)
 
 
 def _nameless(named: set[Atom], table: HostSets) -> dict[Atom, Network]:
@@ -102,20 +102,19 @@ def _nodes_that_cannot_start(
     for command, call in CALLS.items():
         rule = table.tree.find(command) or table.default
         if call.at_start and (rule is None or not rule.atoms):
-            line, column = (rule.rule.line, rule.column) if rule else (place.line, place.column)
             text = f"{command} is granted to no host, and a node needs it: {call.at_start}"
-            findings.warn(line, column, text)
+            findings.warn(rule.where if rule else place, text)
 
 
 def _unused_groups(groups: HostGroups, findings: Findings) -> None:
     for name, group in groups.groups.items():
         if not group.used and group.word is not None:
-            findings.warn(group.word.line, group.word.column, f"the group {quoted(name)} is not used")
+            findings.warn(group.word, f"the group {quoted(name)} is not used")
 
 
 def _missing_sections(present: set[Category], findings: Findings) -> None:
     for decider in sections.DECIDERS:
         if not decider.extension and decider.categories[0] not in present:
             findings.warn(
-                1, 1, f"there is no [{decider.name}] section, so its requests are denied for all hosts"
+                Place(), f"there is no [{decider.name}] section, so its requests are denied for all hosts"
             )

@@ -1,11 +1,11 @@
 """Read `[Ports]`, `[Monitor]` and `[Options]`, which do not decide requests."""
 
 import re
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Hashable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 from appliance.base.validation_messages import meant
-from appliance.policy.ini_reader import Entry, SectionText
+from appliance.policy.ini_reader import Entry, SectionText, is_repeated
 from appliance.policy.model import TELLS
 from appliance.policy.policy import DEFAULT_PORTS
 from appliance.policy.policy_findings import Findings, quoted
@@ -48,14 +48,12 @@ def _range(entry: Entry, findings: Findings) -> range | None:
     found = _RANGE.fullmatch("".join(value.text for value in entry.values))
     first, last = (int(found[1]), int(found[2])) if found else (0, 0)
     if not found:
-        findings.error(word.line, word.column, "expected range = FIRST-LAST, such as 19001-20000")
+        findings.error(word, "expected range = FIRST-LAST, such as 19001-20000")
     elif not 1024 <= first < last <= 65535:
         text = f"{first}-{last}: the range must be ascending, within 1024 to 65535, two ports for each node"
-        findings.error(word.line, word.column, text)
+        findings.error(word, text)
     elif first <= _MASTER_PORT <= last:
-        findings.error(
-            word.line, word.column, f"{first}-{last} contains {_MASTER_PORT}, the port of RVMaster"
-        )
+        findings.error(word, f"{first}-{last} contains {_MASTER_PORT}, the port of RVMaster")
     else:
         return range(first, last + 1)
     return None
@@ -67,9 +65,9 @@ def read_monitor(section: SectionText | None, findings: Findings) -> MonitorSect
         for word in entry.values:
             if not is_global_name(word.text):
                 text = f"{quoted(word.text)} is not a resolved name (/landshark/gps) without patterns"
-                findings.error(word.line, word.column, text)
+                findings.error(word, text)
             elif word.text in names[entry.key.text]:
-                findings.warn(word.line, word.column, f"{word.text} is listed twice")
+                findings.warn(word, f"{word.text} is listed twice")
             names[entry.key.text].add(word.text)
     return MonitorSection(frozenset(names["topic"]), frozenset(names["service"]))
 
@@ -92,7 +90,7 @@ def _one_of(entry: Entry, words: Sequence[str], findings: Findings) -> str:
     if text not in words:
         word = entry.values[0] if entry.values else entry.key
         shown = f"{entry.key.text} is {' or '.join(words)}, not {quoted(text)}{meant(text, words)}"
-        findings.error(word.line, word.column, shown)
+        findings.error(word, shown)
     return text
 
 
@@ -108,25 +106,21 @@ def _audit_only(entry: Entry, findings: Findings) -> frozenset[str]:
         else:
             guess = meant(word.text, ["all", *by_fold.values()])
             known = "" if guess else f"; all, or some of {', '.join(by_fold.values())}"
-            findings.error(word.line, word.column, f"{quoted(word.text)} decides nothing{guess}{known}")
+            findings.error(word, f"{quoted(word.text)} decides nothing{guess}{known}")
     if chosen:
         what = "are" if len(chosen) == len(by_fold) else f"by [{'], ['.join(sorted(chosen))}] are"
-        findings.warn(entry.key.line, entry.key.column, f"audit-only: denials {what} only recorded")
+        findings.warn(entry.key, f"audit-only: denials {what} only recorded")
     return frozenset(chosen)
 
 
 def _entries(section: SectionText | None, keys: Collection[str], findings: Findings) -> Iterator[Entry]:
-    first_lines: dict[str, int] = {}
+    first_lines: dict[Hashable, int] = {}
     for entry in section.entries if section else ():
         word = entry.key
         if word.text not in keys:
             guess = (
                 meant(word.text, keys) or f"; [{section.name.text if section else ''}] has {', '.join(keys)}"
             )
-            findings.error(word.line, word.column, f"unknown key {quoted(word.text)}{guess}")
-        elif word.text in first_lines:
-            text = f"the key {quoted(word.text)} is already defined at line {first_lines[word.text]}"
-            findings.error(word.line, word.column, text)
-        else:
-            first_lines[word.text] = word.line
+            findings.error(word, f"unknown key {quoted(word.text)}{guess}")
+        elif not is_repeated(word.text, word, first_lines, findings):
             yield entry

@@ -4,17 +4,17 @@ If several clauses of the most specific key match a host, the strictest counts. 
 """
 
 import re
-from collections.abc import Iterator
+from collections.abc import Hashable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 
 from appliance.base.validation_messages import meant
 from appliance.policy.groups import HostGroups
 from appliance.policy.host_sets import Atom
-from appliance.policy.ini_reader import Entry, SectionText, Word
-from appliance.policy.keys import BadKeyError, Key, KeyTree, parse_key
+from appliance.policy.ini_reader import Entry, SectionText, Word, is_repeated
+from appliance.policy.keys import BadKeyError, Key, KeyTree, parse_key, ties
 from appliance.policy.model import Rule
-from appliance.policy.policy_findings import Findings, quoted
+from appliance.policy.policy_findings import Findings, Place, quoted
 from appliance.policy.sections import DEFAULT, LIMITS
 
 
@@ -103,19 +103,16 @@ class LimitTable:
 
 def read_limits(section: SectionText | None, file: str, groups: HostGroups, findings: Findings) -> LimitTable:
     table = LimitTable()
-    first_lines: dict[str, int] = {}
+    first_lines: dict[Hashable, int] = {}
     patterns: list[tuple[Key, int]] = []
     for entry in section.entries if section is not None else ():
         if findings.full:
             break
         word = entry.key
         if len(first_lines) >= _LINES:
-            findings.error(word.line, word.column, f"more than {_LINES} limits: use patterns (/camera/**)")
+            findings.error(word, f"more than {_LINES} limits: use patterns (/camera/**)")
             break
-        first = first_lines.setdefault(word.text, word.line)
-        if first != word.line:
-            text = f"the key {quoted(word.text)} is already defined at line {first}: put its limits there"
-            findings.error(word.line, word.column, text)
+        if is_repeated(word.text, word, first_lines, findings, ": put its limits there"):
             continue
         key = _key(word, patterns, findings)
         clauses = tuple(_clauses(entry, groups, findings))
@@ -131,16 +128,9 @@ def _key(word: Word, patterns: list[tuple[Key, int]], findings: Findings) -> Key
     try:
         key = parse_key(word.text, parameter=False)
     except BadKeyError as fault:
-        findings.error(word.line, word.column, f"{quoted(word.text)}: {fault}")
+        findings.error(word, f"{quoted(word.text)}: {fault}")
         return None
-    if not key.exact:
-        for other, line in patterns:
-            if key.ties_with(other):
-                text = f"{quoted(word.text)} and {quoted(other.text)} (line {line}) are equally specific and match the"
-                findings.error(word.line, word.column, f"{text} same names: change one of them")
-                return None
-        patterns.append((key, word.line))
-    return key
+    return None if not key.exact and ties(key, word, patterns, findings) else key
 
 
 def _clauses(entry: Entry, groups: HostGroups, findings: Findings) -> Iterator[Clause]:
@@ -153,10 +143,10 @@ def _clauses(entry: Entry, groups: HostGroups, findings: Findings) -> Iterator[C
         else:
             guess = meant(word.text, _PARTS) or ", such as publisher 30 Hz 10 MB/s"
             text = f"a limit begins with publisher, subscriber or topic, not {quoted(word.text)}{guess}"
-            findings.error(word.line, word.column, text)
+            findings.error(word, text)
             return
     if not parts:
-        findings.error(entry.key.line, entry.key.column, "add whose limit it is: publisher 30 Hz 10 MB/s")
+        findings.error(entry.key, "add whose limit it is: publisher 30 Hz 10 MB/s")
     for word, words in parts:
         clause = _clause(word, words, groups, findings)
         if clause is not None:
@@ -172,7 +162,7 @@ def _clause(part: Word, words: list[Word], groups: HostGroups, findings: Finding
         return None
     if hosts and part.text == LimitScope.TOPIC:
         text = "topic limits all publishers together: name no hosts, or limit each publisher there"
-        findings.error(hosts[0].line, hosts[0].column, text)
+        findings.error(hosts[0], text)
         return None
     atoms = frozenset(atom for _, atom in groups.read(hosts)) if hosts else None
     return Clause(LimitScope(part.text), atoms, rate)
@@ -185,18 +175,18 @@ def _rate(part: Word, words: list[Word], findings: Findings) -> Rate | None:
         word = words.pop(0)
         number = _NUMBER.fullmatch(word.text)
         if number is None:
-            findings.error(word.line, word.column, f"{quoted(word.text)}: put hosts before the numbers")
+            findings.error(word, f"{quoted(word.text)}: put hosts before the numbers")
             return None
         unit = number[2] or (words.pop(0).text if words else "")
         fault = _fault(float(number[1]), _FOLDED.get(unit.casefold()), unit, found)
         if fault:
-            findings.error(word.line, word.column, fault)
+            findings.error(word, fault)
             return None
         kind = "Hz" if unit.casefold() == "hz" else "B/s"
         found[kind] = float(number[1]) * _UNITS[_FOLDED[unit.casefold()]]
     if not found:
         text = f"how much may pass for each {part.text}? as {part.text} 30 Hz 10 MB/s"
-        findings.error(part.line, part.column, text)
+        findings.error(part, text)
         return None
     return Rate(found.get("Hz", 0.0), found.get("B/s", 0.0))
 
@@ -219,8 +209,8 @@ def _lower(one: float, other: float) -> float:
     return min(one, other) if one and other else one or other
 
 
-def _warn_of_shadowed_default(table: LimitTable, lines: dict[str, int], findings: Findings) -> None:
+def _warn_of_shadowed_default(table: LimitTable, lines: Mapping[Hashable, int], findings: Findings) -> None:
     everything = next((rule for rule in table.rules if rule.key is not None and rule.key.text == "/**"), None)
     if everything is not None and DEFAULT in lines:
         text = f"never limits: /** at line {everything.rule.line} matches every name before it"
-        findings.warn(lines[DEFAULT], 1, text)
+        findings.warn(Place(lines[DEFAULT]), text)

@@ -1,10 +1,12 @@
 """Compile the deciding sections into rule tables, and report mistakes."""
 
+from collections.abc import Hashable
+
 from appliance.base.validation_messages import meant
 from appliance.policy import commands
 from appliance.policy.groups import HostGroups
-from appliance.policy.ini_reader import Entry, SectionText, Word
-from appliance.policy.keys import BadKeyError, Key, command_key, parse_key
+from appliance.policy.ini_reader import Entry, SectionText, Word, is_repeated
+from appliance.policy.keys import BadKeyError, Key, command_key, parse_key, ties
 from appliance.policy.model import Category, Rule
 from appliance.policy.policy import CompiledRule, RuleTable, place_of
 from appliance.policy.policy_findings import Findings, quoted
@@ -26,7 +28,7 @@ class RuleCompiler:
         self._findings = findings
 
     def add_section(self, decider: Decider, section: SectionText) -> None:
-        first_lines: dict[tuple[Category, str], int] = {}
+        first_lines: dict[Hashable, int] = {}
         for entry in section.entries:
             if self._findings.full:
                 return
@@ -38,11 +40,9 @@ class RuleCompiler:
             plain, asking = self._asking(category, entry)
             words, asked = self._groups.read(plain), self._groups.read(asking)
             if category is Category.COMMAND:
-                name = Word(commands.ALIASES.get(name.text, name.text), name.line, name.column)
-            first = first_lines.setdefault((category, name.text), name.line)
-            if first != name.line:
-                text = f"the key {quoted(entry.key.text)} is already defined at line {first}: put its hosts there"
-                self._error(entry.key, text)
+                name = Word(name.line, name.column, commands.ALIASES.get(name.text, name.text))
+            key_of_line = (category, name.text)
+            if is_repeated(key_of_line, entry.key, first_lines, self._findings, ": put its hosts there"):
                 continue
             key = self._key(category, name)
             if key is None and name.text != DEFAULT:
@@ -57,7 +57,7 @@ class RuleCompiler:
             place = place_of(rule)
             self._add(
                 category,
-                CompiledRule(rule, key, atoms, (*words, *asked), shown, place, entry.key.column, asked_atoms),
+                CompiledRule(rule, key, atoms, (*words, *asked), shown, place, entry.key, asked_atoms),
             )
 
     def _asking(self, category: Category, entry: Entry) -> tuple[tuple[Word, ...], tuple[Word, ...]]:
@@ -67,29 +67,22 @@ class RuleCompiler:
         plain, asking = entry.values[: places[0]], entry.values[places[0] + 1 :]
         if category not in ASKING:
             text = "ask is for [Publishers], [Clients] and the write keys of [Parameters]"
-            self._error(entry.values[places[0]], text)
+            self._findings.error(entry.values[places[0]], text)
         elif len(places) > 1:
             text = "ask is already in this line: all hosts after it need an approval"
-            self._error(entry.values[places[1]], text)
+            self._findings.error(entry.values[places[1]], text)
         elif not asking:
-            self._error(entry.values[places[0]], "name the hosts that need an approval after ask")
+            self._findings.error(entry.values[places[0]], "name the hosts that need an approval after ask")
         return plain, tuple(word for word in asking if word.text != ASK)
 
     def _fits(self, category: Category, key: Key, name: Word) -> bool:
         self._inner_stars += key.inner_star
         if self._inner_stars > MAXIMUM_INNER_STARS:
             text = f"more than {MAXIMUM_INNER_STARS} keys have a star before the end, such as /*/state: use fewer"
-            self._error(name, text)
+            self._findings.error(name, text)
             return False
         alike = self._patterns.setdefault((category, key.literal, key.subtree), [])
-        for other, line in alike:
-            if key.ties_with(other):
-                both = f"{quoted(name.text)} and {quoted(other.text)} (line {line})"
-                text = "are equally specific and match the same names: change one of them"
-                self._error(name, f"{both} {text}")
-                return False
-        alike.append((key, name.line))
-        return True
+        return not ties(key, name, alike, self._findings)
 
     def _add(self, category: Category, rule: CompiledRule) -> None:
         table = self.tables[category]
@@ -106,9 +99,9 @@ class RuleCompiler:
         category = next((category for category in decider.categories if category.value == verb), None)
         if category is None or not name:
             text = "a key here is read or write and a name, such as read /ns/** or write default"
-            self._error(entry.key, f"{quoted(entry.key.text)}: {text}")
+            self._findings.error(entry.key, f"{quoted(entry.key.text)}: {text}")
             return None
-        return category, Word(name, entry.key.line, entry.key.column + len(verb) + 1)
+        return category, Word(entry.key.line, entry.key.column + len(verb) + 1, name)
 
     def _key(self, category: Category, name: Word) -> Key | None:
         if name.text == DEFAULT:
@@ -119,9 +112,9 @@ class RuleCompiler:
             return parse_key(name.text, parameter=category in PARAMETERS)
         except BadKeyError as fault:
             if meant(name.text, [DEFAULT]) and not name.text.startswith("/"):
-                self._error(name, f"{quoted(name.text)}: did you mean default?")
+                self._findings.error(name, f"{quoted(name.text)}: did you mean default?")
             else:
-                self._error(name, f"{quoted(name.text)}: {fault}")
+                self._findings.error(name, f"{quoted(name.text)}: {fault}")
             return None
 
     def _command(self, name: Word) -> Key | None:
@@ -129,15 +122,12 @@ class RuleCompiler:
         if name.text in commands.COMMANDS:
             return command_key(name.text)
         if elsewhere is not None:
-            self._error(name, f"can never match: {name.text} is decided by {elsewhere}, not here")
+            self._findings.error(name, f"can never match: {name.text} is decided by {elsewhere}, not here")
         elif "*" in name.text:
-            self._error(
+            self._findings.error(
                 name, f"{quoted(name.text)}: commands have no patterns; default matches all other commands"
             )
         else:
             guess = meant(name.text, [*commands.COMMANDS, *commands.DECIDED_ELSEWHERE, DEFAULT])
-            self._error(name, f"unknown command {quoted(name.text)}{guess}")
+            self._findings.error(name, f"unknown command {quoted(name.text)}{guess}")
         return None
-
-    def _error(self, word: Word, text: str) -> None:
-        self._findings.error(word.line, word.column, text)
