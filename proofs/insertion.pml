@@ -190,7 +190,7 @@ inline tell_all() {
 
 /* --- control: grants -------------------------------------------------------------------------------------- */
 
-/* = appliance/master/graph/grants.py Grants.take */
+/* = appliance/master/graph/graph.py Grants.take */
 inline take_grant(p, s) {
     if
     :: granted[PAIR(p, s)] -> granted[PAIR(p, s)] = false; TELL(revoke, p, s)

@@ -8,8 +8,7 @@ from appliance.control.assembly.foundation import Foundation
 from appliance.master.calls.gate import CallGate, HostLimits
 from appliance.master.calls.parameter_rights import ParameterRights
 from appliance.master.endpoints.traffic import RelayTraffic
-from appliance.master.graph.grants import Grants
-from appliance.master.graph.graph import RosGraph
+from appliance.master.graph.graph import Grants, RosGraph
 from appliance.master.graph.mediation import Mediation
 from appliance.master.graph.registry import Registry
 from appliance.master.graph.revocation import Revocation

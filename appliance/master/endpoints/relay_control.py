@@ -16,7 +16,7 @@ from appliance.master.endpoints.node_api import NodeApiClient
 from appliance.master.endpoints.node_ports import NodePorts
 from appliance.master.endpoints.topic_taps_control import TapRequests
 from appliance.master.endpoints.traffic import RelayTraffic
-from appliance.master.graph.grants import Grants
+from appliance.master.graph.graph import Grants
 from appliance.master.graph.registry import Change, Incarnation, Kind, Life, RegistrationKey, Registry
 from appliance.policy.model import Address, address_of
 from appliance.policy.policy import Policy

@@ -6,8 +6,7 @@ A registration that is no longer allowed is kept for a later policy, because a R
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from appliance.master.graph.grants import Grants
-from appliance.master.graph.graph import RosGraph
+from appliance.master.graph.graph import Grants, RosGraph
 from appliance.master.graph.own_node import OWN, rosout_may_have
 from appliance.master.graph.registry import Incarnation, Kind, Life, NodeRegistration, Registry
 from appliance.policy.live_rights import LiveRight, live_by, may_keep

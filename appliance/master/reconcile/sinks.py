@@ -14,7 +14,7 @@ from appliance.base import clock
 from appliance.master.endpoints.node_ports import NodePorts
 from appliance.master.endpoints.proxy_endpoints import ProxyEndpoints
 from appliance.master.endpoints.relay_control import RelayControl
-from appliance.master.graph.grants import Grants
+from appliance.master.graph.graph import Grants
 from appliance.master.graph.registry import (
     Change,
     Incarnation,

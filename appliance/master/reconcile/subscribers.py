@@ -9,7 +9,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass, field
 
 from appliance.master.endpoints.delivery import Delivery, NodeCall
-from appliance.master.graph.grants import Grants
+from appliance.master.graph.graph import Grants
 from appliance.master.graph.mediation import Mediation
 from appliance.master.graph.parameter_updates import settled, updates_of
 from appliance.master.graph.registry import Change, Incarnation, Kind, Life, RegistrationKey, Registry

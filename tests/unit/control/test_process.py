@@ -9,7 +9,7 @@ import pytest
 from appliance.control.process import _end_others, _restore
 from appliance.master.endpoints.node_ports import NodePorts
 from appliance.master.endpoints.proxy_endpoints import ProxyEndpoints
-from appliance.master.graph.grants import Grants
+from appliance.master.graph.graph import Grants
 from appliance.master.graph.registry import Incarnation, Kind, Registry
 from appliance.master.reconcile.sinks import save
 from appliance.store.state_file import StateStore

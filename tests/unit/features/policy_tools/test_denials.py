@@ -13,8 +13,7 @@ from appliance.channel.messages.relay_link import Violation
 from appliance.features.policy_tools.denials import DENIALS, asks_policy, is_denial
 from appliance.features.policy_tools.explanations import explained, granted
 from appliance.features.policy_tools.grant import UngrantableError
-from appliance.master.graph.grants import Grants
-from appliance.master.graph.graph import RosGraph
+from appliance.master.graph.graph import Grants, RosGraph
 from appliance.master.graph.registry import Registry
 from appliance.policy.live_rights import LiveRight, may_keep
 from appliance.policy.model import Decision

@@ -14,8 +14,7 @@ from appliance.master.endpoints.node_api import NodeApiClient
 from appliance.master.endpoints.node_ports import NodePorts
 from appliance.master.endpoints.relay_control import RelayControl
 from appliance.master.endpoints.traffic import RelayTraffic
-from appliance.master.graph.grants import Grants
-from appliance.master.graph.graph import RosGraph
+from appliance.master.graph.graph import Grants, RosGraph
 from appliance.master.graph.registry import Incarnation, Kind, Registry
 from appliance.policy.model import Address
 from appliance.policy.policy import Policy
