@@ -2,7 +2,8 @@
 
 1. All unknown hosts together hold at most `unknown`, however many addresses they have.
 2. All hosts without a registration together hold at most `whole - kept`.
-3. The pool stores nothing about a host without holdings.
+3. With a `share`, each of *n* greedy hosts leaves something for the next one.
+4. The pool stores nothing about a host without holdings.
 
 Each call for a host counts its holdings under its present class. Other hosts are not checked.
 """
@@ -47,6 +48,9 @@ class Bounds:
     kept: int
     """The part of `whole` that is reserved for registered hosts."""
 
+    share: int = 0
+    """A host gets one, and further ones up to this many times what it leaves for all others; 0: up to `host`."""
+
     def __post_init__(self) -> None:
         if min(self.whole, self.host, self.unknown, self.kept) < 0:
             raise ValueError(f"{self} has a part below 0")
@@ -66,7 +70,18 @@ class Bounds:
         if self.unknown and not unknown:
             unknown = 1
         kept = min(self.kept * whole // self.whole, whole - unknown)
-        return Bounds(whole, min(host, whole), unknown, kept)
+        return Bounds(whole, min(host, whole), unknown, kept, self.share)
+
+    def share_refusal(self, host: object, mine: int, total: int, what: str) -> str:
+        """Return the reason why `host` may not have `mine` of then `total`; empty if its share allows it."""
+        left = self.whole - total
+        if not self.share or mine <= max(1, self.share * left):
+            return ""
+        most = "as many" if self.share == 1 else f"{self.share} times as many"
+        return (
+            f"{host} would use {mine} {what}, leaving {left} for all others;"
+            f" a host may use at most {most} as it leaves"
+        )
 
 
 class Pool(Generic[Holder]):
@@ -101,15 +116,15 @@ class Pool(Generic[Holder]):
             return f"{host} has {mine} {what}; the quota of one host is {bounds.host}"
         if quota_class is QuotaClass.UNKNOWN and unknown + amount > bounds.unknown:
             return f"{self.unknown} have {unknown} {what}; their quota together is {bounds.unknown}"
-        others = unknown + named
+        others, total = unknown + named, unknown + named + registered + amount
         if quota_class is not QuotaClass.REGISTERED and others + amount > bounds.whole - bounds.kept:
             return (
                 f"hosts without a registration have {others} {what}; "
                 f"{bounds.kept} of {bounds.whole} are kept for those with one"
             )
-        if others + registered + amount > bounds.whole:
-            return f"all hosts together have {others + registered} {what}; the limit is {bounds.whole}"
-        return ""
+        if total > bounds.whole:
+            return f"all hosts together have {total - amount} {what}; the limit is {bounds.whole}"
+        return bounds.share_refusal(host, mine + amount, total, what)
 
     def take(self, host: Holder, amount: int = 1) -> str:
         quota_class, mine = self._look_up(host)

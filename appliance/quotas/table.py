@@ -148,7 +148,7 @@ QUEUED_NODE_CALLS = QuotaRow(
 )
 RELAY_FRAMES = QuotaRow(
     thing="bytes of unfinished messages in one relay",
-    bounds=Bounds(whole=512 << 20, host=256 << 20, unknown=0, kept=0),
+    bounds=Bounds(whole=512 << 20, host=256 << 20, unknown=0, kept=0, share=1),
     at_limit="the connection of the publisher or client is closed; it may connect again; up to 4 KiB of a connection"
     " are always accepted",
     between="a host gets at most as much as is left for all others",
@@ -158,7 +158,7 @@ RELAY_FRAMES = QuotaRow(
 )
 RELAY_QUEUES = QuotaRow(
     thing="bytes that wait for subscribers and clients in one relay",
-    bounds=Bounds(whole=256 << 20, host=128 << 20, unknown=0, kept=0),
+    bounds=Bounds(whole=256 << 20, host=128 << 20, unknown=0, kept=0, share=1),
     at_limit="messages for the host's slow subscribers are dropped; a subscriber that reads nothing for ten seconds"
     " is disconnected",
     between="a host gets at most as much as is left for all others",
@@ -168,7 +168,7 @@ RELAY_QUEUES = QuotaRow(
 )
 RELAY_LATCHED = QuotaRow(
     thing="bytes of latched messages in one relay",
-    bounds=Bounds(whole=256 << 20, host=128 << 20, unknown=0, kept=0),
+    bounds=Bounds(whole=256 << 20, host=128 << 20, unknown=0, kept=0, share=1),
     at_limit="the message is relayed and not kept; a later subscriber gets it from the publisher when there is room"
     " again",
     between="a host gets at most as much as is left for all others; the host with most makes room for hosts with"
@@ -193,7 +193,7 @@ RELAY_CONNECTIONS = QuotaRow(
 )
 RELAY_HEADERS = QuotaRow(
     thing="bytes of unfinished connection headers in one relay, beyond 4 KiB each",
-    bounds=Bounds(whole=64 << 20, host=16 << 20, unknown=16 << 20, kept=32 << 20),
+    bounds=Bounds(whole=64 << 20, host=16 << 20, unknown=16 << 20, kept=32 << 20, share=1),
     at_limit="the connection is closed",
     between="the long header that has waited longest makes room, those of unknown hosts first",
     alarm="`connection refused`; `rosrv_relay_memory_bytes`",

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from http import HTTPStatus
 from typing import Protocol
 
-from appliance.features.doors.host_shares import HostShares
+from appliance.features.doors.host_shares import of_hosts
 from roswire.node.network import BUFFER_BYTES, ByteWriter, OwnedTasks
 
 
@@ -46,9 +46,9 @@ class DoorConnections:
 
     def __init__(self, limits: ConnectionLimits) -> None:
         self.refused = 0
-        self._open = HostShares("connections", limits.connections)
-        self._new = HostShares("new connections in ten seconds", limits.in_ten_seconds)
-        self._refusing = HostShares("refusals", _MOST_REFUSALS)
+        self._open = of_hosts("connections of this door", limits.connections)
+        self._new = of_hosts("new connections of this door in ten seconds", limits.in_ten_seconds)
+        self._refusing = of_hosts("refusals of this door", _MOST_REFUSALS)
         self._recent: deque[tuple[float, str]] = deque()
         self._tasks = OwnedTasks()
 
@@ -80,7 +80,7 @@ class DoorConnections:
             refused(reason)
             await self._refuse(reader, writer, reason, host)
             return
-        self._open.take(host)
+        self._open.charge(host)
         try:
             await serve(reader, writer)
         finally:
@@ -90,18 +90,16 @@ class DoorConnections:
         now = asyncio.get_running_loop().time()
         while self._recent and self._recent[0][0] <= now - 10:
             self._new.give_back(self._recent.popleft()[1])
-        reason = self._open.refusal(host) or self._new.refusal(host)
+        reason = self._open.refusal(host) or self._new.take(host)
         if not reason:
-            self._new.take(host)
             self._recent.append((now, host))
         return reason
 
     async def _refuse(self, reader: asyncio.StreamReader, writer: ByteWriter, reason: str, host: str) -> None:
         self.refused += 1
-        if self._refusing.refusal(host):
+        if self._refusing.take(host):
             writer.close()
             return
-        self._refusing.take(host)
         try:
             async with asyncio.timeout(_REFUSAL_SECONDS):
                 # If bytes were unread at the end, the client would get a reset instead of the answer.

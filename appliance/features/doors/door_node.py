@@ -18,11 +18,11 @@ from appliance.base import clock
 from appliance.base.counted import counted
 from appliance.features.doors.door_memory import ClientMemory
 from appliance.features.doors.door_parameters import TOO_MANY_CALLS, DoorParameters, ParameterClient
-from appliance.features.doors.host_shares import HostShares, check_share
+from appliance.features.doors.host_shares import check_share, of_hosts
 from appliance.features.doors.known_types import DoorMessage, KnownTypes, SharedFrames
 from appliance.features.doors.lingering import Lingering
 from appliance.features.doors.message_writer import MessageWriter, Now
-from appliance.features.doors.quotas import DOOR_CALLS, DOOR_SERVICES
+from appliance.features.doors.quotas import DOOR_CALLS, DOOR_SERVICES, DOOR_TOPICS
 from appliance.features.doors.requests import (
     AdvertiseTopic,
     AnswerCall,
@@ -133,9 +133,9 @@ class DoorNode:
         calls: ClientMemory,  # charged with arguments of calls, which may outlive their connection
     ) -> None:
         self.node = node
-        self._most_topics = most_topics
+        self._topics = DOOR_TOPICS.bounds.sized(most_topics)
         self._calls = calls
-        self._waiting_calls = HostShares("calls that wait for answers", DOOR_CALLS.bounds.whole)
+        self._waiting_calls = of_hosts("calls of this door that wait for answers", DOOR_CALLS.bounds.whole)
         self._types = types
         self._built_in = built_in
         self._publications: dict[str, _Publication] = {}
@@ -353,7 +353,7 @@ class DoorNode:
         if reason := self._waiting_calls.refusal(client.memory.host):
             raise LimitExceededError(TOO_MANY_CALLS + reason)
         self._calls.take(size, TOO_MANY_CALLS)
-        self._waiting_calls.take(client.memory.host)
+        self._waiting_calls.charge(client.memory.host)
         self._tasks.start(self._call(replace(request, values=values), client, size))
 
     async def _call(self, request: CallOfService, client: DoorClient, size: int) -> None:
@@ -385,9 +385,7 @@ class DoorNode:
             await self._withdraw(request.service)
         elif known is not None:
             raise ProtocolError(f"{request.service} is already offered by a client of this door")
-        check_share(
-            "services", DOOR_SERVICES.bounds.whole, [{o.client} for o in self._offers.values()], client
-        )
+        check_share("services", DOOR_SERVICES.bounds, [{o.client} for o in self._offers.values()], client)
         given, response, definitions = self._types.service(request.type)
         offer = self._offers[request.service] = _Offer(client, response)
 
@@ -453,8 +451,8 @@ class DoorNode:
         end: Callable[[str], Awaitable[None]],
     ) -> None:
         """A topic without a client ends early if a new one needs its slot."""
-        check_share("topics", self._most_topics, [clients for clients in users if clients], client)
-        while len(topics) >= self._most_topics and (topic := unused.pop()) is not None:
+        check_share("topics", self._topics, [clients for clients in users if clients], client)
+        while len(topics) >= self._topics.whole and (topic := unused.pop()) is not None:
             await end(topic)
 
     def _lock(self, name: str) -> asyncio.Lock:

@@ -127,8 +127,7 @@ class DoorParameters:
             if name in self._clients:
                 self._clients[name].add(client)
                 return
-            most, used = DOOR_PARAMETERS.bounds.whole, [*self._clients.values()]
-            check_share("subscribed parameters", most, used, client)
+            check_share("subscribed parameters", DOOR_PARAMETERS.bounds, [*self._clients.values()], client)
             self._clients[name] = {client}
             try:
                 await self._node.subscribe_parameter(name, partial(self._changed, name))

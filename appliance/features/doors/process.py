@@ -186,7 +186,7 @@ class _Process:
     async def _start(self, given: door_link.DoorGiven, network: GivenNetwork) -> None:
         name = node_name(given.name)
         memory = DoorMemory(given.connections)
-        waiting, calls = memory.client(), memory.client()
+        waiting, calls = memory.client("the door's messages"), memory.client("the door")
         while self._door is None:
             node = RosNode(
                 name,

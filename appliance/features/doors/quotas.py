@@ -46,7 +46,7 @@ DOOR_BYTES = QuotaRow(
 
 DOOR_TOPICS = QuotaRow(
     thing="topics that clients of one door publish, and topics to which they subscribe",
-    bounds=Bounds(whole=500, host=375, unknown=0, kept=0),
+    bounds=Bounds(whole=500, host=375, unknown=0, kept=0, share=HOST_SHARE),
     at_limit="refused in words",
     between="a host gets at most three times what is left for all others; a topic without a client ends early",
     counting="host: the address of a client",
@@ -59,7 +59,7 @@ DOOR_TOPICS = QuotaRow(
 
 DOOR_CALLS = QuotaRow(
     thing="calls of services by clients of one door that wait for answers, also after the client has left",
-    bounds=Bounds(whole=256, host=192, unknown=0, kept=0),
+    bounds=Bounds(whole=256, host=192, unknown=0, kept=0, share=HOST_SHARE),
     at_limit="refused in words",
     between="a client has at most 100; a host gets at most three times what is left for all others",
     counting="host: the address of a client",
@@ -71,7 +71,7 @@ DOOR_CALLS = QuotaRow(
 
 DOOR_SERVICES = QuotaRow(
     thing="services that clients of one door offer",
-    bounds=Bounds(whole=400, host=300, unknown=0, kept=0),
+    bounds=Bounds(whole=400, host=300, unknown=0, kept=0, share=HOST_SHARE),
     at_limit="refused in words",
     between="a client offers at most 100; a host gets at most three times what is left for all others",
     counting="host: the address of a client",
@@ -83,7 +83,7 @@ DOOR_SERVICES = QuotaRow(
 
 DOOR_PARAMETERS = QuotaRow(
     thing="parameters to which clients of one door subscribe",
-    bounds=Bounds(whole=2000, host=1500, unknown=0, kept=0),
+    bounds=Bounds(whole=2000, host=1500, unknown=0, kept=0, share=HOST_SHARE),
     at_limit="refused in words",
     between="a client has at most 1000; a host gets at most three times what is left for all others",
     counting="host: the address of a client",

@@ -36,14 +36,7 @@ class HostMemory:
             self._pool.give_back(self._host, -size)
 
     def refusal(self, size: int = 1) -> str:
-        pool = self._pool
-        held, left = pool.held(self._host) + size, pool.bounds.whole - pool.total - size
-        if held > left:
-            return (
-                f"{self._host} would use {held} {pool.what}, leaving {max(left, 0)} for all others;"
-                " a host may use at most as many as it leaves"
-            )
-        return pool.refusal(self._host, size)
+        return self._pool.refusal(self._host, size)
 
     @property
     def exhausted(self) -> bool:

@@ -49,6 +49,30 @@ def test_a_host_cannot_release_more_than_it_has() -> None:
         shared.give_back("host")
 
 
+@pytest.mark.parametrize(("share", "taken"), [(0, [32, 0, 0]), (1, [16, 8, 4]), (3, [24, 6, 1])])
+def test_a_host_gets_one_and_further_ones_by_what_it_leaves(share: int, taken: list[int]) -> None:
+    bounds = Bounds(whole=32, host=32, unknown=0, kept=0, share=share)
+    shared: Pool[str] = Pool("connections", bounds, lambda _host: REGISTERED)
+    for host in "abc":
+        while not shared.take(host):
+            pass
+    assert [shared.held(host) for host in "abc"] == taken
+    others = [shared.take(f"other{number}") for number in range(40)]
+    assert others.count("") == 32 - sum(taken)
+    assert others[-1] == "all hosts together have 32 connections; the limit is 32"
+
+
+def test_the_refusal_of_a_share_names_its_numbers() -> None:
+    assert Bounds(32, 32, 0, 0, share=3).share_refusal("a", 25, 25, "connections") == (
+        "a would use 25 connections, leaving 7 for all others; a host may use at most 3 times as many as it leaves"
+    )
+    assert (
+        Bounds(32, 32, 0, 0, share=1)
+        .share_refusal("a", 17, 17, "connections")
+        .endswith("at most as many as it leaves")
+    )
+
+
 @pytest.mark.parametrize("bounds", [(10, 11, 0, 0), (10, 1, 6, 5), (10, -1, 0, 0)])
 def test_bounds_that_contradict_each_other_are_refused(bounds: tuple[int, int, int, int]) -> None:
     with pytest.raises(ValueError, match="Bounds"):

@@ -16,7 +16,10 @@ async def test_a_host_leaves_connections_for_others() -> None:
             world.network.connect("10.0.0.9", DOOR)
         await asyncio.sleep(1)
         assert len(world.sessions) == SLOTS * 3 // 4
-        assert "one host has 24 connections of this door" in world.refusals[0]
+        assert world.refusals[0] == (
+            "10.0.0.9 would use 25 connections of this door, leaving 7 for all others;"
+            " a host may use at most 3 times as many as it leaves"
+        )
         others = [await world.client(f"10.0.1.{number}") for number in (0, 0, 0, 1, 2, 3, 4)]
         assert all(client.is_open for client in others)
         await asyncio.sleep(10)
@@ -31,7 +34,7 @@ async def test_two_hundred_clients_of_many_hosts_get_the_slots_of_the_door_and_w
         ]
         await asyncio.sleep(6)
         assert sum(client.is_open for client in clients) == SLOTS
-        assert set(world.refusals) == {"this door has 32 connections; at most 32 are allowed"}
+        assert set(world.refusals) == {"all hosts together have 32 connections of this door; the limit is 32"}
         statuses = [client.response.status_code for client in clients if client.response is not None]
         assert (statuses.count(101), statuses.count(503)) == (SLOTS, 200 - SLOTS)
         for client in clients:
@@ -50,7 +53,7 @@ async def test_a_host_that_connects_in_a_loop_leaves_new_connections_for_others(
             client.writer.close()
             await asyncio.sleep(0.01)
         assert admitted == world.limits.in_ten_seconds * 3 // 4
-        assert "one host has 150 new connections in ten seconds of this door" in world.refusals[0]
+        assert "10.0.0.9 would use 151 new connections of this door in ten seconds" in world.refusals[0]
         assert (await world.client("10.0.0.10")).is_open
 
 

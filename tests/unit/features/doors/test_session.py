@@ -771,7 +771,7 @@ async def test_connections_of_a_door_are_bounded_in_number_and_rate() -> None:
         statuses = [answer.status_code for answer in answers if answer is not None]
         assert statuses == [101] * world.limits.connections + [503] * 5
         assert len(world.refusals) == 5
-        assert answers[-1] is not None and b"at most 32 are allowed" in (answers[-1].body or b"")
+        assert answers[-1] is not None and b"the limit is 32" in (answers[-1].body or b"")
         world.network.break_off(DOOR)
         await asyncio.sleep(20)
         assert world.limits.in_ten_seconds == 200
@@ -795,13 +795,13 @@ async def test_topics_of_a_door_are_bounded_over_all_its_hosts(op: str) -> None:
             greedy.send(request | {"topic": f"/a{number}"})
         await asyncio.sleep(2)
         refusals = [(await greedy.next())["msg"] for _number in range(13)]
-        assert set(refusals) == {"one host uses 37 topics of this door; the others are kept for other hosts"}
+        assert all("would use 38 topics of this door, leaving 12 for all others" in one for one in refusals)
         for number in range(13):
             others[number].send(request | {"topic": f"/b{number}"})
         await asyncio.sleep(2)
         assert greedy.frames.empty() and all(other.frames.empty() for other in others)
         others[13].send(request | {"topic": "/c"})
-        assert "use 50 topics; at most 50" in (await others[13].next())["msg"]
+        assert "use 50 topics of this door; the limit is 50" in (await others[13].next())["msg"]
 
 
 @pytest.mark.parametrize(("begin", "end"), [("subscribe", "unsubscribe"), ("advertise", "unadvertise")])
@@ -847,7 +847,7 @@ async def test_a_thousand_calls_that_get_no_answer_leave_calls_for_other_hosts()
             words += [client.frames.get_nowait()["values"]["message"] for _ in range(client.frames.qsize())]
             client.writer.close()
         assert len(words) == 1000 - 192
-        assert "one host has 192 calls that wait for answers" in words[0]
+        assert "would use 193 calls of this door that wait for answers" in words[0]
         other = await world.client("10.0.0.10")
         other.send({"op": "call_service", "service": "/rosapi/get_time", "id": 1})
         assert (await other.next())["result"] is True
@@ -865,7 +865,7 @@ async def test_services_that_one_host_offers_leave_some_for_others() -> None:
             clients[number // 100].send(offer | {"service": f"/s{number}"})
         await asyncio.sleep(5)
         assert sum(client.frames.qsize() for client in clients) == 100
-        assert "one host uses 300 services of this door" in (await clients[3].next())["msg"]
+        assert "would use 301 services of this door" in (await clients[3].next())["msg"]
         other = await world.client("10.0.0.10")
         other.send(offer | {"service": "/other"})
         await asyncio.sleep(1)
@@ -925,7 +925,7 @@ async def test_parameters_of_one_host_leave_some_for_others() -> None:
             client.send({"op": "subscribeParameterUpdates", "parameterNames": names})
         other.send({"op": "subscribeParameterUpdates", "parameterNames": ["/own"]})
         await asyncio.sleep(5)
-        refusal = "one host uses 1499 subscribed parameters of this door"
+        refusal = "would use 1500 subscribed parameters of this door"
         assert sum(refusal in frame.get("message", "") for frame in _taken(*greedy)) == 501
         assert not any("subscribed parameters" in frame.get("message", "") for frame in _taken(other))
 

@@ -4,7 +4,7 @@ from appliance.relay.transport.memory import MemoryPool, RelayMemory, StallDetec
 
 
 def shares(whole: int) -> MemoryPool:
-    return MemoryPool("bytes", Bounds(whole, whole, 0, 0), lambda _host: QuotaClass.REGISTERED)
+    return MemoryPool("bytes", Bounds(whole, whole, 0, 0, share=1), lambda _host: QuotaClass.REGISTERED)
 
 
 def take_all(pool: MemoryPool, host: str, step: int = 1) -> int:
