@@ -41,6 +41,7 @@ def make_operators(base: Foundation, parts: Parts) -> Operators:
     tokens = TokenOrders(
         base.store, trail, ends_of_tokens, lambda: rest().state_tokens(), sessions=base.features.sessions
     )
+    base.bearers.set(tokens.usable)
     clock = ClockCheck(trail, lambda: base.audit.ids.ahead)
     switched_off = SwitchedOffWatch(
         parts.monitors, base.policies, base.store, trail, settings.forgotten_after
@@ -56,7 +57,6 @@ def make_operators(base: Foundation, parts: Parts) -> Operators:
         received=base.receipts.received,
         graph=partial(graph_of, parts),
         tokens_changed=lambda: rest().state_tokens(),
-        bearers=lambda: frozenset(row.name for row in tokens.usable()),
         status=lambda: looks().present(),
         handled_alarms=handled,
     )

@@ -80,8 +80,6 @@ class OperatorContext:
     """Notes that another machine has all records up to a sequence."""
     graph: "Callable[[], Graph]"
     tokens_changed: Callable[[], None]
-    bearers: Callable[[], frozenset[str]]
-    """Returns the names of the usable tokens and sessions."""
     status: "Callable[[], Status]"
     handled_alarms: "HandledAlarms"
     kept: Mapping[str, KeptHosts]

@@ -10,14 +10,14 @@ import re
 import secrets
 from typing import NamedTuple
 
-from appliance.base.actors import DISK
+from appliance.base.actors import DISK, OPERATOR
 from appliance.base.deadlines import Deadlines
 from appliance.signing.request_signing import TokenKeys, keys_of
 
 _FORM = re.compile(r"rosrv_([0-9a-f]{12})_([A-Za-z0-9_-]{43})")
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._@-]{0,62}")
 # `who` has these values in revisions and records that no token made.
-_RESERVED = frozenset({DISK, "operator"})
+_RESERVED = frozenset({DISK, OPERATOR})
 # 2**14 * 8 * 128 bytes = 16 MiB and some 40 ms for one check.
 _COST, _BLOCK, _PARALLEL, _LENGTH = 1 << 14, 8, 1, 32
 

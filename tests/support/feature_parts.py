@@ -25,7 +25,7 @@ def idle_parts() -> FeatureParts:
     parts.operate(
         appliance="", store=store, policies=idle(Policies), monitors=monitors, processes=tuple,
         received=lambda _sequence: None, graph=lambda: Graph([], [], []), tokens_changed=lambda: None,
-        bearers=frozenset, status=lambda: idle(Status), handled_alarms=idle(HandledAlarms),
+        status=lambda: idle(Status), handled_alarms=idle(HandledAlarms),
     )  # fmt: skip
     return parts
 

@@ -9,6 +9,7 @@ import structlog
 
 from appliance.audit.log.log import AuditLog
 from appliance.base.age_clock import AgeClock
+from appliance.channel.messages.api import TokenKept
 from appliance.configuration.settings import Settings
 from appliance.control.assembly.active_role import ActiveRole
 from appliance.control.assembly.current import Current, Later
@@ -53,6 +54,8 @@ class Foundation:
     trail: AuditTrail
     features: FeatureParts
     in_force: Later[[], tuple[int, int]]
+    bearers: Later[[], list[TokenKept]]
+    """Returns the usable tokens and sessions."""
     store: StateStore
     blocks: BlockTable
     table: HostTable
@@ -165,6 +168,7 @@ async def make_foundation(
         trail=trail,
         features=features,
         in_force=in_force,
+        bearers=Later(),
         store=store,
         blocks=blocks,
         table=table,

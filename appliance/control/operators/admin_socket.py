@@ -9,6 +9,7 @@ from typing import Any, Protocol
 import msgspec
 import structlog
 
+from appliance.base.actors import OPERATOR
 from appliance.base.withdrawal import awaited
 from appliance.channel import admin
 from appliance.channel.admin import A
@@ -16,7 +17,6 @@ from appliance.channel.operations import AnyRequest
 
 _log = structlog.get_logger()
 _LINE_LIMIT = 16 << 20
-_OPERATOR = "operator"
 
 
 class RequestHandler(Protocol):
@@ -59,7 +59,7 @@ class AdminServer:
                 False, error=f"not a request of this version: {error}", trouble="request"
             )
         try:
-            return await self._administration.carry_out(request, who=_OPERATOR)
+            return await self._administration.carry_out(request, who=OPERATOR)
         except Exception as error:  # noqa: BLE001  a defect ends one order, not the connection of its operator
             verb = admin.verb_of(request)
             _log.critical("an order ended by a defect", order=verb, exc_info=error)

@@ -5,14 +5,17 @@ relay asks about each request. Nothing is stored, so a restart or a takeover end
 """
 
 import asyncio
-from collections.abc import Awaitable, Callable, Iterable
+from collections.abc import Awaitable, Callable, Iterable, Mapping
 from dataclasses import replace
 from functools import partial
 
 from appliance.base import clock
+from appliance.base.actors import OPERATOR
 from appliance.base.withdrawal import take_effect
 from appliance.channel.answers.limit_answers import LimitUse
+from appliance.channel.answers.token_answers import may
 from appliance.channel.messages import ApprovalAnswered, ApprovalWanted
+from appliance.channel.messages.api import TokenKept
 from appliance.control.errors import SenselessError, UnknownThingError
 from appliance.control.motion_stop import MotionStop
 from appliance.features.approvals import approval_requests as requests
@@ -56,6 +59,7 @@ class ApprovalOrders:
         first: int,
         decide_again: Callable[[], int],
         carried_out: Callable[[Iterable[str]], Awaitable[None]],
+        bearers: Callable[[], Iterable[TokenKept]],  # the usable tokens and sessions
         # The monitors that have a safe message for a topic; None: its relay does not answer.
         guards: Callable[[str], Awaitable[list[str] | None]],
     ) -> None:
@@ -65,6 +69,7 @@ class ApprovalOrders:
         self._stop = stop
         self._decide_again = decide_again
         self._carried_out = carried_out
+        self._bearers = bearers
         self._guards = guards
         self._table = ApprovalTable(first)
         self._unanswered: list[float] = []
@@ -99,7 +104,11 @@ class ApprovalOrders:
     def _decided(self, decision: Decision, wanted: ApprovalWanted, host: Address) -> Decision:
         call = HeldCall(host, Category.CALL, wanted.service, wanted.digest)
         entry = self._table.find(call)
-        if entry is None or entry.state is not ApprovalState.APPROVED or entry.until <= clock.now():
+        approved = entry is not None and entry.state is ApprovalState.APPROVED
+        if entry is not None and approved and (reason := self._ended(entry, self._approvers())):
+            self._end(entry, reason)
+            approved = False
+        if entry is None or not approved:
             told = self._held(call, wanted.caller_id, wanted.type, wanted.shown, wanted.size)
             return replace(decision, allowed=False, reason=f"{told}: {decision.reason}")
         if entry.once:
@@ -152,12 +161,13 @@ class ApprovalOrders:
             raise SenselessError(
                 f"{seconds:g} s is not a lease: give {requests.SHORTEST_LEASE:g}s to {requests.LONGEST_LEASE:g}s"
             )
-        if self._ended(entry):
+        if not self._asks(entry):
             raise SenselessError(
                 f"the policy no longer asks about {entry.call.resource}: there is nothing to approve"
             )
         take_effect()
-        entry = self._table.approve(entry, seconds, who, clock.now())
+        credentials = frozenset(number for number, name in self._approvers().items() if name == who)
+        entry = self._table.approve(entry, seconds, who, clock.now(), credentials=credentials)
         self._unanswered.clear()
         what = "once" if seconds is None else f"for {seconds:g} s"
         self._record("approval given", entry, f"{who} gave approval {entry.number}, {what}", who=who)
@@ -187,18 +197,23 @@ class ApprovalOrders:
                 await asyncio.sleep(CHECK_SECONDS)
 
     async def check(self) -> None:
-        """End expired approvals, and leases of silent hosts. All of them end before the first wait for a relay.
+        """End expired approvals, those of an earlier approver, and leases of silent hosts.
+
+        All of them end before the first wait for a relay.
 
         Silence only ends leases on motions: topics of a group of `[Authority]`, or with a safe message of an enabled
         guard.
         """
         ended, still = [], []
-        for entry in self._table.entries():
+        entries = self._table.entries()
+        approved = any(entry.state is ApprovalState.APPROVED for entry in entries)
+        approvers = self._approvers() if approved else {}
+        for entry in entries:
             silence, in_group = (
                 self._silence(entry),
                 self._policy().commanded(entry.call.resource) is not None,
             )
-            if reason := self._ended(entry) or (silence if in_group else ""):
+            if reason := self._ended(entry, approvers) or (silence if in_group else ""):
                 if entry.state is ApprovalState.WAITS and entry.until <= clock.now():
                     self._unanswered.append(clock.now())
                 self._end(entry, reason)
@@ -209,18 +224,24 @@ class ApprovalOrders:
         self._enforce()
         await asyncio.gather(*map(self._stop_motion, ended), *map(self._end_if_guarded, still))
 
-    def _ended(self, entry: ApprovalEntry) -> str:
-        now, call = clock.now(), entry.call
-        if entry.until <= now:
-            return (
-                "its time is over"
-                if entry.state is ApprovalState.APPROVED
-                else "no operator answered in time"
-            )
+    def _approvers(self) -> dict[str, str]:
+        """Return the names of all who may approve now, by the ids of their tokens and sessions."""
+        found = {one.id: one.name for one in self._bearers() if may(one.role, "operator")}
+        return found | {OPERATOR: OPERATOR}
+
+    def _ended(self, entry: ApprovalEntry, approvers: Mapping[str, str]) -> str:
+        approved = entry.state is ApprovalState.APPROVED
+        if entry.until <= clock.now():
+            return "its time is over" if approved else "no operator answered in time"
+        if approved and entry.credentials.isdisjoint(approvers):
+            return f"{entry.who}, who approved it, no longer has a token or session with the role operator"
+        return "" if self._asks(entry) else "the policy no longer asks"
+
+    def _asks(self, entry: ApprovalEntry) -> bool:
+        call = entry.call
         request = Request(call.host, entry.caller_id, call.category, call.resource)
         asking = (decide_right(self._policy(), Right(request, below)).asks for below in (False, True))
-        # A parameter may be held because of a rule for what is below it.
-        return "" if any(asking) else "the policy no longer asks"
+        return any(asking)  # a parameter may be held because of a rule for what is below it
 
     def _silence(self, entry: ApprovalEntry) -> str:
         moved, group = self._last_message(entry), self._policy().commanded(entry.call.resource)

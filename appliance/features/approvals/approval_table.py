@@ -71,6 +71,8 @@ class ApprovalEntry:
     once: bool = False
     """An approval is for one call; otherwise it is a lease for all calls of this host and name until `until`."""
     who: str = ""
+    credentials: frozenset[str] = frozenset()
+    """The ids of the approver's tokens and sessions; the approval ends with the last of them."""
 
     @property
     def lease(self) -> bool:
@@ -122,7 +124,15 @@ class ApprovalTable:
         self._put(entry)
         return entry
 
-    def approve(self, entry: ApprovalEntry, seconds: float | None, who: str, now: float) -> ApprovalEntry:
+    def approve(
+        self,
+        entry: ApprovalEntry,
+        seconds: float | None,
+        who: str,
+        now: float,
+        *,
+        credentials: frozenset[str],
+    ) -> ApprovalEntry:
         """Approve one call (`seconds` is None), or all calls of its key for some seconds."""
         call, until = entry.call, now + (WAIT_SECONDS if seconds is None else seconds)
         if seconds is not None and call.digest:
@@ -139,6 +149,7 @@ class ApprovalTable:
                 state=ApprovalState.APPROVED,
                 once=seconds is None,
                 who=who,
+                credentials=credentials,
             )
         )
 

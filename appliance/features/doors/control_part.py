@@ -49,7 +49,8 @@ async def inherit(base: Foundation, parts: Any) -> FeaturePart:
     assert isinstance(kept, KeptDoors)  # noqa: S101  `keep` made it
     table = kept.table
     ends = StoredDeadlines(base.store)
-    tickets, visits = DoorTickets(base.store, ends), DoorVisits(kept.bearers)
+    tickets = DoorTickets(base.store, ends)
+    visits = DoorVisits(lambda: frozenset(row.name for row in base.bearers()))
     processes = DoorProcesses(
         base,
         table,

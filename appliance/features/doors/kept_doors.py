@@ -1,6 +1,6 @@
 """The doors in the state, which control reads before the policy comes into force."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Protocol
 
 from appliance.control.operators.request_method import RequestMethod
@@ -31,12 +31,7 @@ class KeptDoors:
 
     def __init__(self, table: DoorTable) -> None:
         self.table = table
-        # These two are set once control has its other parts.
-        self.orders: Orders
-        self.usable: Callable[[], frozenset[str]]
-
-    def bearers(self) -> frozenset[str]:
-        return self.usable()
+        self.orders: Orders  # set once control has its other parts
 
     def addresses(self) -> Mapping[str, Address]:
         return self.table.addresses()
@@ -72,8 +67,6 @@ class LateOrders(Orders):
 
 def operate(context: OperatorContext) -> FeaturePart:
     orders = LateOrders(context)
-    if "doors" in context.kept:
-        _kept(context).usable = context.bearers
     return FeaturePart(
         methods=(
             RequestMethod(requests.DoorsWanted, orders.listed),

@@ -11,6 +11,7 @@ import pytest
 
 from appliance.base import clock
 from appliance.channel.messages import ApprovalWanted
+from appliance.channel.messages.api import TokenKept
 from appliance.control.errors import SenselessError, UnknownThingError
 from appliance.features.approvals.approval_orders import CHECK_SECONDS, LEASE_SECONDS, ApprovalOrders
 from appliance.features.approvals.approval_requests import Approval, ApprovalsWanted, ApproveCall, RefuseCall
@@ -40,6 +41,10 @@ lease base = 5s
 NUMBER = re.compile(r"held for approval ([0-9]+); ask the operator, then repeat; expires in ([0-9]+) s")
 
 
+def bearer(number: str, name: str, role: str = "operator") -> TokenKept:
+    return TokenKept(number, name, role, b"", b"", 0.0)
+
+
 class Site:
     def __init__(self, time: VirtualClock) -> None:
         self.time = time
@@ -54,6 +59,7 @@ class Site:
         self.hanging: set[str] = set()  # topics of a relay that does not answer
         self.replaced = asyncio.Event()  # that relay
         self.obstacle, self.strict = None, False
+        self.bearers = [bearer("1", "ann")]
         self.orders = ApprovalOrders(
             lambda: self.policy,
             cast(Any, self),
@@ -62,6 +68,7 @@ class Site:
             first=17,
             decide_again=self.decide_again,
             carried_out=self.carried_out,
+            bearers=lambda: self.bearers,
             guards=self.guards,
         )
         self.decide_again()
@@ -316,6 +323,56 @@ async def test_an_approval_ends_when_the_policy_no_longer_asks(site: Site) -> No
         site.text = before
         site.decide_again()
         assert number_in(site.publish("/x")) != number
+
+
+@pytest.mark.parametrize(
+    "left",
+    [
+        pytest.param([], id="removed"),
+        pytest.param([bearer("2", "ann", "viewer")], id="another role"),
+        pytest.param([bearer("2", "ann", "admin")], id="another token of this name"),
+    ],
+)
+async def test_an_approval_ends_with_the_role_of_its_approver(site: Site, left: list[TokenKept]) -> None:
+    """The robot stops, and the record has the reason."""
+    number = number_in(site.publish("/cmd_vel"))
+    await site.orders.approve(ApproveCall(number, 60.0), "ann")
+    await site.pass_time(10)
+    assert site.publish("/cmd_vel") == "" and not site.stops
+    site.bearers = left
+    await site.pass_time(CHECK_SECONDS)
+    assert number_in(site.publish("/cmd_vel")) != number
+    assert site.stops == [(str(AGENT), {"/cmd_vel"})]
+    [ended] = [one for one in site.records if one["event"] == "approval ended"]
+    assert ended["reason"].endswith(
+        f"approval {number} ended: ann, who approved it, no longer has a token or session with the role operator"
+    )
+
+
+@pytest.mark.parametrize("seconds", [None, 60.0])
+async def test_a_call_is_refused_as_soon_as_its_approver_has_lost_the_role(
+    site: Site, seconds: float | None
+) -> None:
+    number = number_in(await site.call())
+    await site.orders.approve(ApproveCall(number, seconds), "ann")
+    site.bearers = []
+    assert number_in(await site.call()) != number
+    assert site.events()[-2:] == ["ended", "wanted"]
+
+
+async def test_an_approval_outlives_one_of_two_tokens_of_its_approver_and_any_other(site: Site) -> None:
+    """The admin socket needs no token. A later approval of the same lease replaces the approver."""
+    site.bearers = [bearer("1", "ann"), bearer("2", "ann"), bearer("3", "bob", "admin")]
+    numbers = [number_in(site.publish(topic)) for topic in ("/a", "/b", "/c")]
+    for number, who in zip(numbers, ("ann", "operator", "ann"), strict=True):
+        await site.orders.approve(ApproveCall(number, 60.0), who)
+    await site.orders.approve(ApproveCall(numbers[2], 60.0), "bob")
+    site.bearers = site.bearers[1:]
+    await site.pass_time(1)
+    assert [site.publish(topic) for topic in ("/a", "/b", "/c")] == ["", "", ""]
+    site.bearers = site.bearers[1:]
+    await site.pass_time(1)
+    assert [bool(site.publish(topic)) for topic in ("/a", "/b", "/c")] == [True, False, False]
 
 
 async def test_a_host_has_a_quota_of_waiting_calls(site: Site) -> None:
