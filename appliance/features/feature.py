@@ -108,6 +108,10 @@ class FeaturePart:
     """See `Policy.holders`."""
     approved: "Callable[[], frozenset[Approval]]" = frozenset
     """See `Policy.approved`."""
+    policy_changed: Callable[[], None] = lambda: None
+    """Ends everything that the new policy does not allow, even if the next policy allows it again. A policy also
+    changes with its hosts: a door that is removed and added again has the same name and address.
+    """
     hold_call: "Callable[[Request], str] | None" = None
     """Holds a call that needs an approval, and returns the text for the denied caller."""
     approve: "Callable[[ApprovalWanted], Awaitable[ApprovalAnswered]] | None" = None

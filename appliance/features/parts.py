@@ -112,6 +112,10 @@ class FeatureParts:
     def approved(self) -> "frozenset[Approval]":
         return frozenset(approval for part in self._parts for approval in part.approved())
 
+    def policy_changed(self) -> None:
+        for part in self._parts:
+            part.policy_changed()
+
     def hold_call(self, request: "Request") -> str:
         hold = next((part.hold_call for part in self._parts if part.hold_call is not None), None)
         return _NO_APPROVALS if hold is None else hold(request)

@@ -141,6 +141,11 @@ async def make_foundation(
     tunnels.set(Tunnels(table, trail, *host_authority, listen=settings.listen_address, say=lifeline.say))
     role.hand_tunnels_to(tunnels())
     await tunnels().start()
+
+    def changed(_before: Policy, policy: Policy) -> int:
+        features.policy_changed()
+        return enforcement().policy_changed(policy)
+
     policies = Policies(
         settings.policy,
         store,
@@ -152,7 +157,7 @@ async def make_foundation(
         holders=features.holders,
         approved=features.approved,
         live=lambda: enforcement().revocation.live(),  # noqa: PLW0108  it is assembled later
-        changed=lambda _before, policy: enforcement().policy_changed(policy),
+        changed=changed,
         carried_out=lambda: enforcement().sinks.relay.carried_out(),  # noqa: PLW0108  it is assembled later
         site_keys=settings.site_keys,
     )

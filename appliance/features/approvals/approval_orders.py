@@ -73,6 +73,7 @@ class ApprovalOrders:
         self._guards = guards
         self._table = ApprovalTable(first)
         self._unanswered: list[float] = []
+        self._cut_off: list[ApprovalEntry] = []  # by a change of the policy
         self._moved: dict[int, float] = {}  # of leases: the last message, even after its publisher ended
         self._still: dict[
             int, float
@@ -188,7 +189,14 @@ class ApprovalOrders:
         self._record("approval refused", entry, f"{who} refused approval {entry.number}", who=who)
         return _shown(entry)
 
-    # --- the end of a time ---
+    # --- the end of approvals ---
+
+    def policy_changed(self) -> None:
+        """End all entries about which the policy no longer asks. The next check stops their motions."""
+        for entry in self._table.entries():
+            if not self._asks(entry):
+                self._end(entry, "the policy no longer asks")
+                self._cut_off.append(entry)
 
     async def watch(self) -> None:
         async with asyncio.TaskGroup() as checks:
@@ -204,7 +212,8 @@ class ApprovalOrders:
         Silence only ends leases on motions: topics of a group of `[Authority]`, or with a safe message of an enabled
         guard.
         """
-        ended, still = [], []
+        ended, still = self._cut_off.copy(), []
+        self._cut_off.clear()
         entries = self._table.entries()
         approved = any(entry.state is ApprovalState.APPROVED for entry in entries)
         approvers = self._approvers() if approved else {}
@@ -214,8 +223,6 @@ class ApprovalOrders:
                 self._policy().commanded(entry.call.resource) is not None,
             )
             if reason := self._ended(entry, approvers) or (silence if in_group else ""):
-                if entry.state is ApprovalState.WAITS and entry.until <= clock.now():
-                    self._unanswered.append(clock.now())
                 self._end(entry, reason)
                 ended.append(entry)
             elif silence and self._still.get(entry.number) != self._moved[entry.number]:
@@ -268,6 +275,8 @@ class ApprovalOrders:
         return self._moved[entry.number]
 
     def _end(self, entry: ApprovalEntry, reason: str, who: str = "") -> None:
+        if entry.state is ApprovalState.WAITS and entry.until <= clock.now():
+            self._unanswered.append(clock.now())
         self._table.end(entry)
         self._moved.pop(entry.number, None)
         self._still.pop(entry.number, None)

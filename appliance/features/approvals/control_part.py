@@ -49,6 +49,7 @@ async def inherit(base: "Foundation", parts: "Parts") -> FeaturePart:
         status_fields=lambda: {"approvals": orders.state()},
         limits=orders.limits,
         approved=orders.approved,
+        policy_changed=orders.policy_changed,
         hold_call=orders.hold_call,
         approve=orders.approve_call,
         work={

@@ -37,6 +37,7 @@ async def inherit(base: "Foundation", parts: "Parts") -> FeaturePart:
         methods=request_methods(orders),
         called={TAKE: orders.take_called, GIVE: orders.give_called},
         holders=orders.holders,
+        policy_changed=orders.policy_changed,
         work={
             "the leases of command authority": orders.watch,
             "the stop of what was commanded before groups ended": partial(stop.at_start, lost, relay),

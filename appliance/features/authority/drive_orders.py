@@ -54,7 +54,10 @@ class DriveOrders:
         self._turns: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()
 
     def holders(self) -> dict[str, Address]:
-        return {name: holding.host for name, holding in self._groups.holdings().items()}
+        return self._groups.hosts()
+
+    def policy_changed(self) -> None:
+        self._groups.lose_claims(self._policy().authority)
 
     # --- operators ---
 
@@ -162,7 +165,7 @@ class DriveOrders:
         holding = self._groups.holder(group.name)
         if not self._groups.may_take(group, host):
             raise SenselessError(self._refusal(group, host, holding, who))
-        if holding is not None and holding.host == host:
+        if holding is not None and holding.host == host and not holding.lost:
             self._groups.hold(group.name, host, clock.now())
             return
         reason = "taken" if holding is None else f"{host} may override its holder"

@@ -4,7 +4,7 @@
 2. The first waiting host that may take the group is next. A host that may only ask never is.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 from appliance.policy.authority import AuthorityGroup, Claim
@@ -23,6 +23,8 @@ class Holding:
     since: float
     renewed: float
     """The time when the host last took the group again."""
+    lost: bool = False
+    """Whether a policy since then gave the host no claim; it loses the group at the next check."""
     had_node: bool = False
     """Whether the host has had a live node; otherwise the end of its nodes does not end the authority."""
 
@@ -35,8 +37,15 @@ class GroupHolders:
         self._held: dict[str, Holding] = {}
         self._waiting: dict[str, dict[Address, float]] = {}
 
-    def holdings(self) -> dict[str, Holding]:
-        return dict(self._held)
+    def hosts(self) -> dict[str, Address]:
+        return {group: holding.host for group, holding in self._held.items() if not holding.lost}
+
+    def lose_claims(self, groups: Mapping[str, AuthorityGroup]) -> None:
+        """Mark the holders without a claim; the groups that the policy no longer has lose theirs."""
+        for name, holding in self._held.items():
+            group = groups.get(name)
+            if group is None or self._claim_of(group, holding.host) is None:
+                self._held[name] = replace(holding, lost=True)
 
     def holder(self, group: str) -> Holding | None:
         return self._held.get(group)
@@ -86,7 +95,7 @@ class GroupHolders:
         holding = self._held.get(group.name)
         if holding is None:
             return ""
-        if self._claim_of(group, holding.host) is None:
+        if holding.lost or self._claim_of(group, holding.host) is None:
             return "the policy no longer lets it hold the group"
         if live and not holding.had_node:
             self._held[group.name] = replace(holding, had_node=True)

@@ -134,6 +134,17 @@ def test_a_publication_lasts_for_its_lease(appliance: Appliance, robot: Host, tm
         eventually(lambda: "held for" in robot.run(lambda: refused(publish)), "the lease is over")
 
 
+def test_a_door_that_is_added_again_has_no_approval(appliance: Appliance, robot: Host) -> None:
+    advertise = {"op": "advertise", "topic": "/cmd_vel", "type": "geometry_msgs/Twist", "id": "a"}
+    appliance.rosrv("approve", number_in(agent(robot, advertise, answer="status")["msg"]), "--for", "60s")
+    appliance.rosrv("door", "remove", "agent-1")
+    appliance.rosrv("door", "add", "agent-1", "--port", "9091", "--from", "10.77.0.10")
+    assert "no call waits" in appliance.rosrv("approve").stdout
+    eventually(lambda: not appliance.row("door", "list")["trouble"], "the door serves again")
+    number_in(agent(robot, advertise, answer="status")["msg"])
+    assert appliance.recorded("--event", "approval ended")
+
+
 def published(publish: dict[str, Any]) -> bool:
     return not refused(publish)
 

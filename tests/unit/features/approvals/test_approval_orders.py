@@ -75,6 +75,7 @@ class Site:
 
     def decide_again(self) -> int:
         self.policy = replace(self.text, approved=self.orders.approved())
+        self.orders.policy_changed()
         return 0
 
     async def carried_out(self, topics: Iterable[str]) -> None:
@@ -311,6 +312,7 @@ async def test_a_call_without_an_answer_ends_with_an_alarm(site: Site) -> None:
 
 
 async def test_an_approval_ends_when_the_policy_no_longer_asks(site: Site) -> None:
+    """At once: the next policy may ask again before the next check."""
     for change in ("[Publishers]\n", "block"):
         number = number_in(site.publish("/x"))
         await site.orders.approve(ApproveCall(number, 3600.0), "ann")
@@ -319,10 +321,28 @@ async def test_an_approval_ends_when_the_policy_no_longer_asks(site: Site) -> No
         if change == "block":
             site.text = replace(before, blocks={AGENT: "blocked by ann"})
         site.decide_again()
-        await site.pass_time(CHECK_SECONDS)
         site.text = before
         site.decide_again()
         assert number_in(site.publish("/x")) != number
+
+
+async def test_a_door_that_is_added_again_has_no_approval_of_the_removed_one(site: Site) -> None:
+    """It has the same name and address. The robot stops."""
+    asks = "[Publishers]\ndefault = ask door:agent\n[Authority]\nbase = /cmd_vel\ntake base = door:agent\n"
+
+    def set_doors(doors: dict[str, Address]) -> None:
+        site.text = compile_policy(asks, file="site.ini", hosts=doors)
+        site.decide_again()
+
+    set_doors({"door:agent": AGENT})
+    number = number_in(site.publish("/cmd_vel"))
+    await site.orders.approve(ApproveCall(number, 3600.0), "ann")
+    set_doors({})
+    set_doors({"door:agent": AGENT})
+    assert number_in(site.publish("/cmd_vel")) != number
+    await site.orders.check()
+    assert site.stops == [(str(AGENT), {"/cmd_vel"})]
+    assert "approval 17 ended: the policy no longer asks" in site.records[-2]["reason"]
 
 
 @pytest.mark.parametrize(

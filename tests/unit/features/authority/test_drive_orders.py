@@ -193,6 +193,23 @@ async def test_a_holder_loses_a_group(site: Site) -> None:
     assert stops == [f"base: {reason}" for reason in reasons[:3]], "its messages pass without a group"
 
 
+async def test_a_host_that_loses_its_claim_for_an_instant_loses_the_group(site: Site) -> None:
+    """Such as a door that is removed and added again, with the same name and address. It may take the group again."""
+    for again in (False, True):
+        await site.orders.take(DriveTake("base", PILOT), "op")
+        for text in (TEXT.replace(PILOT, "10.0.0.9"), TEXT):
+            site.policy = compile_policy(text, file="site.ini")
+            site.orders.policy_changed()
+        assert site.orders.holders() == {}
+        if again:
+            await site.orders.take(DriveTake("base", PILOT), "op")
+        await site.pass_time(CHECK_SECONDS)
+        assert (await site.state()).holder == (PILOT if again else "")
+    assert site.handed_over() == [
+        f"nobody -> {PILOT}", f"{PILOT} -> nobody", f"nobody -> {PILOT}", f"{PILOT} -> {PILOT}"
+    ]  # fmt: skip
+
+
 async def test_a_relay_that_hangs_delays_the_end_of_no_other_group(site: Site) -> None:
     arm = TEXT.replace("[Authority]", "").replace("base", "arm").replace("/cmd_vel", "/arm")
     site.policy = compile_policy(TEXT + arm, file="site.ini")
