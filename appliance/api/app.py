@@ -2,6 +2,7 @@
 
 import asyncio
 import pkgutil
+from collections import ChainMap
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
@@ -15,10 +16,7 @@ from appliance.api.front import health
 from appliance.api.front.control import ControlAwayError
 from appliance.api.front.problems import REASON, BadInput, ProblemError, bad_input, defect
 from appliance.api.front.services import Services
-from appliance.api.routes import (
-    operation_routes,
-    policy_routes,
-)
+from appliance.api.routes import operation_routes
 from appliance.api.routes.contract import contract_of
 from appliance.api.routes.contract_page import PATH, page_of
 from appliance.base.validation_messages import refusal
@@ -47,16 +45,11 @@ def build_app(services: Services) -> FastAPI:
             Exception: _defect,
         },
     )
-    answers = policy_routes.ANSWERS
-    for feature in FEATURES:
-        if feature.answers is not None:
-            answers = answers | pkgutil.resolve_name(feature.answers)
+    answers = ChainMap(
+        *(pkgutil.resolve_name(feature.answers) for feature in FEATURES if feature.answers is not None)
+    )
     app.include_router(operation_routes.routes(services, answers))
-    for part in (
-        health,
-        policy_routes,
-    ):
-        app.include_router(part.routes(services))
+    app.include_router(health.routes(services))
     for feature in FEATURES:
         if feature.routes is not None:
             app.include_router(pkgutil.resolve_name(feature.routes)(services))

@@ -92,8 +92,9 @@ def routes(services: Services, answers: Mapping[str, Answer]) -> Routes:
     router = Routes()
     assert answers.keys() <= {one.name for one in OPERATIONS}  # noqa: S101  no name is misspelt
     for operation in sorted(OPERATIONS, key=lambda one: "{" in one.path):  # literal paths before parameters
-        if operation.name:
-            _add(router, services, operation, answers.get(operation.name))
+        own = answers.get(operation.name)
+        if operation.name and (own is not None or not operation.dry_run):  # only an answer of its own can try
+            _add(router, services, operation, own)
     return router
 
 

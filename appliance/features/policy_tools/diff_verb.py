@@ -13,6 +13,7 @@ from appliance.channel.admin import PolicyRevisions, PolicyRevisionWanted
 from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.output import by_host, say_diff, say_json
+from appliance.features.policy_tools.diff import Difference, diff
 from appliance.features.policy_tools.policy_input import (
     Enrolled,
     Robot,
@@ -25,7 +26,6 @@ from appliance.features.policy_tools.policy_input import (
     usage_error,
 )
 from appliance.features.policy_tools.policy_verbs import decision_fields
-from appliance.policy.diff import Difference, diff
 from appliance.policy.host_names import HostNames, in_words
 from appliance.policy.judgement import PolicyContext
 from appliance.policy.model import Request

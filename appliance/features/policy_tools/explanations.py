@@ -9,12 +9,12 @@ from dataclasses import replace
 import msgspec
 
 from appliance.api.front.problems import ProblemError
-from appliance.api.routes.dry_run_policy import refused_text
 from appliance.audit.log.record import AuditRecord
 from appliance.audit.log.record_format import LogEntry
 from appliance.channel.answers.policy_answers import Granted, PolicyKnown, Why
 from appliance.features.policy_tools.decision_reasons import DecisionExplanation, explain
 from appliance.features.policy_tools.denials import asked_of, is_denial
+from appliance.features.policy_tools.dry_run_policy import refused_text
 from appliance.features.policy_tools.grant import UngrantableError, grant
 from appliance.features.policy_tools.stock_tools import stock_tool
 from appliance.features.policy_tools.why import lines_of

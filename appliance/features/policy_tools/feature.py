@@ -8,6 +8,7 @@ _PLACE = "appliance.features.policy_tools."
 POLICY_TOOLS = Feature(
     "policy_tools",
     routes=f"{_PLACE}policy_tool_routes:routes",
+    answers=f"{_PLACE}policy_routes:ANSWERS",
     verbs={
         "audit": Group("", {"why": Verb(f"{_PLACE}grant_verb:why", after=FIRST)}),
         "policy": Group(

@@ -18,6 +18,7 @@ from appliance.api.routes.shown_records import readable_by
 from appliance.audit.search.search import recorded_in_full
 from appliance.channel.admin import PolicyWanted
 from appliance.channel.answers.policy_answers import Granted, Why
+from appliance.features.policy_tools import policy_routes
 from appliance.features.policy_tools.decision_reasons import DecisionExplanation
 from appliance.features.policy_tools.denials import asks_policy
 from appliance.features.policy_tools.explanations import explained, explanation, granted, judge_text
@@ -40,6 +41,7 @@ _MOST_SHOWN = 1000
 
 def routes(services: Services) -> Routes:
     router = Routes(prefix="/v1")
+    router.include_router(policy_routes.routes(services))
     router.include_router(_of_policy(services))
     router.include_router(_of_records(services))
     return router

@@ -2,8 +2,6 @@ import ipaddress
 
 import pytest
 
-from appliance.policy.diff import diff
-from appliance.policy.model import Category, Request
 from appliance.policy.policy_compiler import compile_policy
 from appliance.policy.policy_findings import PolicyError
 from appliance.policy.rate_limits import NO_LIMIT, LimitScope, Rate
@@ -100,18 +98,3 @@ def test_hosts_share_as_the_policy_names_them() -> None:
     addresses = ("10.0.0.1", "10.1.0.1", "10.1.0.2", "10.9.0.1", "10.9.0.2")
     shared = [known.counted_as(ipaddress.ip_address(address)) for address in addresses]
     assert shared == ["10.0.0.1/32", "10.1.0.0/16", "10.1.0.0/16", "", ""]
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "word"),
-    [
-        ("", "/scan = publisher 5 Hz", "limited"),
-        ("/scan = publisher 5 Hz", "/scan = publisher 9 Hz", "limited less"),
-    ],
-)
-def test_diff_shows_changed_limits(old: str, new: str, word: str) -> None:
-    request = Request(GUEST, "/lidar", Category.PUBLISH, "/scan")
-    [difference] = diff(policy(old), policy(new), [request, request])
-    assert (difference.word, difference.count) == (word, 2)
-    assert "5 Hz in [Limits]" in difference.old.reason + difference.new.reason
-    assert diff(policy(new), policy(new), [request]) == []

@@ -11,6 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from appliance.features.policy_tools.decision_reasons import explain
+from appliance.features.policy_tools.diff import diff
 from appliance.features.policy_tools.grant import DecidedRequest, UngrantableError, grant
 from appliance.master.caller import ApiUri, Caller
 from appliance.master.calls.call import (
@@ -34,7 +35,6 @@ from appliance.master.graph.revocation import CALLS
 from appliance.policy.actions import VERBS
 from appliance.policy.cases import run_cases
 from appliance.policy.commands import COMMANDS
-from appliance.policy.diff import diff
 from appliance.policy.judgement import PolicyContext
 from appliance.policy.live_rights import LiveRight, may_keep
 from appliance.policy.model import Category, Decision, Request

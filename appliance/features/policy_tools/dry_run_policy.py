@@ -11,11 +11,11 @@ from typing import Any
 import msgspec
 
 from appliance.api.front.problems import Finding, ProblemError
-from appliance.api.routes.policy_models import Change, Ended, Report
 from appliance.channel.admin import PolicyLoad
 from appliance.channel.answers.graph_answers import Registration
 from appliance.channel.answers.policy_answers import PolicyKnown
-from appliance.policy.diff import diff
+from appliance.features.policy_tools.diff import diff
+from appliance.features.policy_tools.policy_models import Change, Ended, Report
 from appliance.policy.judgement import PolicyContext, judge
 from appliance.policy.live_rights import LiveRight, endings
 from appliance.policy.policy_compiler import compile_policy

@@ -9,18 +9,18 @@ from appliance.api.front.problems import ProblemError
 from appliance.api.front.route_roles import Viewer, ask
 from appliance.api.front.routing import Responses, Routes, Tagged, tagged
 from appliance.api.front.services import Services
-from appliance.api.routes.dry_run_policy import judge_change
 from appliance.api.routes.named_hosts import HostLabels, labels_of
 from appliance.api.routes.operation_routes import Answer, OperationCall
-from appliance.api.routes.policy_models import Report
 from appliance.channel import admin
 from appliance.channel.answers.policy_answers import PolicyInForce
+from appliance.features.policy_tools.dry_run_policy import judge_change
+from appliance.features.policy_tools.policy_models import Report
 
 _UNKNOWN: Responses = {404: {"description": "There is no such revision."}}
 
 
 def routes(services: Services) -> Routes:
-    router = Routes(prefix="/v1/policy", tags=["policy"])
+    router = Routes(prefix="/policy", tags=["policy"])
     control = services.control
 
     @router.get("")

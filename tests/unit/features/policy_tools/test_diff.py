@@ -1,8 +1,15 @@
 import ipaddress
 
-from appliance.policy.diff import diff
+import pytest
+
+from appliance.features.policy_tools.diff import diff
 from appliance.policy.model import Category, Request
 from appliance.policy.policy_compiler import compile_policy
+from tests.unit.policy.test_asking import AGENT
+from tests.unit.policy.test_asking import TEXT as ASKS
+from tests.unit.policy.test_asking import policy as policy_that_asks
+from tests.unit.policy.test_rate_limits import GUEST
+from tests.unit.policy.test_rate_limits import policy as limited
 
 OLD = "[Nodes]\ndefault = *\n[Publishers]\ndefault = 10.0.0.1\n/cmd = 10.0.0.5\n"
 
@@ -35,3 +42,25 @@ def test_audit_only_is_between_allowed_and_denied() -> None:
     new = compile_policy(OLD, file="new.ini")
     found = diff(old, new, [request("10.0.0.9", "/cmd"), request("10.0.0.1", "/x")])
     assert [(d.old.would_deny, d.new.allowed) for d in found] == [(True, False)]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "word"),
+    [
+        ("", "/scan = publisher 5 Hz", "limited"),
+        ("/scan = publisher 5 Hz", "/scan = publisher 9 Hz", "limited less"),
+    ],
+)
+def test_diff_shows_changed_limits(old: str, new: str, word: str) -> None:
+    request = Request(GUEST, "/lidar", Category.PUBLISH, "/scan")
+    [difference] = diff(limited(old), limited(new), [request, request])
+    assert (difference.word, difference.count) == (word, 2)
+    assert "5 Hz in [Limits]" in difference.old.reason + difference.new.reason
+    assert diff(limited(new), limited(new), [request]) == []
+
+
+def test_a_right_that_then_needs_an_approval_is_a_difference() -> None:
+    asks, plain = policy_that_asks(), policy_that_asks(ASKS.replace("ask agent-1", "agent-1"))
+    wanted = Request(AGENT, "/it", Category.PUBLISH, "/cmd_vel")
+    assert [one.word for one in diff(plain, asks, [wanted])] == ["needs approval"]
+    assert not diff(asks, asks, [wanted])
