@@ -1,6 +1,5 @@
 """The objects that the parts of one relay share."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 from appliance.relay.grant_table import GrantTable
@@ -22,8 +21,16 @@ class RelayContext:
     memory: RelayMemory
     scratch: Scratch
     interceptor: Interceptor
-    payer: Callable[[str], str]
-    """Returns the payer for the processor time of a host."""
+    table: GrantTable
+
+    def payer(self, host: str) -> str:
+        """Return the payer for the processor time of a host."""
+        return self.table.payer(host)
+
+    @property
+    def unsettled(self) -> bool:
+        """Whether control has not stated all facts, or specifications are not in force yet."""
+        return self.table.restating or self.interceptor.preparing
 
     @classmethod
     def of(
@@ -35,4 +42,4 @@ class RelayContext:
         table: GrantTable,
     ) -> "RelayContext":
         memory = RelayMemory.of(limits, table.quota_class)
-        return cls(loop, limits, reporter, memory, Scratch(loop.pump), interceptor, table.payer)
+        return cls(loop, limits, reporter, memory, Scratch(loop.pump), interceptor, table)

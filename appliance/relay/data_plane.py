@@ -11,6 +11,7 @@ from appliance.channel import messages
 from appliance.relay.connections.admission import NOTHING, asked_for, bound_name, flaw, missing
 from appliance.relay.connections.headers import kept
 from appliance.relay.connections.incoming_connection import IncomingConnection, RefusedConnection
+from appliance.relay.connections.latched_message import LatchedMessage, make_room
 from appliance.relay.connections.listening_ports import ListeningPorts
 from appliance.relay.connections.message_sink import MessageSink
 from appliance.relay.connections.monitor_calls import OwnAnswer, ServiceCalls
@@ -50,17 +51,14 @@ class DataPlane:
             budget=limits.budget / 1000,
             publish=lambda m: self._calls.call(m) if m.is_call else self._publish(m.topic, m.data),
             changed=self._monitors_changed,
-            holder=self._holder,
+            holder=lambda host: host if self._table.is_registered(host) else "",
             payer=self._table.payer,
         )
         self._context = RelayContext.of(loop, limits, self._reporter, self.interceptor, self._table)
         self.memory = self._context.memory
         self._pending = PendingConnections(loop.clock, self._table.quota_class, self.memory.headers)
         self.ports = ListeningPorts(
-            loop,
-            limits,
-            quota_class=self._table.quota_class,
-            payer=self._table.payer,
+            self._context,
             arrived=self._arrived,
             turned_away=lambda key, host, reason: self._reporter.refused(key, NOTHING, host, "", reason),
             make_room=self._make_connection_room,
@@ -81,7 +79,7 @@ class DataPlane:
         self._flows = RateLimits(loop.clock)
         self._topic_taps = TopicTaps(self._reporter.send)
         self._sink: MessageSink | None = None
-        self._tidying: Iterator[None] = iter(())
+        self._tidying: Iterator[tuple[int, RelayedTopic | ServiceClient]] = iter(())
         loop.after(limits.report_every, self._tick)
 
     def attach(self, link: LoopLink | None) -> None:
@@ -117,7 +115,7 @@ class DataPlane:
         elif isinstance(message, messages.MonitorResumed):
             self._ask_for_latched(self.interceptor.resume(message.name))
         elif isinstance(message, messages.LookWanted | messages.LookEnded):
-            self._tap(message)
+            self._topic_taps.order(message, self.topics.values())
         elif isinstance(message, messages.OwnHeaderStated | messages.OwnPublished):
             self._own_topic(message)
         elif isinstance(message, OwnAnswer):
@@ -174,15 +172,13 @@ class DataPlane:
                 incoming for incoming in self.incoming_connections if incoming.key == message.key
             ]:
                 self._incoming_failed(incoming, "")
-            self._cut_clients("the service's node is gone", message.key)
-            self._forget_services(message.key)
+            self._remove_services("the service's node is gone", message.key)
         elif isinstance(message, messages.PublicationWithdrawn):
             self._remove_topic(message.key, message.topic, "the topic is no longer published")
         elif isinstance(message, messages.GrantRevoked):
             self._cut_by(("topic", message.key, message.topic, message.host, message.caller_id))
         elif isinstance(message, messages.ServiceWithdrawn):
-            self._cut_clients("the service is no longer offered", message.key, message.service)
-            self._forget_services(message.key, message.service)
+            self._remove_services("the service is no longer offered", message.key, message.service)
         elif isinstance(message, messages.ClientRevoked):
             self._cut_by(("service", message.key, message.service, message.host, message.caller_id))
 
@@ -190,12 +186,10 @@ class DataPlane:
         for peer in list(self._by_grant.get(grant, ())):
             peer.cut("its grant is revoked")
 
-    def _cut_clients(self, reason: str, key: str, service: str | None = None) -> None:
+    def _remove_services(self, reason: str, key: str, service: str | None = None) -> None:
         for client in list(self.clients):
             if client.service.key == key and service in {None, client.service.service}:
                 client.cut(reason)
-
-    def _forget_services(self, key: str, service: str | None = None) -> None:
         for entry in [entry for entry in self._services if entry[0] == key and service in {None, entry[1]}]:
             row = self._services.pop(entry).row(*entry)
             if row is not None:
@@ -218,7 +212,7 @@ class DataPlane:
             limited=lambda part, messages, size: self._reporter.limited(
                 (key, topic, part, host, name), messages, size
             ),
-            make_room=lambda size: self._make_room(host, size),
+            make_room=lambda size: make_room(self.memory.latched, host, size, self._latched()),
             refused=self._reporter.send,
             sink=self._sink,
             over=self._loop.over,
@@ -228,14 +222,7 @@ class DataPlane:
             relayed.upstream = self._own[topic] = OwnTopicPublisher(relayed, lambda: self._header_of(topic))
             relayed.monitor(None, wanted=True)
         else:
-            relayed.upstream = PublisherConnection(
-                self._context,
-                relayed,
-                claims=lambda: self._claims(relayed),
-                registered_type=lambda: self._registered_type(key, topic),
-                unsettled=self._not_all_is_stated,
-                objection=lambda header: self.interceptor.objection(topic, header),
-            )
+            relayed.upstream = PublisherConnection(self._context, relayed)
             self._attach_monitors(relayed)
         relayed.withhold(self.interceptor.mask(topic))
         self.topics[key, topic] = relayed
@@ -243,18 +230,6 @@ class DataPlane:
         for other in self.topics.values() if waiting else ():
             if other.topic in waiting:
                 other.announce()
-
-    def _claims(self, relayed: RelayedTopic) -> Iterator[Mapping[str, str]]:
-        if relayed.header is not None:
-            yield relayed.header
-        yield self.interceptor.claim_of(relayed.topic)
-        for member in relayed.members:
-            if isinstance(member, Subscriber):
-                yield member.fields
-
-    def _registered_type(self, key: str, topic: str) -> str:
-        publication = self._table.publication(key, topic)
-        return "" if publication is None else publication.type
 
     def _limit_topic(self, message: messages.PublicationPlaced) -> None:
         relayed = self.topics[message.key, message.topic]
@@ -276,15 +251,8 @@ class DataPlane:
             return None
         return self._flows.of(grant.limit, grant.topic, grant.host, grant.caller_id)
 
-    def _make_room(self, host: str, size: int) -> None:
-        latched, share = self.memory.latched, self.memory.latched.of(host)
-        while share.refusal(size):
-            greatest, held = max(latched.holders(), key=lambda holder: holder[1], default=("", 0))
-            of_greatest = (topic for topic in self.topics.values() if topic.host == greatest)
-            largest = max(of_greatest, key=lambda topic: topic.latch.size, default=None)
-            if held <= share.used + size or largest is None or not largest.latch.size:
-                return
-            largest.latch.give_up()
+    def _latched(self) -> Iterator[tuple[str, LatchedMessage]]:
+        return ((topic.host, topic.latch) for topic in self.topics.values())
 
     def _attach_monitors(self, relayed: RelayedTopic) -> None:
         interceptor, topic = self.interceptor, relayed.topic
@@ -295,9 +263,6 @@ class DataPlane:
             relayed.monitor(pipeline.through, wanted=wanted, call=pipeline.module_call, guarded=guarded)
         else:
             relayed.monitor(None, wanted=wanted)
-
-    def _holder(self, host: str) -> str:
-        return host if self._table.is_registered(host) else ""
 
     def _monitors_changed(self, topics: frozenset[str] | None) -> None:
         monitors = self.interceptor.monitors
@@ -382,13 +347,6 @@ class DataPlane:
         else:
             placed.upstream.refused()
 
-    def _tap(self, message: messages.LookWanted | messages.LookEnded) -> None:
-        if isinstance(message, messages.LookWanted):
-            topics = [topic for topic in self.topics.values() if topic.topic == message.topic]
-            self._topic_taps.begin(message, topics)
-        else:
-            self._topic_taps.end(message.number)
-
     # --- peers --------------------------------------------------------------------------------------------
 
     def _arrived(self, key: str, sock: socket.socket, host: str) -> None:
@@ -397,7 +355,6 @@ class DataPlane:
             sock,
             key,
             host,
-            payer=self._table.payer(host),
             pending=self._pending,
             introduced=self._introduced,
             failed=self._incoming_failed,
@@ -429,7 +386,7 @@ class DataPlane:
         self._forget_incoming(incoming)
         self.ports.left(incoming.host)
         fields = incoming.fields
-        if fields and not reason and not self._not_all_is_stated():
+        if fields and not reason and not self._context.unsettled:
             reason = missing(self._table, incoming.key, incoming.host, fields)
         if reason:
             caller_id = fields.get("callerid", "")
@@ -446,7 +403,7 @@ class DataPlane:
         reason = flaw(fields, rest)
         if not reason:
             reason = missing(self._table, incoming.key, incoming.host, fields)
-            if reason and (patient or self._not_all_is_stated()):
+            if reason and (patient or self._context.unsettled):
                 incoming.wait(self._limits.grant_seconds, lambda: self._judge(incoming, patient=False))
                 self.waiting.setdefault(incoming.key, {}).setdefault(incoming.host, set()).add(incoming)
                 return
@@ -460,9 +417,6 @@ class DataPlane:
             self._subscribe(incoming, sock, kept(fields))
         else:
             self._serve_client(incoming, sock, kept(fields), rest)
-
-    def _not_all_is_stated(self) -> bool:
-        return self._table.restating or self.interceptor.preparing
 
     def _recheck_waiting(self, message: messages.RelayFact) -> None:
         hosts = self.waiting[message.key]
@@ -492,8 +446,6 @@ class DataPlane:
         caller_id = bound_name(self._table, incoming.key, incoming.host, fields)
         if service is None or caller_id is None:  # excluded by `missing`
             return
-        node = self._table.node(incoming.key)
-        traffic = self._services.setdefault((service.key, service.service), ServiceTraffic())
         client = ServiceClient(
             self._context,
             sock,
@@ -501,12 +453,10 @@ class DataPlane:
             incoming.host,
             fields,
             caller_id=caller_id,
-            traffic=traffic,
+            traffic=self._services.setdefault((service.key, service.service), ServiceTraffic()),
+            calls=self._calls,
             refuse=self._peer_refused,
             ended=self._peer_ended,
-            own=self._calls.own if node is not None and node.monitors else None,
-            approvals=self._calls.approvals,
-            asks=lambda: self._table.asks(service.key, service.service, incoming.host, caller_id),
         )
         self.clients.add(client)
         self._by_grant.setdefault(client.grant, set()).add(client)
@@ -546,49 +496,34 @@ class DataPlane:
         """Refuse the peer; its connection counts for its host until it is closed."""
         kind, key, name, host, caller_id = asked
         self._reporter.refused(key, (kind, name), host, caller_id, reason)
-
-        def ended(farewell: RefusedConnection) -> None:
-            self.refused_connections.discard(farewell)
-            self._pending.leave(farewell)
-            self.ports.left(host)
-
-        payer = self._table.payer(host)
-        farewell = RefusedConnection(self._loop, sock, reason, self._limits.farewell, ended, payer=payer)
+        farewell = RefusedConnection(self._context, sock, host, reason, self._refused_left)
         if farewell.live:
             self.refused_connections.add(farewell)
             self._pending.enter(farewell, host)
 
+    def _refused_left(self, farewell: RefusedConnection) -> None:
+        self.refused_connections.discard(farewell)
+        self._pending.leave(farewell)
+        self.ports.left(farewell.host)
+
     def _rows(self) -> list[messages.TopicTraffic]:
-        rows = [row for topic in self.topics.values() if (row := topic.traffic()) is not None]
-        rows += [
-            row
-            for (key, name), service in self._services.items()
-            if (row := service.row(key, name)) is not None
-        ]
-        rows, self._last_rows = self._last_rows + rows, []
+        of_topics = (topic.traffic() for topic in self.topics.values())
+        of_services = (service.row(*entry) for entry, service in self._services.items())
+        rows = [*self._last_rows, *filter(None, of_topics), *filter(None, of_services)]
+        self._last_rows = []
         return rows
 
     def _tick(self) -> None:
-        self._tidying = self._tidy()
+        self._tidying = enumerate([*self.topics.values(), *self.clients])
         self._go_on_tidying()
 
     def _go_on_tidying(self) -> None:
-        for _ in self._tidying:
-            if self._loop.over():
+        for number, part in self._tidying:
+            part.tidy()
+            if not number % _TIDIED and self._loop.over():
                 self._loop.after(0, self._go_on_tidying)
                 return
         self._calls.own.tidy()
         self.interceptor.tick()
         self._reporter.tick(self._rows, self.memory.held())
         self._loop.after(self._limits.report_every, self._tick)
-
-    def _tidy(self) -> Iterator[None]:
-        for number, topic in enumerate(list(self.topics.values())):
-            topic.tidy()
-            topic.upstream.check_stall()
-            if not number % _TIDIED:
-                yield
-        for number, client in enumerate(list(self.clients)):
-            client.check_stall()
-            if not number % _TIDIED:
-                yield

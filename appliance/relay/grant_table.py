@@ -18,13 +18,14 @@ _Fact = tuple[str, ...]
 
 @dataclass(frozen=True)
 class ServiceEndpoint:
-    """The address of a service, and the node that offers it."""
+    """The address of a service, and the node that offers it; `own`: the appliance's own node."""
 
     key: str
     service: str
     host: str
     port: int
     node: str
+    own: bool
 
 
 class GrantTable:
@@ -100,7 +101,8 @@ class GrantTable:
         if not isinstance(placed, messages.ServicePlaced):
             return None
         node = self.node(key)
-        return ServiceEndpoint(key, service, placed.host, placed.port, key if node is None else node.name)
+        name, own = (key, False) if node is None else (node.name, node.monitors)
+        return ServiceEndpoint(key, service, placed.host, placed.port, name, own)
 
     def grant(self, key: str, topic: str, host: str, caller_id: str) -> messages.GrantInstalled | None:
         grant = self._facts.get(("grant", key, topic, host, caller_id))

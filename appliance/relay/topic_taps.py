@@ -10,7 +10,7 @@ from functools import partial
 from typing import Any
 
 from appliance.base import clock
-from appliance.channel.messages import LookWanted, Message, MessageSeen
+from appliance.channel.messages import LookEnded, LookWanted, Message, MessageSeen
 from appliance.relay.connections.relayed_topic import RelayedTopic
 from appliance.relay.transport.frames import Batch
 
@@ -28,7 +28,13 @@ class TopicTaps:
         self._open: dict[int, list[tuple[RelayedTopic, Tap]]] = {}
         self._left: dict[int, int] = {}
 
-    def begin(self, wanted: LookWanted, topics: Iterable[RelayedTopic]) -> None:
+    def order(self, message: LookWanted | LookEnded, topics: Iterable[RelayedTopic]) -> None:
+        if isinstance(message, LookWanted):
+            self._begin(message, [topic for topic in topics if topic.topic == message.topic])
+        else:
+            self._end(message.number)
+
+    def _begin(self, wanted: LookWanted, topics: Iterable[RelayedTopic]) -> None:
         if len(self._open) >= MOST_LOOKS:
             return
         taps = self._open[wanted.number] = []
@@ -38,14 +44,14 @@ class TopicTaps:
             taps.append((topic, tap))
             topic.tap(tap, latched=wanted.latched)
 
-    def end(self, number: int) -> None:
+    def _end(self, number: int) -> None:
         for topic, tap in self._open.pop(number, ()):
             topic.untap(tap)
         self._left.pop(number, None)
 
     def end_all(self) -> None:
         for number in list(self._open):
-            self.end(number)
+            self._end(number)
 
     def _see(self, number: int, topic: RelayedTopic, reader: _Reader, batch: Batch) -> None:
         position = 0

@@ -10,7 +10,6 @@ from collections.abc import Callable, Mapping
 from appliance.relay.connections.headers import canonical
 from appliance.relay.connections.pending_connections import PendingConnections
 from appliance.relay.context import RelayContext
-from appliance.relay.loop import EventLoop
 from appliance.relay.transport.sockets import BufferedSocket
 from roswire.errors import PeerError
 from roswire.tcpros import HeaderParser, encode_header
@@ -29,7 +28,6 @@ class IncomingConnection:
         key: str,
         host: str,
         *,
-        payer: str,
         pending: PendingConnections,
         introduced: Callable[["IncomingConnection"], None],
         failed: Callable[["IncomingConnection", str], None],
@@ -46,7 +44,7 @@ class IncomingConnection:
         self._parser = HeaderParser(limits.header_bytes)
         self._timer = context.loop.after(limits.header_seconds, self._late)
         self._stream = BufferedSocket(
-            context.loop, sock, self._received, lambda _reason: failed(self, ""), payer=payer
+            context.loop, sock, self._received, lambda _reason: failed(self, ""), payer=context.payer(host)
         )
         self._received_bytes = 0
         pending.enter(self, host)
@@ -96,20 +94,18 @@ class RefusedConnection:
 
     def __init__(
         self,
-        loop: EventLoop,
+        context: RelayContext,
         sock: socket.socket,
+        host: str,
         reason: str,
-        seconds: float,
         ended: Callable[["RefusedConnection"], None],
-        *,
-        payer: str,
     ) -> None:
+        self.host = host
         self.live = True
         self._ended = ended
-        self._timer = loop.after(seconds, self.close)
-        self._stream = BufferedSocket(
-            loop, sock, self._received, lambda _reason: self.close(), payer=payer, drained=self._told
-        )
+        self._timer = context.loop.after(context.limits.farewell, self.close)
+        received, broken, payer = self._received, lambda _reason: self.close(), context.payer(host)
+        self._stream = BufferedSocket(context.loop, sock, received, broken, payer=payer, drained=self._told)
         self._stream.send(encode_header({"error": reason}))
         if self.live and not self._stream.backlog:
             self._told()

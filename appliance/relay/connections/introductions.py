@@ -4,8 +4,11 @@ rospy and roscpp accept `type=*`, `md5sum=*`. rosgo, roslibrust up to 0.9 and ma
 their own type and md5sum, some demand a `message_definition`, and some refuse by just closing the connection.
 """
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from itertools import islice
+
+from appliance.relay.connections.relayed_topic import RelayedTopic
+from appliance.relay.context import RelayContext
 
 _ANY = "*"
 _MOST = 8  # claims that one publisher is asked with; subscribers choose them
@@ -24,6 +27,23 @@ class Introductions:
         self._registered = registered
         self._refused: set[tuple[str, str, bool]] = set()
         self.fields: Mapping[str, str] = {"type": _ANY, "md5sum": _ANY}
+
+    @classmethod
+    def of(cls, context: RelayContext, topic: RelayedTopic) -> "Introductions":
+        """Return introductions with the previous header, the type in specifications, and those of subscribers."""
+
+        def claims() -> Iterator[Mapping[str, str]]:
+            if topic.header is not None:
+                yield topic.header
+            yield context.interceptor.claim_of(topic.topic)
+            for member in topic.members:
+                yield member.fields
+
+        def registered() -> str:
+            publication = context.table.publication(topic.key, topic.topic)
+            return "" if publication is None else publication.type
+
+        return cls(claims, registered)
 
     def refused(self) -> bool:
         """Choose the next fields; return False if all are refused."""

@@ -10,10 +10,10 @@ import errno
 import socket
 from collections.abc import Callable
 
-from appliance.quotas.pool import Pool, QuotaClass
+from appliance.quotas.pool import Pool
 from appliance.quotas.table import RELAY_CONNECTIONS
-from appliance.relay.loop import ACCEPTING, QUANTUM, READ, EventLoop
-from appliance.relay.relay_limits import RelayLimits
+from appliance.relay.context import RelayContext
+from appliance.relay.loop import ACCEPTING, QUANTUM, READ
 from appliance.relay.transport.sockets import tune
 
 _NO_DESCRIPTOR_PAUSE = 0.2
@@ -25,21 +25,19 @@ class ListeningPorts:
 
     def __init__(
         self,
-        loop: EventLoop,
-        limits: RelayLimits,
+        context: RelayContext,
         *,
-        quota_class: Callable[[str], QuotaClass],
-        payer: Callable[[str], str],
         arrived: Callable[[str, socket.socket, str], None],
         turned_away: Callable[[str, str, str], None],
         make_room: Callable[[str], bool],
     ) -> None:
-        self._loop = loop
-        self._payer = payer
+        self._loop = context.loop
+        self._payer = context.payer
         self._arrived = arrived
         self._turned_away = turned_away
         self._listening: dict[str, socket.socket] = {}
         self._make_room = make_room
+        limits, quota_class = context.limits, context.table.quota_class
         bounds = RELAY_CONNECTIONS.bounds.sized(limits.connections, limits.connections_per_host)
         self.connected: Pool[str] = Pool("connections to the relay", bounds, quota_class)
 

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from typing import Protocol
 
 from appliance.quotas.pool import Queue, QuotaClass
-from appliance.relay.transport.memory import MemoryPool
+from appliance.relay.transport.memory import HeldBytes, MemoryPool
 
 _FREE = 4096
 _PATIENCE = 1.0
@@ -30,41 +30,38 @@ class PendingConnections:
     ) -> None:
         self._clock = clock
         self._quota_class = quota_class
-        self._hosts: dict[PendingConnection, str] = {}
-        self._long: dict[PendingConnection, int] = {}
+        self._held: dict[PendingConnection, HeldBytes] = {}
         self._headers = headers
         self._waiting: Queue[str, PendingConnection] = Queue(quota_class)
         self._with_long_headers: Queue[str, PendingConnection] = Queue(quota_class)
 
     def enter(self, guest: PendingConnection, host: str) -> None:
-        self._hosts[guest] = host
+        self._held[guest] = HeldBytes(self._headers.of(host))
         self._waiting.put(guest, host, self._clock())
 
     def leave(self, guest: PendingConnection) -> None:
         self._waiting.remove(guest)
         self._with_long_headers.remove(guest)
-        host, held = self._hosts.pop(guest, None), self._long.pop(guest, 0)
-        if host is not None and held:
-            self._headers.of(host).add(-held)
+        held = self._held.pop(guest, None)
+        if held is not None:
+            held.set(0)
 
     def hold(self, guest: PendingConnection, size: int) -> str:
-        host, before = self._hosts[guest], self._long.get(guest, 0)
-        more = max(0, size - _FREE) - before
+        held = self._held[guest]
+        share, more = held.share, max(0, size - _FREE) - held.size
         if more <= 0:
             return ""
-        share = self._headers.of(host)
         why = share.refusal(more)
         while (
             why
             and share.used + more <= self._headers.bounds.host
-            and self._end_longest(self._with_long_headers, host, but=guest)
+            and self._end_longest(self._with_long_headers, share.host, but=guest)
         ):
             why = share.refusal(more)
         if not why:
-            share.add(more)
-            if not before:
-                self._with_long_headers.put(guest, host, self._clock())
-            self._long[guest] = before + more
+            if not held.size:
+                self._with_long_headers.put(guest, share.host, self._clock())
+            held.set(held.size + more)
         return why
 
     def make_room(self, host: str) -> bool:

@@ -435,6 +435,7 @@ class RelayedTopic:
                 if member.missed:
                     self._served.deliver(self.latch.batch, member)
         self._served.trim(stalled=True)
+        self.upstream.check_stall()
 
     def traffic(self) -> TopicTraffic | None:
         if self._reported and not self.counters.messages and not self._served.dropped:

@@ -15,6 +15,9 @@ class TopicSubscriber(Protocol):
 
     caller_id: str
 
+    fields: Mapping[str, str]
+    """The fields of the subscriber's header."""
+
     missed: bool
     """Whether the subscriber missed the last message, because of its rate limit or a withheld topic."""
 

@@ -9,10 +9,10 @@ import socket
 from collections.abc import Callable, Mapping
 
 from appliance.channel.messages import PublicationRefused, TopicTraffic
-from appliance.relay.connections.call_approvals import CallApprovals
 from appliance.relay.connections.exchange import ServiceExchange
 from appliance.relay.connections.headers import size_of, switched_on, to_client, to_service
-from appliance.relay.connections.own_service import OwnServer, OwnService
+from appliance.relay.connections.monitor_calls import ServiceCalls
+from appliance.relay.connections.own_service import OwnServer
 from appliance.relay.context import RelayContext
 from appliance.relay.grant_table import PeerGrant, ServiceEndpoint
 from appliance.relay.loop import LoopTimer
@@ -55,7 +55,7 @@ class ServiceTraffic:
 
 
 class ServiceClient:
-    """One client of one service; `caller_id` is its verified name. With `own`, the appliance offers the service.
+    """One client of one service; `caller_id` is its verified name.
 
     Exactly one of two callbacks is called, once: `ended(self)` after both connections are closed, or `refuse(self,
     sock, reason)`, which takes over the client's socket.
@@ -71,11 +71,9 @@ class ServiceClient:
         *,
         caller_id: str,
         traffic: ServiceTraffic,
+        calls: ServiceCalls,
         refuse: Callable[["ServiceClient", socket.socket, str], None],
         ended: Callable[["ServiceClient"], None],
-        approvals: CallApprovals,
-        asks: Callable[[], bool],
-        own: OwnService | None = None,
     ) -> None:
         self.service = service
         self.host = host
@@ -85,9 +83,7 @@ class ServiceClient:
         self._traffic = traffic
         self._refuse = refuse
         self._ended = ended
-        self._own = own
-        self._approvals = approvals
-        self._asks = asks
+        self._calls = calls
         self._question = 0  # the last one to control
         self._number = 0
         self._live = True
@@ -141,10 +137,10 @@ class ServiceClient:
 
     def _reach(self) -> BufferedSocket | OwnServer:
         loop, service = self._context.loop, self.service
-        if self._own is not None:
+        if service.own:
             called = service.service, self.host, self.caller_id
             received, opened = self._server_received, self._connected
-            return OwnServer(self._own, loop, called=called, received=received, opened=opened)
+            return OwnServer(self._calls.own, loop, called=called, received=received, opened=opened)
         sock = begin_connect(service.host, service.port)
         received, broken = self._server_received, self._server_broken
         return BufferedSocket(
@@ -157,7 +153,7 @@ class ServiceClient:
             if objection:
                 self.cut(objection)
 
-    def check_stall(self) -> None:
+    def tidy(self) -> None:
         held = (
             self._exchange.unfinished + self._client.backlog + (self._server.backlog if self._server else 0)
         )
@@ -226,10 +222,10 @@ class ServiceClient:
         return self._context.interceptor.judge(point, part, body)
 
     def _ask(self, body: bytes) -> bool:
-        if not self._asks():
+        if not self._context.table.asks(*self.grant[1:]):
             return False
         caller = self.service.service, self.host, self.caller_id
-        self._question = self._approvals.ask(caller, self._header.get("type", ""), body, self._approved)
+        self._question = self._calls.approvals.ask(caller, self._header.get("type", ""), body, self._approved)
         return True
 
     def _approved(self, refused: str) -> None:
@@ -307,7 +303,7 @@ class ServiceClient:
 
     def _release(self) -> None:
         self._live = False
-        self._approvals.forget(self._question)
+        self._calls.approvals.forget(self._question)
         if self._timer is not None:
             self._timer.cancel()
         if self._server is not None:

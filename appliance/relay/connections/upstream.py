@@ -8,7 +8,7 @@ A publisher that turns the relay's header away is asked again at once with anoth
 starts over once a connection has flowed for more than `retry_longest` seconds.
 """
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import Enum, auto
 
@@ -52,29 +52,15 @@ class _Attempt:
 
 
 class PublisherConnection(Upstream):
-    """The upstream of one relayed topic; `objection(header)` returns why a publisher is refused.
+    """The upstream of one relayed topic."""
 
-    `unsettled()` returns whether subscribers may still return after a reload or a restart.
-    """
-
-    def __init__(
-        self,
-        context: RelayContext,
-        topic: RelayedTopic,
-        *,
-        claims: Callable[[], Iterable[Mapping[str, str]]],
-        registered_type: Callable[[], str],
-        unsettled: Callable[[], bool],
-        objection: Callable[[dict[str, str]], str] = lambda _header: "",
-    ) -> None:
+    def __init__(self, context: RelayContext, topic: RelayedTopic) -> None:
         self._context = context
         self._loop = context.loop
         self._topic = topic
         self._limits = context.limits
         self._named_subscribers = NamedSubscribers(context, topic.topic, topic.host)
-        self._introductions = Introductions(claims, registered_type)
-        self._unsettled = unsettled
-        self._objection = objection
+        self._introductions = Introductions.of(context, topic)
         self.state = UpstreamState.IDLE
         self.failures = 0
         self._wanted = False
@@ -106,7 +92,7 @@ class PublisherConnection(Upstream):
         """Close the connection after this turn of the loop: a lazy publisher has to learn that it is unused."""
         self._wanted = False
         if self._linger is None:
-            seconds = self._limits.linger if self._unsettled() else 0.0
+            seconds = self._limits.linger if self._context.unsettled else 0.0  # subscribers may still return
             self._linger = self._loop.after(seconds, self._close_unwanted)
 
     def ask(self) -> None:
@@ -170,7 +156,7 @@ class PublisherConnection(Upstream):
         """
         if self._reader is not None:
             self._reader.disarm()
-            reason = self._objection(self._reader.header)
+            reason = self._context.interceptor.objection(self._topic.topic, self._reader.header)
             if reason:
                 self._object(reason)
         elif self._objected and self.state is UpstreamState.WAITING:
@@ -207,7 +193,7 @@ class PublisherConnection(Upstream):
             end = self._turned_away if "error" in header else self._lose
             end(*refusal)
             return
-        reason = self._objection(header)
+        reason = self._context.interceptor.objection(self._topic.topic, header)
         if reason:
             self._object(reason)
             return

@@ -19,24 +19,24 @@ from appliance.relay.relay_limits import RelayLimits
 class HostMemory:
     """The memory of one host in a pool."""
 
-    __slots__ = ("_host", "_pool")
+    __slots__ = ("_pool", "host")
 
     def __init__(self, pool: Pool[str], host: str) -> None:
         self._pool = pool
-        self._host = host
+        self.host = host
 
     @property
     def used(self) -> int:
-        return self._pool.held(self._host)
+        return self._pool.held(self.host)
 
     def add(self, size: int) -> None:
         if size > 0:
-            self._pool.charge(self._host, size)
+            self._pool.charge(self.host, size)
         elif size:
-            self._pool.give_back(self._host, -size)
+            self._pool.give_back(self.host, -size)
 
     def refusal(self, size: int = 1) -> str:
-        return self._pool.refusal(self._host, size)
+        return self._pool.refusal(self.host, size)
 
     @property
     def exhausted(self) -> bool:

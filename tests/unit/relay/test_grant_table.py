@@ -85,7 +85,7 @@ def test_hosts_that_only_a_star_names_pay_as_one() -> None:
 def test_the_latest_place_of_a_service_counts() -> None:
     table = stated()
     table.state(ServicePlaced("k", "/add", "10.0.0.1", 5000))
-    assert table.service("k", "/add") == ServiceEndpoint("k", "/add", "10.0.0.1", 5000, "/talker")
+    assert table.service("k", "/add") == ServiceEndpoint("k", "/add", "10.0.0.1", 5000, "/talker", own=False)
 
 
 def test_the_end_of_a_restatement_withdraws_the_rest() -> None:

@@ -7,6 +7,7 @@ import pytest
 from appliance.quotas.pool import QuotaClass
 from appliance.relay.connections.named_subscribers import NamedSubscribers, looks_for_names
 from appliance.relay.context import RelayContext
+from appliance.relay.grant_table import GrantTable
 from appliance.relay.loop import EventLoop
 from appliance.relay.monitors.interceptor import Interceptor
 from appliance.relay.relay_limits import RelayLimits
@@ -43,7 +44,7 @@ def presences(loop: EventLoop) -> Iterator[NamedSubscribers]:
     reporter = Reporter(limits)
     memory = RelayMemory.of(limits, lambda _host: QuotaClass.REGISTERED)
     interceptor = Interceptor(loop, reporter, budget=1.0, publish=_nothing, changed=_nothing)
-    context = RelayContext(loop, limits, reporter, memory, Scratch(), interceptor, str)
+    context = RelayContext(loop, limits, reporter, memory, Scratch(), interceptor, GrantTable())
     presences = NamedSubscribers(context, TOPIC, "10.0.0.9")
     yield presences
     presences.close()

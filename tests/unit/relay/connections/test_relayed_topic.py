@@ -56,6 +56,7 @@ class RecordedMember:
         self.caller_id = caller_id
         self.host = host
         self.header: Mapping[str, str] = {}
+        self.fields: Mapping[str, str] = {}
         self.received = b""
         self.missed = False
         self.behind_since: float | None = None

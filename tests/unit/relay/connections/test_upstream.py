@@ -22,6 +22,7 @@ class Timer:
 
 @dataclass
 class Relay:
+    unsettled: bool
     topic = "/chatter"
     key = "k"
     host = "10.0.0.2"
@@ -47,13 +48,10 @@ class Relay:
 
 @pytest.mark.parametrize(("unsettled", "seconds"), [(False, 0.0), (True, RelayLimits().linger)])
 def test_a_lazy_publisher_learns_at_once_that_it_has_no_subscriber(unsettled: bool, seconds: float) -> None:
-    relay = Relay()
+    relay = Relay(unsettled)
     publisher = PublisherConnection(
         cast(RelayContext, relay),
         cast(RelayedTopic, relay),
-        claims=lambda: (),
-        registered_type=lambda: "*",
-        unsettled=lambda: unsettled,
     )
     publisher.connect()
     publisher.release()
