@@ -257,7 +257,7 @@ class RelayedTopic:
 
         The latched message is the present value of the topic: a host gets it once the topic is withheld no longer.
         """
-        self._served.mask = mask
+        self._served.withhold(mask)
         self.differs()
 
     def upstream_opened(self, header: Mapping[str, str]) -> None:

@@ -71,6 +71,9 @@ class ServedSubscribers:
         self.dropped = 0
         """The messages that were dropped for slow subscribers since the last report."""
 
+    def withhold(self, mask: Callable[[str], bool] | None) -> None:
+        self.mask = mask
+
     def __len__(self) -> int:
         return len(self._members)
 
