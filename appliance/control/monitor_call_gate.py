@@ -9,9 +9,9 @@ from dataclasses import dataclass, replace
 
 from appliance.base import clock
 from appliance.channel.messages import MonitorCallAnswered, MonitorCallWanted
+from appliance.master.endpoints.relay_control import RelayControl
 from appliance.master.graph.graph import RosGraph
-from appliance.master.graph.mediation import Mediation
-from appliance.master.graph.registry import Incarnation, Kind, Registry
+from appliance.master.graph.registry import Kind, Registry
 from appliance.policy.policy import Policy
 from appliance.policy.rights import decide, request_of, rights_of_call
 from appliance.rpc.front import plain_address
@@ -34,8 +34,7 @@ class MonitorCallGate:
     flush: Callable[[], None]
     policy: Callable[[], Policy]
     trail: AuditTrail
-    mediation: Mediation
-    port: Callable[[Incarnation, Kind, str], int]
+    relay: RelayControl
     name: str
     host: str
 
@@ -49,7 +48,7 @@ class MonitorCallGate:
         host = ipaddress.ip_address(self.host)
         self.graph.service_granted(provider, wanted.service, host, self.name)
         self.flush()  # the relay has the grant before this answer
-        port = self.port(provider, Kind.SERVICE, wanted.service)
+        port = self.relay.port(provider, Kind.SERVICE, wanted.service)
         return MonitorCallAnswered(wanted.number, self.host, port, self.name, "")
 
     async def _refused(self, service: str) -> str:
@@ -65,6 +64,6 @@ class MonitorCallGate:
             return f"denied: {decision.reason}, for which a monitor cannot wait [{record}]"
         if self.trail.strict and await self.trail.durable() is not None:
             return f"denied: {NOT_RECORDED}"
-        if not self.mediation.carries_service(service):
+        if not self.relay.carries_service(service):
             return "the relay does not carry the service"
         return ""

@@ -101,7 +101,7 @@ class SupervisorMessages:
         ends.relay.attach(index, channel)
 
         def carried(topic: str) -> bool:
-            return ends.relay.carries(index, TOPIC, topic)
+            return ends.relay.allocation.of(TOPIC, topic) == index
 
         if self._base.role.took_over:
             # Every connection ended, and roscpp may have given up: subscribers drop all publishers first.

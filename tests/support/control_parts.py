@@ -186,6 +186,8 @@ class RelayPorts:
 
 
 class NoSpecifications:
+    checked = SimpleNamespace(of_topic=lambda _topic: False, of_service=lambda _service: False)
+
     def statement(self, _relay: int) -> messages.SpecificationsStated:
         return messages.SpecificationsStated(0, b"", {}, restarted=False)
 
@@ -339,19 +341,6 @@ class Clients:
         return [1, "", 1]
 
 
-class Modes:
-    stand_ins = True
-
-    def hides_publishers(self, _topic: str) -> bool:
-        return True
-
-    def carries_topic(self, _topic: str) -> bool:
-        return True
-
-    def carries_service(self, _service: str) -> bool:
-        return True
-
-
 class Addresses:
     async def learn(self, _peer: Peer) -> None:
         """Do nothing."""
@@ -379,24 +368,10 @@ class ControlParts:
         self.nodes = NodeApiClient(self.registry, timeout=3.0)
         cast(Any, self.nodes).client = self.clients.client
         self.surround()
-        self.mediation, self.addresses, self.parameters = (Modes(), Addresses(), mirror())
+        self.addresses, self.parameters = Addresses(), mirror()
         trail = cast(Any, self.records)
         rights = ParameterRights(lambda: self.current, trail)
         self.graph = RosGraph(self.registry, self.grants, trail)
-        self.subscribers = Subscribers(
-            self.registry,
-            self.grants,
-            cast(Any, self.mediation),
-            cast(Any, self.deliveries),
-            lambda: self.parameters.tree,
-            may_read_value=rights.may_read_value,
-        )
-        self.revocation = Revocation(
-            self.registry, self.grants, self.graph, lambda: self.current, lambda: self.parameters.tree
-        )
-        self.rosmaster = RosMaster(1, limits=XmlRpcLimits(), hold=1.0)
-        self.rosmaster.calls = cast(Any, self.hidden)
-        self.entries = MasterRegistrations(self.rosmaster, self.registry, self.faces.inner_uri)
         self.relay = RelayControl(
             self.registry,
             self.grants,
@@ -410,6 +385,20 @@ class ControlParts:
             own_header=None,
             own_call=cast(Any, None),
         )
+        self.subscribers = Subscribers(
+            self.registry,
+            self.grants,
+            self.relay,
+            cast(Any, self.deliveries),
+            lambda: self.parameters.tree,
+            may_read_value=rights.may_read_value,
+        )
+        self.revocation = Revocation(
+            self.registry, self.grants, self.graph, lambda: self.current, lambda: self.parameters.tree
+        )
+        self.rosmaster = RosMaster(1, limits=XmlRpcLimits(), hold=1.0)
+        self.rosmaster.calls = cast(Any, self.hidden)
+        self.entries = MasterRegistrations(self.rosmaster, self.registry, self.faces.inner_uri)
         self.sinks = Sinks(
             self.registry,
             self.grants,
@@ -457,7 +446,6 @@ class ControlParts:
             faces=self.faces,
             arrivals=self.arrivals(),
             relay=self.relay,
-            mediation=self.mediation,
             addresses=self.addresses,
             liveness=self.liveness,
             nodes=self.nodes,

@@ -37,7 +37,6 @@ def serving(
     faces: Any = None,
     arrivals: Any = None,
     relay: Any = None,
-    mediation: Any = None,
     liveness: Any = None,
     nodes: Any = None,
     redecide_for: Any = None,
@@ -72,16 +71,15 @@ def serving(
     )
     monitors: Any = None
     if target is not None:
-        node_calls = NodeCalls(registry, graph, relay, mediation, addresses, nodes, liveness, gate, 11311)
+        node_calls = NodeCalls(registry, graph, relay, addresses, nodes, liveness, gate, 11311)
         return pipeline.handler(served(NODE_CALLS.values(), node_calls), target=target)
     return pipeline.handler(
         master_table(
-            RegistrationCalls(registry, graph, arrivals, relay, mediation, parameters, subscribers),
+            RegistrationCalls(registry, graph, arrivals, relay, parameters, subscribers),
             LookupCalls(
                 registry,
                 graph,
                 relay,
-                mediation,
                 addresses,
                 port=11311,
                 stop=lambda _reason: None,

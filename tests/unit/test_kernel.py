@@ -9,7 +9,7 @@ ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "dev" / "architecture.md").read_text()
 SECTION = PAGE.split("\n## The kernel", 1)[1].split("\n## ", 1)[0]
 SIZES = {path: int(lines) for path, lines in re.findall(r"`([\w/]+\.pyx?)` (\d+)", SECTION)}
-BUDGET = 11_896  # lines of code: lower this number with the kernel, and never raise it
+BUDGET = 11_881  # lines of code: lower this number with the kernel, and never raise it
 
 # The modules outside the kernel that the kernel may import.
 OUTSIDE = frozenset(
@@ -31,7 +31,7 @@ OUTSIDE = frozenset(
     relay.relay_limits relay.report relay.topic_taps relay.transport.loop_channel
     relay.transport.memory relay.transport.sockets rpc.acceptor rpc.connection_table rpc.fair_queue
     rpc.front rpc.processor_time rpc.server rpc.xmlrpc_client
-    specifications.allocation specifications.specification_files
+    specifications.allocation
     specifications.specification_manager store.state_file telemetry.metrics
     """.split()  # noqa: SIM905  a list would need a line for each
 )

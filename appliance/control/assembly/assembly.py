@@ -71,7 +71,6 @@ def assemble(base: Foundation) -> Parts:
         core.graph,
         arrivals,
         ends.relay,
-        core.mediation,
         parameters,
         ends.subscribers,
     )
@@ -97,7 +96,6 @@ def assemble(base: Foundation) -> Parts:
         core.registry,
         core.graph,
         ends.relay,
-        core.mediation,
         ends.addresses,
         ends.relay.nodes,
         ends.liveness,
@@ -167,7 +165,6 @@ def _make_calls(
         core.registry,
         core.graph,
         ends.relay,
-        core.mediation,
         ends.addresses,
         base.port(RVMASTER),
         stop=lambda reason: base.lifeline.say(messages.ApplianceStopRequested(reason)),

@@ -9,7 +9,6 @@ from appliance.master.calls.gate import CallGate, HostLimits
 from appliance.master.calls.parameter_rights import ParameterRights
 from appliance.master.endpoints.traffic import RelayTraffic
 from appliance.master.graph.graph import Grants, RosGraph
-from appliance.master.graph.mediation import Mediation
 from appliance.master.graph.registry import Registry
 from appliance.master.graph.revocation import Revocation
 from appliance.master.parameter_charges import ParameterCharges
@@ -31,7 +30,6 @@ class Core:
     watchlist: Watchlist
     carried: RelayTraffic
     grants: Grants
-    mediation: Mediation
     rights: ParameterRights
     graph: RosGraph
     gate: CallGate
@@ -47,12 +45,6 @@ def make_core(base: Foundation) -> Core:
     watchlist = Watchlist()
     carried = RelayTraffic(base.trail, registry, settings.relays, watchlist.cut_off)
     grants = Grants(registry.mark, carried.used)
-    mediation = Mediation(
-        policy,
-        lambda: monitors().checked,
-        relay_all=settings.relaying == "all",
-        stand_ins=settings.mediation == "full",
-    )
     rights = ParameterRights(policy, base.trail)
     parameters = _make_mirror(base)
 
@@ -67,7 +59,6 @@ def make_core(base: Foundation) -> Core:
         watchlist=watchlist,
         carried=carried,
         grants=grants,
-        mediation=mediation,
         rights=rights,
         graph=graph,
         gate=CallGate(policy, registry, limits),

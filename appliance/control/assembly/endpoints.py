@@ -83,6 +83,8 @@ def make_endpoints(base: Foundation, core: Core) -> Endpoints:
             if isinstance(asked, messages.ApprovalWanted)
             else base.features.called(asked)
         ),
+        relay_all=settings.relaying == "all",
+        stand_ins=settings.mediation == "full",
     )
     rosmaster = RosMaster(
         settings.rosmaster_port,
@@ -99,7 +101,7 @@ def make_endpoints(base: Foundation, core: Core) -> Endpoints:
     subscribers = Subscribers(
         core.registry,
         core.grants,
-        core.mediation,
+        relay,
         delivery,
         lambda: core.parameters.tree,
         may_read_value=core.rights.may_read_value,
@@ -113,8 +115,7 @@ def make_endpoints(base: Foundation, core: Core) -> Endpoints:
             sinks.flush,
             core.policy,
             base.trail,
-            core.mediation,
-            relay.port,
+            relay,
             settings.publish_as,
             own_host(base.sockets[RVMASTER].getsockname()[0]),
         )

@@ -63,7 +63,7 @@ def _topics(parts: Parts, live: list[Incarnation], names: dict[str, str]) -> lis
         Topic(
             name,
             parts.core.registry.type_of(name),
-            mediated=parts.core.mediation.carries_topic(name),
+            mediated=parts.endpoints.relay.carries_topic(name),
             publishers=publishers.get(name, []),
             subscribers=subscribers.get(name, []),
             connections=connections.get(name, []),
@@ -79,7 +79,7 @@ def _services(parts: Parts, live: list[Incarnation], names: dict[str, str]) -> l
             **asdict(relay.carried.flow(incarnation.key, registration.resource)),
             name=registration.resource,
             node=incarnation.name,
-            mediated=parts.core.mediation.carries_service(registration.resource),
+            mediated=parts.endpoints.relay.carries_service(registration.resource),
             connections=connections.get(registration.resource, []),
         )
         for incarnation in live

@@ -8,7 +8,6 @@ from appliance.master.caller import Answer, Caller
 from appliance.master.endpoints.node_ports import AdvertisedAddresses
 from appliance.master.endpoints.relay_control import RelayControl
 from appliance.master.graph.graph import RosGraph
-from appliance.master.graph.mediation import Mediation
 from appliance.master.graph.registry import Kind, Registry
 from roswire.uris import node_uri, service_uri
 from roswire.xmlrpc import Value
@@ -24,7 +23,6 @@ class LookupCalls:
     registry: Registry
     graph: RosGraph
     relay: RelayControl
-    mediation: Mediation
     addresses: AdvertisedAddresses
     port: int
     stop: Callable[[str], None]
@@ -36,14 +34,14 @@ class LookupCalls:
         if holder is None:
             return [-1, f"unknown node [{node}]", ""]
         told = self.addresses.address_for(caller.peer)
-        return [1, "node api", holder.uri_for(told, hidden=self.mediation.stand_ins)]
+        return [1, "node api", holder.uri_for(told, hidden=self.relay.stand_ins)]
 
     async def lookup_service(self, caller: Caller, service: str) -> Answer:
         """`lookupService(caller_id, service)` → the relay's port for it; the caller may then call it."""
         provider = next(iter(self.registry.registered(Kind.SERVICE, service)), None)
         if provider is None:
             return [-1, "no provider", ""]
-        if provider.of_monitors or self.mediation.carries_service(service):
+        if provider.of_monitors or self.relay.carries_service(service):
             self.graph.service_granted(provider, service, caller.peer.host, caller.caller_id)
             port = self.relay.port(provider, Kind.SERVICE, service)
             uri = service_uri(self.addresses.address_for(caller.peer), port)

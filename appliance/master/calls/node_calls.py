@@ -16,7 +16,6 @@ from appliance.master.endpoints.node_ports import AdvertisedAddresses
 from appliance.master.endpoints.relay_control import RelayControl, tcpros_port
 from appliance.master.endpoints.traffic import Traffic
 from appliance.master.graph.graph import RosGraph
-from appliance.master.graph.mediation import Mediation
 from appliance.master.graph.registry import Incarnation, Kind, Registry
 from appliance.master.reconcile.liveness import Liveness
 from appliance.rpc.server import NoAnswerError
@@ -35,7 +34,6 @@ class NodeCalls:
     registry: Registry
     graph: RosGraph
     relay: RelayControl
-    mediation: Mediation
     addresses: AdvertisedAddresses
     nodes: NodeApiClient
     liveness: Liveness
@@ -52,7 +50,7 @@ class NodeCalls:
             offered = ", ".join(str(name)[:40] for name in names) or "nothing"
             return [0, f"the appliance relays only TCPROS; the subscriber offers {offered}", []]
         own = target.own or self.gate.is_own_subscriber(caller, topic)  # always connected through the relay
-        if not own and not self.mediation.carries_topic(topic):
+        if not own and not self.relay.carries_topic(topic):
             return await self._negotiated_directly(target, topic, caller)
         self.graph.topic_granted(target, topic, caller.peer.host, caller.caller_id)
         address = self.addresses.address_for(caller.peer)

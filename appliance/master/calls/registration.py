@@ -10,7 +10,6 @@ from appliance.master.calls.call import Attempt
 from appliance.master.calls.parameter_calls import ParameterCalls
 from appliance.master.endpoints.relay_control import RelayControl
 from appliance.master.graph.graph import RosGraph
-from appliance.master.graph.mediation import Mediation
 from appliance.master.graph.registry import Incarnation, Kind, Life, Registry
 from appliance.master.reconcile.arrivals import Arrivals
 from appliance.master.reconcile.subscribers import Subscribers
@@ -24,7 +23,6 @@ class RegistrationCalls:
     graph: RosGraph
     arrivals: Arrivals
     relay: RelayControl
-    mediation: Mediation
     parameters: ParameterCalls
     subscribers: Subscribers
 
@@ -34,7 +32,7 @@ class RegistrationCalls:
         """`registerPublisher(caller_id, topic, topic_type, caller_api)` → the subscribers' (outer) URIs."""
         node = await self.arrivals.incarnation_for(caller, caller_api)
         self.graph.registered(node, Kind.PUBLICATION, topic, topic_type)
-        hidden = self.mediation.hides_publishers(topic)
+        hidden = self.relay.hides_publishers(topic)
         subscribers = self.registry.uris_for(node, Kind.SUBSCRIPTION, topic, hidden=hidden)
         return [1, f"Registered [{node.name}] as publisher of [{topic}]", list(subscribers)]
 

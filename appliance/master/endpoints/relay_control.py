@@ -1,4 +1,9 @@
-"""Send the relays their wanted state and the addresses of publishers, and handle their reports."""
+"""Decide what the relays carry, send them their wanted state and the addresses of publishers, and handle their reports.
+
+The default, `relay_all` and `stand_ins`, is a security boundary: relays carry all topics and services, and nodes get
+only URIs of proxy endpoints. The other modes are faster, but not a boundary: a node that knows a port can send any
+request to it.
+"""
 
 import asyncio
 from collections import deque
@@ -18,7 +23,7 @@ from appliance.master.endpoints.topic_taps_control import TapRequests
 from appliance.master.endpoints.traffic import RelayTraffic
 from appliance.master.graph.graph import Grants
 from appliance.master.graph.registry import Change, Incarnation, Kind, Life, RegistrationKey, Registry
-from appliance.policy.model import Address, address_of
+from appliance.policy.model import Address, Category, address_of
 from appliance.policy.policy import Policy
 from appliance.policy.rate_limits import NO_LIMIT, LimitScope, Rate
 from appliance.policy.rights import asks_to_call
@@ -92,6 +97,8 @@ class RelayControl:
     broken: Callable[[Incarnation], None]
     own_header: messages.OwnHeaderStated | None
     own_call: Callable[[OwnCall], Awaitable[OwnAnswer]]
+    relay_all: bool = True
+    stand_ins: bool = True
     _posts: tuple[RelayOutbox, ...] = field(init=False)
     _asking: set[asyncio.Task[None]] = field(default_factory=set)
     _moving: set[Resource] = field(default_factory=set)
@@ -109,6 +116,30 @@ class RelayControl:
         if not away:
             return "connected"
         return "away" if away == len(self._posts) else f"{away} of {len(self._posts)} are away"
+
+    def carries_topic(self, topic: str) -> bool:
+        policy = self.policy()
+        return (
+            self.relay_all
+            or topic in policy.monitored_topics
+            or policy.limit_rule(topic) is not None
+            or policy.commanded(topic) is not None
+            or policy.asks_for(Category.PUBLISH, topic)
+            or self.monitors().checked.of_topic(topic)
+        )
+
+    def carries_service(self, service: str) -> bool:
+        policy = self.policy()
+        return (
+            self.relay_all
+            or service in policy.monitored_services
+            or policy.commanded(service) is not None
+            or policy.asks_for(Category.CALL, service)
+            or self.monitors().checked.of_service(service)
+        )
+
+    def hides_publishers(self, topic: str) -> bool:
+        return self.stand_ins or self.carries_topic(topic)
 
     def port(self, incarnation: Incarnation, kind: Kind, resource: str) -> int:
         return incarnation.relay_ports[self.allocation.of(_WORDS[kind], resource)]
@@ -162,9 +193,6 @@ class RelayControl:
     ) -> list[messages.MessageSeen]:
         send = self._post(TOPIC, topic).send
         return await self._taps.look(topic, count, seconds, send, latched=latched)
-
-    def carries(self, relay: int, kind: str, resource: str) -> bool:
-        return self.allocation.of(kind, resource) == relay
 
     def live_resources(self) -> set[Resource]:
         return {
@@ -266,7 +294,7 @@ class RelayControl:
         post.stated[node.key] = {}
 
     def _carries(self, post: RelayOutbox, resource: Resource) -> bool:
-        return resource not in self._moving and self.carries(post.index, *resource)
+        return resource not in self._moving and self.allocation.of(*resource) == post.index
 
     def _placed(self, post: RelayOutbox, fact: RegistrationKey) -> messages.RelayFact | None:
         node, kind, resource, _shelved = fact

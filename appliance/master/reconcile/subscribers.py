@@ -9,8 +9,8 @@ from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass, field
 
 from appliance.master.endpoints.delivery import Delivery, NodeCall
+from appliance.master.endpoints.relay_control import RelayControl
 from appliance.master.graph.graph import Grants
-from appliance.master.graph.mediation import Mediation
 from appliance.master.graph.parameter_updates import settled, updates_of
 from appliance.master.graph.registry import Change, Incarnation, Kind, Life, RegistrationKey, Registry
 from appliance.rpc.fair_queue import weigh
@@ -28,7 +28,7 @@ class Subscribers:
 
     registry: Registry
     grants: Grants
-    mediation: Mediation
+    relay: RelayControl
     delivery: Delivery
     tree: Callable[[], Tree]
     may_read_value: Callable[[Incarnation, str, Value], bool]
@@ -83,7 +83,7 @@ class Subscribers:
         return () if kind is Kind.SUBSCRIPTION and (kind, resource) in node.shelf else None
 
     def _publishers_for(self, subscriber: Incarnation, topic: str) -> tuple[str, ...]:
-        hidden = self.mediation.hides_publishers(topic)
+        hidden = self.relay.hides_publishers(topic)
         return self.registry.uris_for(subscriber, Kind.PUBLICATION, topic, hidden=hidden)
 
     # --- lists of publishers ---
@@ -136,7 +136,7 @@ class Subscribers:
                     publisher
                     for publisher in self.registry.registered(Kind.PUBLICATION, topic)
                     if publisher is not subscriber
-                    and (publisher.own or subscriber.own or self.mediation.carries_topic(topic))
+                    and (publisher.own or subscriber.own or self.relay.carries_topic(topic))
                     and PermissionRow(publisher.key, TOPIC, topic, str(subscriber.host), subscriber.name)
                     not in used
                 ]

@@ -34,9 +34,7 @@ class Control:
         if offered:
             registry.register(node, Kind.SERVICE, "/arm", "4001")
         compiled, own = compile_policy(policy, file="p.ini"), cast(Any, self)
-        self.gate = MonitorCallGate(
-            registry, own, lambda: None, lambda: compiled, own, own, lambda *_: 4711, "/rosrv", host
-        )
+        self.gate = MonitorCallGate(registry, own, lambda: None, lambda: compiled, own, own, "/rosrv", host)
 
     def decided(self, asker: Any, method: str, _category: str, resource: str, decision: Any) -> str:
         self.records.append((f"{asker.host} {asker.caller_id} {method}", resource, decision.allowed))
@@ -47,6 +45,9 @@ class Control:
 
     def carries_service(self, _service: str) -> bool:
         return self.carries
+
+    def port(self, *_given: object) -> int:
+        return 4711
 
     def service_granted(self, provider: Incarnation, service: str, host: object, caller_id: str) -> None:
         self.granted.append(f"{provider.key} {host} {caller_id} {service}")

@@ -22,9 +22,12 @@ class Site:
         self.granted: list[Incarnation] = []
         parts: dict[str, Any] = {
             "registry": self.registry,
-            "mediation": SimpleNamespace(carries_service=lambda _name: True, stand_ins=True),
             "graph": self,
-            "relay": SimpleNamespace(port=lambda one, _kind, _name: one.relay_port),
+            "relay": SimpleNamespace(
+                port=lambda one, _kind, _name: one.relay_port,
+                carries_service=lambda _name: True,
+                stand_ins=True,
+            ),
             "addresses": SimpleNamespace(address_for=lambda _peer: "10.0.0.1"),
         }
         self.calls = LookupCalls(**parts, port=11311, stop=lambda _reason: None, unseen=unseen)

@@ -42,17 +42,18 @@ async def test_each_connection_is_read_once() -> None:
             for number in range(CONNECTIONS)
         }
     )
-    relay = SimpleNamespace(carried=carried)
-    mediation = SimpleNamespace(carries_topic=lambda _name: True, carries_service=lambda _name: True)
+    relay = SimpleNamespace(
+        carried=carried, carries_topic=lambda _name: True, carries_service=lambda _name: True
+    )
     other: Any = None
-    parts = (registry, other, relay, mediation, other, other, other, other)
+    parts = (registry, other, relay, other, other, other, other)
     calls = cast(Any, NodeCalls)(*parts, port=11311)
     answer: Any = await calls.get_bus_stats(cast(Caller, SimpleNamespace(target=node)))
     sent, received, _services = answer[2]
     assert (len(sent), len(received)) == (TOPICS, TOPICS)
     assert [name for name, _bytes, rows in sent if len(rows) == CONNECTIONS] == [topic]
     assert connections.looks == CONNECTIONS
-    core, endpoints = SimpleNamespace(registry=registry, mediation=mediation), SimpleNamespace(relay=relay)
+    core, endpoints = SimpleNamespace(registry=registry), SimpleNamespace(relay=relay)
     graph = graph_of(cast(Any, SimpleNamespace(core=core, endpoints=endpoints)))
     assert {row.name: len(row.connections) for row in graph.topics if row.connections} == {topic: CONNECTIONS}
     assert len(graph.services) == TOPICS

@@ -1,7 +1,5 @@
 """Nodes get the lists that they missed because control died during a change, or because they were disconnected."""
 
-from typing import Any, cast
-
 import pytest
 
 from appliance.master.graph.registry import Kind
@@ -41,7 +39,7 @@ async def test_subscribers_without_a_connection_are_absent() -> None:
 
 async def test_no_subscriber_is_absent_without_the_relay() -> None:
     world = await ControlParts.begun()
-    cast(Any, world.mediation).carries_topic = lambda _topic: False
+    world.relay.relay_all = False
     talker, ear, own = world.node("/talker", 1), world.node("/ear", 2), world.node("/rosout", 3)
     own.own = True
     await world.register(talker, Kind.PUBLICATION, "/a")
