@@ -16,20 +16,18 @@ from appliance.channel import messages
 from appliance.configuration import settings
 from appliance.master.caller import Answer, ApiUri, Caller
 from appliance.master.calls.parameter_rights import ParameterRights
-from appliance.master.endpoints.delivery import NodeCall
-from appliance.master.endpoints.node_api import NodeApiClient
+from appliance.master.endpoints.delivery import NodeApiClient, NodeCall
 from appliance.master.endpoints.node_ports import NodePorts
 from appliance.master.endpoints.relay_control import RelayControl
 from appliance.master.endpoints.traffic import RelayTraffic
 from appliance.master.graph.graph import Grants, RosGraph
 from appliance.master.graph.registry import Incarnation, Kind, Life, Registry, new_key
 from appliance.master.graph.revocation import Revocation
-from appliance.master.reconcile.entries import MasterRegistrations
 from appliance.master.reconcile.liveness import Liveness, Watchlist
 from appliance.master.reconcile.reconciler import Reconciler
 from appliance.master.reconcile.sinks import Enforcement, Sinks
 from appliance.master.reconcile.subscribers import Subscribers
-from appliance.master.rosmaster import RosMaster, Wanted
+from appliance.master.rosmaster import MasterRegistrations, RosMaster, Wanted
 from appliance.policy.model import Address, Decision
 from appliance.policy.policy_compiler import compile_policy
 from appliance.quotas.pool import QuotaClass

@@ -18,9 +18,9 @@ OUTSIDE = frozenset(
     base.atomic_files base.clock base.counted base.engine_thread base.input_files base.validation_messages
     channel.channel channel.link channel.messages channel.messages.relay_link channel.rosout_address
     configuration.settings control.assembly.current master.calls.monitor_calls
-    master.calls.request_peek master.endpoints.delivery master.endpoints.node_api
+    master.calls.request_peek master.endpoints.delivery
     master.endpoints.node_ports master.endpoints.topic_taps_control master.endpoints.traffic
-    master.parameter_charges master.reconcile.arrivals master.reconcile.entries
+    master.parameter_charges master.reconcile.arrivals
     master.reconcile.liveness master.rosmaster policy.policy_lint quotas.descriptors quotas.pool
     quotas.table relay.connections.introductions relay.connections.latched_message
     relay.connections.message_sink relay.connections.monitor_calls

@@ -11,17 +11,15 @@ from appliance.control.assembly.foundation import INNER, RVMASTER, Foundation
 from appliance.control.assembly.listener_limits import value_limits
 from appliance.control.monitor_call_gate import MonitorCallGate, own_host
 from appliance.master import rosout
-from appliance.master.endpoints.delivery import Delivery
-from appliance.master.endpoints.node_api import NodeApiClient
+from appliance.master.endpoints.delivery import Delivery, NodeApiClient
 from appliance.master.endpoints.node_ports import AdvertisedAddresses, NodePorts
 from appliance.master.endpoints.proxy_endpoints import MasterSideApi, ProxyEndpoints
 from appliance.master.endpoints.relay_control import RelayControl
 from appliance.master.graph.registry import Incarnation
-from appliance.master.reconcile.entries import MasterRegistrations
 from appliance.master.reconcile.liveness import Liveness
 from appliance.master.reconcile.sinks import Enforcement, Sinks
 from appliance.master.reconcile.subscribers import Subscribers
-from appliance.master.rosmaster import RosMaster, limits_of_answers
+from appliance.master.rosmaster import MasterRegistrations, RosMaster, limits_of_answers
 from appliance.rpc.server import Handler
 from appliance.specifications.allocation import Allocation
 from appliance.specifications.specification_manager import ALLOCATION

@@ -23,10 +23,9 @@ from appliance.channel import messages
 from appliance.features.recorder import recorder_link
 from appliance.features.recorder.recording import MOST_TRIGGERS, Progress, RecordingInProgress, load_progress
 from appliance.features.recorder.recording_answers import Recording, Trigger
-from appliance.features.recorder.recording_plan import KEPT, HourlyLimit, recording_owner, span
+from appliance.features.recorder.recording_plan import KEPT, HourlyLimit, recording_owner, span, trigger_of
 from appliance.features.recorder.recording_store import MOST_TEMPORARY, RecordingStore
 from appliance.features.recorder.settings import RecorderRules
-from appliance.features.recorder.triggers import trigger_of
 
 SETTLE_SECONDS = 0.5
 """The time that late messages and audit records have to arrive."""

@@ -1,7 +1,8 @@
-"""Plan which recording an *act* (an audited event that triggers recordings) begins or extends. No I/O.
+"""Decide which audit records trigger recordings (*acts*), and which recording an act begins or extends. No I/O.
 
 Control makes the plan together with the act's audit record, which names the recording, or the reason why there is
-none. A recording is charged to the cause of its first trigger: `ROBOT`, a host or network as the policy names it,
+none. The recorder finds the triggers in the audit log, so the log proves each of them, and none is missed while control
+restarts. A recording is charged to the cause of its first trigger: `ROBOT`, a host or network as the policy names it,
 `UNKNOWN` for all other hosts together, `OPERATORS`, or `APPLIANCE`. Times are nanoseconds since the epoch.
 
 1. Each host has at most one open recording, and all hosts except the robot together `_MOST_AT_ONCE`. An act
@@ -11,14 +12,21 @@ none. A recording is charged to the cause of its first trigger: `ROBOT`, a host 
 """
 
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass, replace
 
-from appliance.audit.log.record import Severity
+from appliance.audit.log.record import AuditRecord, Severity
+from appliance.audit.log.record_format import without_binding
+from appliance.audit.search.equality import equality_of
 from appliance.base.actors import APPLIANCE, ROBOT
-from appliance.features.recorder.recording_answers import OPERATORS, OpenRecording, Recording, TriggerKind
+from appliance.features.recorder.recording_answers import (
+    OPERATORS,
+    OpenRecording,
+    Recording,
+    Trigger,
+    TriggerKind,
+)
 from appliance.features.recorder.settings import RecorderRules
-from appliance.features.recorder.triggers import kinds_of
 
 KEPT = frozenset({ROBOT, OPERATORS})
 """The owners whose recordings are never removed for another host's recording."""
@@ -28,6 +36,50 @@ _MOST_AT_ONCE = 2
 _SECOND = 1_000_000_000
 _HOUR = 3600 * _SECOND
 _MOST_HOSTS = 4096  # hosts whose last recording's end is remembered
+
+
+_BY_EVENT: dict[str, TriggerKind] = {
+    "message dropped": "drop",
+    "message changed": "change",
+    "monitor verdict": "verdict",
+    "monitor fault": "fault",
+}
+_LONGEST_TEXT = 300
+
+
+def kinds_of(event: str, decision: str | None, severity: Severity) -> list[TriggerKind]:
+    kinds: list[TriggerKind] = [_BY_EVENT[event]] if event in _BY_EVENT else []
+    if decision == "deny":
+        kinds.append("denial")
+    if severity is Severity.ALARM:
+        kinds.append("alarm")
+    return kinds
+
+
+def trigger_of(record: AuditRecord, wanted: Collection[TriggerKind]) -> Trigger | None:
+    for what in kinds_of(record.event, record.decision, record.severity):
+        if what in wanted:
+            reason = without_binding(record.reason, record.detail)
+            text = f"{record.event}: {reason}" if reason else record.event
+            charged_to = str(record.detail.get("charged_to", APPLIANCE))
+            equality = equality_of(record)
+            return Trigger(
+                record.time,
+                what,
+                record.id,
+                text[:_LONGEST_TEXT],
+                charged_to,
+                monitor=_short(record.detail.get("monitor")),
+                resource=_short(record.resource),
+                host=_short(record.host),
+                caller_id=_short(record.caller_id),
+                equal=f"{equality['key']} {equality['reason']}",
+            )
+    return None
+
+
+def _short(value: object) -> str:
+    return "" if value is None else str(value)[:_LONGEST_TEXT]
 
 
 def recording_owner(charged_to: str) -> str:

@@ -34,7 +34,7 @@ from appliance.features.recorder.recording_answers import (
     Sender,
     Timeline,
 )
-from appliance.features.recorder.triggers import kinds_of
+from appliance.features.recorder.recording_plan import kinds_of
 from roswire.message_view import PublisherReader
 
 COLUMNS, MOST_COLUMNS = 200, 1000

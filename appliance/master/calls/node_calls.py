@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from appliance.master.caller import Answer, Caller
 from appliance.master.calls.call import MESSAGE, PROTOCOLS, TOPIC, CallVerb, RosCall, method
 from appliance.master.calls.gate import CallGate
-from appliance.master.endpoints.node_api import NodeApiClient
+from appliance.master.endpoints.delivery import NodeApiClient
 from appliance.master.endpoints.node_ports import AdvertisedAddresses
 from appliance.master.endpoints.relay_control import RelayControl, tcpros_port
 from appliance.master.endpoints.traffic import Traffic

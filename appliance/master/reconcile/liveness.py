@@ -15,8 +15,7 @@ import structlog
 
 from appliance.base import clock
 from appliance.configuration.settings import LivenessSection
-from appliance.master.endpoints.delivery import NodeCall
-from appliance.master.endpoints.node_api import NodeApiClient
+from appliance.master.endpoints.delivery import NodeApiClient, NodeCall
 from appliance.master.endpoints.relay_control import RELAY_NAME
 from appliance.master.graph.graph import RosGraph
 from appliance.master.graph.registry import Incarnation, Kind, Life, Registry

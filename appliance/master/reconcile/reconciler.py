@@ -16,9 +16,8 @@ import structlog
 from appliance.base.counted import counted
 from appliance.master.graph.registry import Kind, Registry
 from appliance.master.parameter_mirror import ParameterMirror
-from appliance.master.reconcile.entries import NAME, EntryKey, MasterEntry, MasterRegistrations
 from appliance.master.reconcile.subscribers import Subscribers
-from appliance.master.rosmaster import RosMaster
+from appliance.master.rosmaster import NAME, EntryKey, MasterEntry, MasterRegistrations, RosMaster
 from appliance.rpc.xmlrpc_client import CallFailedError
 from appliance.telemetry.audit_trail import AuditTrail
 from roswire.parameter_tree import Tree

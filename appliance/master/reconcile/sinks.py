@@ -25,8 +25,8 @@ from appliance.master.graph.registry import (
     Registry,
 )
 from appliance.master.graph.revocation import Revocation
-from appliance.master.reconcile.entries import MasterRegistrations
 from appliance.master.reconcile.subscribers import Subscribers
+from appliance.master.rosmaster import MasterRegistrations
 from appliance.policy.model import Address, address_of
 from appliance.policy.policy import Policy
 from appliance.store.state_file import IncarnationRow, PermissionRow, RegistrationRow, StateStore

@@ -6,7 +6,7 @@ from typing import Any, cast
 
 import pytest
 
-from appliance.master.endpoints.node_api import ANSWER, NodeApiClient
+from appliance.master.endpoints.delivery import ANSWER, NodeApiClient
 from appliance.rpc.xmlrpc_client import CallFailedError, UnansweredError, XmlRpcClient
 from roswire.uris import NodeUri
 from roswire.xmlrpc import build_response

@@ -5,8 +5,8 @@ import pytest
 from appliance.audit.log.events import MONITOR_ACTIONS
 from appliance.audit.log.record import AuditRecord, Severity
 from appliance.features.recorder.recording_answers import TriggerKind
+from appliance.features.recorder.recording_plan import _BY_EVENT, trigger_of
 from appliance.features.recorder.settings import RecorderRules
-from appliance.features.recorder.triggers import _BY_EVENT, trigger_of
 
 KINDS: tuple[TriggerKind, ...] = get_args(TriggerKind)
 

@@ -10,7 +10,7 @@ import pytest
 
 from appliance.channel import messages
 from appliance.channel.channel import Channel
-from appliance.master.endpoints.node_api import NodeApiClient
+from appliance.master.endpoints.delivery import NodeApiClient
 from appliance.master.endpoints.node_ports import NodePorts
 from appliance.master.endpoints.relay_control import RelayControl
 from appliance.master.endpoints.traffic import RelayTraffic

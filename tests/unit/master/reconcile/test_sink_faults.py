@@ -6,12 +6,13 @@ from typing import Any, NamedTuple
 
 import pytest
 
+from appliance.master import rosmaster
 from appliance.master.endpoints.relay_control import RelayControl, RelayOutbox
 from appliance.master.graph.registry import Registry
-from appliance.master.reconcile import entries, sinks
-from appliance.master.reconcile.entries import MasterRegistrations
+from appliance.master.reconcile import sinks
 from appliance.master.reconcile.sinks import Sinks
 from appliance.master.reconcile.subscribers import Subscribers
+from appliance.master.rosmaster import MasterRegistrations
 from tests.unit.master.reconcile.sink_history import history, live
 
 pytestmark = pytest.mark.nightly
@@ -129,9 +130,9 @@ FAULTS = {
         MasterRegistrations, "wanted", "stand_in(node) if service else registration.detail", "registration.detail"
     ),
     "a later life gets no registration": Fault(
-        entries, "_calls", "if wanted is not None:", "if wanted is not None and stated is None:"
+        rosmaster, "_calls", "if wanted is not None:", "if wanted is not None and stated is None:"
     ),
-    "an earlier life stays registered": Fault(entries, "_calls", "stated is not None and (", "False and ("),
+    "an earlier life stays registered": Fault(rosmaster, "_calls", "stated is not None and (", "False and ("),
     # the relays
     "a fact is not compared": Fault(RelayControl, "_state_fact", "wanted == before or", ""),
     "a stated fact is not noted": Fault(
