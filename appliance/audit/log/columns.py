@@ -4,8 +4,9 @@ SQLite and JSON cannot store lone surrogates, integers beyond 64 bits, or arbitr
 limited, or stored as their `repr`.
 """
 
+import contextlib
 import hashlib
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import msgspec
 
@@ -18,12 +19,8 @@ _DEEPEST = 16
 _MOST_ITEMS = 256
 _MOST_KEYS = 128
 _LARGEST_INTEGER = (1 << 63) - 1
-_NONE = type(None)
-_KINDS: tuple[tuple[type, ...], ...] = (
-    (int,), (str,), (int,), (int,), (str,), (str,), (str, _NONE), (str, _NONE), (str, _NONE), (str, _NONE),
-    (str, _NONE), (str, _NONE), (str, _NONE), (str, _NONE), (int, _NONE), (int, _NONE), (str,), (int, _NONE),
-    (bytes,),
-)  # fmt: skip
+_Text = Annotated[str, msgspec.Meta(max_length=LONGEST_TEXT)]
+_Integer = Annotated[int, msgspec.Meta(ge=-_LARGEST_INTEGER, le=_LARGEST_INTEGER)]
 # The hash covers this text; an export and its verification must write it again, from dicts instead of structs.
 _encoder = msgspec.json.Encoder(order="sorted")
 _packer = msgspec.msgpack.Encoder()
@@ -33,62 +30,46 @@ _decode_detail = msgspec.json.Decoder(dict[str, Any]).decode
 class StoredColumns(NamedTuple):
     """The columns of table `record`, in order."""
 
-    sequence: int
-    id: str
-    time: int
-    version: int
-    event: str
-    severity: str
-    decision: str | None
-    host: str | None
-    caller_id: str | None
-    category: str | None
-    resource: str | None
-    rule: str | None
-    rule_key: str | None
-    rule_file: str | None
-    rule_line: int | None
-    revision: int | None
-    reason: str
-    duration_us: int | None
+    sequence: _Integer
+    id: _Text
+    time: _Integer
+    version: _Integer
+    event: _Text
+    severity: _Text
+    decision: _Text | None
+    host: _Text | None
+    caller_id: _Text | None
+    category: _Text | None
+    resource: _Text | None
+    rule: _Text | None
+    rule_key: _Text | None
+    rule_file: _Text | None
+    rule_line: _Integer | None
+    revision: _Integer | None
+    reason: _Text
+    duration_us: _Integer | None
     detail: bytes
 
 
 def to_columns(record: AuditRecord, sequence: int) -> StoredColumns:
     """Return the columns of a record. This never fails, whatever the record contains."""
-    try:
-        columns = _columns(record, sequence)
-        if isinstance(record.detail, dict) and len(columns.detail) <= LARGEST_DETAIL and _storable(columns):
+    with contextlib.suppress(AttributeError, TypeError, ValueError, OverflowError, RecursionError):
+        columns = msgspec.convert(_columns(record, sequence), StoredColumns)
+        packed(columns)  # raises UnicodeEncodeError, a ValueError, for a lone surrogate
+        if isinstance(record.detail, dict) and len(columns.detail) <= LARGEST_DETAIL:
             return columns
-    except (AttributeError, TypeError, ValueError, OverflowError, RecursionError):
-        pass
-    return _columns(plain_record(record), sequence)
+    return StoredColumns(*_columns(plain_record(record), sequence))
 
 
-def _columns(record: AuditRecord, sequence: int) -> StoredColumns:
+def _columns(record: AuditRecord, sequence: int) -> tuple[Any, ...]:
     rule = record.rule
     section, key, file, line = (None,) * 4 if rule is None else (rule.section, rule.key, rule.file, rule.line)
-    return StoredColumns(
+    return (
         sequence, record.id, record.time, SCHEMA_VERSION, record.event, record.severity.value,
         record.decision, record.host, record.caller_id, record.category, record.resource,
         section, key, file, line, record.revision, record.reason, record.duration_us,
         _encoder.encode(record.detail),
     )  # fmt: skip
-
-
-def _storable(columns: StoredColumns) -> bool:
-    value: Any
-    for value, kinds in zip(columns, _KINDS, strict=True):
-        if type(value) not in kinds:
-            return False
-        if isinstance(value, str):
-            if len(value) > LONGEST_TEXT:
-                return False
-            if not value.isascii() and any("\ud800" <= c <= "\udfff" for c in value):
-                return False
-        elif isinstance(value, int) and not -_LARGEST_INTEGER <= value <= _LARGEST_INTEGER:
-            return False
-    return True
 
 
 def from_columns(columns: StoredColumns) -> AuditRecord:
