@@ -31,7 +31,7 @@ def weight(record: AuditRecord) -> int:
 
 
 class Budget:
-    """The debts of hosts, for one thread; only `folded`, `summarised` and `room` may be called from several.
+    """The debts of hosts, for one thread; only `correct` and `room` may be called from several.
 
     `reserve` has the bounds for the disk's reserve, whose last part is left to hosts for which `kept_for` is true.
     """
@@ -66,13 +66,10 @@ class Budget:
             self._charged[host] = self._charged.get(host, 0) + size
             self._charged_bytes += size
 
-    def folded(self, record: AuditRecord) -> None:
+    def correct(self, record: AuditRecord, sign: int) -> None:
+        """Charge a summary (1), or return the charge for a record that was only counted (-1)."""
         if record.host is not None and not record.unknown:
-            self._changes.append((record.host, -weight(record)))
-
-    def summarised(self, record: AuditRecord) -> None:
-        if record.host is not None and not record.unknown:
-            self._changes.append((record.host, weight(record)))
+            self._changes.append((record.host, sign * weight(record)))
 
     def room(self, left: int | None) -> None:
         """Set how many bytes of the disk's reserve are left; None while more than the reserve is free."""

@@ -25,13 +25,12 @@ from appliance.audit.log.folding import FoldSettings, RecordFolder
 from appliance.audit.log.housekeeping import WRITE_ERRORS, CheckpointSchedule, Housekeeping, Waiter, answer
 from appliance.audit.log.ids import IdSource
 from appliance.audit.log.lock_holders import holders
-from appliance.audit.log.log_database import LogUnreadableError
 from appliance.audit.log.log_writer import ChainWriter
 from appliance.audit.log.record import AuditRecord, Severity
 from appliance.audit.log.removal import Remover
 from appliance.audit.log.repetition import summary
 from appliance.audit.log.retention import Retention
-from appliance.audit.log.signatures import CheckpointSigner, RemovalSigner, Signatures
+from appliance.audit.log.signatures import CheckpointSigner, RemovalSigner, Signatures, pinned_key_path
 from appliance.base.clock import now, wall_ns
 from appliance.base.engine_thread import Drive, EngineThread
 from appliance.quotas.pool import QuotaClass
@@ -102,7 +101,6 @@ class AuditLog:
     ) -> None:
         self.path = path
         self.ids = IdSource(clock=clock)
-        self.strict = durability == "strict"
         self._clock = clock
         self._now = now()  # the time of the present turn
         self._queue_limit = queue_limit
@@ -110,23 +108,17 @@ class AuditLog:
         self.budget = budget or Budget(lambda _host: QuotaClass.NAMED)
         self._room = DiskSpace(path, reserve, self.budget.room)
         self._folder = RecordFolder(fold or FoldSettings(), self.ids.next, clock)
-        self._signatures = Signatures(path, signer)
         self._queue: deque[AuditRecord | Waiter | Callable[[], None]] = deque()
         self._held: list[AuditRecord] = []
+        signatures, turn = Signatures(path, signer), lambda: self._now
         self.housekeeping = Housekeeping(
             path,
-            self._signatures,
+            signatures,
             CheckpointSchedule(checkpoint_every, checkpoint_seconds),
-            Remover(
-                retention or Retention(),
-                self._signatures,
-                removals,
-                clock=clock,
-                now=lambda: self._now,
-                report=lambda reason, detail: self._own("records removed", Severity.NOTICE, reason, detail),
-            ),
+            Remover(retention or Retention(), signatures, removals, clock=clock, now=turn, make=self._own),
+            writer=lambda: self._writer,
             clock=clock,
-            now=lambda: self._now,
+            now=turn,
             make=self._own,
             hold=self._held.append,
         )
@@ -137,10 +129,9 @@ class AuditLog:
         self._caught_up = self._written_at = self._retry_at = self._now
         self._lost = _LossCounter()
         self._begun = self._closing = self._ended = False
-        self._counts_recovered = False
         self._continued: tuple[str, int] | None = None
         self._unwritten: str | None = None
-        self._driver = drive("audit log", self.turn, 0.0 if self.strict else _GATHER_SECONDS)
+        self._driver = drive("audit log", self.turn, 0.0 if durability == "strict" else _GATHER_SECONDS)
 
     # --- for the owner, from any thread ---------------------------------------------------------------------
 
@@ -191,24 +182,27 @@ class AuditLog:
 
     def signed(self, number: int, signature: bytes, public_key: bytes) -> None:
         """Store a signature of the signer, if it is valid and made with the pinned key."""
-        keep = partial(self.housekeeping.keep_signature, number, signature, public_key)
-        self._put(partial(self.housekeeping.attempt, keep))
+        keep = self.housekeeping.keep_signature
+        self._soon(lambda writer: keep(writer, number, signature, public_key))
 
     def refused(self, number: int, reason: str) -> None:
         self._put(partial(self.housekeeping.refused, number, reason))
 
     def removal_approved(self, number: int, text: bytes, signature: bytes, public_key: bytes) -> None:
         """Remove records, if the signer's signature of exactly that removal is valid."""
-        remove = partial(self.housekeeping.removal_approved, number, text, signature, public_key)
-        self._put(partial(self.housekeeping.attempt, remove))
+        approved = self.housekeeping.remover.approved
+        self._soon(lambda writer: approved(writer, number, text, signature, public_key))
 
     def removal_refused(self, number: int, reason: str, *, early: bool = False) -> None:
         """Request a removal again later; `early`: the records are too young for the signer."""
         self._put(partial(self.housekeeping.remover.refused, number, reason, early=early))
 
     def request_signatures(self) -> None:
-        self._put(partial(self.housekeeping.attempt, self.housekeeping.ask_signatures))
+        self._soon(self.housekeeping.ask_signatures)
         self._put(self.housekeeping.remover.ask_again)
+
+    def _soon(self, step: Callable[[ChainWriter], None]) -> None:
+        self._put(partial(self.housekeeping.attempt, step))
 
     def close(self, seconds: float = _CLOSE_SECONDS) -> str | None:
         self._closing = True
@@ -255,15 +249,15 @@ class AuditLog:
     def _turn(self, now: float) -> float | None:
         if not self._begun:
             self._begun = True
-            return now if self._attempt(self._open) else self._pause(now)
+            return now if self._attempt() else self._pause(now)
         closing = self._closing  # the queue has everything that was recorded before
         more = self._drain(now)
         for due in self._folder.expire(now):
             self._held.append(due)
-            self.budget.summarised(due)
+            self.budget.correct(due, 1)
         if now >= self._room.due:
             self._look_for_room(now)
-        written = self._attempt(self._write)
+        written = self._attempt()
         self._answer_waiting()
         self.housekeeping.after_batch(written=written)
         if more and written:
@@ -285,8 +279,7 @@ class AuditLog:
 
     def _finish(self) -> None:
         self._held.extend(self._folder.finish())
-        self.housekeeping.unsealed += len(self._held)
-        if self._attempt(self._write) and self.housekeeping.unsealed:
+        if self._attempt() and self._writer is not None and self._writer.unsealed:
             self.housekeeping.attempt(self.housekeeping.seal)
         self._answer_waiting()
         self._unwritten = self._failed
@@ -303,7 +296,7 @@ class AuditLog:
                 written = list(offer(item, now))
                 self._held.extend(written)
                 if not written or written[-1] is not item:
-                    self.budget.folded(item)
+                    self.budget.correct(item, -1)
             elif isinstance(item, asyncio.Future):
                 self._waiting.append(item)
             else:
@@ -319,12 +312,12 @@ class AuditLog:
                 _logger.warning(event, left=left, reason=self._room.scarce)
                 self._held.append(self._own(event, severity, self._room.scarce or "", {"left": left}))
 
-    def _attempt(self, action: Callable[[], None]) -> bool:
-        """Return whether the action succeeded. A failure closes the database until a retry."""
+    def _attempt(self) -> bool:
+        """Return whether everything is written. A failure closes the database until a retry."""
         try:
-            if self._writer is None and action != self._open:
+            if self._writer is None:
                 self._open()
-            action()
+            self._write()
         except WRITE_ERRORS as error:
             self._fail(error)
             return False
@@ -343,55 +336,49 @@ class AuditLog:
             self._failed_since = self._clock()
             _logger.error("the audit log cannot be written", reason=self._failed)
         if self._writer is not None:
-            writer, self._writer, self.housekeeping.writer = self._writer, None, None
+            writer, self._writer = self._writer, None
             with contextlib.suppress(sqlite3.Error):
                 writer.close()
 
     def _open(self) -> None:
-        earlier = self._signatures.key_was_pinned
-        writer = ChainWriter(self.path, self._clock(), self._continued)
+        earlier = pinned_key_path(self.path).exists()
+        self._writer = writer = ChainWriter(self.path, self._clock(), self._continued)
         self.ids.raise_floor(writer.last_id)
-        self._writer = writer
         if writer.created:
             detail = {"log": writer.log_id, "earlier_log_missing": earlier}
             self._held.insert(
                 0, self._own("log begun", Severity.ALARM if earlier else Severity.NOTICE, "", detail)
             )
         # Recover counts only once: afterwards the table has the counts of this process.
-        left = [] if self._counts_recovered else writer.open_folds()
-        if left:
-            writer.close_folds(
-                [summary(fold, self.ids.next(), self._clock(), recovered=True) for fold in left]
-            )
-        self._counts_recovered = True
+        if self._continued is None and (left := writer.open_folds()):
+            summaries = [
+                summary(fold, self.ids.next(), self._clock(), recovered=True) for fold in left.values()
+            ]
+            writer.append(summaries, [(key, None) for key in left])
         self._continued = (writer.log_id, writer.sequence)
-        if not self._failed_since:
-            self._failed = None
-        self.housekeeping.opened(writer)
+        self.housekeeping.ask_signatures(writer)
 
     def _write(self) -> None:
         writer = self._writer
-        if writer is None:
-            raise LogUnreadableError(self._failed or "the log is not open")
-        while self._held or self._folder.touched or self._failed_since:
+        while writer and (self._held or self._folder.touched or self._failed_since):
             batch = self._held[:_LARGEST_BATCH]
             touched = tuple(self._folder.touched)
-            report = self._report_of_failure()
             writer.append(
-                batch + report, [(msgspec.json.encode(key), self._folder.state(key)) for key in touched]
+                batch + self._report_of_failure(),
+                [(msgspec.json.encode(key), self._folder.state(key)) for key in touched],
             )
             self._continued = (writer.log_id, writer.sequence)
             del self._held[: len(batch)]
             self._folder.touched.difference_update(touched)
-            self.housekeeping.unsealed += len(batch) + len(report)
             self._caught_up = self._written_at = self._now
             if self._failed_since:
+                self._failed_since = 0
                 _logger.warning("the audit log is written again")
-            self._failed, self._failed_since = None, 0
             if self._lost.count:
                 self._held.append(
                     self._own("records lost", Severity.ALARM, "the queue was full", self._lost.take())
                 )
+        self._failed = None
 
     def _report_of_failure(self) -> list[AuditRecord]:
         if not self._failed_since:
@@ -405,11 +392,7 @@ class AuditLog:
         answer(waiting, result)
 
     def _own(self, event: str, severity: Severity, reason: str, detail: dict[str, Any]) -> AuditRecord:
+        identity, time = self.ids.next(), self._clock()
         return AuditRecord(
-            id=self.ids.next(),
-            time=self._clock(),
-            event=event,
-            severity=severity,
-            reason=reason,
-            detail=detail,
+            id=identity, time=time, event=event, severity=severity, reason=reason, detail=detail
         )

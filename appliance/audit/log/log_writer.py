@@ -34,14 +34,13 @@ _REPLACED = (
     " there away to begin a new log"
 )
 _TEXT_ROWS = 256
+_FOREVER = 1 << 63
+_AHEAD_STEPS = 20  # the most steps of checkpoints that are skipped because the clock was ahead
 
 
 @functools.cache
 def _insert(rows: int) -> str:
     return "INSERT INTO record VALUES " + ", ".join([_ROW] * rows)  # noqa: S608  only question marks
-
-
-_AHEAD_STEPS = 20  # the most steps of checkpoints that are skipped because the clock was ahead
 
 
 class ChainWriter:
@@ -53,25 +52,22 @@ class ChainWriter:
         Raises `LogUnreadableError`, `sqlite3.Error` or `OSError`.
         """
         self.path = path
-        self._lock = _take_lock(path)
-        try:
-            self.created = continued is None and not path.exists()
-            if continued is not None and not path.exists():
+        with contextlib.ExitStack() as opened:
+            opened.callback(os.close, _take_lock(path))
+            self.created = not path.exists()
+            if self.created and continued is not None:
                 raise LogUnreadableError(f"{path}: {_REPLACED}")
             if self.created:
                 log_database.create(path, begun)
-            self._connection = log_database.open_for_writing(path)
-            try:
-                self._file = _identity(path)
-                self._read_head()
-                if continued is not None and (self.log_id != continued[0] or self.sequence < continued[1]):
-                    raise LogUnreadableError(f"{path}: {_REPLACED}")
-            except BaseException:
-                self._connection.close()
-                raise
-        except BaseException:
-            self._let_go()
-            raise
+            self._connection = opened.enter_context(contextlib.closing(log_database.open_for_writing(path)))
+            self._file = _identity(path)
+            self._read_head()
+            if continued is not None and (self.log_id != continued[0] or self.sequence < continued[1]):
+                raise LogUnreadableError(f"{path}: {_REPLACED}")
+            self._opened = opened.pop_all()
+
+    def close(self) -> None:
+        self._opened.close()
 
     def _read_head(self) -> None:
         execute = self._connection.execute
@@ -91,21 +87,21 @@ class ChainWriter:
                 )
             self.sequence, self.hash = row[0], row[-1]
             self.last_id = max(self.last_id, row[1])
-        last = execute(
-            "SELECT number, sequence, text FROM checkpoint ORDER BY number DESC LIMIT 1"
-        ).fetchone()
-        self._text_through = int(execute("SELECT through FROM indexed").fetchone()[0])
-        self.checkpoint_number, self.checkpoint_sequence, self._checkpoint_hash = 0, 0, NO_CHECKPOINT
-        if last is not None:
-            self.checkpoint_number, self.checkpoint_sequence = last[0], last[1]
-            self._checkpoint_hash = checkpoint_hash(last[2])
+        (self._text_through,) = execute("SELECT through FROM indexed").fetchone()
+        self.checkpoint_number, self._sealed_through, self._checkpoint_hash = 0, 0, NO_CHECKPOINT
+        newest = "SELECT number, sequence, text FROM checkpoint ORDER BY number DESC LIMIT 1"
+        for self.checkpoint_number, self._sealed_through, text in execute(newest):
+            self._checkpoint_hash = checkpoint_hash(text)
+
+    @property
+    def unsealed(self) -> int:
+        """Return how many records the next checkpoint would seal, without the record of the last one."""
+        return self.sequence - self._sealed_through
 
     def append(
         self, records: Sequence[AuditRecord], folds: Iterable[tuple[bytes, FoldState | None]] = ()
     ) -> None:
-        self._check_file()
-        with self._transaction() as execute:
-            sequence, digest, last_id = self._insert(records)
+        with self._transaction(records) as execute:
             for key, state in folds:
                 if state is None:
                     execute("DELETE FROM open_fold WHERE key = ?", (key,))
@@ -113,7 +109,6 @@ class ChainWriter:
                     execute(
                         "INSERT OR REPLACE INTO open_fold VALUES (?, ?)", (key, msgspec.json.encode(state))
                     )
-        self.sequence, self.hash, self.last_id = sequence, digest, last_id
 
     def _insert(self, records: Sequence[AuditRecord]) -> tuple[int, bytes, str]:
         sequence, digest, last_id = self.sequence, self.hash, self.last_id
@@ -129,31 +124,25 @@ class ChainWriter:
             self._connection.execute(_insert(len(part)), values)
         return sequence, digest, last_id
 
-    def seal(self, time: int) -> tuple[Checkpoint, bytes]:
-        """Store a checkpoint of the chain so far; return it and its text."""
+    def seal(self, time: int, report: Callable[[Checkpoint], AuditRecord]) -> None:
+        """Store a checkpoint of the chain so far, and its record, which is the next of the chain."""
+        number, removed = self.checkpoint_number + 1, self._first_sequence() - 1
         checkpoint = Checkpoint(
-            self.log_id,
-            self.checkpoint_number + 1,
-            self.sequence,
-            self.hash.hex(),
-            time,
-            self._checkpoint_hash,
-            self._first_sequence() - 1,
+            self.log_id, number, self.sequence, self.hash.hex(), time, self._checkpoint_hash, removed
         )
         text = checkpoint.text()
-        self._check_file()
-        self._connection.execute(
-            "INSERT INTO checkpoint (number, sequence, text) VALUES (?, ?, ?)",
-            (checkpoint.number, checkpoint.sequence, text),
-        )
-        self.checkpoint_number, self.checkpoint_sequence = checkpoint.number, checkpoint.sequence
+        with self._transaction([report(checkpoint)]) as execute:
+            execute(
+                "INSERT INTO checkpoint (number, sequence, text) VALUES (?, ?, ?)",
+                (number, checkpoint.sequence, text),
+            )
+        self.checkpoint_number, self._sealed_through = number, self.sequence
         self._checkpoint_hash = checkpoint_hash(text)
-        return checkpoint, text
 
-    def unsigned(self, limit: int) -> list[tuple[int, bytes]]:
-        """Return the numbers and texts of unsigned checkpoints, oldest first."""
-        query = "SELECT number, text FROM checkpoint WHERE signature IS NULL ORDER BY number LIMIT ?"
-        return self._connection.execute(query, (limit,)).fetchall()
+    def unsigned(self, after: int, limit: int) -> list[tuple[int, bytes]]:
+        """Return the numbers and texts of unsigned checkpoints above the number `after`, oldest first."""
+        query = "SELECT number, text FROM checkpoint WHERE signature IS NULL AND number > ? ORDER BY number LIMIT ?"
+        return self._connection.execute(query, (after, limit)).fetchall()
 
     def checkpoint_text(self, number: int) -> bytes | None:
         row = self._connection.execute("SELECT text FROM checkpoint WHERE number = ?", (number,)).fetchone()
@@ -165,13 +154,9 @@ class ChainWriter:
             (signature, public_key, number),
         )
 
-    def open_folds(self) -> list[FoldState]:
-        rows = self._connection.execute("SELECT state FROM open_fold").fetchall()
-        return [msgspec.json.decode(state, type=FoldState) for (state,) in rows]
-
-    def close_folds(self, summaries: Sequence[AuditRecord]) -> None:
-        keys = [key for (key,) in self._connection.execute("SELECT key FROM open_fold")]
-        self.append(summaries, [(key, None) for key in keys])
+    def open_folds(self) -> dict[bytes, FoldState]:
+        rows = self._connection.execute("SELECT key, state FROM open_fold")
+        return {key: msgspec.json.decode(state, type=FoldState) for key, state in rows}
 
     @property
     def text_lag(self) -> int:
@@ -181,7 +166,6 @@ class ChainWriter:
         through = self._text_through
         if through >= self.sequence:
             return False
-        self._check_file()
         end = min(through + rows, self.sequence)
         with self._transaction() as execute:
             execute(
@@ -194,41 +178,41 @@ class ChainWriter:
         return bool(end < self.sequence)
 
     def size(self) -> int:
-        (pages,) = self._connection.execute("PRAGMA page_count").fetchone()
-        (free,) = self._connection.execute("PRAGMA freelist_count").fetchone()
-        (page_size,) = self._connection.execute("PRAGMA page_size").fetchone()
-        return int((pages - free) * page_size)
+        (size,) = self._connection.execute(
+            "SELECT (page_count - freelist_count) * page_size"
+            " FROM pragma_page_count, pragma_freelist_count, pragma_page_size"
+        ).fetchone()
+        return int(size)
 
     def removable(
-        self, step: int, *, signed: bool, between: tuple[int, int] | None = None
+        self, step: int, *, signed: bool, before: int = _FOREVER, now: int = _FOREVER
     ) -> RemovedRange | None:
         """Return the range of about `step` oldest records that ends at a (signed) checkpoint, but not the last one.
 
-        `between` is an age limit and the present time. Checkpoints with a later time, made while the clock was ahead,
-        are removed with the following ones.
+        The checkpoint was made before the time `before`. Checkpoints with a time after `now`, made while the clock was
+        ahead, are removed with the following ones.
         """
-        first = self._first_sequence()
-        condition = "AND signature IS NOT NULL" if signed else ""
-        rows = self._connection.execute(
-            "SELECT number, sequence, text FROM checkpoint WHERE sequence >= ? AND"  # noqa: S608  fixed text
-            f" number < (SELECT max(number) FROM checkpoint) {condition} ORDER BY number LIMIT ?",
-            (first, step * _AHEAD_STEPS),
+        execute, first = self._connection.execute, self._first_sequence()
+        rows = execute(
+            "SELECT number, sequence, text FROM checkpoint WHERE sequence >= ? AND"
+            " number < (SELECT max(number) FROM checkpoint) AND (signature IS NOT NULL OR NOT ?)"
+            " ORDER BY number LIMIT ?",
+            (first, signed, step * _AHEAD_STEPS),
         )
         upto: tuple[int, int, bytes] | None = None
         for row in rows:
             made = parse_checkpoint(row[2]).time
-            if between is not None and made > between[1]:
+            if made > now:
                 continue
-            too_young = between is not None and made >= between[0]
-            if too_young or (upto is not None and row[1] >= first + step):
+            if made >= before or (upto is not None and row[1] >= first + step):
                 break
             upto = row
-        return None if upto is None else self._range(first, *upto)
-
-    def _range(self, first: int, number: int, last: int, text: bytes) -> RemovedRange:
-        query = "SELECT time, hash FROM record WHERE sequence = ?"
-        first_time, _hash = self._connection.execute(query, (first,)).fetchone()
-        last_time, last_hash = self._connection.execute(query, (last,)).fetchone()
+        if upto is None:
+            return None
+        number, last, text = upto
+        ends = "SELECT time, hash FROM record WHERE sequence = ?"
+        first_time, _hash = execute(ends, (first,)).fetchone()
+        last_time, last_hash = execute(ends, (last,)).fetchone()
         return RemovedRange(
             first, last, last_hash.hex(), first_time, last_time, number, checkpoint_hash(text)
         )
@@ -251,47 +235,28 @@ class ChainWriter:
         return [as_kept(StoredColumns(*row[:-1]), row[-1]) for row in rows]
 
     def remove(self, gone: RemovedRange, report: AuditRecord, kept: Sequence[AuditRecord] = ()) -> None:
-        self._check_file()
-        with self._transaction() as execute:
-            sequence, digest, last_id = self._insert([report, *kept])
-            (through,) = execute("SELECT through FROM indexed").fetchone()
+        with self._transaction([report, *kept]) as execute:
             execute(
                 f"INSERT INTO words (words, rowid, text) SELECT 'delete', sequence, {log_database.TEXT_OF_RECORD}"  # noqa: S608  fixed names
                 " FROM record WHERE sequence <= ?",
-                (min(gone.last_sequence, through),),
+                (min(gone.last_sequence, self._text_through),),
             )
             execute("UPDATE indexed SET through = max(through, ?)", (gone.last_sequence,))
             execute("DELETE FROM record WHERE sequence <= ?", (gone.last_sequence,))
             execute("DELETE FROM checkpoint WHERE number <= ?", (gone.last_checkpoint,))
-        self.sequence, self.hash, self.last_id = sequence, digest, last_id
-        self._text_through = max(through, gone.last_sequence)
+        self._text_through = max(self._text_through, gone.last_sequence)
         self._connection.executescript("PRAGMA incremental_vacuum(256)")  # `execute` would free one page only
 
-    def _check_file(self) -> None:
+    @contextlib.contextmanager
+    def _transaction(self, records: Sequence[AuditRecord] = ()) -> Iterator[Callable[..., sqlite3.Cursor]]:
+        """Append records, and commit them with the statements of the block; a failure changes nothing."""
         if _identity(self.path) != self._file:
             raise LogUnreadableError(f"{self.path}: {_REPLACED}")
-
-    @contextlib.contextmanager
-    def _transaction(self) -> Iterator[Callable[..., sqlite3.Cursor]]:
-        execute = self._connection.execute
-        execute("BEGIN IMMEDIATE")
-        try:
-            yield execute
-            execute("COMMIT")
-        except BaseException:
-            if self._connection.in_transaction:
-                execute("ROLLBACK")
-            raise
-
-    def close(self) -> None:
-        try:
-            self._connection.close()
-        finally:
-            self._let_go()
-
-    def _let_go(self) -> None:
-        os.close(self._lock)
-        self._lock = -1
+        with self._connection:
+            self._connection.execute("BEGIN IMMEDIATE")
+            head = self._insert(records)
+            yield self._connection.execute
+        self.sequence, self.hash, self.last_id = head
 
 
 def _identity(path: Path) -> tuple[int, int] | None:

@@ -1,6 +1,7 @@
 """Define the record of the audit log: schema version 1. A written record never changes."""
 
 import enum
+from collections.abc import Callable
 from typing import Any
 
 import msgspec
@@ -51,3 +52,7 @@ class AuditRecord(msgspec.Struct, frozen=True, kw_only=True):
     detail: dict[str, Any] = {}
     unknown: bool = False
     folds: bool = False
+
+
+MakeRecord = Callable[[str, Severity, str, dict[str, Any]], AuditRecord]
+"""Makes a record about the log itself from event, severity, reason and detail."""

@@ -4,7 +4,7 @@ A size limit keeps denials and alarms longer than other records: they are writte
 their id and time, at most half of a step. Hosts take turns, so a flood from one host displaces no records of others.
 """
 
-from collections import OrderedDict
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Annotated
@@ -73,17 +73,13 @@ def worth_keeping(evidence: Sequence[AuditRecord], removed: int) -> list[AuditRe
 
     A host's alarms are chosen first, then its denials, then summaries.
     """
-    waiting: OrderedDict[str, list[AuditRecord]] = OrderedDict()
+    by_host: dict[str, list[AuditRecord]] = {}
     for record in sorted(evidence, key=_rank):
         # Version 0.1.0 wrote `stranger`.
         who = _UNKNOWN_HOSTS if {"unknown_host", "stranger"} & record.detail.keys() else str(record.host)
-        waiting.setdefault(who, []).append(record)
-    chosen: set[str] = set()
-    while waiting and len(chosen) < removed // 2:
-        who, records = waiting.popitem(last=False)
-        chosen.add(records.pop(0).id)
-        if records:
-            waiting[who] = records
+        by_host.setdefault(who, []).append(record)
+    turns = itertools.chain.from_iterable(itertools.zip_longest(*by_host.values()))
+    chosen = {record.id for record in itertools.islice(filter(None, turns), removed // 2)}
     return [record for record in evidence if record.id in chosen]
 
 

@@ -63,41 +63,25 @@ class Signatures:
         self._pin = pinned_key_path(log)
         self._signer = signer
         self._asked: set[int] = set()
-        self._waiting = False
 
     @property
     def has_signer(self) -> bool:
         return self._signer is not None
 
-    @property
-    def key_was_pinned(self) -> bool:
-        return self._pin.exists()
-
-    def sealed(self, number: int, text: bytes) -> None:
-        # The signer signs in order: once a checkpoint waits, all later ones wait until `ask`.
-        self._waiting = self._waiting or len(self._asked) >= ASKED_AT_ONCE
-        if not self._waiting:
-            self._ask(number, text)
-
-    def ask(self, writer: ChainWriter) -> None:
-        self._asked.clear()
-        self._waiting = False
-        if self._signer is not None:
-            unsigned = writer.unsigned(ASKED_AT_ONCE)
-            self._waiting = len(unsigned) == ASKED_AT_ONCE
-            for number, text in unsigned:
-                self._ask(number, text)
-
-    def _ask(self, number: int, text: bytes) -> None:
+    def ask(self, writer: ChainWriter, *, again: bool = False) -> None:
+        """Request the next signatures, at most `ASKED_AT_ONCE` together; `again`: also those requested before."""
         if self._signer is None:
             return
-        oldest = not self._asked
-        self._asked.add(number)
-        self._signer(number, text, oldest=oldest)
+        if again:
+            self._asked.clear()
+        left = ASKED_AT_ONCE - len(self._asked)
+        for number, text in writer.unsigned(max(self._asked, default=0), left):
+            oldest = not self._asked
+            self._asked.add(number)
+            self._signer(number, text, oldest=oldest)
 
     def keep(self, writer: ChainWriter, number: int, signature: bytes, public_key: bytes) -> str | None:
         """Store a signature, and pin the first key; return the reason if the signature is invalid."""
-        self._asked.discard(number)
         text = writer.checkpoint_text(number)
         if text is None:
             return f"there is no checkpoint {number}"
@@ -107,7 +91,8 @@ class Signatures:
         if not self._pin.exists():
             write_public_key(self._pin, public_key)
         writer.keep_signature(number, signature, public_key)
-        if not self._asked and self._waiting:
+        self._asked.discard(number)
+        if not self._asked:
             self.ask(writer)
         return None
 

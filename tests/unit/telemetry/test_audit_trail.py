@@ -100,7 +100,7 @@ def test_records_that_the_log_has_yet_to_count_are_not_owed() -> None:
     class Behind(Log):
         async def wait_durable(self) -> str | None:
             for record in self.records:
-                self.budget.folded(record)
+                self.budget.correct(record, -1)
             self.records.clear()
             return None
 

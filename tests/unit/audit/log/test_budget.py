@@ -44,7 +44,7 @@ def test_a_host_in_debt_waits_until_it_is_paid() -> None:
 def test_a_folded_record_costs_nothing() -> None:
     desk = Desk()
     record = desk.spend(GUEST)
-    desk.budget.folded(record)
+    desk.budget.correct(record, -1)
     assert desk.budget.pause(GUEST) == 0
 
 
@@ -65,7 +65,7 @@ def test_unknown_hosts_have_no_debt() -> None:
     for number in range(1000):
         unknown = AuditRecord(id="0", time=0, event="decision", host=f"10.9.0.{number}", unknown=True)
         desk.budget.charge(unknown)
-        desk.budget.folded(unknown)
+        desk.budget.correct(unknown, -1)
     assert not list(desk.budget.owed.holders())
     assert desk.budget.pause("10.9.0.1") == 0
 

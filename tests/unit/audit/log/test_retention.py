@@ -75,11 +75,11 @@ def test_removal_by_age_waits_for_receipts(make_log: MakeLog, path: Path, notary
     log.record(decision(log))
     settle(log)
     retain(log)
-    log.housekeeping.remover.sealed()
+    log.housekeeping.remover.due = 0.0
     retain(log)
     assert 400 < first_sequence(path) <= 701
     received[0] = 2100
-    log.housekeeping.remover.sealed()
+    log.housekeeping.remover.due = 0.0
     retain(log)
     assert first_sequence(path) > 1900
     log.close()
