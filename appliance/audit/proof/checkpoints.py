@@ -6,7 +6,7 @@ which may be under way.
 """
 
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -74,7 +74,6 @@ class CheckpointVerifier:
         self._remembered = remembered
         self.signed = 0
         self.signed_through = 0
-        self.last_number = 0
         self.rows: list[StoredCheckpoint] = []
         self.removed = [] if remembered is None or remembered.removed is None else [remembered.removed]
         """The values of `removed` in the signer's memory and in checkpoints."""
@@ -89,16 +88,17 @@ class CheckpointVerifier:
                 raise sqlite3.DataError("a column has a value of another type than a log's tables hold")
             self.rows.append(StoredCheckpoint(*row))
 
-    def check(self, before: tuple[int, str], chain: dict[int, bytes], last: int) -> Iterator[LogFinding]:
-        """Yield the faults; `before` is the last checkpoint that retention removed: number and hash, or zeros."""
-        number, previous = before
-        self.last_number = number
+    def check(
+        self, removed: RemovedRange, chain: dict[int, bytes], last: int, reported: Iterable[int]
+    ) -> Iterator[LogFinding]:
+        """Yield the faults; `reported` are the numbers of checkpoints that have a record in the chain."""
+        number, previous = removed.last_checkpoint, removed.last_checkpoint_hash
         for row in self.rows:
             if row.number != number + 1:
                 message = "removed from the log"
                 yield _finding(FindingKind.CHECKPOINT_MISSING, number + 1, message, row.number - 1)
                 previous = ""
-            number = self.last_number = row.number
+            number = row.number
             yield from self._check_row(row, previous, chain, last)
             previous = checkpoint_hash(row.text)
         if len(self._on_their_way) > ASKED_AT_ONCE:
@@ -112,6 +112,9 @@ class CheckpointVerifier:
             yield LogFinding(
                 FindingKind.NO_KEY, 0, 0, "checkpoints are signed, but there is no key to verify them with"
             )
+        for missing in sorted(one for one in reported if one > number):
+            message = "the chain has its record, but it was removed"
+            yield _finding(FindingKind.CHECKPOINT_MISSING, missing, message)
 
     def _check_row(
         self, row: StoredCheckpoint, previous: str, chain: dict[int, bytes], last_sequence: int

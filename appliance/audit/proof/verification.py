@@ -18,7 +18,7 @@ from appliance.audit.log.columns import StoredColumns, follows
 from appliance.audit.log.log_database import reading
 from appliance.audit.log.retention import RemovedRange
 from appliance.audit.log.signatures import pinned_key_path, read_public_key, signature_is_valid
-from appliance.audit.proof.chain_findings import Elsewhere, FindingKind, LogFinding, Verification
+from appliance.audit.proof.chain_findings import FindingKind, LogFinding, Verification
 from appliance.audit.proof.checkpoints import (
     CheckpointVerifier,
     SignerMemory,
@@ -34,7 +34,7 @@ _TOLD_EVERY = 5000
 _MOST_FINDINGS = 1000
 _EVENT, _DETAIL = StoredColumns._fields.index("event"), StoredColumns._fields.index("detail")
 # The distances by which a record may have been renumbered.
-_DISTANCES = tuple(distance for step in range(1, 1000) for distance in (step, -step))
+_DISTANCES = (0, *(distance for step in range(1, 1000) for distance in (step, -step)))
 _WORDS_TABLES = ("words_data", "words_idx", "words_docsize", "words_config")
 _LOG_ID = re.compile("[0-9a-f]{32}")
 _Count = Annotated[int, msgspec.Meta(ge=0)]
@@ -134,47 +134,41 @@ class _Verifier:
         if not self._log:
             self._structure("table log does not have the one id of a log: what it sealed is unknown")
         removed = self._last_removal()
+        audit, copies = self._checkpoints, self._copies
         try:
-            self._checkpoints.read(self._connection)
+            audit.read(self._connection)
         except sqlite3.DatabaseError as error:
             self._structure(f"the checkpoints cannot be read: {error}")
-        self._sealed = {row.sequence: b"" for row in self._checkpoints.rows}
-        if self._copies is not None:
-            self._sealed |= dict.fromkeys(self._copies.sequences, b"")
+        sealed = {row.sequence for row in audit.rows} | (copies.sequences if copies else set())
+        self._sealed = dict.fromkeys(sealed, b"")
         self._walk(removed)
         chain = {sequence: digest for sequence, digest in self._sealed.items() if digest}
-        self._check_checkpoints(removed, chain)
-        elsewhere = self._check_copies(removed, chain)
+        last = self.last - self._shift
+        self._findings += audit.check(removed, chain, last, self._reported)
+        if copies is not None:
+            texts = {row.number: row.text for row in audit.rows}
+            if removed.last_sequence:
+                chain[removed.last_sequence] = bytes.fromhex(removed.last_hash)
+            self._findings += copies.check(chain, removed.last_sequence, last, texts)
         removal = self._check_removal(removed)
-        audit = self._checkpoints
         self._findings.sort(key=lambda finding: finding.first)
         if self._further is not None:
             self._findings.append(self._further)
         return Verification(
             ok=not self._findings, log=self._log, records=self.records, first=self.first, last=self.last,
-            removed=removed.last_sequence if removed else 0, checkpoints=len(audit.rows),
+            removed=removed.last_sequence, checkpoints=len(audit.rows),
             signed_checkpoints=audit.signed, signed_through=audit.signed_through,
             unsealed=max(0, self.last - audit.signed_through), key=self._key.hex() if self._key else None,
-            findings=self._findings, elsewhere=elsewhere, removal=removal,
+            findings=self._findings, elsewhere=copies.result() if copies else None, removal=removal,
         )  # fmt: skip
 
-    def _check_copies(self, removed: RemovedRange | None, chain: dict[int, bytes]) -> Elsewhere | None:
-        if self._copies is None:
-            return None
-        gone, last = (removed.last_sequence if removed else 0), self.last - self._shift
-        if removed is not None:
-            chain = {**chain, gone: bytes.fromhex(removed.last_hash)}
-        texts = {row.number: row.text for row in self._checkpoints.rows}
-        self._findings += self._copies.check(chain, gone, last, texts)
-        return self._copies.result()
-
-    def _check_removal(self, removed: RemovedRange | None) -> str:
+    def _check_removal(self, removed: RemovedRange) -> str:
         """Return "signed", "unsigned", or "" without a removal.
 
         Only versions that never signed removals made unsigned ones. So with a signed statement that has a smaller
         `removed`, an unsigned removal is a finding.
         """
-        if removed is None:
+        if not (removed.last_sequence or removed.last_checkpoint):
             return ""
         if self._key is None:
             return "unsigned"  # without a key, no signature can be checked
@@ -224,17 +218,17 @@ class _Verifier:
         message = message.encode("utf-8", "backslashreplace").decode()  # bytes that were not text
         self._findings.append(LogFinding(FindingKind.STRUCTURE, 0, 0, f"database: {message}"))
 
-    def _last_removal(self) -> RemovedRange | None:
+    def _last_removal(self) -> RemovedRange:
         try:
-            return last_removal(self._connection)
+            found = last_removal(self._connection)
         except (*_NOT_AS_WRITTEN, sqlite3.DatabaseError):
-            return None  # a damaged record is found when it is walked
+            found = None  # a damaged record is found when it is walked
+        return found or RemovedRange(0, 0, genesis(self._log).hex(), 0, 0, 0, NO_CHECKPOINT)
 
     # --- the chain ------------------------------------------------------------------------------------------
 
-    def _walk(self, removed: RemovedRange | None) -> None:
-        self.last = removed.last_sequence if removed else 0
-        previous = bytes.fromhex(removed.last_hash) if removed else genesis(self._log)
+    def _walk(self, removed: RemovedRange) -> None:
+        self.last, previous = removed.last_sequence, bytes.fromhex(removed.last_hash)
         try:
             for row in self._rows():
                 self.records += 1
@@ -283,19 +277,15 @@ class _Verifier:
 
         After `_MOST_FINDINGS`, no search is made, so that a forged log cannot take hours.
         """
-        if len(self._findings) >= _MOST_FINDINGS:
-            return self._changed(row, row.sequence - self._shift)
-        ahead = list(self._rows(row.sequence, _WINDOW))
+        ahead = list(self._rows(row.sequence, _WINDOW)) if len(self._findings) < _MOST_FINDINGS else []
         place = row.sequence - self._shift
-        order = _original_order([row, *ahead], previous, place)
+        order = _original_order([row, *ahead], previous, place) if ahead else []
         if not order:
             return self._changed_or_renumbered(row, ahead[0] if ahead else None, place)
-        first = order[0].sequence
-        if len(order) > 1 and max(written.sequence for written in order) == row.sequence + len(order) - 1:
-            self._explained = row.sequence + len(order) - 1
-            self._find(
-                FindingKind.REORDERED, row.sequence, self._explained, "not in the order they were written in"
-            )
+        first, end = order[0].sequence, row.sequence + len(order) - 1
+        if len(order) > 1 and max(written.sequence for written in order) == end:
+            self._explained = end
+            self._find(FindingKind.REORDERED, row.sequence, end, "not in the order they were written in")
             for offset, written in enumerate(order):
                 self._note(written, place + offset)
             return order[-1].hash
@@ -305,50 +295,30 @@ class _Verifier:
         return previous
 
     def _changed_or_renumbered(self, row: _Row, following: _Row | None, place: int) -> bytes:
-        plain_change = following is None or following.follows(row.hash, place + 1)
-        for distance in () if plain_change else _DISTANCES:
-            if following is not None and following.follows(row.hash, place + 1 + distance):
-                if distance > 0:
-                    message = "removed; what follows was renumbered"
-                    self._find(FindingKind.MISSING, place, place + distance - 1, message)
-                else:
-                    message = "inserted with a hash of its own; what follows was renumbered"
-                    self._find(FindingKind.INSERTED, row.sequence + distance, row.sequence - 1, message)
-                self._shift -= distance
-                self._note(row, place + distance)
-                return row.hash
-        return self._changed(row, place)
-
-    def _changed(self, row: _Row, place: int) -> bytes:
-        message = (
-            "does not have the content it was written with"
-            f" (or record {row.sequence - 1} was replaced by one with a hash of its own)"
-        )
-        self._find(FindingKind.CHANGED, row.sequence, row.sequence, message)
-        self._note(row, place)
+        fitting = (by for by in _DISTANCES if following and following.follows(row.hash, place + 1 + by))
+        distance, sequence = next(fitting, 0), row.sequence
+        if distance > 0:
+            message = "removed; what follows was renumbered"
+            self._find(FindingKind.MISSING, place, place + distance - 1, message)
+        elif distance < 0:
+            message = "inserted with a hash of its own; what follows was renumbered"
+            self._find(FindingKind.INSERTED, sequence + distance, sequence - 1, message)
+        else:
+            message = (
+                "does not have the content it was written with"
+                f" (or record {sequence - 1} was replaced by one with a hash of its own)"
+            )
+            self._find(FindingKind.CHANGED, sequence, sequence, message)
+        self._shift -= distance
+        self._note(row, place + distance)
         return row.hash
-
-    # --- the checkpoints ------------------------------------------------------------------------------------
-
-    def _check_checkpoints(self, removed: RemovedRange | None, chain: dict[int, bytes]) -> None:
-        before = (removed.last_checkpoint, removed.last_checkpoint_hash) if removed else (0, NO_CHECKPOINT)
-        audit = self._checkpoints
-        self._findings += audit.check(before, chain, self.last - self._shift)
-        for number in sorted(self._reported):
-            if number > audit.last_number:
-                message = f"checkpoint {number}: the chain has its record, but it was removed"
-                self._findings.append(LogFinding(FindingKind.CHECKPOINT_MISSING, number, number, message))
 
 
 def _original_order(rows: list[_Row], previous: bytes, place: int) -> list[_Row]:
+    """Return the rows that were written after `previous`, until they are a permutation of the first ones."""
     order: list[_Row] = []
     left = list(rows)
-    while left:
-        found = next(
-            (candidate for candidate in left if candidate.follows(previous, place + len(order))), None
-        )
-        if found is None:
-            break
+    while found := next((row for row in left if row.follows(previous, place + len(order))), None):
         order.append(found)
         left.remove(found)
         previous = found.hash
