@@ -160,21 +160,6 @@ class GraphWanted(AdminRequest[graph_answers.Graph], frozen=True, tag="graph"):
     """Nodes, topics and services, whether the appliance relays them, and rates."""
 
 
-@rest(
-    "operator", "GET", "/v1/messages", ("topic", "messages", "seconds", "latched"), name="topic_messages",
-    problems={404: "No node publishes or subscribes to it."}, tag="graph",
-)  # fmt: skip
-class TopicLook(WaitingRequest[graph_answers.TopicMessages], frozen=True, tag="topic look"):
-    """The next messages of a topic as subscribers get them, with their fields. The query is recorded."""
-
-    topic: Annotated[str, parameter("name of the topic", max_length=500, examples=["/scan"])]
-    messages: Annotated[int, parameter("maximum number of messages", ge=1, le=20)] = 1
-    seconds: Annotated[float, parameter("how long to wait for messages, in seconds", gt=0, le=10)] = 2.0
-    latched: Annotated[
-        bool, parameter("send a latched message first; false if the client already has it")
-    ] = True
-
-
 @rest(None)
 class MetricsWanted(AdminRequest[measures.Measures], frozen=True, tag="metrics"):
     """The status, and everything that control counts."""

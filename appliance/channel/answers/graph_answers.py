@@ -1,10 +1,10 @@
 """The graph: the connections between nodes, whether through the appliance or not, and their traffic."""
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import msgspec
 
-from appliance.channel.answers.field_docs import NanoMoment, doc
+from appliance.channel.answers.field_docs import doc
 
 
 class Node(msgspec.Struct, frozen=True):
@@ -71,32 +71,6 @@ class Graph(msgspec.Struct, frozen=True):
     nodes: list[Node]
     topics: list[Topic]
     services: list[Service]
-
-
-class TopicMessage(msgspec.Struct, frozen=True):
-    """A message of a topic as subscribers get it, after the monitors."""
-
-    time: Annotated[NanoMoment, doc("when the relay sent it, nanoseconds since the epoch")]
-    node: Annotated[str, doc("the node that published it")]
-    size: Annotated[int, doc("bytes, without the length prefix")]
-    fields: Annotated[
-        dict[str, Any],
-        doc(
-            "by name; long values are cut and the rest is counted (`… 344 more`), bytes are hexadecimal, NaN and"
-            " infinity are strings"
-        ),
-    ]
-    why: Annotated[str, doc("why only the first bytes are shown instead of the fields; else empty")]
-
-
-class TopicMessages(msgspec.Struct, frozen=True):
-    """The next messages of a topic, fewer than requested if no more came in time."""
-
-    topic: str
-    type: str
-    publishers: list[str]
-    subscribers: list[str]
-    messages: list[TopicMessage]
 
 
 class Registration(msgspec.Struct, frozen=True):

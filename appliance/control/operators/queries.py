@@ -8,16 +8,9 @@ from typing import Any
 import msgspec
 
 import appliance
-from appliance.base.clock import now, wall
-from appliance.base.validation_messages import meant
+from appliance.base.clock import wall
 from appliance.channel import admin
-from appliance.channel.answers.graph_answers import (
-    Graph,
-    Registration,
-    Registrations,
-    TopicMessage,
-    TopicMessages,
-)
+from appliance.channel.answers.graph_answers import Graph, Registration, Registrations
 from appliance.channel.answers.inventory_answers import InUse, Inventory
 from appliance.channel.answers.measures import Measures
 from appliance.channel.answers.monitor_answers import Monitors
@@ -33,7 +26,6 @@ from appliance.channel.answers.status import (
 from appliance.control.assembly.assembly import Parts
 from appliance.control.assembly.monitor_states import monitors_of, monitors_status
 from appliance.control.assembly.policies import Policies
-from appliance.control.errors import SenselessError, UnknownThingError
 from appliance.control.links.supervisor_link import Surroundings
 from appliance.control.operators.measurements import measures_of
 from appliance.control.operators.overview import graph_of
@@ -43,13 +35,6 @@ from appliance.master.graph.registry import Kind, Life
 from appliance.policy.live_rights import LiveRight
 from appliance.policy.sections import DECIDERS
 from appliance.telemetry.audit_trail import AuditTrail
-
-MOST_MESSAGES = 20
-LONGEST_LOOK = 10.0
-"""The longest time in seconds that a query waits for messages."""
-
-ONE_LOOK = 60.0
-"""The seconds for which all queries of one token for one topic make only one audit record."""
 
 _TOPIC = (Kind.PUBLICATION, Kind.SUBSCRIPTION)
 
@@ -73,7 +58,6 @@ class Queries:
     handled: Callable[[Status], Status]
     name: str = ""
     started: float = field(default_factory=wall)
-    _shown: dict[tuple[str, str], float] = field(default_factory=dict)
 
     async def status(self, _request: admin.StatusWanted) -> Status:
         return self.present()
@@ -97,53 +81,6 @@ class Queries:
 
     async def monitors(self, request: admin.MonitorsWanted) -> Monitors:
         return monitors_of(self.parts.monitors, self.parts.monitor_calls.rv_state(), texts=request.texts)
-
-    async def topic_look(self, request: admin.TopicLook, who: str) -> TopicMessages:
-        if not 1 <= request.messages <= MOST_MESSAGES or not 0 < request.seconds <= LONGEST_LOOK:
-            raise SenselessError(f"ask for 1 to {MOST_MESSAGES} messages, within {LONGEST_LOOK:g} seconds")
-        topics = {topic.name: topic for topic in graph_of(self.parts).topics}
-        topic = topics.get(request.topic)
-        if topic is None:
-            near = meant(request.topic, topics)
-            raise UnknownThingError(f"no node publishes or subscribes to {request.topic[:200]}{near}")
-        if not topic.mediated:
-            raise SenselessError(
-                f"the messages of {topic.name} do not pass the appliance (relaying: monitored), so it cannot show them"
-            )
-        self._record_look(topic.name, who)
-        seen = await self.parts.endpoints.relay.look(
-            topic.name, request.messages, request.seconds, latched=request.latched
-        )
-        registry = self.parts.core.registry
-        rows = []
-        for message in seen:
-            node = registry.by_key(message.key)
-            name = node.name if node is not None else ""
-            rows.append(TopicMessage(message.time, name, message.size, message.fields, message.why))
-        return TopicMessages(
-            topic.name,
-            seen[0].type if seen else topic.type,
-            [publisher.node for publisher in topic.publishers],
-            topic.subscribers,
-            rows,
-        )
-
-    def _record_look(self, topic: str, who: str) -> None:
-        """Record only the first of equal queries within `ONE_LOOK`, because a plot in the console polls."""
-        moment = now()
-        for key in [key for key, since in self._shown.items() if moment - since >= ONE_LOOK]:
-            del self._shown[key]
-        if (who, topic) in self._shown:
-            return
-        self._shown[who, topic] = moment
-        self.trail.happened(
-            "topic looked into",
-            f"messages of {topic} are shown, for {ONE_LOOK:g} seconds from now",
-            category="topic",
-            resource=topic,
-            who=who,
-            seconds=ONE_LOOK,
-        )
 
     async def metrics(self, _request: admin.MetricsWanted) -> Measures:
         return measures_of(

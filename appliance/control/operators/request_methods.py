@@ -22,7 +22,6 @@ def request_methods(
         RequestMethod(admin.InventoryWanted, queries.inventory, order=False),
         RequestMethod(admin.GraphWanted, queries.graph, order=False),
         RequestMethod(admin.MonitorsWanted, queries.monitors, order=False),
-        RequestMethod(admin.TopicLook, queries.topic_look, who=True, order=False),
         RequestMethod(admin.MetricsWanted, queries.metrics, order=False),
         RequestMethod(admin.RegistrationsWanted, queries.registrations, order=False),
         RequestMethod(admin.PolicyReload, policies.reload, who=True),

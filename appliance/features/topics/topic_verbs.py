@@ -15,12 +15,13 @@ from appliance.base import clock
 from appliance.base.timestamps import parse_timestamp
 from appliance.base.validation_messages import meant
 from appliance.channel import admin
-from appliance.channel.answers.graph_answers import Topic, TopicMessage
+from appliance.channel.answers.graph_answers import Topic
 from appliance.cli import completion
 from appliance.cli.audit.audit_errors import Errors
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.message_lines import lines_of
 from appliance.cli.output import say_json, usage_error
+from appliance.features.topics.look_request import TopicLook, TopicMessage
 from appliance.features.topics.publishers import publishers_at
 from rosmop.tool.terminal import printable, refused, say
 from roswire.errors import InvalidNameError
@@ -66,7 +67,7 @@ def echo(
     """
     shown = 0
     while shown < count:
-        request = admin.TopicLook(topic, min(count - shown, _AT_ONCE), seconds, latched=not shown)
+        request = TopicLook(topic, min(count - shown, _AT_ONCE), seconds, latched=not shown)
         body = appliance.ask_or_exit(request)
         for message in body.messages:
             _show(message, field, as_json=appliance.as_json)

@@ -1,0 +1,80 @@
+"""Show operators the next messages of a topic, from the relay that carries it. Each look is recorded."""
+
+from appliance.base.clock import now
+from appliance.base.validation_messages import meant
+from appliance.control.assembly.assembly import Parts
+from appliance.control.assembly.foundation import Foundation
+from appliance.control.errors import SenselessError, UnknownThingError
+from appliance.control.operators.overview import graph_of
+from appliance.control.operators.request_method import RequestMethod
+from appliance.features.feature import FeaturePart
+from appliance.features.topics.look_request import TopicLook, TopicMessage, TopicMessages
+from appliance.telemetry.audit_trail import AuditTrail
+
+MOST_MESSAGES = 20
+LONGEST_LOOK = 10.0
+"""The longest time in seconds that a query waits for messages."""
+
+ONE_LOOK = 60.0
+"""The seconds for which all queries of one token for one topic make only one audit record."""
+
+
+async def inherit(base: Foundation, parts: Parts) -> FeaturePart:
+    looks = TopicLooks(parts, base.trail)
+    return FeaturePart(methods=(RequestMethod(TopicLook, looks.messages, who=True, order=False),))
+
+
+class TopicLooks:
+    """Answers `TopicLook`."""
+
+    def __init__(self, parts: Parts, trail: AuditTrail) -> None:
+        self._parts = parts
+        self._trail = trail
+        self._shown: dict[tuple[str, str], float] = {}
+
+    async def messages(self, request: TopicLook, who: str) -> TopicMessages:
+        if not 1 <= request.messages <= MOST_MESSAGES or not 0 < request.seconds <= LONGEST_LOOK:
+            raise SenselessError(f"ask for 1 to {MOST_MESSAGES} messages, within {LONGEST_LOOK:g} seconds")
+        topics = {topic.name: topic for topic in graph_of(self._parts).topics}
+        topic = topics.get(request.topic)
+        if topic is None:
+            near = meant(request.topic, topics)
+            raise UnknownThingError(f"no node publishes or subscribes to {request.topic[:200]}{near}")
+        if not topic.mediated:
+            raise SenselessError(
+                f"the messages of {topic.name} do not pass the appliance (relaying: monitored), so it cannot show them"
+            )
+        self._record_look(topic.name, who)
+        seen = await self._parts.endpoints.relay.look(
+            topic.name, request.messages, request.seconds, latched=request.latched
+        )
+        registry = self._parts.core.registry
+        rows = []
+        for message in seen:
+            node = registry.by_key(message.key)
+            name = node.name if node is not None else ""
+            rows.append(TopicMessage(message.time, name, message.size, message.fields, message.why))
+        return TopicMessages(
+            topic.name,
+            seen[0].type if seen else topic.type,
+            [publisher.node for publisher in topic.publishers],
+            topic.subscribers,
+            rows,
+        )
+
+    def _record_look(self, topic: str, who: str) -> None:
+        """Record only the first of equal queries within `ONE_LOOK`, because a plot in the console polls."""
+        moment = now()
+        for key in [key for key, since in self._shown.items() if moment - since >= ONE_LOOK]:
+            del self._shown[key]
+        if (who, topic) in self._shown:
+            return
+        self._shown[who, topic] = moment
+        self._trail.happened(
+            "topic looked into",
+            f"messages of {topic} are shown, for {ONE_LOOK:g} seconds from now",
+            category="topic",
+            resource=topic,
+            who=who,
+            seconds=ONE_LOOK,
+        )
