@@ -1,16 +1,58 @@
-"""Define the types of settings with a unit.
+"""Define the types of settings with a unit, and the rules for values.
 
-pydantic reads the metadata of these types; msgspec and the users of a setting see only the plain type.
+pydantic reads the metadata of these types; msgspec and the users of a setting see only the plain type. The metadata
+imports pydantic when pydantic reads it, because each process and each verb loads the settings of all features.
 """
 
-from typing import Annotated
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar
 
-from pydantic import ByteSize, Field, GetPydanticSchema
 
-BYTES = GetPydanticSchema(lambda _source, handler: handler(ByteSize))
-Seconds = Annotated[float, Field(gt=0, le=86_400 * 365, allow_inf_nan=False)]
-Milliseconds = Annotated[float, Field(ge=1.0, le=1000.0, allow_inf_nan=False)]
-Count = Annotated[int, Field(gt=0)]
-Size = Annotated[int, BYTES, Field(gt=0)]
-SizeOfMebibytes = Annotated[int, BYTES, Field(ge=1 << 20)]  # at least 1 MiB
-WithinAnHour = Annotated[float, Field(gt=0, le=3600, allow_inf_nan=False)]
+@dataclass(frozen=True)
+class Metadata:
+    """Metadata that pydantic takes as several, and makes when it reads them."""
+
+    make: Callable[[], Iterable[Any]]
+    __is_annotated_types_grouped_metadata__: ClassVar[bool] = True
+
+    def __iter__(self) -> Iterator[Any]:
+        return iter(self.make())
+
+
+def rules(**given: Any) -> Metadata:
+    """Return the rules of pydantic's `Field`, such as `gt=0`."""
+
+    def make() -> Iterable[Any]:
+        from pydantic import Field  # noqa: PLC0415  see the head
+
+        found: list[Any] = Field(**given).metadata
+        return found
+
+    return Metadata(make)
+
+
+def check(function: Callable[[Any], Any]) -> Metadata:
+    """Return a check that a value has to pass; the function raises `ValueError`."""
+
+    def make() -> Iterable[Any]:
+        from pydantic import AfterValidator  # noqa: PLC0415  see the head
+
+        return (AfterValidator(function),)
+
+    return Metadata(make)
+
+
+def _bytes() -> Iterable[Any]:
+    from pydantic import ByteSize, GetPydanticSchema  # noqa: PLC0415  see the head
+
+    return (GetPydanticSchema(lambda _source, handler: handler(ByteSize)),)
+
+
+BYTES = Metadata(_bytes)
+Seconds = Annotated[float, rules(gt=0, le=86_400 * 365, allow_inf_nan=False)]
+Milliseconds = Annotated[float, rules(ge=1.0, le=1000.0, allow_inf_nan=False)]
+Count = Annotated[int, rules(gt=0)]
+Size = Annotated[int, BYTES, rules(gt=0)]
+SizeOfMebibytes = Annotated[int, BYTES, rules(ge=1 << 20)]  # at least 1 MiB
+WithinAnHour = Annotated[float, rules(gt=0, le=3600, allow_inf_nan=False)]

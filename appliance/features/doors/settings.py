@@ -3,9 +3,7 @@
 import ipaddress
 from typing import Annotated, ClassVar
 
-from pydantic import Field
-
-from appliance.configuration.quantities import Count
+from appliance.configuration.quantities import Count, rules
 from appliance.configuration.sections import FeatureSection, key, section
 
 MOST_DOORS = 32
@@ -25,7 +23,7 @@ class Doors(FeatureSection):
         default=[],
         description="pages that may connect, as https://NAME[:PORT]; the page of the appliance itself always may",
     )
-    connections: Annotated[Count, Field(le=200)] = key(
+    connections: Annotated[Count, rules(le=200)] = key(
         default=32, description="connections of one door at the same time"
     )
     connections_in_ten_seconds: Count = key(default=200, description="new connections of one door")

@@ -4,8 +4,7 @@ import re
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
-from pydantic import AfterValidator, Field
-
+from appliance.configuration.quantities import check, rules
 from appliance.configuration.sections import FeatureSection, key, section, split_receiver
 from appliance.formats.fleet_membership import FOLDER, SETTINGS, joined_settings
 
@@ -42,17 +41,17 @@ class Bundles:
     root: Path | None = key(
         default=None, description="the trusted root metadata (root.json) that the fleet's operator gives out"
     )
-    site: Annotated[str, AfterValidator(_checked_word)] = key(
+    site: Annotated[str, check(_checked_word)] = key(
         default="", description="the site that this robot belongs to"
     )
-    group: Annotated[str, AfterValidator(_checked_word)] = key(
+    group: Annotated[str, check(_checked_word)] = key(
         default="", description="the robot group: the robots that get the same bundles"
     )
-    interval: Annotated[float, Field(ge=1, le=86_400, allow_inf_nan=False)] = key(
+    interval: Annotated[float, rules(ge=1, le=86_400, allow_inf_nan=False)] = key(
         default=300.0,
         description="seconds between two polls; an event of the collector makes the next one earlier",
     )
-    confirm_seconds: Annotated[float, Field(ge=1, le=3600, allow_inf_nan=False)] = key(
+    confirm_seconds: Annotated[float, rules(ge=1, le=3600, allow_inf_nan=False)] = key(
         default=30.0,
         description="for which a new bundle must stay healthy; otherwise it is rolled back automatically",
     )
@@ -69,7 +68,7 @@ class Fleet(FeatureSection):
     `rosrv fleet join` gives `collector`, `robot` and the files; keys here override them.
     """
 
-    collector: Annotated[str, AfterValidator(_checked_collector)] | None = key(
+    collector: Annotated[str, check(_checked_collector)] | None = key(
         default=None, description="https://ADDRESS:PORT: an address, so that no name server is needed"
     )
     name: str | None = key(

@@ -2,9 +2,7 @@
 
 from typing import Annotated, ClassVar, Literal
 
-from pydantic import Field
-
-from appliance.configuration.quantities import BYTES, Count, Seconds, WithinAnHour
+from appliance.configuration.quantities import BYTES, Count, Seconds, WithinAnHour, rules
 from appliance.configuration.sections import FeatureSection, key, section
 
 
@@ -14,7 +12,7 @@ class RecorderRules(FeatureSection):
 
     place: ClassVar[str] = "recorder"
     enabled: bool = key(default=False, description="whether anything is recorded")
-    memory: Annotated[int, BYTES, Field(ge=16 << 20)] = key(
+    memory: Annotated[int, BYTES, rules(ge=16 << 20)] = key(
         default=64 << 20,
         description="of all relays together, for the last messages received; it survives a relay's crash",
     )
@@ -41,7 +39,7 @@ class RecorderRules(FeatureSection):
     per_hour: Count = key(
         default=6, description="recordings that one host may start with one kind of trigger"
     )
-    disk: Annotated[int, BYTES, Field(ge=64 << 20)] = key(
+    disk: Annotated[int, BYTES, rules(ge=64 << 20)] = key(
         default=2 << 30, description="of all recordings; one uses at most an eighth of it"
     )
     days: Seconds | None = key(default=30.0, description="after which a recording is removed; null: never")

@@ -5,9 +5,8 @@ from pathlib import Path
 from typing import Annotated, ClassVar, Literal, get_args
 from urllib.parse import urlsplit
 
-from pydantic import AfterValidator, Field
-
 from appliance.channel.answers.token_answers import TokenRole
+from appliance.configuration.quantities import check, rules
 from appliance.configuration.sections import FeatureSection, is_loopback, key, section, split_receiver
 
 Algorithm = Literal["RS256", "RS384", "RS512", "PS256", "PS384", "PS512", "ES256", "ES384", "ES512"]
@@ -83,7 +82,7 @@ def _checked_door_group(text: str) -> str:
 
 
 _Values = Annotated[
-    list[Annotated[str, Field(min_length=1, max_length=256)]], Field(min_length=1, max_length=256)
+    list[Annotated[str, rules(min_length=1, max_length=256)]], rules(min_length=1, max_length=256)
 ]
 
 
@@ -91,13 +90,13 @@ _Values = Annotated[
 class Sso(FeatureSection):
     """Single sign-on by OpenID Connect for the console and REST; off unless `issuer` is given. Tokens remain valid."""
 
-    issuer: Annotated[str, AfterValidator(_checked_issuer)] | None = key(
+    issuer: Annotated[str, check(_checked_issuer)] | None = key(
         default=None, description="the provider's issuer URL, exactly as in its discovery document"
     )
-    address: Annotated[str, AfterValidator(_checked_address)] | None = key(
+    address: Annotated[str, check(_checked_address)] | None = key(
         default=None, description="ADDRESS:PORT of the provider; names are not looked up. Or give `proxy`"
     )
-    proxy: Annotated[str, AfterValidator(_checked_proxy)] | None = key(
+    proxy: Annotated[str, check(_checked_proxy)] | None = key(
         default=None,
         description="http://ADDRESS:PORT of a proxy (CONNECT) that reaches a provider with many addresses",
     )
@@ -115,12 +114,12 @@ class Sso(FeatureSection):
         max_length=40,
         description="the provider's name on the console's button",
     )
-    url: Annotated[str, AfterValidator(_checked_url)] = key(
+    url: Annotated[str, check(_checked_url)] = key(
         default="",
         description="https://HOST:PORT at which browsers open the console; the provider must permit the redirect URI"
         " `URL/console`",
     )
-    scopes: list[Annotated[str, Field(pattern=r"^[!#-\[\]-~]{1,100}$")]] = key(
+    scopes: list[Annotated[str, rules(pattern=r"^[!#-\[\]-~]{1,100}$")]] = key(
         default=["openid", "profile", "email"], description="scopes to request; `openid` is required"
     )
     name_claim: str = key(
@@ -141,27 +140,27 @@ class Sso(FeatureSection):
         description="values of `roles_claim` that give each role; the highest role counts, and without a role no person"
         " signs in",
     )
-    doors: dict[Annotated[str, AfterValidator(_checked_door_group)], _Values] = key(
+    doors: dict[Annotated[str, check(_checked_door_group)], _Values] = key(
         default_factory=dict, description="values of `roles_claim` that give each group of doors"
     )
-    domains: list[Annotated[str, AfterValidator(_checked_domain)]] = key(
+    domains: list[Annotated[str, check(_checked_domain)]] = key(
         default=[],
         description="domains of verified e-mail addresses that may sign in; empty: any address, or none",
     )
-    session_hours: Annotated[float, Field(gt=0, le=24, allow_inf_nan=False)] = key(
+    session_hours: Annotated[float, rules(gt=0, le=24, allow_inf_nan=False)] = key(
         default=8.0, description="longest session"
     )
     outlives_id_token: bool = key(
         default=False,
         description="on: a session may last `session_hours`, although the ID token expires before",
     )
-    clock_skew_seconds: Annotated[float, Field(ge=0, le=300, allow_inf_nan=False)] = key(
+    clock_skew_seconds: Annotated[float, rules(ge=0, le=300, allow_inf_nan=False)] = key(
         default=60.0, description="by which the clocks of the provider and of this machine may differ"
     )
-    algorithms: Annotated[list[Algorithm], Field(min_length=1)] = key(
+    algorithms: Annotated[list[Algorithm], rules(min_length=1)] = key(
         default=[*get_args(Algorithm)], description="signatures of ID tokens that are accepted"
     )
-    keys_hours: Annotated[float, Field(ge=1, le=168, allow_inf_nan=False)] = key(
+    keys_hours: Annotated[float, rules(ge=1, le=168, allow_inf_nan=False)] = key(
         default=24.0, description="for which the provider's last keys are used while it does not serve keys"
     )
 

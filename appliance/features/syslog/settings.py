@@ -3,8 +3,7 @@
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
-from pydantic import AfterValidator
-
+from appliance.configuration.quantities import check
 from appliance.configuration.sections import FeatureSection, checked_receiver, key, section, split_receiver
 
 
@@ -13,7 +12,7 @@ class Syslog(FeatureSection):
     """The receiver of the audit log (RFC 5424), served by a process of its own; off unless `to` is given."""
 
     place: ClassVar[str] = "audit.syslog"
-    to: Annotated[str, AfterValidator(checked_receiver)] | None = key(
+    to: Annotated[str, check(checked_receiver)] | None = key(
         default=None,
         description="udp://ADDRESS:PORT, tcp://… or tls://…: an address, so that no name server is needed",
     )
