@@ -7,6 +7,7 @@
 
 import hashlib
 from collections.abc import Callable
+from itertools import islice
 
 from appliance.channel.messages import ApprovalAnswered, ApprovalWanted, Message
 from appliance.relay.loop import EventLoop
@@ -27,8 +28,7 @@ class CallApprovals:
         self._send = send
         self._connected = False
         self._open: dict[int, tuple[str, Answered]] = {}  # by number: the host, and who waits
-        self._sent: dict[str, set[int]] = {}  # by host
-        self._unsent: dict[str, dict[int, ApprovalWanted]] = {}  # by host, oldest first
+        self._queues: dict[str, dict[int, ApprovalWanted]] = {}  # by host; control has the first ones
         self._number = 0
 
     def ask(self, caller: tuple[str, str, str], type_: str, body: bytes, answered: Answered) -> int:
@@ -40,45 +40,36 @@ class CallApprovals:
         number, host, digest = self._number, caller[1], hashlib.sha256(body).hexdigest()
         self._open[number] = host, answered
         if self._connected:
-            wanted = ApprovalWanted(number, *caller, type_, digest, body[:_SHOWN], len(body))
-            self._unsent.setdefault(host, {})[number] = wanted
-            self._send_next(host)
+            queue = self._queues.setdefault(host, {})
+            queue[number] = ApprovalWanted(number, *caller, type_, digest, body[:_SHOWN], len(body))
+            if len(queue) <= MOST_OF_HOST:
+                self._send(queue[number])
         else:
             self._loop.after(0, lambda: self.answered(ApprovalAnswered(number, AWAY)))
         return number
 
     def forget(self, number: int) -> None:
-        if number not in self._open:
-            return
-        host, _answered = self._open[number]
-        if number in self._sent.get(host, ()):
+        host, _answered = self._open.pop(number, ("", None))
+        queue = self._queues.get(host, {})
+        if number in islice(queue, MOST_OF_HOST):  # its answer will come
             self._open[number] = host, lambda _refused: None
         else:
-            del self._open[number]
-            self._unsent.get(host, {}).pop(number, None)
+            queue.pop(number, None)
 
     def answered(self, answer: ApprovalAnswered) -> None:
         host, waiting = self._open.pop(answer.number, ("", None))
         if waiting is None:
             return
-        self._sent.get(host, set()).discard(answer.number)
-        self._send_next(host)
+        queue = self._queues.get(host, {})
+        if queue.pop(answer.number, None) is not None:
+            for wanted in islice(queue.values(), MOST_OF_HOST - 1, MOST_OF_HOST):
+                self._send(wanted)
+            if not queue:
+                del self._queues[host]
         waiting(answer.refused)
 
     def attach(self, connected: bool) -> None:
         self._connected = connected
-        self._sent.clear()
-        self._unsent.clear()
+        self._queues.clear()
         for number in list(self._open):
             self.answered(ApprovalAnswered(number, AWAY))
-
-    def _send_next(self, host: str) -> None:
-        sent, unsent = self._sent.setdefault(host, set()), self._unsent.setdefault(host, {})
-        while unsent and len(sent) < MOST_OF_HOST:
-            number = next(iter(unsent))
-            sent.add(number)
-            self._send(unsent.pop(number))
-        if not unsent:
-            del self._unsent[host]
-        if not sent:
-            del self._sent[host]

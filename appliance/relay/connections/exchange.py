@@ -8,7 +8,6 @@
 from collections import deque
 from collections.abc import Callable
 
-from appliance.relay.monitors.interceptor import ServiceVerdict
 from roswire.errors import ProtocolError
 from roswire.tcpros import (
     FrameParser,
@@ -36,8 +35,8 @@ class ServiceExchange:
         to_service: Callable[[bytes], None],
         to_client: Callable[[bytes], None],
         count: Callable[[int], None],
-        judge: Callable[[str, bytes], ServiceVerdict] | None = None,
-        asks: Callable[[bytes], bool] = lambda _body: False,
+        judge: Callable[[str, bytes], ServiceReply],
+        asks: Callable[[bytes], bool],
     ) -> None:
         self._persistent = persistent
         self._to_service = to_service
@@ -45,10 +44,10 @@ class ServiceExchange:
         self._count = count
         self._judge = judge
         self._asks = asks
-        self._asking: bytes | None = None
         self._requests = FrameParser(limit)
         self._replies = ServiceReplyParser(limit)
         self._waiting: deque[bytes] = deque()
+        self._asking = False  # whether the first waiting request needs an approval
         self._busy = False
         self.done = False
         self.held = 0
@@ -56,11 +55,11 @@ class ServiceExchange:
 
     @property
     def may_read(self) -> bool:
-        return not self._busy and self._asking is None and not self._waiting and not self.done
+        return not self._busy and not self._waiting and not self.done
 
     @property
     def ready(self) -> bool:
-        return bool(self._waiting) and not self._busy and self._asking is None and not self.done
+        return bool(self._waiting) and not self._busy and not self._asking and not self.done
 
     @property
     def unfinished(self) -> int:
@@ -75,61 +74,33 @@ class ServiceExchange:
         for reply in self._replies.feed(data):
             if not self._busy:
                 raise ProtocolError("the service sent a reply without a request")
-            self._reply(reply)
+            self.held_replies -= len(reply.body) + _REPLY_HEAD
+            self._busy = False
+            self._answer(self._judge("response", reply.body) if reply.ok else reply)
 
     def advance(self) -> None:
         if self.ready:
-            body = self._asking = self._waiting.popleft()
-            if not self._asks(body):
+            self._asking = self._asks(self._waiting[0])
+            if not self._asking:
                 self.settle("")
 
     def settle(self, refused: str) -> None:
-        body, self._asking = self._asking, None
-        if body is None:
-            raise RuntimeError("no request is held")
-        if refused:
-            self._pass_on(encode_frame(body))
-            self._refuse(refused)
-        else:
-            self._request(body)
-
-    def _request(self, body: bytes) -> None:
+        """Pass the first waiting request on, or refuse it for this reason."""
+        self._asking = False
+        body = self._waiting.popleft()
         data = encode_frame(body)
-        self._pass_on(data)
-        if self._judge is not None:
-            judged = self._judge("request", body)
-            if judged.refused is not None:
-                self._refuse(judged.refused)
-                return
-            if judged.body is not body:
-                data = encode_frame(judged.body)
-        self._busy = True
-        self._to_service(data)
-
-    def _refuse(self, reason: str) -> None:
-        self.done = not self._persistent
-        data = encode_service_error(reason)
-        self._count(len(data))
-        self._to_client(data)
-
-    def _reply(self, reply: ServiceReply) -> None:
-        self.held_replies -= len(reply.body) + _REPLY_HEAD
-        if reply.ok and self._judge is not None:
-            judged = self._judge("response", reply.body)
-            reply = (
-                ServiceReply(True, judged.body)
-                if judged.refused is None
-                else ServiceReply(False, judged.refused.encode())
-            )
-        if reply.ok:
-            data = encode_service_reply(reply.body)
-        else:
-            data = encode_service_error(reply.body.decode("utf-8", "replace"))
-        self._busy = False
-        self.done = not self._persistent
-        self._count(len(data))
-        self._to_client(data)
-
-    def _pass_on(self, data: bytes) -> None:
         self.held -= len(data)
         self._count(len(data))
+        judged = ServiceReply(False, refused.encode()) if refused else self._judge("request", body)
+        if judged.ok:
+            self._busy = True
+            self._to_service(data if judged.body is body else encode_frame(judged.body))
+        else:
+            self._answer(judged)
+
+    def _answer(self, reply: ServiceReply) -> None:
+        text = "" if reply.ok else reply.body.decode("utf-8", "replace")
+        data = encode_service_reply(reply.body) if reply.ok else encode_service_error(text)
+        self.done = not self._persistent
+        self._count(len(data))
+        self._to_client(data)

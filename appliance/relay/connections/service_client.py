@@ -16,13 +16,12 @@ from appliance.relay.connections.own_service import OwnServer
 from appliance.relay.context import RelayContext
 from appliance.relay.grant_table import PeerGrant, ServiceEndpoint
 from appliance.relay.loop import LoopTimer
-from appliance.relay.monitors.interceptor import ServiceVerdict
 from appliance.relay.monitors.observation_points import ObservationPoint
 from appliance.relay.transport.frames import SMALL
 from appliance.relay.transport.memory import HeldBytes, StallDetector
 from appliance.relay.transport.sockets import BufferedSocket, begin_connect
 from roswire.errors import PeerError
-from roswire.tcpros import HeaderParser, encode_header
+from roswire.tcpros import HeaderParser, ServiceReply, encode_header
 
 _PATIENT = 1 << 20  # bytes that may wait without a time limit, while the host has memory
 
@@ -99,15 +98,6 @@ class ServiceClient:
         self._parser = HeaderParser(context.limits.header_bytes)
         self._greeted = False
         self._header: dict[str, str] = {}
-        self._exchange = ServiceExchange(
-            context.limits.message_bytes,
-            persistent=switched_on(fields, "persistent"),
-            to_service=self._to_service,
-            to_client=self._to_client,
-            count=traffic.count,
-            judge=self._judge,
-            asks=self._ask,
-        )
         self._client = BufferedSocket(
             context.loop,
             sock,
@@ -117,6 +107,15 @@ class ServiceClient:
             drained=self._advance,
         )
         self._client.read(False)
+        self._exchange = ServiceExchange(
+            context.limits.message_bytes,
+            persistent=switched_on(fields, "persistent"),
+            to_service=self._to_service,
+            to_client=self._client.send,
+            count=traffic.count,
+            judge=self._judge,
+            asks=self._ask,
+        )
 
     @property
     def grant(self) -> PeerGrant:
@@ -154,9 +153,7 @@ class ServiceClient:
                 self.cut(objection)
 
     def tidy(self) -> None:
-        held = (
-            self._exchange.unfinished + self._client.backlog + (self._server.backlog if self._server else 0)
-        )
+        held = self._exchange.unfinished + self._unsent
         patience = SMALL if any(weight.share.exhausted for weight in self._weights) else _PATIENT
         if self._stall.seen(held if held > patience else 0, self._context.loop.clock()):
             seconds = self._context.limits.stall_seconds
@@ -212,10 +209,10 @@ class ServiceClient:
             self.service.key, self.service.service, "service", self.host, self.caller_id
         )
         self._traffic.connected(1)
-        self._to_client(encode_header(to_client(header, self.service.node)))
+        self._client.send(encode_header(to_client(header, self.service.node)))
         self._guard(self._exchange.from_service, self._parser.rest)
 
-    def _judge(self, part: str, body: bytes) -> ServiceVerdict:
+    def _judge(self, part: str, body: bytes) -> ServiceReply:
         service = self.service
         sender = (self.host, self.caller_id) if part == "request" else (service.host, service.node)
         point = ObservationPoint(service.key, service.service, *sender)
@@ -262,21 +259,21 @@ class ServiceClient:
             self._weigh()
 
     def _weigh(self) -> None:
-        waiting = self._client.backlog + (self._server.backlog if self._server else 0)
         of_service = self._exchange.held_replies + size_of(self._header)
-        parts = (self._exchange.held, of_service, waiting)
+        parts = (self._exchange.held, of_service, self._unsent)
         for weight, size in zip(self._weights, parts, strict=True):
             weight.set(size)
             if size > SMALL and weight.share.exhausted:
                 self.cut("the relay has no memory left for messages of this host")
                 return
 
+    @property
+    def _unsent(self) -> int:
+        return self._client.backlog + (self._server.backlog if self._server else 0)
+
     def _to_service(self, data: bytes) -> None:
         if self._server is not None:
             self._server.send(data)
-
-    def _to_client(self, data: bytes) -> None:
-        self._client.send(data)
 
     def _server_broken(self, reason: str) -> None:
         if self._greeted:

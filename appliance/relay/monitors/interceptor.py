@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from appliance.base import clock
@@ -39,6 +38,7 @@ from appliance.relay.monitors.time_budget import TimeBudget
 from appliance.relay.report import Reporter
 from appliance.relay.transport.pump import Version
 from rosmop.run.outcomes import MessageSender
+from roswire.tcpros import ServiceReply
 
 if TYPE_CHECKING:
     from rosmop.run.engine import MonitorSet
@@ -46,14 +46,6 @@ if TYPE_CHECKING:
     from rosmop.run.outcomes import Outcome, Published
 
 _AFTER_DEFECT = 1.0
-
-
-@dataclass(frozen=True, slots=True)
-class ServiceVerdict:
-    """The body of a request or reply to pass on, or the reason why the message is refused."""
-
-    body: bytes
-    refused: str | None = None
 
 
 class Interceptor:
@@ -342,12 +334,13 @@ class Interceptor:
         self.preparation.change()
         self._prepared.clear()
 
-    def judge(self, point: ObservationPoint, part: str, body: bytes) -> ServiceVerdict:
+    def judge(self, point: ObservationPoint, part: str, body: bytes) -> ServiceReply:
+        """Return the body of a request or reply to pass on, or an error with the reason why it is refused."""
         service = point.resource
         if self.blocked:
-            return ServiceVerdict(b"", self.blocked)
+            return ServiceReply(False, self.blocked.encode())
         if self.monitors is None or self.monitors.service_type_of(service, shadowed=True) is None:
-            return ServiceVerdict(body)
+            return ServiceReply(True, body)
         now, due = self.now(), self.monitors.next_due
         view = memoryview(body)
         channel = self.monitors.channel_of(service, part)
@@ -373,11 +366,11 @@ class Interceptor:
         self.schedule()
         if outcome.result == "dropped":
             self.observer.dropped(outcome, point, view)
-            return ServiceVerdict(b"", refusal(outcome, part))
+            return ServiceReply(False, refusal(outcome, part).encode("utf-8", "replace"))
         if outcome.result == "changed":
             self.observer.changed(outcome, point, body[:SHOWN], len(body))
-            return ServiceVerdict(bytes(outcome.buffer))
-        return ServiceVerdict(body)
+            return ServiceReply(True, bytes(outcome.buffer))
+        return ServiceReply(True, body)
 
     def tick(self) -> None:
         """Send the counts of this second; the next event of each kind is reported in full.

@@ -6,7 +6,7 @@ from appliance.channel.messages import ApprovalAnswered
 from appliance.relay.connections.call_approvals import AWAY, CallApprovals
 from appliance.relay.connections.exchange import ServiceExchange
 from roswire.errors import ProtocolError
-from roswire.tcpros import encode_frame, encode_service_error, encode_service_reply
+from roswire.tcpros import ServiceReply, encode_frame, encode_service_error, encode_service_reply
 
 
 class Relay:
@@ -22,6 +22,7 @@ class Relay:
             to_service=self.service.extend,
             to_client=self.client.extend,
             count=lambda _size: None,
+            judge=lambda _part, body: ServiceReply(True, body),
             asks=self.ask,
         )
         self.approvals.attach(True)

@@ -4,7 +4,7 @@ import pytest
 
 from appliance.relay.connections.exchange import ServiceExchange
 from roswire.errors import LimitExceededError, ProtocolError
-from roswire.tcpros import encode_frame, encode_service_error, encode_service_reply
+from roswire.tcpros import ServiceReply, encode_frame, encode_service_error, encode_service_reply
 
 
 class Conversation:
@@ -18,6 +18,8 @@ class Conversation:
             to_service=self.service.append,
             to_client=self.client.append,
             count=self.counted.append,
+            judge=lambda _part, body: ServiceReply(True, body),
+            asks=lambda _body: False,
         )
 
     def ask(self, data: bytes) -> None:

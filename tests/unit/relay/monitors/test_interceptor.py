@@ -381,10 +381,13 @@ def test_state_is_written_before_its_effect(
 def test_the_client_of_a_service_reads_why_its_request_could_not_be_judged(world: Monitored) -> None:
     world.load(LATCH.replace("open = wish;", "int zero = 0; open = 1 / zero;"))
     interceptor = world.engine.interceptor
-    refused = interceptor.judge(ObservationPoint("k", "/mode"), "request", b"\0").refused
-    assert refused == "the request is dropped by the monitor gate: division by zero"
+    refused = interceptor.judge(ObservationPoint("k", "/mode"), "request", b"\0")
+    assert (
+        not refused.ok
+        and refused.body.decode() == "the request is dropped by the monitor gate: division by zero"
+    )
     world.state(MonitorSwitched("gate", False))
-    assert interceptor.judge(ObservationPoint("k", "/mode"), "request", b"\0").refused is None
+    assert interceptor.judge(ObservationPoint("k", "/mode"), "request", b"\0").ok
 
 
 def test_events_without_a_control_reach_the_next_one(world: Monitored) -> None:
