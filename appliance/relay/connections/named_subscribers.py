@@ -5,9 +5,10 @@ An action client waits until *its server* subscribes to its goals and cancellati
 to serve the subscriber, so the subscriber misses nothing that the publisher sends from then on.
 """
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from functools import partial
 
+from appliance.relay.connections.served_subscribers import TopicSubscriber
 from appliance.relay.context import RelayContext
 from appliance.relay.loop import LoopTimer
 from appliance.relay.transport.sockets import BufferedSocket, begin_connect
@@ -16,10 +17,21 @@ from roswire.tcpros import encode_header
 _GOAL = "ActionGoal"
 _CANCEL = "actionlib_msgs/GoalID"
 _RETRY_SECONDS = 1.0
+_SEEN_OF_A_HOST = 16  # subscribers of a host that a publisher may see by name, over one connection each
 
 
 def looks_for_names(type_name: str) -> bool:
     return type_name.endswith(_GOAL) or type_name == _CANCEL
+
+
+def seen_names(members: Iterable[TopicSubscriber], servers: Collection[str]) -> frozenset[str]:
+    """Return the names of subscribers that a publisher sees, first of all those of its `servers`."""
+    of_host: dict[str, set[str]] = {}
+    for member in sorted(members, key=lambda member: member.caller_id not in servers):
+        names = of_host.setdefault(member.host, set())
+        if len(names) < _SEEN_OF_A_HOST:
+            names.add(member.caller_id)
+    return frozenset().union(*of_host.values())
 
 
 class ActionServers:

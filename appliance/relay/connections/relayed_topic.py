@@ -25,6 +25,7 @@ from appliance.channel.messages import LatchRefused, TopicTraffic
 from appliance.relay.connections.headers import to_subscriber
 from appliance.relay.connections.latched_message import LatchedMessage
 from appliance.relay.connections.message_sink import MessageSink, MessageStream
+from appliance.relay.connections.named_subscribers import seen_names
 from appliance.relay.connections.served_subscribers import ServedSubscribers, TopicSubscriber
 from appliance.relay.connections.startup_replay import APPEARED, StartupReplay
 from appliance.relay.transport.frames import Batch
@@ -32,8 +33,6 @@ from appliance.relay.transport.memory import HostMemory
 from appliance.relay.transport.pump import SUBSCRIBERS, ModuleCall, Traffic, Version
 from appliance.relay.transport.rate_limit import Part, PublicationRateLimit, RateAllowance
 from roswire.tcpros import encode_frame
-
-_SEEN_OF_A_HOST = 16  # subscribers of a host that a publisher may see by name, over one connection each
 
 
 class Upstream:
@@ -479,16 +478,9 @@ class RelayedTopic:
 
     def announce(self) -> None:
         if self._header is not None:
-            self.upstream.announce(self._names, self._header.get("type", ""))
-
-    def _names(self) -> frozenset[str]:
-        of_host: dict[str, set[str]] = {}
-        servers = self._servers(self.topic)
-        for member in sorted(self._served, key=lambda member: member.caller_id not in servers):
-            names = of_host.setdefault(member.host, set())
-            if len(names) < _SEEN_OF_A_HOST:
-                names.add(member.caller_id)
-        return frozenset().union(*of_host.values())
+            self.upstream.announce(
+                lambda: seen_names(self._served, self._servers(self.topic)), self._header.get("type", "")
+            )
 
     def _pause_or_trim(self) -> None:
         since = [member.behind_since for member in self._served.row if member.behind_since is not None]

@@ -48,7 +48,6 @@ class _Attempt:
     stream: BufferedSocket
     parser: HeaderParser
     address: tuple[str, int]
-    payer: str
 
 
 class PublisherConnection(Upstream):
@@ -115,7 +114,7 @@ class PublisherConnection(Upstream):
         stream = BufferedSocket(
             self._loop, sock, self._header_received, self._broken, payer=payer, opened=self._connected
         )
-        self._attempt = _Attempt(stream, HeaderParser(self._limits.header_bytes), (host, port), payer)
+        self._attempt = _Attempt(stream, HeaderParser(self._limits.header_bytes), (host, port))
         late = f"no answer from {host}:{port} within {self._limits.connect_seconds:g} s"
         self._enter(UpstreamState.CONNECTING, self._limits.connect_seconds, lambda: self._lose(late))
 
@@ -188,7 +187,7 @@ class PublisherConnection(Upstream):
             return
         if header is None:
             return
-        refusal = _refusal(header) or self._no_room(header)
+        refusal = self._refusal(header)
         if refusal is not None:
             end = self._turned_away if "error" in header else self._lose
             end(*refusal)
@@ -199,7 +198,12 @@ class PublisherConnection(Upstream):
             return
         self._flow(header, attempt)
 
-    def _no_room(self, header: Mapping[str, str]) -> tuple[str, Violation] | None:
+    def _refusal(self, header: Mapping[str, str]) -> tuple[str, Violation] | None:
+        if "error" in header:
+            return f"the publisher says: {header['error']}", "connection refused"
+        missing = [field for field in ("type", "md5sum") if field not in header]
+        if missing:
+            return f"the publisher's header lacks the field {missing[0]}", "malformed"
         size = size_of(header)
         if size > SMALL and self._context.memory.frames.of(self._topic.host).refusal(size):
             return "the relay has no memory left for headers of this host", "limit exceeded"
@@ -219,14 +223,8 @@ class PublisherConnection(Upstream):
         self._introductions.accepted()
         self._enter(UpstreamState.FLOWING)
         self._named_subscribers.open(attempt.address, self._introductions.fields)
-        self._reader = reader = UpstreamReader(
-            self._context,
-            self._topic,
-            attempt.stream.take(),
-            payer=attempt.payer,
-            header=header,
-            lost=self._lose,
-        )
+        sock = attempt.stream.take()
+        self._reader = reader = UpstreamReader(self._context, self._topic, sock, header, self._lose)
         self._topic.upstream_opened(header)
         reader.start(attempt.parser.rest)
 
@@ -279,12 +277,3 @@ class PublisherConnection(Upstream):
         if self._timer is not None:
             self._timer.cancel()
         self._timer = None if late is None else self._loop.after(seconds, late)
-
-
-def _refusal(header: dict[str, str]) -> tuple[str, Violation] | None:
-    if "error" in header:
-        return f"the publisher says: {header['error']}", "connection refused"
-    missing = [field for field in ("type", "md5sum") if field not in header]
-    if missing:
-        return f"the publisher's header lacks the field {missing[0]}", "malformed"
-    return None

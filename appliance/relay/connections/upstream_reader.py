@@ -39,8 +39,6 @@ class UpstreamReader:
         context: RelayContext,
         topic: RelayedTopic,
         sock: socket.socket,
-        *,
-        payer: str,
         header: dict[str, str],
         lost: Lost,
     ) -> None:
@@ -51,7 +49,7 @@ class UpstreamReader:
         self._loop = context.loop
         self._topic = topic
         self._socket = sock
-        self._payer = payer
+        self._payer = context.payer(topic.host)
         self._lost = lost
         self._receiver = FrameReceiver(context.scratch, context.limits.message_bytes, memory)
         self._buffer = self._receiver.buffer

@@ -34,7 +34,7 @@ from appliance.relay.monitors.observer import Observer, dropped, refusal
 from appliance.relay.monitors.shadow import ShadowMonitors
 from appliance.relay.monitors.state_keeper import LEAVING, StateKeeper, continued, start_outcome, state_left
 from appliance.relay.monitors.state_memory import NOT_KEPT, CellsPlace
-from appliance.relay.monitors.time_budget import TimeBudget
+from appliance.relay.monitors.time_budget import TimeBudgets
 from appliance.relay.report import Reporter
 from appliance.relay.transport.pump import Version
 from rosmop.run.outcomes import MessageSender
@@ -81,8 +81,7 @@ class Interceptor:
         self._awaited: SpecificationsStated | None = None
         self.preparation = Version()
         """The version of all options that pipelines and services have prepared."""
-        self._time_budgets: dict[ObservationPoint, TimeBudget] = {}
-        """The time budgets of points; `tick` removes those that have recovered."""
+        self.time_budgets = TimeBudgets(payer)
         self._prepared: dict[tuple[ObservationPoint, str], BatchOptions] = {}
         """The prepared options for requests and replies; they last a second, or until `preparation` changes."""
         self._timer: LoopTimer | None = None
@@ -91,8 +90,6 @@ class Interceptor:
         self.observations = Observations(loop, reporter, self._rows)
         self._changed = changed
         self._holder = holder
-        self._payer = payer
-        self._shared_pace = TimeBudget()
         self.senders = Senders()
         self._publish = publish
         self._keeper: StateKeeper | None = None
@@ -322,14 +319,6 @@ class Interceptor:
 
     # --- messages ---
 
-    def time_budget(self, point: ObservationPoint) -> TimeBudget:
-        """Return the budget of a point; hosts with a common payer share one."""
-        if self._payer(point.host) != point.host:
-            return self._shared_pace
-        if point not in self._time_budgets:
-            self._time_budgets[point] = TimeBudget()
-        return self._time_budgets[point]
-
     def invalidate_prepared(self) -> None:
         self.preparation.change()
         self._prepared.clear()
@@ -347,7 +336,7 @@ class Interceptor:
         outcome = self._walked(self.monitors, point, channel, body, now)
         if outcome is None:
             self.invalidate_prepared()
-            time_budget = self.time_budget(point)
+            time_budget = self.time_budgets.of(point)
             self.monitors.hurry(time_budget.part(now))
             try:
                 outcome = self.monitors.process_service(
@@ -383,12 +372,7 @@ class Interceptor:
             self.invalidate_prepared()
         self._prepared.clear()
         self.observations.tick()
-        now = self.now()
-        self._time_budgets = {
-            point: time_budget
-            for point, time_budget in self._time_budgets.items()
-            if not time_budget.recovered(now)
-        }
+        self.time_budgets.forget_recovered(self.now())
 
     def close(self) -> None:
         self._loader.close()
@@ -421,7 +405,7 @@ class Interceptor:
             return prepared
 
         try:
-            fuel = self.time_budget(point).fuel(now, self.budget)
+            fuel = self.time_budgets.of(point).fuel(now, self.budget)
             return monitors.process_fast(way, body, now, prepare, fuel)
         except Exception as error:  # noqa: BLE001  a defect of the walk must not end the relay
             observer.defect(error, point, now)

@@ -4,6 +4,9 @@ After a message is cut off, messages get a tenth of the budget for some seconds,
 the policy does not name share one budget, because each of many addresses could send such a message.
 """
 
+from collections.abc import Callable
+
+from appliance.relay.monitors.observation_points import ObservationPoint
 from rosmop.run.outcomes import FUEL_PER_SECOND
 
 _SHORTEST = 4_000_000_000
@@ -34,3 +37,22 @@ class TimeBudget:
 
     def recovered(self, now: int) -> bool:
         return now >= self._until + self._length
+
+
+class TimeBudgets:
+    """The budgets of all points; hosts whose `payer` is a common one share a budget."""
+
+    def __init__(self, payer: Callable[[str], str]) -> None:
+        self._payer = payer
+        self._shared = TimeBudget()
+        self._own: dict[ObservationPoint, TimeBudget] = {}
+
+    def of(self, point: ObservationPoint) -> TimeBudget:
+        if self._payer(point.host) != point.host:
+            return self._shared
+        if point not in self._own:
+            self._own[point] = TimeBudget()
+        return self._own[point]
+
+    def forget_recovered(self, now: int) -> None:
+        self._own = {point: budget for point, budget in self._own.items() if not budget.recovered(now)}

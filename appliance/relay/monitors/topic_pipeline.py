@@ -133,7 +133,7 @@ class TopicPipeline:
             alone = walked is not None and walked.paused and walked.position == progress.position
             if alone:
                 walked = lane.process_one(
-                    *given, interceptor.time_budget(self.point).fuel(progress.time, interceptor.budget)
+                    *given, interceptor.time_budgets.of(self.point).fuel(progress.time, interceptor.budget)
                 )
         except Exception as error:  # noqa: BLE001  a defect of the walk must not end the relay
             self._failed(error, lane, progress.time)
@@ -147,7 +147,7 @@ class TopicPipeline:
         self._account(walked, progress, counts)
         if alone:
             if walked.paused:  # the engine would take much longer
-                interceptor.time_budget(self.point).cut(progress.time)
+                interceptor.time_budgets.of(self.point).cut(progress.time)
             return progress.position > begun
         return walked.paused or progress.position == progress.end
 
@@ -165,11 +165,8 @@ class TopicPipeline:
             interceptor.observer.report_line(*said, point=self.point, time=progress.time, observed=observed)
 
     def _prepare(self, monitors: MonitorSet, lane: FastLane) -> tuple[BatchOptions, FastPathCounts]:
-        observer, point, number = (
-            self._interceptor.observer,
-            self.point,
-            self._interceptor.preparation.number,
-        )
+        observer, point = self._interceptor.observer, self.point
+        number = self._interceptor.preparation.number
         self._until = _NEVER if monitors.next_due is None else monitors.next_due
         if self._prepared is None or self._prepared[0] is not lane:
             counts = FastPathCounts(lane, point)
@@ -189,12 +186,8 @@ class TopicPipeline:
         return options, counts
 
     def _one_by_one(self, monitors: MonitorSet, progress: BatchProgress, count: int) -> None:
-        interceptor, point, now, observer = (
-            self._interceptor,
-            self.point,
-            progress.time,
-            self._interceptor.observer,
-        )
+        interceptor, observer = self._interceptor, self._interceptor.observer
+        point, now = self.point, progress.time
         view, position, end = progress.view, progress.position, progress.end
         process, topic = monitors.process, point[1]
         shows = observer.shows(point)
@@ -208,7 +201,7 @@ class TopicPipeline:
             body = view[first:following]
             before = bytes(body[:SHOWN]) if shows else b""
             observed = ObservedMessage(progress, position, bytes(body[:head]))
-            monitors.hurry(interceptor.time_budget(point).part(now))
+            monitors.hurry(interceptor.time_budgets.of(point).part(now))
             try:
                 outcome = process(topic, body, now, observed.sender(self._source))
             except Exception as error:  # noqa: BLE001  a defect of the monitors must not end the relay
@@ -230,7 +223,7 @@ class TopicPipeline:
             position = following
             looked += 1
             if outcome.faults and monitors.late:
-                interceptor.time_budget(point).cut(now)
+                interceptor.time_budgets.of(point).cut(now)
             if interceptor.over():
                 break
         progress.position = position
