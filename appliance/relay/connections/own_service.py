@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from appliance.channel.messages import Message, OwnServiceAnswered, OwnServiceCalled
+from appliance.relay.connections.call_approvals import AWAY
 from appliance.relay.loop import EventLoop
 from roswire.tcpros import HeaderParser, encode_header, encode_service_reply
 
@@ -19,7 +20,6 @@ HEADER: Final = {
     "request_type": "std_srvs/TriggerRequest",
     "response_type": "std_srvs/TriggerResponse",
 }
-_AWAY = "the appliance's control is not running: this call had no effect"
 _SECOND = 1.0
 
 
@@ -69,7 +69,7 @@ class OwnService:
     def control_gone(self) -> None:
         for call in list(self._calls.values()):
             if not call.until:
-                self._settle(call, False, _AWAY)
+                self._settle(call, False, AWAY)
 
     def tidy(self) -> None:
         now = self._loop.clock()

@@ -306,7 +306,7 @@ class RelayedTopic:
         batch.first = self.counters.following
         self.counters.add(batch.messages, len(batch.view))
         self._reported = False
-        passing: Batch | None = batch
+        passing = batch
         if self.flow.limits:
             passing = self.flow.passing(batch, self._clock(), latching=self.latch.is_latching)
         return self._take(batch, passing, since)
@@ -326,27 +326,21 @@ class RelayedTopic:
         self._reported = False
         return self._take(rest, rest, since)
 
-    def _take(self, batch: Batch, passing: Batch | None, since: float) -> Batch | None:
-        stream = self._stream
-        if stream is None:
-            return None if passing is None else self._admit(passing, since)
+    def _take(self, batch: Batch, passing: Batch, since: float) -> Batch | None:
         # Write after subscribers got the batch, to delay nothing; copy it first: monitors may change it in place.
-        whole = batch
-        if self._monitoring.through is not None and stream.keeps:
+        stream, whole = self._stream, batch
+        if stream is not None and stream.keeps and self._monitoring.through is not None:
             whole = Batch(memoryview(bytes(batch.view)), batch.messages, batch.last)
             whole.first = batch.first
-        passes = 0 if passing is None else passing.messages
-        rest = None if passing is None else self._admit(passing, since)
-        if stream is self._stream:
-            judged = 0 if passing is None else passing.judged
-            taken = passes - (0 if rest is None else rest.messages)
-            if rest is None:
-                taken = whole.messages
-            elif passes < whole.messages:  # limits have dropped the others
-                dropped = whole.tail(whole.messages - passes)
-                stream.write(dropped.view, dropped.messages, dropped.first)
-            head = whole if taken == whole.messages else whole.head(taken)
-            stream.write(head.view, head.messages, head.first, judged)
+        rest = self._admit(passing, since) if passing.messages else None
+        if stream is not None and stream is self._stream:
+            head = whole
+            if rest is not None:
+                head = whole.head(passing.messages - rest.messages)
+                if passing.messages < whole.messages:  # limits have dropped the others
+                    dropped = whole.tail(whole.messages - passing.messages)
+                    stream.write(dropped.view, dropped.messages, dropped.first)
+            stream.write(head.view, head.messages, head.first, passing.judged)
         return rest
 
     def _admit(self, batch: Batch, since: float, *, divided: bool = True) -> Batch | None:

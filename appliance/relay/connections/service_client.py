@@ -19,6 +19,7 @@ from appliance.relay.loop import LoopTimer
 from appliance.relay.monitors.observation_points import ObservationPoint
 from appliance.relay.transport.frames import SMALL
 from appliance.relay.transport.memory import HeldBytes, StallDetector
+from appliance.relay.transport.pump import Traffic
 from appliance.relay.transport.sockets import BufferedSocket, begin_connect
 from roswire.errors import PeerError
 from roswire.tcpros import HeaderParser, ServiceReply, encode_header
@@ -30,27 +31,23 @@ class ServiceTraffic:
     """The traffic of one service since the last report, and its clients."""
 
     def __init__(self) -> None:
-        self.messages = 0
-        self.bytes = 0
-        self.clients = 0
-        self.changed = False
+        self._counters = Traffic()
+        self._clients = 0
+        self._changed = False
 
     def count(self, size: int) -> None:
-        self.messages += 1
-        self.bytes += size
-        self.changed = True
+        self._counters.add(1, size)
+        self._changed = True
 
     def connected(self, change: int) -> None:
-        self.clients += change
-        self.changed = True
+        self._clients += change
+        self._changed = True
 
     def row(self, key: str, service: str) -> TopicTraffic | None:
-        if not self.changed:
+        if not self._changed:
             return None
-        row = TopicTraffic(key, service, self.messages, self.bytes, 0, self.clients)
-        self.messages = self.bytes = 0
-        self.changed = False
-        return row
+        self._changed = False
+        return TopicTraffic(key, service, *self._counters.take()[:2], 0, self._clients)
 
 
 class ServiceClient:

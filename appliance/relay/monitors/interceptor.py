@@ -168,18 +168,23 @@ class Interceptor:
         return self._holder("" if point is None else point.host)
 
     def _taken(self, message: SpecificationsStated, began: list[str], anew: frozenset[str] | None) -> None:
+        switched = self._apply()
+        self._changed(None if anew is None else anew | switched)
+        self._reporter.send(taken(message, began, self.monitors))
+
+    def _apply(self) -> frozenset[str]:
+        """Switch the monitors, and give them their constants; return the topics of those that were switched."""
         self.invalidate_prepared()
-        if self.monitors is not None:
-            both = (*self.monitors.monitors, *self.monitors.shadowed)
-            switches = {monitor.name: self._switches.get(monitor.name, True) for monitor in both}
-            switched = self.monitors.topics_of(self.monitors.switch(switches, self.now()))
-            anew = None if anew is None else anew | switched
-            self.monitors.give(self._given)
-            self.keep_all()
+        if self.monitors is None:
+            return frozenset()
+        both = (*self.monitors.monitors, *self.monitors.shadowed)
+        switches = {monitor.name: self._switches.get(monitor.name, True) for monitor in both}
+        switched = self.monitors.switch(switches, self.now())
+        self.monitors.give(self._given)
+        self.keep_all()
         self.schedule()
         self.shadow.schedule()
-        self._changed(anew)
-        self._reporter.send(taken(message, began, self.monitors))
+        return self.monitors.topics_of(switched)
 
     def _tell_held(self) -> None:
         self.invalidate_prepared()
@@ -200,25 +205,12 @@ class Interceptor:
         elif isinstance(message, StopWanted):
             self._reporter.send(StopBegun(message.number, self._guards(message.topic, begin=message.begin)))
         else:
-            self._give(message.name, message.values)
+            self._given[message.name] = dict(message.values)
+            self._apply()
 
     def switch(self, name: str, enabled: bool) -> None:
-        self.invalidate_prepared()
         self._switches[name] = enabled
-        if self.monitors is not None:
-            switched = self.monitors.switch({name: enabled}, self.now())
-            if switched:
-                self.keep_all()
-                self.schedule()
-                self.shadow.schedule()
-                self._changed(self.monitors.topics_of(switched))
-
-    def _give(self, name: str, values: Mapping[str, GivenValue]) -> None:
-        self.invalidate_prepared()
-        self._given[name] = dict(values)
-        if self.monitors is not None:
-            self.monitors.give(self._given)
-            self.keep_all()
+        self._changed(self._apply())
 
     def resume(self, name: str) -> frozenset[str]:
         self.invalidate_prepared()

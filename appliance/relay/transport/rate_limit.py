@@ -235,14 +235,14 @@ class PublicationRateLimit:
         limits: dict[Part, RateAllowance | None] = {"publisher": own, "topic": together}
         self.limits = {part: limit for part, limit in limits.items() if limit is not None}
 
-    def passing(self, batch: Batch, now: float, *, latching: bool) -> Batch | None:
+    def passing(self, batch: Batch, now: float, *, latching: bool) -> Batch:
         self.forget()
         part = batch
         for name, limit in self.limits.items():
             part = limit.cut(part, now, partial(self._dropped, name))
         if part.messages < batch.messages and latching:
             self._wait(batch)
-        return self._take(part) if part.messages else None
+        return self._take(part)
 
     def later(self, now: float) -> Batch | None:
         waiting = self._waiting
