@@ -218,7 +218,7 @@ async def _restore(base: Foundation, parts: Parts) -> None:
         if incarnation.life is Life.REPLACED:
             continue
         try:
-            await ends.faces.reopen(incarnation)
+            await ends.faces.reopen(incarnation, parts.serve(incarnation))
         except NoPortError as error:
             _log.error("a node cannot be restored", node=incarnation.name, error=str(error))
             core.registry.forget(incarnation)

@@ -8,7 +8,7 @@ import contextlib
 import functools
 import ipaddress
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from types import SimpleNamespace
 from typing import Any, NamedTuple, Self, cast
 
@@ -21,11 +21,11 @@ from appliance.master.endpoints.node_ports import NodePorts
 from appliance.master.endpoints.relay_control import RelayControl
 from appliance.master.endpoints.traffic import RelayTraffic
 from appliance.master.graph.graph import Grants, RosGraph
-from appliance.master.graph.registry import Incarnation, Kind, Life, Registry, new_key
+from appliance.master.graph.registry import Change, Incarnation, Kind, Life, Registry, new_key
 from appliance.master.graph.revocation import Revocation
 from appliance.master.reconcile.liveness import Liveness, Watchlist
 from appliance.master.reconcile.reconciler import Reconciler
-from appliance.master.reconcile.sinks import Enforcement, Sinks
+from appliance.master.reconcile.sinks import Enforcement, ProxyEndpoints, Sinks, StoredGraph
 from appliance.master.reconcile.subscribers import Subscribers
 from appliance.master.rosmaster import MasterRegistrations, RosMaster, Wanted
 from appliance.policy.model import Address, Decision
@@ -294,6 +294,9 @@ class Inner:
         self.go = asyncio.Event()
         self.go.set()
 
+    def flush(self, changed: Iterable[Change]) -> None:
+        ProxyEndpoints.flush(cast(Any, self), changed)
+
     def close(self, incarnation: Incarnation) -> None:
         self._note(Ended("close", incarnation))
 
@@ -356,7 +359,7 @@ class ControlParts:
         self.seen: list[Seen] = []
         self.full = False  # whether the relay reads nothing
         note = self.seen.append
-        self.registry = Registry(woken=lambda: self.sinks.soon())  # noqa: PLW0108  it is made later
+        self.registry = Registry()
         self.grants = Grants(self.registry.mark, set)
         self.records, self.watchlist = Records(note), Watchlist()
         self.hidden, self.clients = HiddenMaster(note), Clients()
@@ -399,14 +402,16 @@ class ControlParts:
         self.entries = MasterRegistrations(self.rosmaster, self.registry, self.faces.inner_uri)
         self.sinks = Sinks(
             self.registry,
-            self.grants,
-            self.store,
-            self.subscribers,
-            self.entries,
-            self.relay,
-            cast(Any, self.faces),
+            (
+                StoredGraph(self.grants, self.store),
+                self.subscribers,
+                self.entries,
+                self.relay,
+                self.relay.carried,
+                self.faces,
+            ),
         )
-        self.enforcement = Enforcement(self.revocation, self.sinks, idle(NodePorts))
+        self.enforcement = Enforcement(self.revocation, self.sinks.flush, self.relay, idle(NodePorts))
         self.start_relay()
         self.reconciler = Reconciler(
             self.rosmaster,

@@ -20,7 +20,7 @@ from appliance.master.calls.node_calls import NODE_CALLS, NodeCalls
 from appliance.master.calls.parameter_calls import ParameterCalls
 from appliance.master.calls.pipeline import Pipeline
 from appliance.master.calls.registration import RegistrationCalls
-from appliance.master.reconcile.arrivals import Arrivals
+from appliance.master.reconcile.arrivals import Arrivals, ServeNode
 from appliance.master.reconcile.publisher import OwnPublisher
 from appliance.master.reconcile.reconciler import Reconciler
 from appliance.master.reconcile.reminders import RelayMoves, Reminders
@@ -42,6 +42,7 @@ class Parts:
     monitor_calls: MonitorCalls
     pipeline: Pipeline
     table: Table
+    serve: ServeNode
 
 
 def assemble(base: Foundation) -> Parts:
@@ -50,6 +51,25 @@ def assemble(base: Foundation) -> Parts:
     settings = base.settings
     reminders = Reminders(core.registry, ends.subscribers)
     base.role.on_end_of_gap(reminders.begin)
+    parameters = ParameterCalls(
+        ends.rosmaster,
+        core.parameters,
+        ends.subscribers,
+        core.rights,
+        int(base.settings.limits.offload_bytes),
+    )
+    pipeline = _make_pipeline(base, core, ends, parameters)
+    node_calls = NodeCalls(
+        core.registry,
+        core.graph,
+        ends.relay,
+        ends.addresses,
+        ends.relay.nodes,
+        ends.liveness,
+        core.gate,
+        base.port(RVMASTER),
+    )
+    serve = partial(pipeline.handler, served(NODE_CALLS.values(), node_calls))
     arrivals = Arrivals(
         core.registry,
         core.graph,
@@ -58,21 +78,10 @@ def assemble(base: Foundation) -> Parts:
         places=ends.places,
         faces=ends.faces,
         addresses=ends.addresses,
-    )
-    parameters = ParameterCalls(
-        ends.rosmaster,
-        core.parameters,
-        ends.subscribers,
-        core.rights,
-        int(base.settings.limits.offload_bytes),
+        serve=serve,
     )
     registration = RegistrationCalls(
-        core.registry,
-        core.graph,
-        arrivals,
-        ends.relay,
-        parameters,
-        ends.subscribers,
+        core.registry, core.graph, arrivals, ends.relay, parameters, ends.subscribers
     )
     publisher = OwnPublisher(
         core.registry,
@@ -91,18 +100,15 @@ def assemble(base: Foundation) -> Parts:
     core.monitors.set(monitors)
     port = base.port(RVMASTER)
     monitor_calls = MonitorCalls(monitors, core.registry, ends.relay, ends.rosmaster.port, port)
-    pipeline, table = _make_calls(base, core, ends, registration, monitor_calls)
-    node_calls = NodeCalls(
+    lookups = LookupCalls(
         core.registry,
         core.graph,
         ends.relay,
         ends.addresses,
-        ends.relay.nodes,
-        ends.liveness,
-        core.gate,
         port,
+        stop=lambda reason: base.lifeline.say(messages.ApplianceStopRequested(reason)),
+        unseen=settings.publish_as if settings.hide_publisher else None,
     )
-    ends.handler.set(partial(pipeline.handler, served(NODE_CALLS.values(), node_calls)))
     return Parts(
         core=core,
         endpoints=ends,
@@ -120,7 +126,8 @@ def assemble(base: Foundation) -> Parts:
         monitors=monitors,
         monitor_calls=monitor_calls,
         pipeline=pipeline,
-        table=table,
+        table=master_table(registration, lookups, parameters, monitor_calls),
+        serve=serve,
     )
 
 
@@ -153,23 +160,8 @@ def _make_monitors(
     )
 
 
-def _make_calls(
-    base: Foundation,
-    core: Core,
-    ends: Endpoints,
-    registration: RegistrationCalls,
-    monitor_calls: MonitorCalls,
-) -> tuple[Pipeline, Table]:
+def _make_pipeline(base: Foundation, core: Core, ends: Endpoints, parameters: ParameterCalls) -> Pipeline:
     settings, trail, offload = base.settings, base.trail, int(base.settings.limits.offload_bytes)
-    lookups = LookupCalls(
-        core.registry,
-        core.graph,
-        ends.relay,
-        ends.addresses,
-        base.port(RVMASTER),
-        stop=lambda reason: base.lifeline.say(messages.ApplianceStopRequested(reason)),
-        unseen=settings.publish_as if settings.hide_publisher else None,
-    )
     execution = Execution(
         gate=core.gate,
         policy=core.policy,
@@ -177,15 +169,15 @@ def _make_calls(
         registry=core.registry,
         flush=ends.sinks.flush,
         liveness=ends.liveness,
-        parameters=registration.parameters,
+        parameters=parameters,
         redecide_for=ends.enforcement.redecide_for,
         hold_call=base.features.hold_call,
         large=offload,
         large_writes=LargeWrites(offload, base.quota_class, base.role.before_answer),
     )
-    pipeline = Pipeline(
+    return Pipeline(
         execution,
-        Multicall(execution, registration.parameters, trail, offload=offload),
+        Multicall(execution, parameters, trail, offload=offload),
         addresses=ends.addresses,
         trail=trail,
         limits=value_limits(settings),
@@ -194,4 +186,3 @@ def _make_calls(
         processor=base.listener_limits.time,
         before_answer=base.role.before_answer,
     )
-    return pipeline, master_table(registration, lookups, registration.parameters, monitor_calls)

@@ -1,6 +1,5 @@
 """Make the endpoints of RVMaster, which carry changes of the graph to nodes, relays and the ROS master."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from ipaddress import ip_address, ip_network
 
@@ -13,14 +12,11 @@ from appliance.control.monitor_call_gate import MonitorCallGate, own_host
 from appliance.master import rosout
 from appliance.master.endpoints.delivery import Delivery, NodeApiClient
 from appliance.master.endpoints.node_ports import AdvertisedAddresses, NodePorts
-from appliance.master.endpoints.proxy_endpoints import MasterSideApi, ProxyEndpoints
 from appliance.master.endpoints.relay_control import RelayControl
-from appliance.master.graph.registry import Incarnation
 from appliance.master.reconcile.liveness import Liveness
-from appliance.master.reconcile.sinks import Enforcement, Sinks
+from appliance.master.reconcile.sinks import Enforcement, MasterSideApi, ProxyEndpoints, Sinks, StoredGraph
 from appliance.master.reconcile.subscribers import Subscribers
 from appliance.master.rosmaster import MasterRegistrations, RosMaster, limits_of_answers
-from appliance.rpc.server import Handler
 from appliance.specifications.allocation import Allocation
 from appliance.specifications.specification_manager import ALLOCATION
 
@@ -32,7 +28,7 @@ _REFUSALS_OF_A_ROBOT = (
 
 @dataclass(frozen=True, slots=True)
 class Endpoints:
-    """The endpoints. `handler` is set once calls can be served."""
+    """The endpoints."""
 
     places: NodePorts
     addresses: AdvertisedAddresses
@@ -45,11 +41,10 @@ class Endpoints:
     sinks: Sinks
     enforcement: Enforcement
     liveness: Liveness
-    handler: Current[Callable[[Incarnation], Handler]]
 
 
 def make_endpoints(base: Foundation, core: Core) -> Endpoints:
-    settings, policies, handler = base.settings, base.policies, Current[Callable[[Incarnation], Handler]]()
+    settings, policies = base.settings, base.policies
     places = NodePorts(
         settings.listen_address[0],
         policies.current.ports,
@@ -92,7 +87,6 @@ def make_endpoints(base: Foundation, core: Core) -> Endpoints:
         core.registry,
         places,
         inner_port=base.port(INNER),
-        serve=handler,
         server=base.listener_limits.server,
     )
     entries = MasterRegistrations(rosmaster, core.registry, faces.inner_uri)
@@ -104,8 +98,8 @@ def make_endpoints(base: Foundation, core: Core) -> Endpoints:
         lambda: core.parameters.tree,
         may_read_value=core.rights.may_read_value,
     )
-    sinks = Sinks(core.registry, core.grants, base.store, subscribers, entries, relay, faces)
-    base.woken.set(sinks.soon)
+    stored = StoredGraph(core.grants, base.store)
+    sinks = Sinks(core.registry, (stored, subscribers, entries, relay, core.carried, faces))
     gate.set(
         MonitorCallGate(
             core.registry,
@@ -118,7 +112,7 @@ def make_endpoints(base: Foundation, core: Core) -> Endpoints:
             own_host(base.sockets[RVMASTER].getsockname()[0]),
         )
     )
-    enforcement = Enforcement(core.revocation, sinks, places)
+    enforcement = Enforcement(core.revocation, sinks.flush, relay, places)
     base.enforcement.set(enforcement)
     return Endpoints(
         places=places,
@@ -149,7 +143,6 @@ def make_endpoints(base: Foundation, core: Core) -> Endpoints:
             refusals=_REFUSALS_OF_A_ROBOT if base.role.paired else _REFUSALS,
             shut_out=base.role.in_doubt,
         ),
-        handler=handler,
     )
 
 

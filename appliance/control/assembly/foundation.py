@@ -66,7 +66,6 @@ class Foundation:
     listener_limits: ListenerLimits
     sockets: Mapping[str, socket.socket]
     enforcement: Current[Enforcement]
-    woken: Later[[], None]
     parameters_dirty: asyncio.Event
     role: ActiveRole
 
@@ -87,8 +86,7 @@ async def make_foundation(
 
     `tunnels` is set here, before the supervisor can report about tunnels.
     """
-    policy, woken = Current[Policy](), Later[[], None]()
-    registry = Registry(settings.limits.nodes_per_host, woken=woken)
+    policy, registry = Current[Policy](), Registry(settings.limits.nodes_per_host)
     quota_class = HostQuotaClass(policy, registry.registrations_of)
     audit, enforcement = Current[AuditLog](), Current[Enforcement]()
     signing = SignerRequests(audit)
@@ -158,7 +156,7 @@ async def make_foundation(
         approved=features.approved,
         live=lambda: enforcement().revocation.live(),  # noqa: PLW0108  it is assembled later
         changed=changed,
-        carried_out=lambda: enforcement().sinks.relay.carried_out(),  # noqa: PLW0108  it is assembled later
+        carried_out=lambda: enforcement().relay.carried_out(),  # noqa: PLW0108  it is assembled later
         site_keys=settings.site_keys,
     )
     policies.start(restarted=restarted or role.paired)
@@ -184,7 +182,6 @@ async def make_foundation(
         listener_limits=ListenerLimits(settings, trail, policy, quota_class),
         sockets=_open_listeners(settings, lifeline),
         enforcement=enforcement,
-        woken=woken,
         parameters_dirty=asyncio.Event(),
         role=role,
     )

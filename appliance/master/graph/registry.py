@@ -56,6 +56,10 @@ class Life(enum.StrEnum):
     FORGOTTEN = "forgotten"
 
 
+ENDED = frozenset({Life.REPLACED, Life.FORGOTTEN})
+"""The states of incarnations whose endpoints are closed."""
+
+
 @dataclass(frozen=True, slots=True)
 class NodeRegistration:
     """A registration of a node. `detail` is the topic's type or the service's `rosrpc` port."""
@@ -146,11 +150,11 @@ Change = Incarnation | RegistrationKey | PermissionRow
 
 
 class Registry:
-    """All known incarnations. `woken` is called for the first of several changes."""
+    """All known incarnations."""
 
-    def __init__(self, nodes_of_host: int = 500, *, woken: Callable[[], None] = lambda: None) -> None:
+    def __init__(self, nodes_of_host: int = 500) -> None:
         self._most_of_host = nodes_of_host
-        self._woken = woken
+        self._woken: list[Callable[[], None]] = []
         self._by_key: dict[str, Incarnation] = {}
         self._known: dict[tuple[str, Address, str], Incarnation] = {}
         self._live: dict[str, Incarnation] = {}
@@ -164,9 +168,14 @@ class Registry:
         self.version = 0  # increases with every change
         self._changed: dict[Change, None] = {}
 
+    def on_change(self, woken: Callable[[], None]) -> None:
+        """Call `woken` for the first of several changes."""
+        self._woken.append(woken)
+
     def mark(self, change: Change) -> None:
         if not self._changed:
-            self._woken()
+            for woken in self._woken:
+                woken()
         self._changed[change] = None
 
     def take_changes(self) -> list[Change]:

@@ -11,13 +11,17 @@ from dataclasses import dataclass
 from appliance.base import clock
 from appliance.master.caller import ApiUri, Caller
 from appliance.master.endpoints.node_ports import AdvertisedAddresses, NodePorts, NoPortError
-from appliance.master.endpoints.proxy_endpoints import ProxyEndpoints
 from appliance.master.graph.graph import RosGraph
 from appliance.master.graph.registry import Incarnation, Life, Registry, new_key
 from appliance.master.reconcile.liveness import Liveness
+from appliance.master.reconcile.sinks import ProxyEndpoints
 from appliance.policy.model import Address
+from appliance.rpc.server import Handler
 
 _CONNECT_SECONDS = 1.0
+
+ServeNode = Callable[[Incarnation], Handler]
+"""Makes the handler of a node's proxy endpoint."""
 
 
 class NodeElsewhereError(Exception):
@@ -35,6 +39,7 @@ class Arrivals:
     places: NodePorts
     faces: ProxyEndpoints
     addresses: AdvertisedAddresses
+    serve: ServeNode
 
     def known(self, caller: Caller, api: ApiUri) -> Incarnation | None:
         return self.registry.find(caller.caller_id, caller.peer.host, api.text)
@@ -58,7 +63,7 @@ class Arrivals:
         incarnation = self._make(caller, api)
         incarnation.calls += 1
         try:
-            await self.faces.open(incarnation)  # first, so that the end of the node closes its ports
+            await self.faces.open(incarnation, self.serve(incarnation))
             await self._check_place(caller, incarnation)
         except (NoPortError, NodeElsewhereError):
             self.graph.forgotten(incarnation)

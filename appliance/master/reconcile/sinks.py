@@ -1,21 +1,28 @@
-"""Make the store, the nodes, the ROS master and the relays agree with the registry, at the end of each turn.
+"""Make the store, the nodes, the ROS master, the relays and the endpoints agree with the registry, at each turn's end.
 
 1. A call is answered after its changes are flushed: they are stored, and the relay has them before a peer can use
    them. If a relay cannot take a change, operators' orders wait for it (`relay_control.py`).
 2. Whatever else changes the registry, `soon` flushes it before the event loop waits again.
+
+The sinks of the store and of the endpoints are defined here. Every incarnation has two endpoints, and neither reveals
+the node's real URI. The *inner* (master-side) endpoint is for the ROS master: one loopback listener serves all
+incarnations, whose keys are the paths of its URIs. The *outer* (peer-side) endpoint has its own port.
 """
 
 import asyncio
-from collections.abc import Iterable, Sequence
+import socket
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Protocol
 
 from appliance.base import clock
-from appliance.master.endpoints.node_ports import NodePorts
-from appliance.master.endpoints.proxy_endpoints import ProxyEndpoints
+from appliance.master.endpoints.node_ports import NodePorts, NoPortError
 from appliance.master.endpoints.relay_control import RelayControl
 from appliance.master.graph.graph import Grants
 from appliance.master.graph.registry import (
+    ENDED,
+    PUBLISHER_PATH,
     Change,
     Incarnation,
     Kind,
@@ -25,45 +32,45 @@ from appliance.master.graph.registry import (
     Registry,
 )
 from appliance.master.graph.revocation import Revocation
-from appliance.master.reconcile.subscribers import Subscribers
-from appliance.master.rosmaster import MasterRegistrations
 from appliance.policy.model import Address, address_of
 from appliance.policy.policy import Policy
+from appliance.rpc.server import Handler, HttpRequest, HttpServer
 from appliance.store.state_file import IncarnationRow, PermissionRow, RegistrationRow, StateStore
-from roswire.uris import parse_node_uri
+from roswire.uris import node_uri, parse_node_uri
+from roswire.xmlrpc import build_fault, build_response
+
+_TOGETHER = 1000  # changes that are written together
+_SHELVED = "revoked "  # the prefix of the stored kind of a withdrawn registration
+
+
+class Sink(Protocol):
+    """States the wanted state of changed keys."""
+
+    def flush(self, changed: Sequence[Change], /) -> None:
+        """State what differs; `changed` has nodes first."""
 
 
 @dataclass(frozen=True, slots=True)
 class Sinks:
-    """All sinks of the registry."""
+    """All sinks of the registry, in the order in which they get changes.
+
+    The endpoints are the last, because no sink may use the ports of an ended node afterwards.
+    """
 
     registry: Registry
-    grants: Grants
-    store: StateStore
-    subscribers: Subscribers
-    entries: MasterRegistrations
-    relay: RelayControl
-    faces: ProxyEndpoints
+    sinks: tuple[Sink, ...]
+
+    def __post_init__(self) -> None:
+        self.registry.on_change(self.soon)
 
     def soon(self) -> None:
         asyncio.get_running_loop().call_soon(self.flush)
 
     def flush(self) -> None:
-        """Send all changes. The endpoints of ended nodes close last, when no sink uses their ports."""
-        changed = self.registry.take_changes()
-        if not changed:
-            return
-        with ExitStack() as others:  # a defect of a sink takes no change from the others
-            others.callback(self._close_ended, changed)
-            for sink in (self.relay, self.entries, self.subscribers):
-                others.callback(sink.flush, changed)
-            save(changed, self.grants, self.store)
-
-    def _close_ended(self, changed: Iterable[Change]) -> None:
-        for node in changed:
-            if isinstance(node, Incarnation) and node.life in {Life.REPLACED, Life.FORGOTTEN}:
-                self.relay.carried.forgotten(node.key)
-                self.faces.close(node)
+        if changed := self.registry.take_changes():
+            with ExitStack() as others:  # a defect of a sink takes no change from the others
+                for sink in reversed(self.sinks):
+                    others.callback(sink.flush, changed)
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +78,8 @@ class Enforcement:
     """Revokes rights that are no longer allowed."""
 
     revocation: Revocation
-    sinks: Sinks
+    flush: Callable[[], None]
+    relay: RelayControl
     places: NodePorts
 
     def policy_changed(self, policy: Policy) -> int:
@@ -81,61 +89,65 @@ class Enforcement:
         """
         self.places.policy_changed(policy.ports)
         count = self.revocation.redecide()
-        self.sinks.flush()
-        self.sinks.relay.compare()
+        self.flush()
+        self.relay.compare()
         return count
 
     def expel(self, host: Address, reason: str) -> int:
         count = self.revocation.expel(host, reason)
-        self.sinks.flush()
+        self.flush()
         return count
 
     def redecide_for(self, host: Address, caller_id: str) -> None:
         self.revocation.redecide_for(host, caller_id)
-        self.sinks.flush()
+        self.flush()
 
 
-_TOGETHER = 1000  # changes that are written together
-_SHELVED = "revoked "  # the prefix of the stored kind of a withdrawn registration
+# --- the store ---
 
 
-def save(changed: Sequence[Change], grants: Grants, store: StateStore) -> None:
-    """Store the present state of what has changed.
+@dataclass(frozen=True, slots=True)
+class StoredGraph:
+    """Stores the present state of what has changed."""
 
-    After a crash, the store has all changes of a turn or none. Only a turn with thousands of changes is divided, so
-    that no other change waits for one large write.
-    """
-    for begin in range(0, len(changed), _TOGETHER):
-        with store.database.together():
-            for change in changed[begin : begin + _TOGETHER]:
-                _save(change, grants, store)
+    grants: Grants
+    store: StateStore
 
+    def flush(self, changed: Sequence[Change]) -> None:
+        """After a crash, the store has all changes of a turn or none.
 
-def _save(change: Change, grants: Grants, store: StateStore) -> None:
-    match change:
-        case Incarnation(life=Life.FORGOTTEN):
-            store.forget_incarnation(change.key)  # with its registrations and grants
-        case Incarnation():
-            store.save_incarnation(
-                IncarnationRow(
-                    change.key, change.name, str(change.host), change.api_text, change.told, change.outer_port,
-                    change.relay_port, change.own, change.life.value, change.changed, change.more_relay_ports,
-                )
-            )  # fmt: skip
-        case RegistrationKey(node, kind, resource, shelved) if node.life is not Life.FORGOTTEN:
-            stored_kind = f"{_SHELVED}{kind.value}" if shelved else kind.value
-            one = (node.shelf if shelved else node.registrations).get((kind, resource))
-            if one is None:
-                store.remove_registration(node.key, stored_kind, resource)
-            else:
-                store.save_registration(
-                    RegistrationRow(node.key, stored_kind, resource, one.detail, one.order)
-                )
-        case PermissionRow():
-            if change in grants.of(change.key):
-                store.save_permission(change)
-            else:
-                store.remove_permission(change)
+        Only a turn with thousands of changes is divided, so that no other change waits for one large write.
+        """
+        for begin in range(0, len(changed), _TOGETHER):
+            with self.store.database.together():
+                for change in changed[begin : begin + _TOGETHER]:
+                    self._save(change)
+
+    def _save(self, change: Change) -> None:
+        match change:
+            case Incarnation(life=Life.FORGOTTEN):
+                self.store.forget_incarnation(change.key)  # with its registrations and grants
+            case Incarnation():
+                self.store.save_incarnation(
+                    IncarnationRow(
+                        change.key, change.name, str(change.host), change.api_text, change.told, change.outer_port,
+                        change.relay_port, change.own, change.life.value, change.changed, change.more_relay_ports,
+                    )
+                )  # fmt: skip
+            case RegistrationKey(node, kind, resource, shelved) if node.life is not Life.FORGOTTEN:
+                stored_kind = f"{_SHELVED}{kind.value}" if shelved else kind.value
+                one = (node.shelf if shelved else node.registrations).get((kind, resource))
+                if one is None:
+                    self.store.remove_registration(node.key, stored_kind, resource)
+                else:
+                    self.store.save_registration(
+                        RegistrationRow(node.key, stored_kind, resource, one.detail, one.order)
+                    )
+            case PermissionRow():
+                if change in self.grants.of(change.key):
+                    self.store.save_permission(change)
+                else:
+                    self.store.remove_permission(change)
 
 
 def restore(registry: Registry, store: StateStore) -> int:
@@ -166,3 +178,71 @@ def restore(registry: Registry, store: StateStore) -> int:
     for incarnation in by_key.values():
         registry.restore(incarnation)
     return len(by_key)
+
+
+# --- the endpoints ---
+
+
+@dataclass(frozen=True, slots=True)
+class ProxyEndpoints:
+    """The open endpoints: `server(socket, handler)` serves the outer one of an incarnation."""
+
+    registry: Registry
+    places: NodePorts
+    inner_port: int
+    server: Callable[[socket.socket, Handler], HttpServer]
+    servers: dict[str, HttpServer] = field(default_factory=dict, init=False)
+
+    def flush(self, changed: Iterable[Change]) -> None:
+        for node in changed:
+            if isinstance(node, Incarnation) and node.life in ENDED:
+                self.close(node)
+
+    def inner_uri(self, incarnation: Incarnation) -> str:
+        return node_uri("127.0.0.1", self.inner_port, f"/{incarnation.key}/")
+
+    async def open(self, incarnation: Incarnation, handler: Handler) -> None:
+        """Serve an incarnation; if this fails, close its ports and raise `NoPortError`."""
+        try:
+            sock = self.places.socket(incarnation.outer_port).dup()
+        except OSError as error:
+            self.places.close(incarnation)
+            raise NoPortError(f"no proxy endpoint for {incarnation.name}: {error.strerror}") from error
+        server = self.server(sock, handler)
+        self.servers[incarnation.key] = server
+        await server.start()
+
+    async def reopen(self, incarnation: Incarnation, handler: Handler) -> None:
+        ports = incarnation.ports
+        if not self.places.reopen(incarnation):
+            raise NoPortError(f"a port of {incarnation.name} is in use by another program")
+        await self.open(incarnation, handler)
+        if incarnation.ports != ports:
+            self.registry.mark(incarnation)
+
+    def close(self, incarnation: Incarnation) -> None:
+        server = self.servers.pop(incarnation.key, None)
+        if server is not None:
+            server.close()
+            self.places.close(incarnation)
+
+    def close_all(self) -> None:
+        """Stop serving; the ports stay open for the next control process."""
+        for server in self.servers.values():
+            server.close()
+
+
+class MasterSideApi:
+    """Serves the ROS master's calls to nodes. The path is the incarnation's key, which no other host knows.
+
+    The calls are acknowledged and ignored: the ROS master joins the names in a value to keys that the policy did not
+    decide. `Subscribers` calls the nodes instead.
+    """
+
+    def __init__(self, registry: Registry) -> None:
+        self._registry = registry
+
+    async def handle(self, request: HttpRequest) -> bytes:
+        if request.path != PUBLISHER_PATH and self._registry.by_key(request.path.strip("/")) is None:
+            return build_fault(1, "this address serves no calls")
+        return build_response([1, "", 0])

@@ -8,10 +8,9 @@ import pytest
 
 from appliance.control.process import _end_others, _restore
 from appliance.master.endpoints.node_ports import NodePorts
-from appliance.master.endpoints.proxy_endpoints import ProxyEndpoints
 from appliance.master.graph.graph import Grants
 from appliance.master.graph.registry import Incarnation, Kind, Registry
-from appliance.master.reconcile.sinks import save
+from appliance.master.reconcile.sinks import ProxyEndpoints, StoredGraph
 from appliance.store.state_file import StateStore
 from roswire.uris import parse_node_uri
 from tests.support.engines import InlineDatabase
@@ -26,7 +25,7 @@ def fail(reason: str) -> None:
 
 
 class Ports(idle_class(ProxyEndpoints)):  # type: ignore[misc]  # it is made
-    async def reopen(self, _incarnation: Incarnation) -> None:
+    async def reopen(self, _incarnation: Incarnation, _handler: object) -> None:
         """Act as `ProxyEndpoints`."""
 
 
@@ -37,7 +36,7 @@ async def test_restored_nodes_follow_the_policy_in_force(tmp_path: Path) -> None
     node = Incarnation("key", "/n", host, parse_node_uri(URI), URI, "10.0.0.1", 19001, 19002)
     before.add(node)
     before.register(node, Kind.PUBLICATION, "/secret", "std_msgs/String")
-    save(before.take_changes(), idle(Grants), store)
+    StoredGraph(idle(Grants), store).flush(before.take_changes())
     await store.settled()
     registry = Registry()
     decided: list[tuple[object, list[str]]] = []
@@ -49,6 +48,7 @@ async def test_restored_nodes_follow_the_policy_in_force(tmp_path: Path) -> None
     policies = SimpleNamespace(current="the new policy")
     parts = SimpleNamespace(
         core=SimpleNamespace(registry=registry, grants=idle(Grants)),
+        serve=lambda _node: None,
         endpoints=SimpleNamespace(
             faces=Ports(),
             places=idle(NodePorts),

@@ -3,8 +3,8 @@ from typing import Any
 
 import pytest
 
-from appliance.master.endpoints.proxy_endpoints import MasterSideApi
 from appliance.master.graph.registry import PUBLISHER_PATH, Kind
+from appliance.master.reconcile.sinks import MasterSideApi
 from appliance.rpc.server import HttpRequest, Peer
 from roswire.xmlrpc import FaultReceived, Value, build_call, parse_response
 from tests.support.control_parts import ControlParts

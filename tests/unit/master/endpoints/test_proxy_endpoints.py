@@ -1,8 +1,8 @@
 import ipaddress
 from typing import Any, cast
 
-from appliance.master.endpoints.proxy_endpoints import ProxyEndpoints
 from appliance.master.graph.registry import Incarnation
+from appliance.master.reconcile.sinks import ProxyEndpoints
 from roswire.uris import parse_node_uri
 
 
@@ -17,7 +17,7 @@ class Told:
 def test_ports_are_closed_once() -> None:
     """A node is closed when it is replaced, and again when it is forgotten: then another node may have its ports."""
     places, server = Told(), Told()
-    faces = ProxyEndpoints(cast(Any, None), cast(Any, places), *[cast(Any, None)] * 3)
+    faces = ProxyEndpoints(cast(Any, None), cast(Any, places), *[cast(Any, None)] * 2)
     faces.servers["key"] = cast(Any, server)
     uri = "http://10.0.0.5:4000/"
     host = ipaddress.ip_address("10.0.0.5")

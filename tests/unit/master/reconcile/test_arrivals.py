@@ -5,15 +5,19 @@ import pytest
 
 from appliance.master.endpoints import node_ports
 from appliance.master.endpoints.node_ports import NodePorts, NoPortError
-from appliance.master.endpoints.proxy_endpoints import ProxyEndpoints
 from appliance.master.graph.registry import Incarnation, Registry
 from appliance.master.reconcile.arrivals import Arrivals
+from appliance.master.reconcile.sinks import ProxyEndpoints
 from appliance.policy.model import Address
 from appliance.policy.policy_compiler import compile_policy
 from tests.support.control_parts import ControlParts
 
 pytestmark = pytest.mark.anyio
 _NODES = 4
+
+
+def _serve(_incarnation: Incarnation) -> Any:
+    return None
 
 
 class FewPorts:
@@ -29,13 +33,13 @@ class FewPorts:
 
 
 class SlowFaces:
-    async def open(self, _incarnation: Incarnation) -> None:
+    async def open(self, _incarnation: Incarnation, _handler: object) -> None:
         for _turn in range(3):
             await asyncio.sleep(0)
 
 
 class NoFaces:
-    async def open(self, incarnation: Incarnation) -> None:
+    async def open(self, incarnation: Incarnation, _handler: object) -> None:
         raise NoPortError(f"no proxy endpoint for {incarnation.name}: Too many open files")
 
 
@@ -49,6 +53,7 @@ async def world_with(faces: NoFaces | SlowFaces) -> ControlParts:
         places=cast(Any, FewPorts(world.registry)),
         faces=cast(Any, faces),
         addresses=cast(Any, world.addresses),
+        serve=_serve,
     )
     cast(Any, world.faces).incarnation_for = arrivals.incarnation_for
     return world
@@ -154,9 +159,7 @@ async def world_with_ports(monkeypatch: pytest.MonkeyPatch) -> tuple[ControlPart
         "10.0.0.1", range(1, 1 + 2 * _NODES), keep=lambda *_: None, drop=lambda _: None,
         policy=lambda: NAMING,
     )  # fmt: skip
-    faces = ProxyEndpoints(
-        world.registry, places, 9, lambda: cast(Any, lambda _node: None), lambda sock, _: cast(Any, sock)
-    )
+    faces = ProxyEndpoints(world.registry, places, 9, lambda sock, _: cast(Any, sock))
     arrivals = Arrivals(
         world.registry,
         world.graph,
@@ -165,6 +168,7 @@ async def world_with_ports(monkeypatch: pytest.MonkeyPatch) -> tuple[ControlPart
         places,
         faces,
         cast(Any, world.addresses),
+        _serve,
     )
     monkeypatch.setattr(world.faces, "incarnation_for", arrivals.incarnation_for)
     monkeypatch.setattr(world.faces, "close", faces.close)

@@ -9,8 +9,7 @@ import pytest
 from appliance.master import rosmaster
 from appliance.master.endpoints.relay_control import RelayControl, RelayOutbox
 from appliance.master.graph.registry import Registry
-from appliance.master.reconcile import sinks
-from appliance.master.reconcile.sinks import Sinks
+from appliance.master.reconcile.sinks import ProxyEndpoints, StoredGraph
 from appliance.master.reconcile.subscribers import Subscribers
 from appliance.master.rosmaster import MasterRegistrations
 from tests.unit.master.reconcile.sink_history import history, live
@@ -30,18 +29,18 @@ class Fault(NamedTuple):
 
 FAULTS = {
     # the store
-    "a forgotten node stays stored": Fault(sinks, "_save", "store.forget_incarnation(change.key)", "pass"),
-    "a node is not stored": Fault(sinks, "_save", "store.save_incarnation(", "(lambda *_: None)("),
+    "a forgotten node stays stored": Fault(StoredGraph, "_save", "self.store.forget_incarnation(change.key)", "pass"),
+    "a node is not stored": Fault(StoredGraph, "_save", "self.store.save_incarnation(", "(lambda *_: None)("),
     "an ended registration stays stored": Fault(
-        sinks, "_save", "store.remove_registration(node.key, stored_kind, resource)", "pass"
+        StoredGraph, "_save", "self.store.remove_registration(node.key, stored_kind, resource)", "pass"
     ),
-    "a registration is not stored": Fault(sinks, "_save", "store.save_registration(", "(lambda *_: None)("),
+    "a registration is not stored": Fault(StoredGraph, "_save", "self.store.save_registration(", "(lambda *_: None)("),
     "a withdrawn registration is stored as in force": Fault(
-        sinks, "_save", "if shelved else kind.value", "if 0 else kind.value"
+        StoredGraph, "_save", "if shelved else kind.value", "if 0 else kind.value"
     ),
-    "an ended grant stays stored": Fault(sinks, "_save", "store.remove_permission(change)", "pass"),
-    "a grant is not stored": Fault(sinks, "_save", "store.save_permission(change)", "pass"),
-    "only a part of a long turn is stored": Fault(sinks, "save", "begin + _TOGETHER", "begin + 1"),
+    "an ended grant stays stored": Fault(StoredGraph, "_save", "self.store.remove_permission(change)", "pass"),
+    "a grant is not stored": Fault(StoredGraph, "_save", "self.store.save_permission(change)", "pass"),
+    "only a part of a long turn is stored": Fault(StoredGraph, "flush", "begin + _TOGETHER", "begin + 1"),
     # the nodes
     "a list is not compared": Fault(Subscribers, "_state", "!= wanted", "is not wanted"),
     "a list is sent only once": Fault(Subscribers, "_state", "!= wanted", "is None"),
@@ -180,9 +179,9 @@ FAULTS = {
         RelayControl, "_state_all", "post.unstated |= dict.fromkeys(changes)", "pass"
     ),
     # the turn
-    "a node that ended keeps its ports": Fault(Sinks, "_close_ended", "self.faces.close(node)", "pass"),
+    "a node that ended keeps its ports": Fault(ProxyEndpoints, "flush", "self.close(node)", "pass"),
     "a replaced node keeps its ports": Fault(
-        Sinks, "_close_ended", "Life.REPLACED, Life.FORGOTTEN", "Life.FORGOTTEN"
+        ProxyEndpoints, "flush", "in ENDED", "is Life.FORGOTTEN"
     ),
     "a change is not noted": Fault(
         Registry, "mark", "self._changed[change] = None", "self._changed.setdefault(0)"
