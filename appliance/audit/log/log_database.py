@@ -6,8 +6,8 @@ A new log gets its name when it is complete, so an empty or cut file is an error
 import os
 import secrets
 import sqlite3
-from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from urllib.parse import quote
 
@@ -43,6 +43,13 @@ TABLES = (
     "CREATE INDEX checkpoint_unsigned ON checkpoint (number) WHERE signature IS NULL",
 )
 
+_FOR_WRITING = (
+    "PRAGMA journal_mode = WAL",
+    "PRAGMA synchronous = FULL",
+    "PRAGMA journal_size_limit = 67108864",
+    "PRAGMA temp_store = MEMORY",
+    "PRAGMA cache_size = -16384",
+)
 COLUMNS = ", ".join(StoredColumns._fields)
 TEXT_OF_RECORD = (
     "coalesce(host, '') || ' ' || coalesce(caller_id, '') || ' ' || coalesce(resource, '') || ' ' ||"
@@ -57,12 +64,10 @@ class LogUnreadableError(Exception):
 def create(path: Path, begun: int) -> None:
     """Create a log that the group of the folder may read; `begun` is nanoseconds since the epoch."""
     making = name_to_make(path)
-    descriptor = os.open(making, os.O_CREAT | os.O_EXCL | os.O_RDWR, 0o600)
-    os.fchmod(descriptor, 0o640)
-    os.close(descriptor)
+    making.touch(0o600, exist_ok=False)
     try:
-        connection = sqlite3.connect(making, isolation_level=None)
-        try:
+        making.chmod(0o640)
+        with closing(sqlite3.connect(making, isolation_level=None)) as connection, connection:
             connection.execute("PRAGMA auto_vacuum = INCREMENTAL")
             connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
             connection.execute(f"PRAGMA user_version = {LAYOUT_VERSION}")
@@ -71,9 +76,6 @@ def create(path: Path, begun: int) -> None:
                 connection.execute(statement)
             connection.execute("INSERT INTO log VALUES (?, ?)", (secrets.token_hex(16), begun))
             connection.execute("INSERT INTO indexed VALUES (0)")
-            connection.execute("COMMIT")
-        finally:
-            connection.close()
         # Unlike rename(), link() does not replace a log that another process has created.
         os.link(making, path)
     finally:
@@ -82,25 +84,12 @@ def create(path: Path, begun: int) -> None:
 
 def open_for_writing(path: Path) -> sqlite3.Connection:
     """Return a connection that commits durably. Raises `LogUnreadableError` and `sqlite3.Error`."""
-    connection = sqlite3.connect(
-        _uri(path, "rw"),
-        uri=True,
-        isolation_level=None,
-        timeout=_BUSY_SECONDS,
-        check_same_thread=False,
-        cached_statements=128,  # an INSERT for each number of rows up to 64, and others
-    )
-    return _checked(connection, path, _prepare_writing)
-
-
-def _prepare_writing(connection: sqlite3.Connection) -> None:
-    mode = connection.execute("PRAGMA journal_mode = WAL").fetchone()[0]
+    connection = _connected(path, "rw", _FOR_WRITING)
+    mode = connection.execute("PRAGMA journal_mode").fetchone()[0]
     if mode != "wal":
+        connection.close()
         raise sqlite3.OperationalError(f"the file system has no write-ahead log (journal mode is {mode})")
-    connection.execute("PRAGMA synchronous = FULL")
-    connection.execute("PRAGMA journal_size_limit = 67108864")
-    connection.execute("PRAGMA temp_store = MEMORY")
-    connection.execute("PRAGMA cache_size = -16384")
+    return connection
 
 
 def open_for_reading(path: Path) -> sqlite3.Connection:
@@ -119,9 +108,7 @@ def open_for_reading(path: Path) -> sqlite3.Connection:
     mode = "ro"
     if not os.access(path.parent, os.W_OK) and not path.with_name(path.name + "-shm").exists():
         mode = "ro&immutable=1"  # a copy on a read-only medium does not change
-    connection = sqlite3.connect(_uri(path, mode), uri=True, isolation_level=None, timeout=_BUSY_SECONDS,
-                                 check_same_thread=False)  # fmt: skip
-    return _checked(connection, path, lambda _: None)
+    return _connected(path, mode, ())
 
 
 @contextmanager
@@ -134,34 +121,39 @@ def reading(path: Path, advice: str = "; run 'rosrv audit verify'") -> Iterator[
         raise LogUnreadableError(f"{path}: cannot be read: {error}{advice}") from error
 
 
-def _uri(path: Path, mode: str) -> str:
-    return f"file:{quote(str(path.absolute()))}?mode={mode}"
-
-
-def _checked(
-    connection: sqlite3.Connection, path: Path, prepare: Callable[[sqlite3.Connection], object]
-) -> sqlite3.Connection:
-    try:
-        kind = connection.execute("PRAGMA application_id").fetchone()[0]
-        version = connection.execute("PRAGMA user_version").fetchone()[0]
-        if kind != APPLICATION_ID:
-            raise LogUnreadableError(
-                f"{path}: not an audit log, or one that was cut; see 'rosrv audit verify'"
-            )
-        if version == 1:
-            raise LogUnreadableError(
-                f"{path}: written by version 0.1.0 of rosrv; start version 0.2.0 on it once"
-            )
-        if version != LAYOUT_VERSION:
-            raise LogUnreadableError(f"{path}: written by another version of rosrv (layout {version})")
-        prepare(connection)
-        connection.execute("SELECT count(*) FROM sqlite_schema")  # an error may quote bytes of the schema
-    except (sqlite3.DatabaseError, UnicodeDecodeError) as error:
-        connection.close()
-        if isinstance(error, sqlite3.OperationalError):
+def _connected(path: Path, mode: str, settings: Iterable[str]) -> sqlite3.Connection:
+    """Return a connection with these settings to a database that is a log."""
+    connection = sqlite3.connect(
+        f"file:{quote(str(path.absolute()))}?mode={mode}",
+        uri=True,
+        isolation_level=None,
+        timeout=_BUSY_SECONDS,
+        check_same_thread=False,
+        cached_statements=128,  # an INSERT for each number of rows up to 64, and others
+    )
+    with ExitStack() as failed:
+        failed.callback(connection.close)
+        try:
+            kind = connection.execute("PRAGMA application_id").fetchone()[0]
+            version = connection.execute("PRAGMA user_version").fetchone()[0]
+            if kind != APPLICATION_ID:
+                raise LogUnreadableError(
+                    f"{path}: not an audit log, or one that was cut; see 'rosrv audit verify'"
+                )
+            if version == 1:
+                raise LogUnreadableError(
+                    f"{path}: written by version 0.1.0 of rosrv; start version 0.2.0 on it once"
+                )
+            if version != LAYOUT_VERSION:
+                raise LogUnreadableError(f"{path}: written by another version of rosrv (layout {version})")
+            for setting in settings:
+                connection.execute(setting)
+            connection.execute("SELECT count(*) FROM sqlite_schema")  # an error may quote bytes of the schema
+        except sqlite3.OperationalError:
             raise
-        raise LogUnreadableError(f"{path}: damaged: {error}; keep it as evidence and move it away") from error
-    except BaseException:
-        connection.close()
-        raise
+        except (sqlite3.DatabaseError, UnicodeDecodeError) as error:
+            raise LogUnreadableError(
+                f"{path}: damaged: {error}; keep it as evidence and move it away"
+            ) from error
+        failed.pop_all()
     return connection
