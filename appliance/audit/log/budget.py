@@ -46,10 +46,8 @@ class Budget:
         clock: Callable[[], float] = clock.now,
     ) -> None:
         self.quota_class = quota_class
-        self._plenty, self._scarce = (
-            bounds,
-            dataclasses.replace(bounds, host=reserve.host, unknown=reserve.host),
-        )
+        self._plenty = bounds
+        self._scarce = dataclasses.replace(bounds, host=reserve.host, unknown=reserve.host)
         self._kept, self._kept_for = reserve.kept, kept_for
         self._clock = clock
         self.owed: Pool[str] = Pool("bytes of audit records to pay off", bounds, quota_class)
@@ -74,6 +72,7 @@ class Budget:
     def room(self, left: int | None) -> None:
         """Set how many bytes of the disk's reserve are left; None while more than the reserve is free."""
         self._left = left
+        self.owed.bounds = self._plenty if left is None else self._scarce
 
     def shut_out(self, host: str) -> str:
         """Return why a nearly full disk blocks this host, or an empty string."""
@@ -90,7 +89,6 @@ class Budget:
         if self._left is None and not self._changes and self._is_usual(host):
             return ""
         self._pay()
-        self.owed.bounds = self._plenty if self._left is None else self._scarce
         return self.owed.refusal(host, 0)
 
     def pause(self, host: str) -> float:

@@ -11,7 +11,7 @@
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from appliance.audit.log.record import AuditRecord
 from appliance.audit.log.repetition import (
@@ -31,6 +31,9 @@ from appliance.audit.log.repetition import (
 from appliance.quotas.pool import Bounds, Pool, QuotaClass
 from appliance.quotas.table import AUDIT_KINDS, AUDIT_READ_KINDS
 
+_DENIALS = frozenset({"connection refused", "limit exceeded", "malformed", "rate limited"})
+"""The events that are folded like denials."""
+
 _Holder = tuple[str | None, QuotaClass]
 
 
@@ -41,9 +44,6 @@ class FoldSettings:
     seconds: float = 10.0
     kinds: Bounds = AUDIT_KINDS.bounds
     read_kinds: Bounds = AUDIT_READ_KINDS.bounds
-    events: frozenset[str] = field(
-        default=frozenset({"connection refused", "limit exceeded", "malformed", "rate limited"})
-    )
 
     def __post_init__(self) -> None:
         if self.seconds < 0:
@@ -111,7 +111,7 @@ class RecordFolder:
         if not self._settings.seconds:
             yield record
             return
-        denial = record.decision == "deny" or record.event in self._settings.events
+        denial = record.decision == "deny" or record.event in _DENIALS
         if not (denial or record.folds or (record.decision == "allow" and self._by_subject)):
             yield record
             return

@@ -8,8 +8,6 @@ import contextlib
 import itertools
 import sqlite3
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
-from pathlib import Path
 
 from appliance.audit.log.log_database import LogUnreadableError
 from appliance.audit.log.log_writer import ChainWriter
@@ -43,34 +41,28 @@ def _settle(futures: list[Waiter], result: str | None) -> None:
             future.set_result(result)
 
 
-@dataclass(frozen=True)
-class CheckpointSchedule:
-    """A checkpoint is due after `records` records or `seconds` seconds, whichever is first."""
-
-    records: int = 1000
-    seconds: float = 60.0
-
-
 class Housekeeping:
-    """The background work of one log; `writer` returns None while the database is closed."""
+    """The background work of one log; `writer` returns None while the database is closed.
+
+    A checkpoint is due after `records` records or `seconds` seconds, whichever is first.
+    """
 
     def __init__(
         self,
-        path: Path,
         signatures: Signatures,
-        checkpoints: CheckpointSchedule,
         remover: Remover,
         *,
+        records: int,
+        seconds: float,
         writer: Callable[[], ChainWriter | None],
         clock: Callable[[], int],
         now: Callable[[], float],
         make: MakeRecord,
         hold: Callable[[AuditRecord], None],
     ) -> None:
-        self._path = path
         self._signatures = signatures
         self.remover = remover
-        self._checkpoints = checkpoints
+        self._records, self._seconds = records, seconds
         self._writer = writer
         self._clock = clock
         self._now = now
@@ -94,7 +86,7 @@ class Housekeeping:
         try:
             step(writer)
         except WRITE_ERRORS as error:
-            self._failing = f"{self._path}: {error}"
+            self._failing = f"{writer.path}: {error}"
             self._paused_until = self._now() + _HOUSE_SECONDS
         else:
             self._failing = None
@@ -103,7 +95,7 @@ class Housekeeping:
         if now < self._paused_until:
             return None
         writer, due = self._writer(), self.remover.due
-        return min(due, self._sealed_at + self._checkpoints.seconds) if writer and writer.unsealed else due
+        return min(due, self._sealed_at + self._seconds) if writer and writer.unsealed else due
 
     # --- between two batches of records -----------------------------------------------------------------------
 
@@ -122,8 +114,8 @@ class Housekeeping:
     # --- checkpoints ------------------------------------------------------------------------------------------
 
     def _seal_if_due(self, writer: ChainWriter) -> None:
-        waited = self._now() - self._sealed_at >= self._checkpoints.seconds or bool(self._waiting)
-        if writer.unsealed >= self._checkpoints.records or (writer.unsealed and waited):
+        waited = self._now() - self._sealed_at >= self._seconds or bool(self._waiting)
+        if writer.unsealed >= self._records or (writer.unsealed and waited):
             self.seal(writer)
         if self._waiting:
             number = writer.checkpoint_number

@@ -22,7 +22,7 @@ import structlog
 from appliance.audit.log.budget import Budget
 from appliance.audit.log.disk_space import DiskSpace
 from appliance.audit.log.folding import FoldSettings, RecordFolder
-from appliance.audit.log.housekeeping import WRITE_ERRORS, CheckpointSchedule, Housekeeping, Waiter, answer
+from appliance.audit.log.housekeeping import WRITE_ERRORS, Housekeeping, Waiter, answer
 from appliance.audit.log.ids import IdSource
 from appliance.audit.log.lock_holders import holders
 from appliance.audit.log.log_writer import ChainWriter
@@ -52,25 +52,12 @@ class Lag(NamedTuple):
     seconds: float
 
 
-class _LossCounter:
-    """Records that did not fit into the queue. Thread-safe."""
+class _Lost(NamedTuple):
+    """Records that did not fit into the queue."""
 
-    def __init__(self) -> None:
-        self.count = 0
-        self._first = self._last = 0
-        self._lock = threading.Lock()
-
-    def add(self, record: AuditRecord) -> None:
-        with self._lock:
-            self._first = self._first if self.count else record.time
-            self._last = record.time
-            self.count += 1
-
-    def take(self) -> dict[str, Any]:
-        with self._lock:
-            detail = {"count": self.count, "first_time": self._first, "last_time": self._last}
-            self.count = 0
-            return detail
+    records: int = 0
+    first_time: int = 0
+    last_time: int = 0
 
 
 class AuditLog:
@@ -112,10 +99,10 @@ class AuditLog:
         self._held: list[AuditRecord] = []
         signatures, turn = Signatures(path, signer), lambda: self._now
         self.housekeeping = Housekeeping(
-            path,
             signatures,
-            CheckpointSchedule(checkpoint_every, checkpoint_seconds),
             Remover(retention or Retention(), signatures, removals, clock=clock, now=turn, make=self._own),
+            records=checkpoint_every,
+            seconds=checkpoint_seconds,
             writer=lambda: self._writer,
             clock=clock,
             now=turn,
@@ -127,10 +114,9 @@ class AuditLog:
         self._failed: str | None = "the log is being opened"
         self._failed_since = 0
         self._caught_up = self._written_at = self._retry_at = self._now
-        self._lost = _LossCounter()
-        self._begun = self._closing = self._ended = False
+        self._lost, self._lock = _Lost(), threading.Lock()
+        self._closing = self._ended = False
         self._continued: tuple[str, int] | None = None
-        self._unwritten: str | None = None
         self._driver = drive("audit log", self.turn, 0.0 if durability == "strict" else _GATHER_SECONDS)
 
     # --- for the owner, from any thread ---------------------------------------------------------------------
@@ -140,8 +126,10 @@ class AuditLog:
 
         The caller must not change `detail` afterwards.
         """
-        if self._is_full:
-            self._lost.add(record)
+        if self._backlog >= self._queue_limit:
+            with self._lock:
+                records, first, _ = self._lost
+                self._lost = _Lost(records + 1, first or record.time, record.time)
             return record.id
         self.budget.charge(record)
         found_by = self._folder.in_full(record)
@@ -149,8 +137,8 @@ class AuditLog:
         return found_by
 
     @property
-    def _is_full(self) -> bool:
-        return len(self._queue) + len(self._held) >= self._queue_limit
+    def _backlog(self) -> int:
+        return len(self._queue) + len(self._held)
 
     async def wait_durable(self) -> str | None:
         """Return None after the fsync, or the reason why the records cannot be written."""
@@ -168,7 +156,7 @@ class AuditLog:
 
     @property
     def failed(self) -> str | None:
-        return self._failed
+        return self._failed or (f"{self.path}: the log is closed" if self._ended else None)
 
     @property
     def degraded(self) -> str | None:
@@ -177,7 +165,7 @@ class AuditLog:
 
     @property
     def lag(self) -> Lag:
-        waiting = len(self._queue) + len(self._held)
+        waiting = self._backlog
         return Lag(waiting, now() - self._caught_up if waiting else 0.0)
 
     def signed(self, number: int, signature: bytes, public_key: bytes) -> None:
@@ -208,7 +196,7 @@ class AuditLog:
         self._closing = True
         if not self._driver.end(seconds):
             return f"{self.path}: still being written after {seconds:g} s"
-        return self._unwritten
+        return self._failed
 
     def _put(self, item: AuditRecord | Waiter | Callable[[], None]) -> None:
         self._queue.append(item)
@@ -229,11 +217,10 @@ class AuditLog:
             due = self._turn(now)
         except BaseException as error:
             # A defect: the owner must see that records are no longer written, and deny requests.
-            self._unwritten = self._failed = f"{self.path}: writing ended: {type(error).__name__}: {error}"
+            self._failed = f"{self.path}: writing ended: {type(error).__name__}: {error}"
             raise
         finally:
             if due is None:
-                self._failed = self._failed or f"{self.path}: the log is closed"
                 self._ended = True
                 self._answer_waiting()
                 self._refuse_queued()
@@ -244,12 +231,9 @@ class AuditLog:
             while True:
                 item = self._queue.popleft()
                 if isinstance(item, asyncio.Future):
-                    answer([item], self._failed)
+                    answer([item], self.failed)
 
     def _turn(self, now: float) -> float | None:
-        if not self._begun:
-            self._begun = True
-            return now if self._attempt() else self._pause(now)
         closing = self._closing  # the queue has everything that was recorded before
         more = self._drain(now)
         for due in self._folder.expire(now):
@@ -282,7 +266,6 @@ class AuditLog:
         if self._attempt() and self._writer is not None and self._writer.unsealed:
             self.housekeeping.attempt(self.housekeeping.seal)
         self._answer_waiting()
-        self._unwritten = self._failed
         if self._writer is not None:
             self._writer.close()
 
@@ -374,10 +357,11 @@ class AuditLog:
             if self._failed_since:
                 self._failed_since = 0
                 _logger.warning("the audit log is written again")
-            if self._lost.count:
-                self._held.append(
-                    self._own("records lost", Severity.ALARM, "the queue was full", self._lost.take())
-                )
+            if self._lost.records:
+                with self._lock:
+                    lost, self._lost = self._lost, _Lost()
+                detail = {"count": lost.records, "first_time": lost.first_time, "last_time": lost.last_time}
+                self._held.append(self._own("records lost", Severity.ALARM, "the queue was full", detail))
         self._failed = None
 
     def _report_of_failure(self) -> list[AuditRecord]:
@@ -387,7 +371,7 @@ class AuditLog:
         return [self._own("log failed", Severity.ALARM, self._failed or "", detail)]
 
     def _answer_waiting(self) -> None:
-        result = self._failed if self._held or self._folder.touched else None
+        result = self.failed if self._held or self._folder.touched else None
         waiting, self._waiting = self._waiting, []
         answer(waiting, result)
 

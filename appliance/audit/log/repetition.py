@@ -109,14 +109,10 @@ def _plain_words(reason: str) -> str:
 
 
 def storable(record: AuditRecord) -> AuditRecord:
-    rule = record.rule
     texts = [record.host, record.caller_id, record.category, record.resource, record.reason, record.event]
     texts += [str(record.detail[name]) for name in ABOUT if name in record.detail]
-    texts += [] if rule is None else [rule.section, rule.key, rule.file]
     try:
-        for text in texts:
-            if text is not None and not text.isascii():
-                text.encode()
+        msgspec.msgpack.encode((texts, record.rule))
     except UnicodeEncodeError:
         return plain_record(record)
     return record
