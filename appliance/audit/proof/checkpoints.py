@@ -25,8 +25,8 @@ _TYPES = (int, int, bytes, bytes | None, bytes | None)
 class SignerMemory(msgspec.Struct, frozen=True):
     """The hashes of the checkpoints that the signer signed, from number `first` on, and the last approved removal."""
 
-    first: int
-    hashes: bytes
+    first: int = 1
+    hashes: bytes = b""
     removed: int | None = None
 
     @property
@@ -38,12 +38,11 @@ class SignerMemory(msgspec.Struct, frozen=True):
         return self.hashes[at : at + _HASH].hex() if self.first <= number <= self.last else None
 
 
-def read_signer_memory(directory: Path, log: str) -> SignerMemory | None:
-    path = directory / f"{log}.signed"
+def read_signer_memory(directory: Path, log: str) -> SignerMemory:
+    path, removed = (directory / f"{log}.{what}" for what in ("signed", "removed"))
     if not path.exists():
-        return None
+        return SignerMemory()
     data = path.read_bytes()
-    removed = directory / f"{log}.removed"
     approved = int.from_bytes(removed.read_bytes(), "big") if removed.exists() else None
     return SignerMemory(int.from_bytes(data[:_HEADER], "big"), data[_HEADER:], approved)
 
@@ -68,17 +67,17 @@ def last_removal(connection: sqlite3.Connection) -> RemovedRange | None:
 class CheckpointVerifier:
     """Verifies checkpoints, in order, against the hashes of the chain."""
 
-    def __init__(self, log: str, key: bytes | None, remembered: SignerMemory | None) -> None:
+    def __init__(self, log: str, key: bytes | None, remembered: SignerMemory) -> None:
         self._log = log
         self._key = key
         self._remembered = remembered
         self.signed = 0
         self.signed_through = 0
         self.rows: list[StoredCheckpoint] = []
-        self.removed = [] if remembered is None or remembered.removed is None else [remembered.removed]
+        self.removed = [] if remembered.removed is None else [remembered.removed]
         """The values of `removed` in the signer's memory and in checkpoints."""
-        self._signed_seen = False
-        self._on_their_way: list[int] = []
+        self._signature_missing: list[int] = []
+        """The checkpoints that the signer signed, and that have no signature; the last ones may be under way."""
 
     def read(self, connection: sqlite3.Connection) -> None:
         """Read all checkpoints. Raises `sqlite3.DatabaseError` after the readable ones."""
@@ -101,14 +100,18 @@ class CheckpointVerifier:
             number = row.number
             yield from self._check_row(row, previous, chain, last)
             previous = checkpoint_hash(row.text)
-        if len(self._on_their_way) > ASKED_AT_ONCE:
-            yield from self._signatures_removed()
-        if self._remembered is not None and self._remembered.last > number:
+        last_signed = max((row.number for row in self.rows if row.signature is not None), default=0)
+        many = sum(missing > last_signed for missing in self._signature_missing) > ASKED_AT_ONCE
+        for missing in self._signature_missing:
+            if many or missing < last_signed:
+                message = "the signer signed it, its signature was removed"
+                yield _finding(FindingKind.SIGNATURE_MISSING, missing, message)
+        if self._remembered.last > number:
             message = (
                 "signed by the signer, but not in the log: its end was cut off, or an old copy was restored"
             )
             yield _finding(FindingKind.CHECKPOINT_MISSING, number + 1, message, self._remembered.last)
-        if self._key is None and self._signed_seen:
+        if self._key is None and last_signed:
             yield LogFinding(
                 FindingKind.NO_KEY, 0, 0, "checkpoints are signed, but there is no key to verify them with"
             )
@@ -121,18 +124,14 @@ class CheckpointVerifier:
     ) -> Iterator[LogFinding]:
         number, _sequence, text, signature, public_key = row
         wrong = self._disagreement(row, previous, chain, last_sequence)
-        remembered = self._remembered.hash(number) if self._remembered else None
+        remembered = self._remembered.hash(number)
         if wrong is not None:
             yield wrong
         elif remembered is not None and remembered != checkpoint_hash(text):
             yield _finding(FindingKind.CHECKPOINT_CHANGED, number, "not the one that the signer signed")
         elif signature is None and remembered is not None:
-            self._on_their_way.append(number)
-        if signature is None:
-            return
-        yield from self._signatures_removed()
-        self._signed_seen = True
-        if self._key is None:
+            self._signature_missing.append(number)
+        if signature is None or self._key is None:
             return
         key, expected = None if public_key is None else public_key.hex(), self._key.hex()
         match signature_fault(text, signature.hex(), key, expected, signature_is_valid):
@@ -144,12 +143,6 @@ class CheckpointVerifier:
             case _ if wrong is None:
                 self.signed += 1
                 self.signed_through = row.sequence
-
-    def _signatures_removed(self) -> Iterator[LogFinding]:
-        numbers, self._on_their_way = self._on_their_way, []
-        for number in numbers:
-            message = "the signer signed it, its signature was removed"
-            yield _finding(FindingKind.SIGNATURE_MISSING, number, message)
 
     def _disagreement(
         self, row: StoredCheckpoint, previous: str, chain: dict[int, bytes], last_sequence: int

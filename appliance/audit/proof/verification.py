@@ -65,7 +65,7 @@ def verify(
         connection.text_factory = lambda text: text.decode("utf-8", "surrogateescape")
         log = _log_id(connection)
         # Read the memory before the log, so that a checkpoint signed in between is at most in the log.
-        remembered = None if signer is None else read_signer_memory(signer, log)
+        remembered = SignerMemory() if signer is None else read_signer_memory(signer, log)
         connection.execute("BEGIN").execute("SELECT count(*) FROM sqlite_schema")  # the log as it is now
         # A key is pinned before its first signature is stored: read it after that.
         if public_key is None and pinned_key_path(path).exists():
@@ -109,7 +109,7 @@ class _Verifier:
         connection: sqlite3.Connection,
         log: str,
         key: bytes | None,
-        remembered: SignerMemory | None,
+        remembered: SignerMemory,
         *,
         copies: Sequence[SignedCheckpoint] | None,
         progress: Callable[[int], None],

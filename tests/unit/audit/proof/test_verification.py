@@ -425,7 +425,7 @@ def test_too_many_missing_signatures_are_found(make_log: MakeLog, path: Path, tm
 def test_a_checkpoint_made_during_verification_is_not_a_finding(
     log: Path, make_log: MakeLog, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def meanwhile(directory: Path, log_id: str) -> SignerMemory | None:
+    def meanwhile(directory: Path, log_id: str) -> SignerMemory:
         writing = make_log(checkpoint_every=10, checkpoint_seconds=3600)
         for number in range(40):
             writing.record(decision(writing, number))
