@@ -142,14 +142,10 @@ def write_segment(log: Path, number: int, write: Callable[[bytes], object]) -> S
 
 def next_segment(log: Path, after: int) -> int | None:
     """Return the first checkpoint above `after`, signed or not. Raises `LogUnreadableError`."""
+    query = "SELECT min(number) FROM checkpoint WHERE number > ?"
     with reading(log) as connection:
-        return _number(
-            connection.execute("SELECT min(number) FROM checkpoint WHERE number > ?", (after,)).fetchone()
-        )
-
-
-def _number(row: tuple[int | None]) -> int | None:
-    return row[0]
+        number: int | None = connection.execute(query, (after,)).fetchone()[0]
+    return number
 
 
 def _header(connection: sqlite3.Connection, number: int) -> SegmentHeader | None:

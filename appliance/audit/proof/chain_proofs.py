@@ -3,6 +3,7 @@
 `appliance/formats/bundle_verifier.py` verifies them with the public key alone.
 """
 
+import itertools
 import json
 import sqlite3
 from collections.abc import Iterator
@@ -17,7 +18,7 @@ from appliance.audit.log.record_format import LogEntry, as_json
 from appliance.audit.proof.checkpoints import last_removal
 from appliance.audit.proof.copies import SignedCheckpoint, select_signed
 from appliance.audit.search.query import Filter
-from appliance.audit.search.search import search
+from appliance.audit.search.search import export
 from appliance.signing.log_proof import NO_CHECKPOINT, genesis, link
 
 _Hash = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]
@@ -37,15 +38,20 @@ class ChainProof(msgspec.Struct, frozen=True, kw_only=True):
 
 def evidence(path: Path, wanted: Filter, page: int = 1000) -> Iterator[tuple[LogEntry, ChainProof]]:
     """Yield the records found with their proofs, oldest first. Raises `LogUnreadableError` and `FilterError`."""
-    cursor: str | None = "0"
-    waiting: LogEntry | None = None
-    while cursor is not None:
-        entries, cursor = search(path, wanted, cursor, page, newest_first=False)
-        if waiting is not None:
-            entries = [waiting, *entries]
-        last = cursor is None
-        yield from _placed(path, entries, whole=last)
-        waiting = entries[-1] if entries and not last else None
+    entries, ahead = itertools.tee(export(path, wanted, page))
+    following = itertools.chain((entry.sequence for entry in itertools.islice(ahead, 1, None)), [0])
+    pairs = zip(entries, following, strict=False)
+    while part := list(itertools.islice(pairs, page)):
+        with reading(path) as connection:
+            connection.execute("BEGIN")
+            places = ChainReader(connection)
+            chains = [places.place(entry.sequence, after) for entry, after in part]
+        for (entry, _after), chain in zip(part, chains, strict=True):
+            if chain is None:
+                raise LogUnreadableError(
+                    f"{path}: retention removed record {entry.sequence} while it was exported: export again"
+                )
+            yield entry, chain
 
 
 def evidence_line(entry: LogEntry, chain: ChainProof, robot: str = "") -> str:
@@ -56,24 +62,6 @@ def evidence_line(entry: LogEntry, chain: ChainProof, robot: str = "") -> str:
 def stored_line(columns: StoredColumns, chain: ChainProof) -> bytes:
     stored = columns._asdict() | {"detail": columns.detail.decode("utf-8", "surrogateescape")}
     return json.dumps({**stored, "chain": msgspec.to_builtins(chain)}, separators=(",", ":")).encode() + b"\n"
-
-
-def _placed(path: Path, entries: list[LogEntry], *, whole: bool) -> Iterator[tuple[LogEntry, ChainProof]]:
-    """Yield entries with their proofs; leave out the last entry unless the export ends with it (`whole`)."""
-    following = [entry.sequence for entry in entries[1:]] + ([0] if whole else [])
-    with reading(path) as connection:
-        connection.execute("BEGIN")
-        places = ChainReader(connection)
-        placed = [
-            (entry, places.place(entry.sequence, after))
-            for entry, after in zip(entries, following, strict=False)
-        ]
-    for entry, chain in placed:
-        if chain is None:
-            raise LogUnreadableError(
-                f"{path}: retention removed record {entry.sequence} while it was exported: export again"
-            )
-        yield entry, chain
 
 
 class ChainReader:
@@ -88,11 +76,9 @@ class ChainReader:
 
     def place(self, sequence: int, following: int) -> ChainProof | None:
         """Return the proof up to the record `following` (0: none); None for a removed record."""
-        query = "SELECT hash FROM record WHERE sequence = ?"
-        row = self._connection.execute(query, (sequence,)).fetchone()
-        if row is None:
+        digest = self._hash(sequence)
+        if digest is None:
             return None
-        digest: bytes = row[0]
         checkpoint = self._checkpoint(sequence)
         ends = checkpoint if checkpoint and (not following or checkpoint.sequence < following) else None
         upto = ends.sequence if ends else following - 1
@@ -108,14 +94,17 @@ class ChainReader:
     def _previous(self, sequence: int) -> str:
         if self._before[0] == sequence - 1:
             return self._before[1]
-        query = "SELECT hash FROM record WHERE sequence = ?"
-        row = self._connection.execute(query, (sequence - 1,)).fetchone()
-        if row is not None:
-            return str(row[0].hex())
+        digest = self._hash(sequence - 1)
+        if digest is not None:
+            return digest.hex()
         if sequence == 1:
             return genesis(str(self._log)).hex()
         removed = last_removal(self._connection)
         return NO_CHECKPOINT if removed is None else removed.last_hash
+
+    def _hash(self, sequence: int) -> bytes | None:
+        rows = self._connection.execute("SELECT hash FROM record WHERE sequence = ?", (sequence,))
+        return next((digest for (digest,) in rows), None)
 
     def _checkpoint(self, sequence: int) -> SignedCheckpoint | None:
         known = self._sealing

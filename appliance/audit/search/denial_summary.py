@@ -20,7 +20,7 @@ from appliance.audit.log.record_format import LogEntry, rfc3339, rule_text, with
 from appliance.audit.log.repetition import OTHERS
 from appliance.audit.search.equality import FOLDED, plain_reason, time_span, times
 from appliance.audit.search.query import Filter
-from appliance.audit.search.search import search
+from appliance.audit.search.search import export
 from appliance.base.varying_numbers import without_numbers
 
 LARGEST_SUMMARY = 1000
@@ -99,16 +99,8 @@ class _HostCounts:
 
 def summary_of_log(path: Path, wanted: Filter, limit: int) -> DenialSummary:
     """Return the summary of a log, with at most `limit` hosts. Raises `LogUnreadableError` and `FilterError`."""
-    return summarised(_newest_first(path, msgspec.structs.replace(wanted, decision=("deny",))), limit)
-
-
-def _newest_first(path: Path, wanted: Filter) -> Iterator[LogEntry]:
-    cursor: str | None = None
-    while True:
-        entries, cursor = search(path, wanted, cursor, _PAGE)
-        yield from entries
-        if cursor is None:
-            return
+    denials = msgspec.structs.replace(wanted, decision=("deny",))
+    return summarised(export(path, denials, _PAGE, newest_first=True), limit)
 
 
 def summarised(denials: Iterable[LogEntry], limit: int) -> DenialSummary:

@@ -77,11 +77,14 @@ def show(path: Path, record_id: str, neighbours: int = 5) -> RecordInContext | N
     return _reading(path, find)
 
 
-def export(path: Path, wanted: Filter, page: int = 1000) -> Iterator[LogEntry]:
-    cursor: str | None = "0"
-    while cursor is not None:
-        entries, cursor = search(path, wanted, cursor, page, newest_first=False)
+def export(path: Path, wanted: Filter, page: int = 1000, *, newest_first: bool = False) -> Iterator[LogEntry]:
+    """Yield all records found. Raises `LogUnreadableError` and `FilterError`."""
+    cursor = None if newest_first else "0"
+    while True:
+        entries, cursor = search(path, wanted, cursor, page, newest_first=newest_first)
         yield from entries
+        if cursor is None:
+            return
 
 
 def last_sequence(path: Path) -> int:
