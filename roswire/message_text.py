@@ -8,6 +8,7 @@ import itertools
 import re
 from dataclasses import dataclass
 
+from roswire.counted import counted
 from roswire.errors import DefinitionError
 
 PRIMITIVES = {
@@ -120,7 +121,9 @@ def parse_service(name: str, text: str, source: str) -> ServiceDefinition:
     lines = text.split("\n")
     breaks = [index for index, line in enumerate(lines) if line.startswith("---")]
     if len(breaks) != 1:
-        raise DefinitionError(f"{len(breaks)} lines '---'; write one between request and response", source)
+        raise DefinitionError(
+            f"{counted(len(breaks), 'line')} '---'; write one between request and response", source
+        )
     middle = breaks[0]
     request = parse_message(f"{name}Request", "\n".join(lines[:middle]), source)
     response = parse_message(f"{name}Response", "\n".join(lines[middle + 1 :]), source, middle + 2)

@@ -2,10 +2,11 @@
 
 from collections.abc import Mapping
 
+from appliance.base.counted import counted
 from appliance.channel.answers.monitor_answers import Replacement
 from appliance.cli.commit_confirm import say_deadline
 from appliance.cli.output import moment
-from rosmop.tool.terminal import counted, say
+from rosmop.tool.terminal import say
 
 
 def say_replaced(body: Replacement, promote: str = "rosrv monitor promote") -> None:

@@ -14,6 +14,7 @@ from rich.text import Text
 from appliance.api.front.moments import in_full
 from appliance.base.actors import DISK
 from appliance.base.ages import age
+from appliance.base.counted import counted
 from appliance.channel.admin import A, AdminAnswer, StatusWanted
 from appliance.channel.alarms import Alarm, activity, open_alarms
 from appliance.channel.answers.host_answers import PortsSeen
@@ -33,7 +34,6 @@ from appliance.cli.status_watch import LEAST_SECONDS, LONGEST_SECONDS, StatusVie
 from appliance.features.views import pair_view, states_of
 from appliance.policy.host_names import HostInWords
 from rosmop.tool.tables import table_of
-from rosmop.tool.terminal import counted
 
 _PORT_STATES = ("closed", "open", "unknown")
 _MOST_NAMED = 8

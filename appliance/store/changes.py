@@ -110,7 +110,9 @@ class Tables:
                 )
             for row in change.rows:
                 if len(row) != len(columns):
-                    raise ChangeError(f"a row of {change.table} has {len(columns)} values, not {len(row)}")
+                    raise ChangeError(
+                        f"a row of {change.table} has {counted(len(columns), 'value')}, not {len(row)}"
+                    )
                 for value, (name, column) in zip(row, columns.items(), strict=True):
                     if problem := column.problem(value):
                         raise ChangeError(f"{change.table}.{name} {problem}")

@@ -15,6 +15,7 @@ import typer
 from appliance.audit.log.record_format import printable
 from appliance.audit.search.filter_options import FILTER, FilteredCommand
 from appliance.audit.search.query import FilterError
+from appliance.base.counted import counted
 from appliance.base.timestamps import TimestampError
 from rosrv_fleet.bundles.commands import bundle
 from rosrv_fleet.collector import Collector, make_collector
@@ -97,7 +98,7 @@ def init(
     typer.echo(f"public key of receipts: {make_receipt_key(found.data)}")
     with psycopg.connect(found.database) as connection:
         applied = migrate(connection)
-    typer.echo(f"database: {len(applied)} migrations applied")
+    typer.echo(f"database: {counted(len(applied), 'migration')} applied")
 
 
 @app.command("serve")
@@ -240,7 +241,8 @@ def _print_proof(proof: LogProof, *, as_json: bool) -> None:
         return
     begins = f" after {proof.begins_after} that retention removed" if proof.begins_after else ""
     typer.echo(
-        f"{proof.robot}: log {proof.log}: {proof.records} records in {proof.segments} segments are proven{begins},"
+        f"{proof.robot}: log {proof.log}: {counted(proof.records, 'record')} in {counted(proof.segments, 'segment')}"
+        f" {'is' if proof.records == 1 else 'are'} proven{begins},"
         f" up to {proof.last}; {proof.missing} are missing"
     )
     if proof.removal:
@@ -266,7 +268,7 @@ def reindex(config: Config = DEFAULT_CONFIG) -> None:
         indexed, damaged = _index_all(collector)
     finally:
         collector.database.close()
-    _note(f"{indexed} segments are indexed")
+    _note(f"{counted(indexed, 'segment is', 'segments are')} indexed")
     raise typer.Exit(1 if damaged else 0)
 
 

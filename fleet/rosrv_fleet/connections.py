@@ -20,6 +20,7 @@ from typing import Any
 import structlog
 
 from appliance.base import clock
+from appliance.base.counted import counted
 from rosrv_fleet.config import Limits
 
 _OTHER_FILES = 256  # open files that are not connections: uploads, the database, workers
@@ -255,7 +256,7 @@ def permitted_connections(wanted: int) -> int:
     most = files - _OTHER_FILES
     if most < _LEAST_CONNECTIONS:
         raise TooFewFilesError(
-            f"only {files} files may be open: raise the limit (LimitNOFILE, ulimit -n) to {needed}"
+            f"only {counted(files, 'file')} may be open: raise the limit (LimitNOFILE, ulimit -n) to {needed}"
         )
     if most < wanted:
         _log.warning(

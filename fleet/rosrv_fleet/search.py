@@ -13,6 +13,7 @@ from psycopg_pool import PoolTimeout
 from appliance.audit.log.columns import StoredColumns, from_columns
 from appliance.audit.log.record_format import LogEntry, as_object
 from appliance.audit.search.query import FilterError
+from appliance.base.counted import counted
 from rosrv_fleet.database import IndexDatabase
 from rosrv_fleet.search_sql import FleetFilter, SearchCursor, days_statement, parse_cursor, search_statement
 
@@ -45,7 +46,7 @@ class Searches:
         with self._lock:
             if self._running[token] >= max(1, self._most // 2):
                 raise TooManySearchesError(
-                    f"the token {token} has {self._running[token]} searches running: wait for them"
+                    f"the token {token} has {counted(self._running[token], 'search')} running: wait for them"
                 )
             if self._running.total() >= self._most:
                 raise TooManySearchesError(f"{self._most} searches are running: try again")

@@ -10,6 +10,7 @@ from datetime import UTC, datetime
 
 import msgspec
 
+from appliance.base.counted import counted
 from appliance.formats.segments import SegmentError, SegmentHeader, SegmentReader
 from rosrv_fleet.enrolment import Robot
 from rosrv_fleet.segment_store import RemovalNote, SegmentPlace, SegmentStore
@@ -107,7 +108,7 @@ def _begin_after(note: RemovalNote, proof: LogProof) -> None:
     day = datetime.fromtimestamp(note.time // 10**9, UTC).date().isoformat()
     proof.removal = (
         f"records up to {proof.removed} were removed by the collector ({note.by}), the last on {day}:"
-        f" {note.segments} segments with {note.gaps} gaps and {note.forks} forks"
+        f" {counted(note.segments, 'segment')} with {counted(note.gaps, 'gap')} and {counted(note.forks, 'fork')}"
     )
 
 

@@ -8,6 +8,8 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Protocol
 
+from roswire.counted import counted
+
 ATTEMPTS = 3
 
 Work = Callable[[bytes], bytes]
@@ -83,6 +85,6 @@ def execute(
                 continue
             tried = attempts.pop(number)
             if isinstance(result, WorkerDeath):
-                yield number, WorkerDeath(f"{result.reason}; tried {tried} times")
+                yield number, WorkerDeath(f"{result.reason}; tried {counted(tried, 'time')}")
             else:
                 yield number, result

@@ -18,6 +18,7 @@ from rosmop.certify.guesses import PastGuesses
 from rosmop.certify.machines import StateMachineFollower
 from rosmop.certify.past_formulas import PastFollower
 from rosmop.certify.words import ExpressionDerivatives
+from roswire.counted import counted
 
 MOST_STEPS = 200_000
 MOST_WORK = 400_000
@@ -67,7 +68,9 @@ def certify(logic: str, formula: str, events: Sequence[str], tables: AutomatonTa
         return Certificate(False, False, f"the certifier does not read it ({error}): tested, not proved")
     except WorkLimitError:
         return Certificate(False, False, "there are too many cases to check: tested, not proved")
-    return Certificate(True, False, f"proved: its automaton matches its definition ({pairs} cases checked)")
+    return Certificate(
+        True, False, f"proved: its automaton matches its definition ({counted(pairs, 'case')} checked)"
+    )
 
 
 def _look_at_form(logic: str, events: Sequence[str], tables: AutomatonTables) -> None:
@@ -81,7 +84,9 @@ def _look_at_form(logic: str, events: Sequence[str], tables: AutomatonTables) ->
         raise _WrongError("it has time limits, but its logic has none")
     for state, row in enumerate(tables.table):
         if len(row) != len(events):
-            raise _WrongError(f"state {state} has {len(row)} transitions, but there are {len(events)} events")
+            raise _WrongError(
+                f"state {state} has {counted(len(row), 'transition')} for {counted(len(events), 'event')}"
+            )
     reached = itertools.chain((tables.initial,), *tables.table, (target for _, target in limits))
     if not all(map(range(len(tables.table)).__contains__, reached)):
         raise _WrongError("a transition leads to a state that does not exist")

@@ -7,6 +7,7 @@ from rosmop.form.findings import SpecificationError
 from rosmop.text import tree
 from rosmop.types import value_types
 from rosmop.types.value_types import Type
+from roswire.counted import counted
 
 
 def converted(scope: FunctionScope, node: tree.Expression, target: Type) -> nodes.Expression:
@@ -26,7 +27,8 @@ def elements(scope: FunctionScope, node: tree.InitializerList, target: Type) -> 
         )
     if target.length is not None and len(node.items) > target.length:
         raise SpecificationError.at(
-            node.items[target.length].position, f"more than the {target.length} elements of the array"
+            node.items[target.length].position,
+            f"more than the {counted(target.length, 'element')} of the array",
         )
     items = tuple(converted(scope, item, target.element) for item in node.items)
     return nodes.Vector(target, items, 0 if target.length is None else target.length - len(items))

@@ -12,6 +12,7 @@ from rosmop.text import tree
 from rosmop.types import value_types
 from rosmop.types.messages import MessageTypes, UnknownNameError
 from rosmop.types.value_types import Type
+from roswire.counted import counted
 from roswire.message_layout import ArrayPart, FixedField, FixedPart, MessageLayout, Part, StringPart
 
 _PARTS_OF_TIME = {"sec": 0, "nsec": 4}
@@ -28,7 +29,8 @@ def type_of_path(messages: MessageTypes, record: str, path: tuple[tree.PathStep,
                 )
             if kind.length is not None and step.index >= kind.length:
                 raise SpecificationError.at(
-                    step.position, f"`{step.name}` has {kind.length} elements; {step.index} is past the end"
+                    step.position,
+                    f"`{step.name}` has {counted(kind.length, 'element')}; {step.index} is past the end",
                 )
             kind = kind.element
     return kind

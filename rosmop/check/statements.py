@@ -21,6 +21,7 @@ from rosmop.types import value_types
 from rosmop.types.messages import nearest, shown
 from rosmop.types.resolve import record, resolve
 from roswire import names
+from roswire.counted import counted
 from roswire.errors import DefinitionError
 
 LARGE = 4096
@@ -168,7 +169,8 @@ def _array(
             length = len(declarator.value.value)
             raise SpecificationError.at(
                 declarator.value.position,
-                f"a string of {length} characters and its terminating zero need `{declarator.name}[{length + 1}]`",
+                f"a string of {counted(length, 'character')} and its terminating zero need"
+                f" `{declarator.name}[{length + 1}]`",
             )
         return value_types.CHARACTERS, nodes.Call(value_types.CHARACTERS, "e_filled", (zeros, text), site)
     if size is None:

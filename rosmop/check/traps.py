@@ -36,8 +36,8 @@ def _called_again(event: tree.EventDefinition) -> Iterator[Diagnostic]:
         case tree.MessageTrigger(part="request" | "response", topic=service):
             for node in tree.walk(event.action):
                 if isinstance(node, tree.CallStatement) and node.service == service:
-                    text = f"{shown(event.name)} calls {service}, and happens with each call of it"
-                    text += ": it calls without end; call it from another event"
+                    text = f"calls {service}, and happens with each call of it: it calls without end;"
+                    text = f"{shown(event.name)} {text} call it from another event"
                     yield Diagnostic(node.position, "warning", text)
 
 

@@ -10,6 +10,7 @@ from rosmop.check.invocation import MemberCall, Method, empty, length
 from rosmop.form import nodes
 from rosmop.form.findings import Position, SpecificationError
 from rosmop.types import value_types
+from roswire.counted import counted
 
 
 def element_value(base: Value, index: Value, position: Position, site: int) -> Value:
@@ -21,7 +22,7 @@ def element_value(base: Value, index: Value, position: Position, site: int) -> V
     known = index.constant
     if kind.length is not None and isinstance(known, int) and not 0 <= known < kind.length:
         raise SpecificationError.at(
-            index.position, f"index {known} is past the end of an array of {kind.length} elements"
+            index.position, f"index {known} is past the end of an array of {counted(kind.length, 'element')}"
         )
     place = ElementLvalue(base, at, site) if base.place is not None else None
     element = nodes.Call(kind.element, "l_element", (base.form, at), site)

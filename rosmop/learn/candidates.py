@@ -14,6 +14,7 @@ from rosmop.learn.rv_text import identifier, literal, number, rounded_down, roun
 from rosmop.learn.series import HighestValues, Series, Statistic, ValueSeries
 from rosmop.learn.topic_orders import TopicOrders, TopicPair
 from rosmop.learn.topics import TopicContent, TopicRhythm
+from roswire.counted import counted
 
 QUIET_HOURS = 10.0
 MOST = {"range": 10, "constant": 12, "values": 6, "rate": 6, "unchanged": 6, "moves": 2, "order": 2}
@@ -131,8 +132,9 @@ class _Proposer:
         for path, lengths in self._by_field(topic, content.lengths):
             if len(lengths.windows) == 1:
                 (length,) = lengths.windows
+                always = f"always {counted(length, 'element')}"
                 yield Candidate(
-                    topic, "length", path, f"{path} has another length", f"always {length} elements", support,
+                    topic, "length", path, f"{path} has another length", always, support,
                     condition=f"{{v}}.size() != {length}", shown="(long) {v}.size()",
                 )  # fmt: skip
         yield from self._sets(topic, content, support)

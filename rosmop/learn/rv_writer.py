@@ -6,6 +6,7 @@ from itertools import count, groupby
 
 from rosmop.learn.candidates import Candidate, CandidateSupport, LearntFacts
 from rosmop.learn.rv_text import CPP, WORDS, formatted, identifier, number, one_line, short_names
+from roswire.counted import counted
 
 _TOLD_EVERY = "1.0"  # seconds
 _WIDTH = 104  # the maximum number of columns of a statement
@@ -34,9 +35,8 @@ def _new_name(text: str, taken: set[str]) -> str:
 
 
 def on(support: CandidateSupport) -> str:
-    return f"{support.messages} messages, {support.seconds:g} s, {support.recordings} recording" + "s" * (
-        support.recordings != 1
-    )
+    messages, recordings = counted(support.messages, "message"), counted(support.recordings, "recording")
+    return f"{messages}, {support.seconds:g} s, {recordings}"
 
 
 def _topic(name: str, rows: list[Candidate], known: LearntFacts) -> str:

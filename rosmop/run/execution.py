@@ -25,6 +25,7 @@ from rosmop.run.slices import Key, Slice, Slices
 from rosmop.runtime import safe_messages
 from rosmop.runtime.action_context import FOLDED_NS, FaultError, LogLine, MalformedError, Published
 from rosmop.runtime.wire import Buffer, WireMessage
+from roswire.counted import counted
 
 OnFault = Literal["drop", "pass"]
 Asked = Callable[[Verdict, int], bool]
@@ -611,7 +612,7 @@ class MonitorExecution:
         if step.told is None or now - step.told >= FOLDED_NS:
             _, index, count = message.past or (0, 0, 0)
             times = "" if step.past == 1 else f" ({step.past} times)"
-            text = f"{step.name} did not happen: index {index} is past the end of {count} elements{times}"
+            text = f"{step.name} did not happen: index {index} is past the end of {counted(count, 'element')}{times}"
             self.warn(step.monitor, text)
             step.told, step.past = now, 0
         message.past = None

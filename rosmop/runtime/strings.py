@@ -5,6 +5,7 @@ import re
 
 from rosmop.runtime.action_context import BYTES_PER_INSTRUCTION, PART, Context, FaultError
 from rosmop.runtime.numbers import f32
+from roswire.counted import counted
 
 NOT_FOUND = (1 << 64) - 1
 """`std::string::npos`."""
@@ -47,19 +48,19 @@ def character(text: bytes, index: int, site: int) -> int:
         return value - 256 if value > 127 else value
     if index == len(text):
         return 0
-    raise FaultError(site, f"index {index} is past the end of a string of {len(text)} characters")
+    raise FaultError(site, f"index {index} is past the end of {_string(text)}")
 
 
 def member(text: bytes, index: int, site: int) -> int:
     """`text.at(index)`, `front` or `back`: unlike in `character`, the index after the last is a fault."""
     if index == len(text):
-        raise FaultError(site, f"index {index} is past the end of a string of {len(text)} characters")
+        raise FaultError(site, f"index {index} is past the end of {_string(text)}")
     return character(text, index, site)
 
 
 def with_character(context: Context, text: bytes, index: int, value: int, site: int) -> bytes:
     if not 0 <= index < len(text):
-        raise FaultError(site, f"index {index} is past the end of a string of {len(text)} characters")
+        raise FaultError(site, f"index {index} is past the end of {_string(text)}")
     if len(text) > _LONG:
         context.allocate(len(text), site, len(text))
     return text[:index] + bytes((value & 0xFF,)) + text[index + 1 :]
@@ -67,7 +68,7 @@ def with_character(context: Context, text: bytes, index: int, value: int, site: 
 
 def substring(context: Context, text: bytes, start: int, count: int, site: int) -> bytes:
     if start > len(text):
-        raise FaultError(site, f"substr from {start}, past the end of a string of {len(text)} characters")
+        raise FaultError(site, f"substr from {start}, past the end of {_string(text)}")
     result = text[start : start + count]
     if len(result) > _LONG:
         context.allocate(len(result), site)
@@ -113,21 +114,21 @@ def resize(context: Context, text: bytes, size: int, value: int, site: int) -> b
 
 def erase(context: Context, text: bytes, start: int, count: int, site: int) -> bytes:
     if start > len(text):
-        raise FaultError(site, f"erase from {start}, past the end of a string of {len(text)} characters")
+        raise FaultError(site, f"erase from {start}, past the end of {_string(text)}")
     context.allocate(len(text), site, len(text))
     return text[:start] + text[start + count :]
 
 
 def insert(context: Context, text: bytes, start: int, added: bytes, site: int) -> bytes:
     if start > len(text):
-        raise FaultError(site, f"insert at {start}, past the end of a string of {len(text)} characters")
+        raise FaultError(site, f"insert at {start}, past the end of {_string(text)}")
     context.allocate(len(text) + len(added), site, len(text))
     return text[:start] + added + text[start:]
 
 
 def replace(context: Context, text: bytes, start: int, count: int, added: bytes, site: int) -> bytes:  # noqa: PLR0917  the arguments are C++'s
     if start > len(text):
-        raise FaultError(site, f"replace at {start}, past the end of a string of {len(text)} characters")
+        raise FaultError(site, f"replace at {start}, past the end of {_string(text)}")
     context.allocate(len(text) + len(added), site, len(text))
     return text[:start] + added + text[start + count :]
 
@@ -143,7 +144,9 @@ def filled(context: Context, buffer: bytes, text: bytes, site: int) -> bytes:
     _allocate(context, buffer, site)
     copied = _cut(text) + b"\0"
     if len(copied) > len(buffer):
-        raise FaultError(site, f"strcpy of {len(copied)} characters into a buffer of {len(buffer)}")
+        raise FaultError(
+            site, f"strcpy of {counted(len(copied), 'character')} into a buffer of {len(buffer)}"
+        )
     return copied + buffer[len(copied) :]
 
 
@@ -151,7 +154,7 @@ def filled_at_most(context: Context, buffer: bytes, text: bytes, count: int, sit
     """A `char` buffer after `strncpy(buffer, text, count)`."""
     _allocate(context, buffer, site)
     if count > len(buffer):
-        raise FaultError(site, f"strncpy of {count} characters into a buffer of {len(buffer)}")
+        raise FaultError(site, f"strncpy of {counted(count, 'character')} into a buffer of {len(buffer)}")
     copied = _cut(text)[:count]
     return copied + b"\0" * (count - len(copied)) + buffer[count:]
 
@@ -168,6 +171,10 @@ def extended(context: Context, buffer: bytes, text: bytes, site: int) -> bytes:
 
 def terminated(context: Context, buffer: bytes, site: int) -> bytes:
     return _cut(charged(context, buffer, site))
+
+
+def _string(text: bytes) -> str:
+    return f"a string of {counted(len(text), 'character')}"
 
 
 def _cut(buffer: bytes) -> bytes:

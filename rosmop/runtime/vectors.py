@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import Any
 
 from rosmop.runtime.action_context import BYTES_PER_INSTRUCTION, PART, Context, FaultError
+from roswire.counted import counted
 
 Values = list[Any]
 
@@ -140,7 +141,7 @@ def filled_with(  # noqa: PLR0917  the arguments are C++'s
 
 def fixed(values: Values, count: int, site: int) -> Values:
     if len(values) != count:
-        raise FaultError(site, f"{len(values)} elements for an array of exactly {count}")
+        raise FaultError(site, f"{counted(len(values), 'element')} for an array of exactly {count}")
     return values
 
 

@@ -11,6 +11,7 @@ from rosmop.form.nodes import SafeMessage
 from rosmop.runtime.action_context import PART, Context, MalformedError
 from rosmop.runtime.safe_messages import HEAD, sent
 from rosmop.runtime.times import with_part
+from roswire.counted import counted
 
 Buffer = bytes | bytearray | memoryview
 
@@ -36,7 +37,7 @@ def text_end(buffer: Buffer, start: int) -> int:
 def count(buffer: Buffer, start: int, least: int) -> int:
     number: int = _LENGTH.unpack_from(buffer, start)[0]
     if number * least > len(buffer) - start - 4 or (not least and number > MAX_EMPTY):
-        raise MalformedError(f"an array of {number} elements in a message of {len(buffer)} bytes")
+        raise MalformedError(f"an array of {counted(number, 'element')} in a message of {len(buffer)} bytes")
     return number
 
 
@@ -64,7 +65,7 @@ def elements(
 ) -> tuple[list[Any], int]:
     if number > _MAX_DECODED:
         raise MalformedError(
-            f"an array of {number} elements; at most {_MAX_DECODED} that are not numbers are read"
+            f"an array of {counted(number, 'element')}; at most {_MAX_DECODED} that are not numbers are read"
         )
     values = []
     for index in range(number):

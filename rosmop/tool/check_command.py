@@ -14,7 +14,8 @@ from rosmop.run.engine import MonitorSet
 from rosmop.tool.command_context import CommandContext
 from rosmop.tool.monitor_output import explained, say_finding
 from rosmop.tool.specification_input import load
-from rosmop.tool.terminal import counted, say, say_json
+from rosmop.tool.terminal import say, say_json
+from roswire.counted import counted
 
 
 def check(

@@ -15,7 +15,8 @@ from rosmop.learn.recordings import LearningError
 from rosmop.tool.batch_session import SOME_FAILED, BatchSession, RecordingsOptions, batch_session
 from rosmop.tool.command_context import CommandContext
 from rosmop.tool.specification_input import BESIDE
-from rosmop.tool.terminal import counted, say, say_json
+from rosmop.tool.terminal import say, say_json
+from roswire.counted import counted
 from roswire.definitions import Definitions
 from roswire.errors import DefinitionError
 from roswire.message_text import BUILTINS

@@ -11,7 +11,8 @@ from rosmop.batch.replay_job import KINDS, ClosestMargin, Occurrence, Replayed
 from rosmop.form.findings import Position, line_of
 from rosmop.tool.monitor_output import BILLION
 from rosmop.tool.tables import add_row, say_table, table_of
-from rosmop.tool.terminal import counted, say, say_json
+from rosmop.tool.terminal import say, say_json
+from roswire.counted import counted
 
 MOST_IN_ROWS = 10_000
 _MOST_RECORDINGS = 100  # lines of the table of recordings

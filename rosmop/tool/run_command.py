@@ -17,7 +17,8 @@ from rosmop.tool.monitor_output import lines, record
 from rosmop.tool.progress_bar import progress
 from rosmop.tool.replay_report import MOST_IN_ROWS, ReplayReport
 from rosmop.tool.specification_input import read_for_recordings
-from rosmop.tool.terminal import counted, refused, say, say_json
+from rosmop.tool.terminal import refused, say, say_json
+from roswire.counted import counted
 
 _PROGRESS_EVERY = 1000
 

@@ -16,10 +16,6 @@ def printable(text: str) -> str:
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
 
 
-def counted(number: int, noun: str) -> str:
-    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
-
-
 def refused(findings: Iterable[object]) -> typer.Exit:
     """Print the findings. The caller raises the result (exit status 1)."""
     for finding in findings:

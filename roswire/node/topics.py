@@ -10,6 +10,7 @@ from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from dataclasses import dataclass
 from zlib import crc32
 
+from roswire.counted import counted
 from roswire.errors import LimitExceededError, ProtocolError, RosError
 from roswire.node.network import ByteWriter, NodeMemory, NodeNetwork, OwnedTasks
 from roswire.node.tcpros_receiver import TcprosReceiver
@@ -233,7 +234,7 @@ class NodePublication:
         own: Callable[[], NodeSubscription | None],
     ) -> None:
         if queue < 1:
-            raise ValueError(f"a queue of {queue} messages; give at least 1")
+            raise ValueError(f"a queue of {counted(queue, 'message')}; give at least 1")
         self.topic = topic
         self.type = kind
         self.latched = latched

@@ -10,6 +10,7 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+from roswire.counted import counted
 from roswire.errors import LimitExceededError, PeerError, ProtocolError
 from roswire.xmlrpc.xmlrpc_reader import XmlRpcDocument
 from roswire.xmlrpc.xmlrpc_values import DEFAULT_LIMITS, Value, XmlRpcLimits
@@ -200,7 +201,7 @@ def parse_call(body: bytes, limits: XmlRpcLimits = DEFAULT_LIMITS) -> MethodCall
         parts = params[0]
         if isinstance(parts, list) and len(parts) > limits.parts:
             raise LimitExceededError(
-                f"system.multicall of {len(parts)} calls; at most {limits.parts} are allowed"
+                f"system.multicall of {counted(len(parts), 'call')}; at most {limits.parts} are allowed"
             )
     return MethodCall(method, tuple(params))
 
@@ -212,7 +213,7 @@ def parse_response(body: bytes, limits: XmlRpcLimits = DEFAULT_LIMITS) -> Value:
         return parsed
     document = XmlRpcDocument(body, limits, "methodResponse")
     if len(document.values) != 1:
-        raise ProtocolError(f"answer with {len(document.values)} values; it has one")
+        raise ProtocolError(f"answer with {counted(len(document.values), 'value')}; it has one")
     value = document.values[0]
     if not document.is_fault:
         return value

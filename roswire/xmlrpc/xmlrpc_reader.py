@@ -16,6 +16,7 @@ from collections.abc import Callable, Mapping
 from datetime import datetime
 from xml.parsers import expat
 
+from roswire.counted import counted
 from roswire.errors import LimitExceededError, ProtocolError
 from roswire.xmlrpc.xmlrpc_values import Value, XmlRpcLimits
 
@@ -189,7 +190,7 @@ class XmlRpcDocument:
         text.clear()
         if len(string) > self._limits.string:
             raise LimitExceededError(
-                f"string of {len(string)} characters; at most {self._limits.string} are allowed"
+                f"string of {counted(len(string), 'character')}; at most {self._limits.string} are allowed"
             )
         return string
 
@@ -198,7 +199,7 @@ class XmlRpcDocument:
         text = self._string()
         if len(text) > _LONGEST_SCALAR:
             raise self._error(
-                f"<{self._state}> with {len(text)} characters; at most {_LONGEST_SCALAR} are allowed"
+                f"<{self._state}> with {counted(len(text), 'character')}; at most {_LONGEST_SCALAR} are allowed"
             )
         return text
 

@@ -420,9 +420,10 @@ def shown_habits(source: Source) -> Iterator[tuple[int, str]]:
 
 
 MISCOUNTED = re.compile(
-    r" (?:(?:more|further|new|other) )?(?:arguments|bundles|calls|changes|checkpoints|commands|connections|denials|"
-    r"errors|files|findings|hosts|lines|messages|monitors|nodes|parts|ports|records|registrations|reports|restarts|rows|rules|"
-    r"sessions|times|topics|trials|warnings)\b"
+    r" (?:(?:more|further|new|other) )?(?:arguments|bundles|calls|cases|changes|characters|checkpoints|commands|"
+    r"connections|denials|elements|errors|events|files|findings|forks|gaps|hosts|lines|messages|migrations|monitors|nodes|"
+    r"parts|ports|processes|records|registrations|reports|restarts|robots|rows|rules|searches|segments|sessions|times|"
+    r"topics|transitions|trials|values|warnings)\b"
 )
 LIMIT = re.compile(r"[A-Z_]{3,}|most|limit|bound|longest|least|range")
 """Names of numbers that are never 1."""
@@ -511,7 +512,8 @@ RULES = {
         ["raise ValueError(f'{name} is not a group')"],
     ),
     "counted": Rule(
-        ("appliance/",), miscounted, forbid("counted(number, noun) of appliance/base/counted.py: there may be one"),
+        WITH_FLEET, miscounted,
+        forbid("counted(number, noun) of appliance/base/counted.py or roswire/counted.py: there may be one"),
         ["f'{self.left} more errors are not shown'", "f'{len(found)} hosts'"],
         ["f'more than {_MOST} hosts'", "'1 host' if n == 1 else f'{n} hosts'", "f'{counted(n, \"host\")} left'"],
     ),

@@ -9,12 +9,12 @@ from appliance.audit.log.record_format import printable
 from appliance.audit.search.denial_summary import LARGEST_SUMMARY, DenialSummary, HostDenials
 from appliance.audit.search.filter_options import Since, Until, times_given
 from appliance.audit.search.query import Filter
+from appliance.base.counted import counted
 from appliance.cli.audit.audit_errors import Errors
 from appliance.cli.audit.verification_text import write
 from appliance.cli.connection.target import Appliance, speaks_with
 from appliance.cli.output import say_json
 from appliance.policy.host_names import HostInWords
-from rosmop.tool.terminal import counted
 
 _SECONDS = 19  # characters of a time
 _LONGEST_REASON = 160

@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from appliance.base.counted import counted
 from appliance.cli import output
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.durations import span_given
@@ -17,7 +18,7 @@ from appliance.features.blocks.block_requests import (
     HostBlocks,
     HostUnblock,
 )
-from rosmop.tool.terminal import counted, say
+from rosmop.tool.terminal import say
 
 _usage_error = functools.partial(output.usage_error, verb="rosrv host")
 _Address = Annotated[

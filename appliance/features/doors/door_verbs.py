@@ -4,6 +4,7 @@ from typing import Annotated
 
 import typer
 
+from appliance.base.counted import counted
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.durations import span_given
 from appliance.cli.output import moment, say_json
@@ -15,7 +16,7 @@ from appliance.features.doors.door_requests import (
     DoorsWanted,
     DoorTicket,
 )
-from rosmop.tool.terminal import counted, say
+from rosmop.tool.terminal import say
 
 _Name = Annotated[str, typer.Argument(metavar="NAME", help="Name of the door", show_default=False)]
 

@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal, Self
 import msgspec
 from msgspec import UNSET, Meta, Struct, UnsetType
 
+from appliance.base.counted import counted
 from appliance.features.doors.message_reader import BYTE_TYPES, TIME_TYPES, MessageValueError
 from roswire.definitions import Definitions
 from roswire.message_text import PRIMITIVES, Field, MessageDefinition
@@ -237,4 +238,4 @@ def _write_count(field: Field, count: int, out: bytearray) -> None:
     if field.length is None:
         out += _LENGTH.pack(count)
     elif count != field.length:
-        raise _FieldError(f"Expected {field.notation}, got {count} elements")
+        raise _FieldError(f"Expected {field.notation}, got {counted(count, 'element')}")

@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from appliance.base.atomic_files import write_where_told
+from appliance.base.counted import counted
 from appliance.channel import admin
 from appliance.channel.answers.monitor_answers import Monitors, MonitorState, Replacement
 from appliance.channel.messages import GivenValue
@@ -30,7 +31,7 @@ from appliance.features.guards.presets import (
 from appliance.features.guards.suggestions import proposals
 from appliance.features.table import verb_function
 from rosmop.tool.tables import say_table, table_of
-from rosmop.tool.terminal import counted, say
+from rosmop.tool.terminal import say
 
 _Name = Annotated[
     str, typer.Argument(metavar="GUARD", autocompletion=completion.monitors, show_default=False)

@@ -9,6 +9,7 @@ from typing import Annotated
 
 import typer
 
+from appliance.base.counted import counted
 from appliance.channel.admin import PolicyRevisions, PolicyRevisionWanted
 from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.target import Appliance, speaks
@@ -32,7 +33,7 @@ from appliance.policy.model import Request
 from appliance.policy.policy import Policy
 from appliance.policy.policy_compiler import compile_policy
 from appliance.policy.policy_findings import PolicyError
-from rosmop.tool.terminal import counted, refused, say
+from rosmop.tool.terminal import refused, say
 
 _MOST_CALLERS = 4  # names in one line
 

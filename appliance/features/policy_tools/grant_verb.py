@@ -8,6 +8,7 @@ import msgspec
 import typer
 
 from appliance.audit.log.record_format import LogEntry
+from appliance.base.counted import counted
 from appliance.base.input_files import read_given
 from appliance.channel.admin import PolicyLoad, PolicyWanted
 from appliance.channel.answers.policy_answers import Granted, Why
@@ -18,7 +19,7 @@ from appliance.cli.connection.admin_client import AdminSocket, NotRunningError
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.output import say_json, usage_error, write_told
 from appliance.features.policy_tools.live_verbs import say_loaded
-from rosmop.tool.terminal import counted, printable, say
+from rosmop.tool.terminal import printable, say
 
 
 @speaks

@@ -12,6 +12,7 @@ from appliance.audit.log.log_database import LogUnreadableError
 from appliance.audit.search.filter_options import Since
 from appliance.audit.search.query import Filter, FilterError
 from appliance.base import clock
+from appliance.base.counted import counted
 from appliance.base.timestamps import TimestampError, parse_timestamp
 from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.target import Appliance, speaks_with
@@ -28,7 +29,7 @@ from appliance.policy.host_sets import Network
 from appliance.policy.model import Category
 from appliance.policy.policy_compiler import compile_policy
 from appliance.policy.policy_findings import PolicyError
-from rosmop.tool.terminal import counted, refused
+from rosmop.tool.terminal import refused
 
 _OWN_NODE = "the appliance's own node"
 

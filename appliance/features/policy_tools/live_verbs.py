@@ -4,6 +4,7 @@ from typing import Annotated
 
 import typer
 
+from appliance.base.counted import counted
 from appliance.channel.admin import (
     PolicyConfirm,
     PolicyReload,
@@ -15,7 +16,7 @@ from appliance.channel.answers.policy_answers import Loaded
 from appliance.cli.commit_confirm import ConfirmWithin, say_deadline, seconds_within, verbs_of
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.output import loaded_by, say_json
-from rosmop.tool.terminal import counted, printable, say
+from rosmop.tool.terminal import printable, say
 
 
 @speaks

@@ -10,6 +10,7 @@ from typing import Annotated
 
 import typer
 
+from appliance.base.counted import counted
 from appliance.base.owner_access import is_named_there
 from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.target import Appliance, speaks
@@ -35,7 +36,7 @@ from appliance.policy.policy import Policy
 from appliance.policy.policy_compiler import compile_policy
 from appliance.policy.policy_findings import FindingSeverity, PolicyError, PolicyFinding
 from appliance.policy.rights import needs_node, rights_of
-from rosmop.tool.terminal import counted, refused, say
+from rosmop.tool.terminal import refused, say
 
 _File = Annotated[Path, typer.Argument(readable=False, metavar="FILE", help="The policy", show_default=False)]
 OptionalFile = Annotated[

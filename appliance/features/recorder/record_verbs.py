@@ -15,6 +15,7 @@ from appliance.audit.log.log_database import LogUnreadableError
 from appliance.audit.log.record_format import rfc3339
 from appliance.base import clock
 from appliance.base.atomic_files import name_to_make
+from appliance.base.counted import counted
 from appliance.base.timestamps import parse_timestamp
 from appliance.cli import completion
 from appliance.cli.connection.admin_client import AdminSocket, NotRunningError
@@ -35,7 +36,7 @@ from appliance.features.recorder.timeline import (
     timeline,
 )
 from appliance.policy.host_names import HostInWords
-from rosmop.tool.terminal import counted, printable, refused, say
+from rosmop.tool.terminal import printable, refused, say
 
 if TYPE_CHECKING:
     from appliance.cli.connection.rest_orders import RestWay

@@ -39,7 +39,8 @@ def running(appliance: Appliance) -> Iterator[SelftestFinding]:
         return
     status = answer.given()
     yield ok(
-        "appliance", f"{status.version}, {len(status.processes)} processes, nodes find it at {status.master}"
+        "appliance",
+        f"{status.version}, {counted(len(status.processes), 'process')}, nodes find it at {status.master}",
     )
     yield from run_check("status", lambda: _status(status))
     yield from run_check("processes", lambda: _processes(status.processes))

@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from appliance.base.counted import counted
 from appliance.cli.connection.admin_client import ADMIN_SOCKET, AdminSocket
 from appliance.cli.connection.target import Appliance, speaks_with
 from appliance.cli.output import say_json
@@ -19,7 +20,7 @@ from appliance.configuration.config_sources import ConfigError, resolve
 from appliance.configuration.settings import Settings, load_resolved
 from appliance.features.selftest.selftest_findings import SelftestFinding, fail
 from rosmop.tool.tables import say_table
-from rosmop.tool.terminal import counted, printable
+from rosmop.tool.terminal import printable
 
 _STYLES = {"ok": "green", "warn": "yellow", "fail": "bold red", "skip": "dim"}
 

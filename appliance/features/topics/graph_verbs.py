@@ -1,9 +1,10 @@
 """The commands `rosrv node list` and `rosrv topic list`."""
 
+from appliance.base.counted import counted
 from appliance.channel.admin import GraphWanted
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.output import say_json, say_row
-from rosmop.tool.terminal import counted, say
+from rosmop.tool.terminal import say
 
 
 @speaks

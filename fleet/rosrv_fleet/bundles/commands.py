@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from appliance.base.atomic_files import write_whole
+from appliance.base.counted import counted
 from appliance.base.input_files import files_below, read_given
 from appliance.formats.bundle_archive import (
     LONGEST,
@@ -184,7 +185,7 @@ def publish(
         _copy(repository / "metadata", folder / "metadata", "*.json", leave="snapshot")
         _copy(repository / "metadata", folder / "metadata", "*.snapshot.json")
         read_publication(folder)
-        say(f"{folder}: snapshot {state.snapshot} with {len(state.bundles)} bundles is published")
+        say(f"{folder}: snapshot {state.snapshot} with {counted(len(state.bundles), 'bundle')} is published")
 
 
 @contextmanager

@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
+from appliance.base.counted import counted
 from rosrv_fleet.collector import Collector
 from rosrv_fleet.console.frame import Column, Tone, ago, alert, badge, choice, field, link, row, table, text
 from rosrv_fleet.health import FleetHealth, RobotState, health_of
@@ -125,7 +126,7 @@ def _summary(rows: Sequence[RobotRow], health: FleetHealth) -> str:
     items = "".join(
         f"<li>{link('/', f'{count:,} {label}', state=state)}</li>" for state, label, count in numbers
     )
-    waiting = f"<li>{health.waiting:,} segments not yet searchable</li>" if health.waiting else ""
+    waiting = f"<li>{counted(health.waiting, 'segment')} not yet searchable</li>" if health.waiting else ""
     return f'<ul class="figures" aria-label="Numbers">{items}{waiting}</ul>'
 
 

@@ -5,6 +5,7 @@ from typing import Any, Literal
 
 from psycopg import Error as DatabaseError
 
+from appliance.base.counted import counted
 from rosrv_fleet.console.frame import Column, Tone, alert, badge, link, moment, row, since, table, text
 from rosrv_fleet.enrolment import RobotGroup
 from rosrv_fleet.rollouts.conditions import ConditionKind
@@ -82,7 +83,7 @@ def group_page(service: BundleService, group: RobotGroup, *, may_change: bool) -
     head = f"<h1>Rollouts of {text(group)}</h1>"
     if state["rollout"] is None:
         start = f"rosrv-fleet rollout start {text(group)}/1.tar"
-        head += f"<p>{state['robots_known']:,} robots, no rollout yet: <code>{start}</code></p>"
+        head += f"<p>{counted(state['robots_known'], 'robot')}, no rollout yet: <code>{start}</code></p>"
     else:
         head += _rollout(group, state["rollout"], may_change=may_change)
     return head + _robots(service, group) + _history(service, group)
@@ -136,7 +137,8 @@ def _robots(service: BundleService, group: RobotGroup) -> str:
     )
     more = ""
     if len(order) > _MOST_ROBOTS:
-        more = f"<p>{link('/', f'All {len(order):,} robots of the group', group=str(group))}</p>"
+        every = f"All {counted(len(order), 'robot')} of the group"
+        more = f"<p>{link('/', every, group=str(group))}</p>"
     return table("Robots, problems first", _ROBOTS, rows, "No robot is enrolled in this group.") + more
 
 

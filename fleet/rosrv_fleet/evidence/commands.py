@@ -11,6 +11,7 @@ import typer
 
 from appliance.audit.log.record_format import rfc3339
 from appliance.base.atomic_files import name_to_make
+from appliance.base.counted import counted
 from appliance.base.input_files import open_given
 from rosrv_fleet.operator_client import NO_TOKEN, Authority, Token, Url, answer_to
 from rosrv_fleet.output import say, say_json
@@ -75,8 +76,9 @@ def list_evidence(
 def _content(found: dict[str, Any]) -> str:
     recording = f", recording {found['recording']}" if found["recording"] else ""
     return (
-        f"{found['records']} records from {rfc3339(found['since'])} to {rfc3339(found['until'])}{recording},"
-        f" {found['bytes']} bytes, {found['collected']} of {found['checkpoints']} checkpoints are collected"
+        f"{counted(found['records'], 'record')} from {rfc3339(found['since'])} to {rfc3339(found['until'])}{recording},"
+        f" {found['bytes']} bytes,"
+        f" {found['collected']} of {counted(found['checkpoints'], 'checkpoint is', 'checkpoints are')} collected"
     )
 
 

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
+from appliance.base.counted import counted
 from rosrv_fleet.operator_client import NO_TOKEN, Authority, Token, Url, answer_to
 from rosrv_fleet.output import say, say_json
 
@@ -97,7 +98,7 @@ def _show(group: dict[str, Any]) -> None:
     shown = group["rollout"]
     place = f"{group['site']}/{group['group']}"
     if shown is None:
-        say(f"{place}: {group['robots_known']} robots, no rollout{_problems(group)}")
+        say(f"{place}: {counted(group['robots_known'], 'robot')}, no rollout{_problems(group)}")
         return
     say(f"{place}: {shown['bundle']} {shown['state']}: {shown['why']}")
     acts = (f"{act['act']} by {act['who']} at {_time(act['at'])}" for act in shown["acts"])

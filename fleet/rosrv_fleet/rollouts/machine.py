@@ -13,6 +13,7 @@ from typing import Literal
 
 import msgspec
 
+from appliance.base.counted import counted
 from appliance.formats.terms import BundlePath, Terms
 
 RolloutState = Literal["running", "stopped", "reverted", "done"]
@@ -100,7 +101,8 @@ def fault_of_rings(rollout: BundleRollout, robots: Collection[str]) -> str:
             )
     first = rollout.terms.rings[0]
     if not any(ring_of(rollout, robot) == 0 for robot in robots):
-        return f"the first ring, {first.name}, has none of the {len(robots)} robots of {place}: name robots in it"
+        known = counted(len(robots), "robot")
+        return f"the first ring, {first.name}, has none of the {known} of {place}: name robots in it"
     return ""
 
 
@@ -227,9 +229,9 @@ def _why(rollout: BundleRollout, seen: RobotSeen, baseline: Baseline, now: float
     if rollout.path not in (seen.in_force, seen.trying):
         return ""
     if seen.failing > baseline.failing:
-        return f"{seen.failing} monitors fail, {baseline.failing} before"
+        return f"{counted(seen.failing, 'monitor fails', 'monitors fail')}, {baseline.failing} before"
     if seen.denials >= max(gates.least_denials, gates.denial_factor * max(1, baseline.denials)):
-        return f"{seen.denials} denials a minute, {baseline.denials} before"
+        return f"{counted(seen.denials, 'denial')} a minute, {baseline.denials} before"
     return ""
 
 
@@ -247,7 +249,8 @@ def _unhealthy_ring(rollout: BundleRollout, robots: Mapping[str, RobotSeen], now
 
 def _why_sick(rollout: BundleRollout, index: int, ill: Sequence[str], size: int, why: str) -> str:
     name = rollout.terms.rings[index].name
-    return f"{len(ill)} of {size} robots of ring {name} are unhealthy, such as {ill[0]}: {why}"
+    are = "is" if len(ill) == 1 else "are"
+    return f"{len(ill)} of {counted(size, 'robot')} of ring {name} {are} unhealthy, such as {ill[0]}: {why}"
 
 
 def _not_taken(rollout: BundleRollout, robots: Mapping[str, RobotSeen]) -> str:
@@ -256,7 +259,8 @@ def _not_taken(rollout: BundleRollout, robots: Mapping[str, RobotSeen]) -> str:
         taken = sum(robots[robot].in_force == rollout.path for robot in members)
         if taken < rollout.gates.share * len(members):
             name = rollout.terms.rings[index].name
-            return f"{taken} of {len(members)} robots of ring {name} have it in force"
+            have = "has" if taken == 1 else "have"
+            return f"{taken} of {counted(len(members), 'robot')} of ring {name} {have} it in force"
     return ""
 
 

@@ -3,8 +3,9 @@ import sys
 
 import pytest
 
+from appliance.base.counted import counted
 from appliance.cli.output import loaded_by, moment, say_json, say_row, usage_error
-from rosmop.tool.terminal import counted, printable, say
+from rosmop.tool.terminal import printable, say
 
 
 def test_control_characters_never_reach_the_terminal(capsys: pytest.CaptureFixture[str]) -> None:

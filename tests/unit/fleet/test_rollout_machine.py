@@ -97,7 +97,7 @@ def test_healthy_robots_finish_a_rollout() -> None:
     [
         (RobotSeen(60, OLD, refused=NEW, reason="a test failed"), "refused: a test failed"),
         (RobotSeen(60, NEW, denials=12), "12 denials a minute, 4 before"),
-        (RobotSeen(60, NEW, failing=1), "1 monitors fail"),
+        (RobotSeen(60, NEW, failing=1), "1 monitor fails, 0 before"),
         (RobotSeen(60, "", trying=NEW, denials=12), "denials"),
         (RobotSeen(-200, NEW), "silent"),
     ],
@@ -195,7 +195,7 @@ def test_a_time_without_a_collector_counts_for_no_gate() -> None:
     [
         (RobotSeen(), "never seen", "never reported"),
         (RobotSeen(10), "silent", "no report for 990 s"),
-        (RobotSeen(1000, NEW, failing=1), "unhealthy", "1 monitors fail"),
+        (RobotSeen(1000, NEW, failing=1), "unhealthy", "1 monitor fails, 0 before"),
         (RobotSeen(1000, OLD, refused=NEW, reason="a test"), "unhealthy", "refused: a test"),
         (RobotSeen(1000, OLD, trouble="no route"), "behind", "no route"),
         (RobotSeen(1000, NEW), "in force", ""),
