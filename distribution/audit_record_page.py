@@ -16,7 +16,7 @@ CHAIN: dict[str, Any] = {
         "then": {
             "type": ["array", "null"],
             "items": _HASH,
-            "description": "content hashes of the omitted records after it; null: version 0.1.0 wrote them",
+            "description": "content hashes of the omitted records after it, or null in records of version 0.1.0",
         },
         "checkpoint": {
             "type": ["object", "null"],

@@ -100,7 +100,8 @@ class Switch(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     shadow: Annotated[
         bool | None,
         doc(
-            "true: put it into shadow mode, where its would-be actions are only recorded; false: end shadow mode"
+            "with true, put it into shadow mode, where its would-be actions are only recorded; with false, end"
+            " shadow mode"
         ),
     ] = None
 

@@ -336,7 +336,7 @@ class Settings:
     forgotten_after: Seconds | None = key(
         default=86_400.0,
         description="seconds for which a monitor may be disabled or in shadow mode, or a section of the policy"
-        " audit-only, before that is an alarm; null: never",
+        " audit-only, before that is an alarm; with null, it never is",
     )
     on_fault: Literal["drop", "pass"] = key(
         default="drop", description="handling of a message at which an action of a monitor faults"
@@ -371,10 +371,11 @@ class Settings:
         default=12311,
         ge=0,
         le=65_535,
-        description="loopback port of the hidden ROS master; 0: any free one",
+        description="loopback port of the hidden ROS master; with 0, any free one",
     )
     isolation: Literal["container", "netns", "none"] = key(
-        default="netns", description="isolation of the appliance; none: no firewall, for development only"
+        default="netns",
+        description="isolation of the appliance; with none, it has no firewall: for development only",
     )
     relaying: Literal["all", "monitored"] = key(
         default="all",

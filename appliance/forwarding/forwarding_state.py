@@ -20,7 +20,7 @@ class ForwardingState(msgspec.Struct, frozen=True):
     behind: int
     seconds: float
     missed: int
-    trouble: Annotated[str, doc("why forwarding is stopped; empty: it is not")]
+    trouble: Annotated[str, doc("why forwarding is stopped, or empty if it is not")]
     to: str
     send: str
 

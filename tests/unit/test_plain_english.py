@@ -55,6 +55,11 @@ HABITS = (
     ),
     Habit(r"\b[Ww]hoever\b", "any host that, anyone who", "Whoever reaches it may call."),
     Habit(r"(?:^|[.:;|]\s+)(?:Who|That of|Those of|Of)\s(?![^.]*\?)", "the noun", "Who asks is recorded."),
+    Habit(
+        r"(?:^|; )(?:null|empty): ",
+        ", or null if; by default,",
+        "The port of an agent; null: it has none.",
+    ),
     Habit(r", too\b(?! \w+ly)", "also", "It is recorded, too."),
     Habit(r"(?<!and )\balso (?:if|when|while|not)\b", "even if, not even", "It holds also if control dies."),
     Habit(

@@ -139,7 +139,7 @@ EVENTS: dict[str, str] = {
     "appliance started": "The appliance is in service; `detail.robot` is the `name` of the robot in `appliance.yaml`.",
     "appliance stopped": "The appliance was shut down in an orderly way.",
     "took over": "This appliance of a pair became the active one; `detail` has the epoch, both names, the last"
-    " checkpoint of the other appliance's log that was replicated (null: none), and the takeover before.",
+    " checkpoint of the other appliance's log that was replicated (null without one), and the takeover before.",
     "handed over": "This appliance of a pair handed over to the other one in an orderly way; it answers nothing after"
     " this record until it takes over again.",
     "malformed": "A peer sent an invalid request, or a publisher an invalid header; it was rejected for the `reason`"

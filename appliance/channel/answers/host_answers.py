@@ -14,9 +14,9 @@ class PortsSeen(msgspec.Struct, frozen=True):
     """Whether a machine's ROS ports are closed to all but the appliance, as probed from another host."""
 
     state: PortsState
-    checked: Annotated[Moment | None, doc("null: never")]
+    checked: Annotated[Moment | None, doc("when its ports were last checked, or null if never")]
     open: Annotated[list[int], doc("TCP ports that accepted a connection, the first hundred")]
-    who: Annotated[str, doc("name of the token that reported it, or `operator`; empty: never checked")]
+    who: Annotated[str, doc("name of the token that reported it, or `operator`, or empty if never checked")]
 
 
 class Host(msgspec.Struct, frozen=True):
@@ -38,11 +38,11 @@ class Host(msgspec.Struct, frozen=True):
     expires_soon: Annotated[bool, doc("within 14 days, or a third of its life if that is shorter")]
     renewing: Annotated[bool, doc("it has a newer certificate that it has not installed yet")]
     revoked: Moment | None
-    remote: Annotated[str | None, doc("its real address; null: no tunnel")]
+    remote: Annotated[str | None, doc("its real address, or null if it has no tunnel")]
     seconds: Annotated[int | None, doc("age of the SA")]
     bytes_in: int | None
     bytes_out: int | None
     last_seen: Annotated[Moment | None, doc("when a packet last arrived through its tunnel")]
-    token_expires: Annotated[Moment | None, doc("when its one-time token expires; null: none")]
+    token_expires: Annotated[Moment | None, doc("when its one-time token expires, or null if it has none")]
     ports: PortsSeen
-    token_by: Annotated[str, doc("who made its one-time token; empty: it has no token")] = ""
+    token_by: Annotated[str, doc("who made its one-time token, or empty if it has none")] = ""

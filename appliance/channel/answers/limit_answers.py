@@ -12,10 +12,10 @@ class LimitUse(msgspec.Struct, frozen=True):
 
     resource: Annotated[str, doc("the resource with its unit")]
     used: Annotated[int, doc("by all hosts together")]
-    allowed: Annotated[int | None, doc("for all hosts together; null: only each host has a limit")]
-    setting: Annotated[str, doc("the setting that changes the limit; empty: there is none")]
-    host: Annotated[str, doc("the host that uses most; empty: none, or hosts have no quota of their own")] = (
-        ""
-    )
+    allowed: Annotated[int | None, doc("for all hosts together, or null if only each host has a limit")]
+    setting: Annotated[str, doc("the setting that changes the limit, or empty if there is none")]
+    host: Annotated[
+        str, doc("the host that uses most, or empty if none does, or hosts have no quota of their own")
+    ] = ""
     host_used: Annotated[int, doc("by that host")] = 0
     host_allowed: Annotated[int, doc("the limit of one host")] = 0

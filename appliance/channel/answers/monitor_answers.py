@@ -23,8 +23,12 @@ class GivenState(msgspec.Struct, frozen=True):
     default: Annotated[
         bool | int | float | str, doc("the value in the text of the specification, in the unit")
     ]
-    least: Annotated[int | float | None, doc("the least value, in the unit; null: not a number")] = None
-    most: Annotated[int | float | None, doc("the greatest value, in the unit; null: not a number")] = None
+    least: Annotated[
+        int | float | None, doc("the least value, in the unit, or null if it is not a number")
+    ] = None
+    most: Annotated[
+        int | float | None, doc("the greatest value, in the unit, or null if it is not a number")
+    ] = None
 
 
 class MonitorState(msgspec.Struct, frozen=True):
@@ -58,10 +62,12 @@ class MonitorState(msgspec.Struct, frozen=True):
     shadow: Annotated[
         bool, doc("in shadow mode: it gets copies of messages, and its would-be actions are recorded")
     ] = False
-    off_until: Annotated[Moment | None, doc("when it is enabled again automatically; null: no end")] = None
+    off_until: Annotated[Moment | None, doc("when it is enabled again automatically, or null if never")] = (
+        None
+    )
     given: Annotated[list[GivenState], doc("constants and topics that are given to it")] = []
     confirm_by: Annotated[
-        Moment | None, doc("when it returns to shadow mode unless confirmed; null: it stays as it is")
+        Moment | None, doc("when it returns to shadow mode unless confirmed, or null if it stays as it is")
     ] = None
 
 
@@ -74,7 +80,9 @@ class Monitors(msgspec.Struct, frozen=True):
     note: str
     loaded: Moment
     confirm_by: RollbackDue
-    folder: Annotated[str | None, doc("the folder that `reload` reads; null: no folder was given at start")]
+    folder: Annotated[
+        str | None, doc("the folder that `reload` reads, or null if none was given at the start")
+    ]
     differs_from_folder: bool
     warnings: list[str]
     refused: Annotated[
@@ -189,7 +197,7 @@ class Switched(msgspec.Struct, frozen=True):
     began: Annotated[
         list[str], doc("monitors that entered or left shadow mode and are in their initial state")
     ] = []
-    until: Annotated[Moment | None, doc("when they are enabled again automatically; null: no end")] = None
+    until: Annotated[Moment | None, doc("when they are enabled again automatically, or null if never")] = None
     confirm_by: Annotated[
-        Moment | None, doc("when they return to shadow mode unless confirmed; null: they stay in force")
+        Moment | None, doc("when they return to shadow mode unless confirmed, or null if they stay in force")
     ] = None

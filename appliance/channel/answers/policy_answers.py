@@ -98,13 +98,15 @@ class Granted(msgspec.Struct, frozen=True, kw_only=True):
     added: Annotated[
         list[str],
         doc(
-            "a line for each missing right; none: the policy allows the request, and something else denied it"
+            "a line for each missing right, or none if the policy allows the request, and something else denied it"
         ),
     ]
     diff: Annotated[list[str], doc("lines of the unified diff")]
     text: Annotated[str, doc("the whole changed policy, ready to be loaded")]
     findings: Annotated[list[str], doc("why it would be rejected: the test cases that it fails")]
-    tool: Annotated[str, doc("the stock tool that was denied, such as rostopic; empty: it is not one")] = ""
+    tool: Annotated[
+        str, doc("the stock tool that was denied, such as rostopic, or empty if it is not one")
+    ] = ""
     tool_needs: Annotated[
         list[str], doc("the lines that this tool also needs, which `?tool=1` adds to the change")
     ] = []

@@ -21,11 +21,13 @@ class ProcessInfo(msgspec.Struct, frozen=True):
     restarts: int
     sandbox: Annotated[
         str,
-        doc("limits of its system calls, files and ports; empty: the supervisor, or not reported yet"),
+        doc(
+            "limits of its system calls, files and ports, or empty for the supervisor, or if not reported yet"
+        ),
     ] = ""
     lacks: Annotated[list[str], doc("parts of the sandbox that this kernel does not support")] = []
     congestion: Annotated[str, doc("the TCP congestion control of a relay's connections")] = ""
-    failing: Annotated[str, doc("why it ends soon after every start; empty: it is not failing")] = ""
+    failing: Annotated[str, doc("why it ends soon after every start, or empty if it is not failing")] = ""
     output: Annotated[list[str], doc("the last lines that the program of a failing process printed")] = []
 
 
@@ -68,20 +70,24 @@ class PolicyState(msgspec.Struct, frozen=True):
     warnings: int
     audit_only: Annotated[list[str], doc("sections whose denials are recorded and pass")]
     confirm_by: Moment | None
-    loaded: Annotated[Moment | None, doc("when it came into force; null: an earlier version")] = None
+    loaded: Annotated[
+        Moment | None, doc("when it came into force, or null if a version that did not store it made it")
+    ] = None
     file_refused: Annotated[
-        str, doc("why the file was refused at the last start or reload; empty: it was not")
+        str, doc("why the file was refused at the last start or reload, or empty if it was not")
     ] = ""
 
 
 class IpsecState(msgspec.Struct, frozen=True):
     """The state of the tunnels, and problems that need attention."""
 
-    esp: Annotated[Literal["kernel", "user space"] | None, doc("where ESP runs; null: no tunnels are open")]
-    key_exchange: Annotated[
-        list[str], doc("key exchanges offered and accepted, best first; empty: not known yet")
+    esp: Annotated[
+        Literal["kernel", "user space"] | None, doc("where ESP runs, or null if no tunnels are open")
     ]
-    post_quantum: Annotated[bool | None, doc("whether ML-KEM is among them; null: not known yet")]
+    key_exchange: Annotated[
+        list[str], doc("key exchanges offered and accepted, best first, or empty if not known yet")
+    ]
+    post_quantum: Annotated[bool | None, doc("whether ML-KEM is among them, or null if not known yet")]
     charon: Annotated[str | None, doc("its version")]
     pool: str
     address: Annotated[str, doc("the appliance's own address in the tunnels")]
@@ -128,14 +134,18 @@ class ClockState(msgspec.Struct, frozen=True):
 
     synchronised: Annotated[
         bool | None,
-        doc("whether a time service synchronises the machine's clock; null: the kernel does not report it"),
+        doc(
+            "whether a time service synchronises the machine's clock, or null if the kernel does not report it"
+        ),
     ]
     behind_seconds: Annotated[
-        float, doc("how far the clock is behind the last record, because it was set back; 0: it is not")
+        float, doc("how far the clock is behind the last record, because it was set back, or 0 if it is not")
     ]
     before_program_seconds: Annotated[
         float,
-        doc("how far the clock is before this program's build date, because it was never set; 0: it is not"),
+        doc(
+            "how far the clock is before this program's build date, because it was never set, or 0 if it is not"
+        ),
     ] = 0.0
 
 
@@ -161,7 +171,7 @@ class SwitchedOff(msgspec.Struct, frozen=True):
     what: Annotated[str, doc("a sentence: what is off, and how")]
     again: Annotated[str, doc("how to enable it again")]
     since: Moment
-    until: Annotated[Moment | None, doc("when it is enabled again automatically; null: never")]
+    until: Annotated[Moment | None, doc("when it is enabled again automatically, or null if never")]
     forgotten: Annotated[bool, doc("off for longer than `forgotten_after`: an alarm")]
 
 
@@ -169,7 +179,9 @@ class BlocksState(msgspec.Struct, frozen=True):
     """The hosts that operators block (`rosrv host blocks`)."""
 
     hosts: int
-    first_end: Annotated[Moment | None, doc("when the first block ends; null: none ends without an order")]
+    first_end: Annotated[
+        Moment | None, doc("when the first block ends, or null if none ends without an order")
+    ]
 
 
 class MinuteState(msgspec.Struct, frozen=True):
@@ -186,7 +198,9 @@ class HandledAlarm(msgspec.Struct, frozen=True):
     kind: Annotated[str, doc("the alarm's name")]
     who: Annotated[str, doc("name of the token, or `operator`")]
     since: Moment
-    until: Annotated[Moment | None, doc("when the silence ends; null: it is acknowledged, and not silenced")]
+    until: Annotated[
+        Moment | None, doc("when the silence ends, or null if it is acknowledged and not silenced")
+    ]
     note: str = ""
 
 
@@ -201,7 +215,9 @@ class Status(msgspec.Struct, frozen=True):
     relaying: Annotated[str, doc("`all`, or `monitored`: only topics and services with monitors are relayed")]
     mediation: Annotated[str, doc("`full`, or `monitored`: nodes then get each other's own addresses")]
     firewall: FirewallState
-    probe: Annotated[str, doc("probe of the hidden ROS master: `passed`, or the finding; empty: not run yet")]
+    probe: Annotated[
+        str, doc("probe of the hidden ROS master: `passed`, or the finding, or empty if not run yet")
+    ]
     policy: PolicyState
     ipsec: IpsecState
     monitors: MonitorsState
@@ -219,7 +235,7 @@ class Status(msgspec.Struct, frozen=True):
     switched_off: Annotated[list[SwitchedOff], doc("what an operator switched off")] = []
     blocks: BlocksState = BlocksState(0, None)
     last_minute: MinuteState = MinuteState(0, {})
-    name: Annotated[str, doc("the robot's name (`name` in appliance.yaml); empty: none")] = ""
+    name: Annotated[str, doc("the robot's name (`name` in appliance.yaml), or empty if it has none")] = ""
     handled_alarms: Annotated[
         list[HandledAlarm], doc("alarms that an operator acknowledged or silenced")
     ] = []

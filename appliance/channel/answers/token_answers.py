@@ -29,7 +29,8 @@ class Token(msgspec.Struct, frozen=True):
     expires: Moment
     revoked: Moment | None
     last_used: Annotated[
-        Moment | None, doc("when it was last presented, to within a minute; null: not since `uses_since`")
+        Moment | None,
+        doc("when it was last presented, to within a minute, or null if not since `uses_since`"),
     ] = None
     valid: Annotated[
         bool,
@@ -43,7 +44,7 @@ class Tokens(msgspec.Struct, frozen=True):
     tokens: list[Token]
     uses_since: Annotated[
         Moment | None,
-        doc("uses are known since this time: the first start of a version that stores them; null: unknown"),
+        doc("since when uses are known: the first start of a version that stores them, or null if unknown"),
     ] = None
 
 

@@ -25,7 +25,7 @@ class SilencedAlarm(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     kind: Annotated[str, doc("the alarm's name", min_length=1, max_length=300)]
     seconds: Annotated[
         Annotated[float, msgspec.Meta(ge=1, le=LONGEST_SILENCE_SECONDS)] | None,
-        doc("the silence ends after this time; null: it ends now"),
+        doc("the silence ends after this time; with null, it ends now"),
     ] = None
     note: Annotated[str, doc("reason, shown to operators", max_length=200)] = ""
 

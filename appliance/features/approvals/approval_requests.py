@@ -37,7 +37,7 @@ class Approval(msgspec.Struct, frozen=True):
     ]
     resource: Annotated[str, doc("the topic, service or parameter")]
     type: Annotated[str, doc("type of the service; empty for a topic or a parameter")]
-    sha256: Annotated[str, doc("hash of the arguments; empty: the approval is for any arguments")]
+    sha256: Annotated[str, doc("hash of the arguments, or empty if the approval is for any arguments")]
     arguments: Annotated[
         str, doc("first 4096 bytes of the arguments as the service would get them, in hexadecimal")
     ]

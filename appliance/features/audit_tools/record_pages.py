@@ -15,7 +15,7 @@ _EQUALITY = {
     "type": "object",
     "properties": {
         "key": {"type": "string", "description": "equal in equal records"},
-        "reason": {"type": "string", "description": "equal in equal records; empty: equal to each"},
+        "reason": {"type": "string", "description": "equal in equal records, or empty if equal to each"},
         "reach": {"type": "integer", "description": "how many of the last rows the record can join"},
         "times": {"type": "integer", "description": "how often the event happened"},
         "value": {"type": "string", "description": "the reason, without the words about repetitions"},
@@ -31,7 +31,7 @@ PAGE = {
         "records": {"type": "array", "items": RECORD_REFERENCE},
         "cursor": {
             "type": ["string", "null"],
-            "description": "cursor of the next page; null: this is the last page",
+            "description": "cursor of the next page, or null on the last page",
         },
         "equality": {
             "type": "array",

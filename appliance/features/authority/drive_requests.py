@@ -31,8 +31,8 @@ class GroupState(msgspec.Struct, frozen=True):
 
     group: Annotated[str, doc("its name")]
     names: Annotated[list[str], doc("its topics and services")]
-    holder: Annotated[str, doc("address of the host that holds it; empty: none")]
-    held_seconds: Annotated[float | None, doc("since the holder got it; null: no host holds it")]
+    holder: Annotated[str, doc("address of the host that holds it, or empty if none does")]
+    held_seconds: Annotated[float | None, doc("how long the holder has had it, or null if no host holds it")]
     lease: Annotated[float, doc("seconds of silence after which a holder loses the group")]
     left_seconds: Annotated[float | None, doc("until silence ends the authority")]
     waiting: Annotated[list[str], doc("addresses of the hosts that asked for it, the first one first")]

@@ -19,7 +19,7 @@ class NewBlock(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ]
     for_seconds: Annotated[
         Annotated[float, msgspec.Meta(ge=1, le=LONGEST_BLOCK_SECONDS)] | None,
-        doc("the block ends after this time; null: it ends by an order only"),
+        doc("the block ends after this time; by default, only by an order"),
     ] = None
     note: Annotated[str, doc("reason for the block, shown to operators", max_length=200)] = ""
     force: Annotated[bool, doc("block the robot's own host also")] = False
@@ -31,7 +31,7 @@ class BlockedHost(msgspec.Struct, frozen=True):
     address: str
     name: Annotated[str, doc("its name if it is enrolled, else empty")]
     since: Moment
-    until: Annotated[Moment | None, doc("null: it ends by an order only")]
+    until: Annotated[Moment | None, doc("when it ends, or null if only by an order")]
     who: Annotated[str, doc("name of the token, or `operator`")]
     note: str
 
@@ -56,7 +56,7 @@ class HostBlocked(BlockedHost, frozen=True, kw_only=True):
     """A host was blocked."""
 
     ended: BlockEnded
-    replaced: Annotated[BlockedHost | None, doc("its earlier block; null: it was not blocked")]
+    replaced: Annotated[BlockedHost | None, doc("its earlier block, or null if it was not blocked")]
     other_addresses: Annotated[
         list[str],
         doc("further addresses of the same machine that have rights: of its tunnel, or outside it"),

@@ -30,8 +30,8 @@ class ConnectedClient(msgspec.Struct, frozen=True, kw_only=True):
     address: Annotated[str, doc("of the client")]
     since: Moment
     protocol: Annotated[str, doc("`rosbridge`, or the subprotocol of Foxglove")]
-    ticket: Annotated[str, doc("id of its ticket; empty: it came to an agent's port")]
-    who: Annotated[str, doc("who made the ticket; empty: no ticket, or it is over")]
+    ticket: Annotated[str, doc("id of its ticket, or empty if it came to an agent's port")]
+    who: Annotated[str, doc("who made the ticket, or empty if there is no ticket, or it is over")]
     received: Annotated[int, doc("frames from the client")]
     sent: Annotated[int, doc("frames to the client")]
     refused: Annotated[int, doc("requests of the client that were refused")]
@@ -44,9 +44,9 @@ class DoorState(msgspec.Struct, frozen=True, kw_only=True):
     address: Annotated[str, doc("its source address inside the appliance, as in records")]
     node: Annotated[str, doc("the name of its ROS node")]
     added: Moment
-    port: Annotated[int | None, doc("the port of an agent; null: only tickets open this door")]
-    source: Annotated[str, doc("the address or network of the agent; empty: any")]
-    trouble: Annotated[str, doc("why it does not serve; empty: it serves")]
+    port: Annotated[int | None, doc("the port of an agent, or null if only tickets open this door")]
+    source: Annotated[str, doc("the address or network of the agent, or empty if any may connect")]
+    trouble: Annotated[str, doc("why it does not serve, or empty if it serves")]
     connections: Annotated[int, doc("at present")]
     received: Annotated[int, doc("frames from clients since the start of its process")]
     sent: Annotated[int, doc("frames to clients since the start of its process")]
@@ -59,9 +59,9 @@ class DoorState(msgspec.Struct, frozen=True, kw_only=True):
 class OwnDoor(msgspec.Struct, frozen=True, kw_only=True):
     """The door of the caller; a token's door has its name, a person's door the name of a group in `sso.doors`."""
 
-    name: Annotated[str, doc("its name, even if it does not exist; empty: the caller can have none")]
-    door: Annotated[DoorState | None, doc("null: there is none")]
-    reason: Annotated[str, doc("why there is none, and what to do; empty: there is one")]
+    name: Annotated[str, doc("its name, even if it does not exist, or empty if the caller can have none")]
+    door: Annotated[DoorState | None, doc("the caller's door, or null if there is none")]
+    reason: Annotated[str, doc("why there is none, and what to do, or empty if there is one")]
 
 
 class DoorList(msgspec.Struct, frozen=True):
@@ -84,10 +84,10 @@ class NewDoor(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     name: Annotated[str, msgspec.Meta(max_length=31)]
     port: Annotated[
         Annotated[int, msgspec.Meta(ge=1024, le=65_535)] | None,
-        doc("port of an agent; null: only tickets open the door"),
+        doc("port of an agent; without it, only tickets open the door"),
     ] = None
     source: Annotated[
-        str, doc("address or network of the agent; empty: any"), msgspec.Meta(max_length=64)
+        str, doc("address or network of the agent; by default, any"), msgspec.Meta(max_length=64)
     ] = ""
 
 

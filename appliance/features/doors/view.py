@@ -21,10 +21,10 @@ class DoorHealth(msgspec.Struct, frozen=True, kw_only=True):
 
     name: Annotated[str, doc("`door:NAME` in the policy")]
     up: Annotated[bool, doc("whether it serves")]
-    trouble: Annotated[str, doc("why it does not serve; empty: it serves, or starts")]
+    trouble: Annotated[str, doc("why it does not serve, or empty if it serves or starts")]
     connections: Annotated[int, doc("at present")]
     limit: Annotated[int, doc("the most connections, `doors.connections`")]
-    full_seconds: Annotated[float, doc("how long it has been at its limit of connections; 0: it is not")]
+    full_seconds: Annotated[float, doc("how long it has been at its limit of connections, or 0 if it is not")]
     received: Annotated[int, doc("frames from clients")]
     sent: Annotated[int, doc("frames to clients")]
     received_bytes: Annotated[int, doc("bytes from clients, as on the wire")]
@@ -117,7 +117,7 @@ DOORS_VIEW = FeatureView(
         StateView(
             "doors",
             DoorsState,
-            "null: there are no doors",
+            "the doors, or null if there are none",
             before="handled_alarms",
             alarms=_alarms,
             metrics=tuple(_METRICS.values()),

@@ -17,17 +17,19 @@ class BundlesState(msgspec.Struct, frozen=True):
     """The bundle of the fleet in force (SITE/GROUP/VERSION.tar, or empty), and the results of later ones."""
 
     collector: Annotated[str, doc("URL of the collector")]
-    in_force: Annotated[str, doc("the bundle in force; empty: none")]
+    in_force: Annotated[str, doc("the bundle in force, or empty if there is none")]
     sha256: Annotated[str, doc("SHA-256 of its archive")]
-    since: Annotated[Moment | None, doc("when its trial ended; null: none is in force")]
-    trying: Annotated[str, doc("the bundle in its commit-confirm period; empty: none")]
+    since: Annotated[Moment | None, doc("when its trial ended, or null if none is in force")]
+    trying: Annotated[str, doc("the bundle in its commit-confirm period, or empty if there is none")]
     refused: Annotated[
-        str, doc("the last bundle that this robot refused; empty: none since the one in force")
+        str, doc("the last bundle that this robot refused, or empty if none since the bundle in force")
     ]
     reason: Annotated[str, doc("why it was refused")]
     changed: Annotated[bool, doc("an operator has changed a part of the bundle on this robot")]
-    checked: Annotated[Moment | None, doc("when the collector's metadata were last verified; null: not yet")]
-    trouble: Annotated[str, doc("why no bundles are taken now; empty: they are")]
+    checked: Annotated[
+        Moment | None, doc("when the collector's metadata were last verified, or null if not yet")
+    ]
+    trouble: Annotated[str, doc("why no bundles are taken now, or empty if they are")]
     rejected: Annotated[bool, doc("the collector serves metadata that are not accepted")]
 
 
@@ -39,10 +41,15 @@ _COLLECTOR_METRICS = (
     counter("rosrv_collector_missed_total", "records that retention removed before the collector had them"),
 )
 _BUNDLE_METRICS = (
-    gauge("rosrv_bundle_version", "version of the fleet's bundle in force; 0: none; absent without a fleet"),
+    gauge(
+        "rosrv_bundle_version",
+        "version of the fleet's bundle in force, or 0 if there is none; absent without a fleet",
+    ),
     gauge("rosrv_bundle_refused", "1 while the last bundle that was offered is refused"),
     gauge("rosrv_bundle_changed", "1 while a part of the bundle in force is changed on this robot"),
-    gauge("rosrv_bundle_checked_seconds", "since the collector's metadata were last verified; -1: not yet"),
+    gauge(
+        "rosrv_bundle_checked_seconds", "since the collector's metadata were last verified, or -1 if not yet"
+    ),
     gauge("rosrv_bundle_rejected", "1 while the collector serves bundles or metadata that are not accepted"),
 )
 
@@ -101,7 +108,7 @@ FLEET_VIEW = FeatureView(
         StateView(
             "collector",
             ForwardingState,
-            "segments pushed to the collector; null: none is configured",
+            "segments pushed to the collector, or null if none is configured",
             part="audit",
             alarms=_collector_alarms,
             metrics=_COLLECTOR_METRICS,
@@ -111,7 +118,7 @@ FLEET_VIEW = FeatureView(
         StateView(
             "bundles",
             BundlesState,
-            "null: no bundles of a fleet are configured",
+            "the bundles of the fleet, or null if none are configured",
             before="handled_alarms",
             alarms=_bundle_alarms,
             metrics=_BUNDLE_METRICS,

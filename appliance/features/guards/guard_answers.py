@@ -14,9 +14,9 @@ class PresetParameter(msgspec.Struct, frozen=True):
     name: Annotated[str, doc("its name in the text")]
     kind: Annotated[str, doc("`int`, `double`, `bool`, `corners`, `joints`, `time` or `hosts`")]
     default: Annotated[str, doc("the value in the preset")]
-    unit: Annotated[str, doc("the unit of its values; empty: none")]
-    least: Annotated[str, doc("the least value; empty: not a number")]
-    most: Annotated[str, doc("the greatest value; empty: not a number")]
+    unit: Annotated[str, doc("the unit of its values, or empty if they have none")]
+    least: Annotated[str, doc("the least value, or empty if it is not a number")]
+    most: Annotated[str, doc("the greatest value, or empty if it is not a number")]
     what: Annotated[str, doc("its meaning, for a person")]
     loads: Annotated[bool, doc("it is in the text: a change loads the guard again, and for admins only")]
 
@@ -55,9 +55,11 @@ class GuardRow(msgspec.Struct, frozen=True):
     stops: Annotated[int, doc("messages that it changed or dropped; in shadow mode: that it would have")]
     why_held: Annotated[str, doc("why it holds its topics, if it does")] = ""
     confirm_by: Annotated[
-        Moment | None, doc("when it returns to shadow mode unless confirmed; null: it stays")
+        Moment | None, doc("when it returns to shadow mode unless confirmed, or null if it stays")
     ] = None
-    off_until: Annotated[Moment | None, doc("when it is enabled again automatically; null: no end")] = None
+    off_until: Annotated[Moment | None, doc("when it is enabled again automatically, or null if never")] = (
+        None
+    )
 
 
 class GuardList(msgspec.Struct, frozen=True):
@@ -78,7 +80,7 @@ class GuardPlan(msgspec.Struct, frozen=True):
     revision: int
     tag: Tag
     name: Annotated[str, doc("the guard")]
-    file: Annotated[str, doc("the specification file that would be loaded; empty: none")]
+    file: Annotated[str, doc("the specification file that would be loaded, or empty if there is none")]
     text: Annotated[str, doc("its text")]
     begins: Annotated[bool, doc("the guard would begin in its initial state")]
     shadow: Annotated[bool, doc("it would be in shadow mode")]
@@ -113,13 +115,13 @@ class Suggestions(msgspec.Struct, frozen=True):
 class DriverCheck(msgspec.Struct, frozen=True):
     """The present check of a robot's driver, or the last one since control started."""
 
-    command: Annotated[str, doc("the topic whose motions are withheld; empty: there was no check")] = ""
+    command: Annotated[str, doc("the topic whose motions are withheld, or empty if there was no check")] = ""
     by: Annotated[str, doc("the topic that shows how the base moves")] = ""
     outcome: Annotated[
         str,
         doc(
-            "empty: under way; `stopped`: the driver stopped the base; `moving`: it did not, within the time; not"
-            " measured: `idle`: no slow drive; `ended`: a stop command came; `silent`: the odometry was silent;"
+            "empty while it is under way; `stopped`: the driver stopped the base; `moving`: it did not, in time;"
+            " not measured: `idle`: no slow drive; `ended`: a stop command came; `silent`: the odometry was silent;"
             " `interrupted`: a process ended, or the client no longer asked"
         ),
     ] = ""

@@ -26,7 +26,7 @@ class NewGuard(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     topics: Annotated[_Values, doc("by the names that the preset has for them; `command` is needed")]
     values: Annotated[_Values, doc("by parameter, as text")] = {}
     types: Annotated[_Values, doc("types of topics that no node has yet, by the names of the topics")] = {}
-    name: Annotated[_Name, doc("empty: that of the preset")] = ""
+    name: Annotated[_Name, doc("its name; by default, that of the preset")] = ""
     shadow: Annotated[bool, doc("only record what it would have done")] = False
 
 
@@ -39,10 +39,10 @@ class GuardValues(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class GuardDraft(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A change of a guard to try: with `preset` a new guard, otherwise new values of the guard `name`."""
 
-    preset: Annotated[_Name, doc("the preset of a new guard; empty: a guard that is loaded")] = ""
+    preset: Annotated[_Name, doc("the preset of a new guard, or empty for a guard that is loaded")] = ""
     topics: Annotated[_Values, doc("of a new guard, as in a new guard")] = {}
     types: Annotated[_Values, doc("of a new guard, as in a new guard")] = {}
-    name: Annotated[_Name, doc("the guard; empty: named as the preset")] = ""
+    name: Annotated[_Name, doc("the guard; by default, it has the name of the preset")] = ""
     values: Annotated[_Values, doc("by parameter, as text")] = {}
     shadow: Annotated[bool, doc("a new guard only records what it would have done")] = False
     enforce: Annotated[bool, doc("bring the guard from shadow mode into force")] = False

@@ -41,5 +41,5 @@ def _line(state: GuardsState) -> tuple[str, str]:
 
 GUARDS_VIEW = FeatureView(
     "guards",
-    (StateView("guards", GuardsState, "null: no guard is loaded", alarms=_alarms, line=_line),),
+    (StateView("guards", GuardsState, "the guards, or null if none is loaded", alarms=_alarms, line=_line),),
 )

@@ -17,7 +17,7 @@ class EventShown(msgspec.Struct, frozen=True, kw_only=True):
     topic: str | None
     type: str | None
     part: Annotated[str | None, doc("for a service: request or response")]
-    every: Annotated[float | None, doc("interval in seconds; null: not periodic")]
+    every: Annotated[float | None, doc("interval in seconds, or null if it is not periodic")]
 
 
 class PropertyShown(msgspec.Struct, frozen=True, kw_only=True):
@@ -60,7 +60,7 @@ class History(msgspec.Struct, frozen=True):
 
     name: str
     happened: list[Happened]
-    cursor: Annotated[str | None, doc("cursor of the next page; null: this is the last page")]
+    cursor: Annotated[str | None, doc("cursor of the next page, or null on the last page")]
 
 
 class Replaced(msgspec.Struct, frozen=True, kw_only=True):

@@ -28,7 +28,7 @@ class Ended(msgspec.Struct, frozen=True):
     """Something live, such as a connection, that the policy ends."""
 
     host: str
-    caller_id: Annotated[str, doc("empty: the client gave no name")]
+    caller_id: Annotated[str, doc("the client's name, or empty if it gave none")]
     what: Literal["publication", "subscription", "service", "call", "parameter"]
     resource: str
     reason: str
@@ -76,9 +76,13 @@ class Explained(msgspec.Struct, frozen=True, kw_only=True):
     decision: Decided
     rule: RuleText | None
     reason: str
-    told: Annotated[str | None, doc("text of the answer to a denied host ([Options] tell); null: allowed")]
+    told: Annotated[
+        str | None, doc("text of the answer to a denied host ([Options] tell), or null if it is allowed")
+    ]
     through: Annotated[list[str], doc("words of the rule that match the host")]
-    limit: Annotated[str, doc("the limit on allowed messages, and its line of [Limits]; empty: none")]
+    limit: Annotated[
+        str, doc("the limit on allowed messages, and its line of [Limits], or empty if there is none")
+    ]
     lost: list[LostRule]
     node: Annotated["Explained | None", doc("the node name that the host gives, if the action needs a node")]
     command: Annotated[

@@ -28,9 +28,9 @@ class Trigger(msgspec.Struct, frozen=True):
     resource: Annotated[str, doc("topic, service or call of the audit record")] = ""
     host: Annotated[str, doc("address of the peer in the audit record")] = ""
     caller_id: Annotated[str, doc("the name that this peer gave: a claim")] = ""
-    equal: Annotated[str, doc("the same in triggers whose audit records are equal; empty: equal to none")] = (
-        ""
-    )
+    equal: Annotated[
+        str, doc("the same in triggers whose audit records are equal, or empty if equal to none")
+    ] = ""
 
 
 class RecordedTopic(msgspec.Struct, frozen=True):
@@ -139,7 +139,7 @@ class RecordedEvent(msgspec.Struct, frozen=True, kw_only=True):
     record: Annotated[str, doc("id of the audit record")]
     event: str
     severity: str
-    decision: Annotated[str | None, doc("allow, deny or would deny; null: nothing was decided")]
+    decision: Annotated[str | None, doc("allow, deny or would deny, or null if nothing was decided")]
     host: Annotated[str | None, doc("the host that the record is about")]
     caller_id: str | None
     resource: Annotated[str | None, doc("topic, service, call or monitor")]

@@ -23,7 +23,7 @@ RecordingId = Annotated[
 
 
 class NewRecording(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The wanted recording: seconds before and after now (null: as configured), and why."""
+    """The wanted recording: seconds before and after now (by default, as configured), and why."""
 
     before: Annotated[Annotated[float, msgspec.Meta(ge=0)] | None, doc("seconds")] = None
     after: Annotated[Annotated[float, msgspec.Meta(gt=0)] | None, doc("seconds")] = None
@@ -31,7 +31,7 @@ class NewRecording(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class MemorySpan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A period from `since` (null: from the first data) to `until` (null: now)."""
+    """A period from `since` (by default, the first data) to `until` (by default, now)."""
 
     since: GivenNanoMoment = None
     until: GivenNanoMoment = None

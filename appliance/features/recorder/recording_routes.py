@@ -47,7 +47,7 @@ _Moment = Annotated[
 ]
 _Topics = Annotated[
     list[Annotated[str, Query(max_length=500)]],
-    Query(max_length=20, description="only these topics; none: all topics", examples=[["/scan"]]),
+    Query(max_length=20, description="only these topics; by default, all", examples=[["/scan"]]),
 ]
 _Reading = Callable[[Recording, Path], _T]
 

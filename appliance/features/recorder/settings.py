@@ -42,7 +42,9 @@ class RecorderRules(FeatureSection):
     disk: Annotated[int, BYTES, rules(ge=64 << 20)] = key(
         default=2 << 30, description="of all recordings; one uses at most an eighth of it"
     )
-    days: Seconds | None = key(default=30.0, description="after which a recording is removed; null: never")
+    days: Seconds | None = key(
+        default=30.0, description="after which a recording is removed; with null, never"
+    )
 
     def __post_init__(self) -> None:
         if self.longest < self.before + self.after:

@@ -41,7 +41,7 @@ RECORDER_VIEW = FeatureView(
         StateView(
             "recorder",
             RecorderState,
-            "null: nothing is recorded",
+            "the flight recorder, or null if nothing is recorded",
             before="switched_off",
             alarms=_alarms,
             metrics=_METRICS,

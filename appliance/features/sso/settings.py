@@ -145,7 +145,7 @@ class Sso(FeatureSection):
     )
     domains: list[Annotated[str, check(_checked_domain)]] = key(
         default=[],
-        description="domains of verified e-mail addresses that may sign in; empty: any address, or none",
+        description="domains of verified e-mail addresses that may sign in; without it, any address, or none",
     )
     session_hours: Annotated[float, rules(gt=0, le=24, allow_inf_nan=False)] = key(
         default=8.0, description="longest session"

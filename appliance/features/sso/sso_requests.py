@@ -27,7 +27,7 @@ class SignedOn(msgspec.Struct, frozen=True):
     id: Annotated[str, doc("id of the session")]
     name: Annotated[str, doc("name of the person in the audit log")]
     subject: Annotated[str, doc("permanent identifier of the person at the provider (`sub`)")]
-    mail: Annotated[str, doc("verified e-mail address; empty: none")]
+    mail: Annotated[str, doc("verified e-mail address, or empty without one")]
     role: TokenRole
     groups: Annotated[list[str], doc("groups of doors")]
     expires: Moment

@@ -17,17 +17,17 @@ class OtherAppliance(msgspec.Struct, frozen=True):
     behind_changes: Annotated[int, doc("changes of the state that it lacks; on a standby always 0")]
     behind_bytes: Annotated[int, doc("bytes of these changes that are kept in memory")]
     waiting_seconds: Annotated[
-        float | None, doc("age of the oldest answer that waits for it; null: none waits")
+        float | None, doc("age of the oldest answer that waits for it, or null if none waits")
     ]
-    reason: Annotated[str, doc("why the last replication ended; empty: it is open, or never began")]
+    reason: Annotated[str, doc("why the last replication ended, or empty if it is open, or never began")]
     trouble_seconds: Annotated[
         float | None,
-        doc("how long it has been away, or (on the active appliance) not in sync; null: neither"),
+        doc("how long it has been away, or (on the active appliance) not in sync, or null if neither"),
     ]
     witness_seconds: Annotated[
         float | None,
         doc(
-            "on the active appliance: seconds since the witness last answered the other one; null: not known"
+            "on the active appliance: seconds since the witness last answered the other one, or null if not known"
         ),
     ]
 
@@ -36,10 +36,14 @@ class WitnessSeen(msgspec.Struct, frozen=True):
     """The witness on the robot, as this appliance sees it."""
 
     address: str
-    answered_seconds: Annotated[float | None, doc("seconds since its last answer; null: it never answered")]
-    holder: Annotated[str, doc("the appliance that has the lease; empty: none yet")]
-    refusal: Annotated[str, doc("why it refused the last request; empty: it did not")]
-    trouble: Annotated[str, doc("why it could not save a takeover, such as a full disk; empty: it could")]
+    answered_seconds: Annotated[
+        float | None, doc("seconds since its last answer, or null if it never answered")
+    ]
+    holder: Annotated[str, doc("the appliance that has the lease, or empty if none has it yet")]
+    refusal: Annotated[str, doc("why it refused the last request, or empty if it did not")]
+    trouble: Annotated[
+        str, doc("why it could not save a takeover, such as a full disk, or empty if it could")
+    ]
 
 
 class StandbyState(msgspec.Struct, frozen=True):
@@ -61,5 +65,7 @@ class StandbyState(msgspec.Struct, frozen=True):
     witness: WitnessSeen
     obstacle: Annotated[
         str,
-        doc("why the standby cannot take over, although it follows; empty: its last check found no reason"),
+        doc(
+            "why the standby cannot take over, although it follows, or empty if its last check found no reason"
+        ),
     ]

@@ -55,7 +55,7 @@ STANDBY_VIEW = FeatureView(
         StateView(
             "standby",
             StandbyState,
-            "null: this appliance is not one of two",
+            "this appliance as one of two, or null on a single one",
             before="handled_alarms",
             alarms=lambda state: standby_troubles(state, PATIENCE_SECONDS),
             metrics=_METRICS,

@@ -28,7 +28,7 @@ SYSLOG_VIEW = FeatureView(
         StateView(
             "forwarding",
             ForwardingState,
-            "null: forwarding is not configured",
+            "the forwarding of records, or null if it is not configured",
             part="audit",
             required=True,
             alarms=_alarms,

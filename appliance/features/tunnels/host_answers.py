@@ -22,11 +22,13 @@ class Hosts(msgspec.Struct, frozen=True):
     revision: Annotated[int, doc("the number in the ETag")]
     hosts: list[Host]
     machines: Annotated[list[Machine], doc("machines of nodes without a tunnel")]
-    esp: Annotated[Literal["kernel", "user space"] | None, doc("where ESP runs; null: no tunnels are open")]
-    key_exchange: Annotated[
-        list[str], doc("key exchanges offered and accepted, best first; empty: not known yet")
+    esp: Annotated[
+        Literal["kernel", "user space"] | None, doc("where ESP runs, or null if no tunnels are open")
     ]
-    post_quantum: Annotated[bool | None, doc("whether ML-KEM is among them; null: not known yet")]
+    key_exchange: Annotated[
+        list[str], doc("key exchanges offered and accepted, best first, or empty if not known yet")
+    ]
+    post_quantum: Annotated[bool | None, doc("whether ML-KEM is among them, or null if not known yet")]
     pool: str
     address: Annotated[str, doc("the appliance's own address in the tunnels")]
     hosts_file: str

@@ -34,8 +34,8 @@ class KitWishes(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     endpoint: Annotated[
         Endpoint | None,
         doc(
-            "address or name at which the host reaches the appliance; null: `ipsec.endpoint` of the configuration, else"
-            " the machine's address towards its default route (422 if it has none)"
+            "address or name at which the host reaches the appliance; by default, `ipsec.endpoint` of the"
+            " configuration, else the machine's address towards its default route (422 if it has none)"
         ),
     ] = None
     ports: Annotated[
@@ -49,7 +49,7 @@ class KitWishes(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
 class TokenWishes(KitWishes, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A one-time token for a host, new or enrolled before."""
 
-    address: Annotated[Address | None, doc("its virtual address; null: the next free one")] = None
+    address: Annotated[Address | None, doc("its virtual address; by default, the next free one")] = None
     days: Days = 90
     token_seconds: TokenSeconds = 3600
 
@@ -83,4 +83,6 @@ class PortsTold(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     state: PortsState
     open: Annotated[list[Port], msgspec.Meta(max_length=100)] = []
-    checked: Annotated[GivenMoment | None, doc("RFC 3339, or seconds since the epoch; null: now")] = None
+    checked: Annotated[GivenMoment | None, doc("RFC 3339, or seconds since the epoch; by default, now")] = (
+        None
+    )
