@@ -81,7 +81,7 @@ class PumpFuzzer:
         self._actions: list[tuple[int, Callable[[], None]]] = [
             (40, self._send), (40, self._wait), (12, self._arm), (6, self._read), (3, self._step), (2, self._replace),
             (2, self._end_publisher), (2, self._end_subscriber), (2, self._change), (1, self._move), (1, self._count),
-            (1, self._misplace), (1, self._disarm), (1, self._misuse),
+            (1, self._misplace), (1, self._disarm), (1, self._misuse), (4, self._walk),
         ]  # fmt: skip
         self._weights = [weight for weight, _ in self._actions]
 
@@ -233,6 +233,12 @@ class PumpFuzzer:
         counters.delayed(self._random.choice((0.0, -1.0, 1e9, 1e-7)), self._random.choice((0, 1, 1 << 40)))
         messages, _size, counts, _seconds = counters.take()
         assert isinstance(messages, int) and len(counts) in {0, 11}, counts
+
+    def _walk(self) -> None:
+        data = self._mutated(b"".join(self._frame() for _ in range(self._random.choice((0, 1, 5)))))
+        bounds = (-(1 << 63), -1, 0, 1, len(data) - 1, len(data), (1 << 63) - 1)
+        end, messages, last = self._pump.walk(data, *self._random.choices(bounds, k=2))
+        assert 0 <= last <= end <= len(data) and 0 <= messages <= len(data), (end, messages, last)
 
     def _misplace(self) -> None:
         connection = self._random.choice(self._connections)
