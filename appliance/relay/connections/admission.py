@@ -12,33 +12,33 @@ from appliance.relay.grant_table import GrantTable
 from roswire.errors import InvalidNameError
 from roswire.names import canonical_tool_id
 
-_REQUIRED = {"topic": ("md5sum", "callerid"), "service": ("md5sum", "callerid")}
+_KINDS = ("topic", "service")
+_REQUIRED = ("md5sum", "callerid")
 
 NOTHING = ("", "")
 """The kind and name for a header that names neither a topic nor a service."""
 
 
 def asked_for(fields: Mapping[str, str]) -> tuple[str, str]:
-    return next(((kind, fields[kind]) for kind in _REQUIRED if fields.get(kind)), NOTHING)
+    return next(((kind, fields[kind]) for kind in _KINDS if fields.get(kind)), NOTHING)
 
 
 def flaw(fields: Mapping[str, str], rest: bytes) -> str:
     """Return why a header is rejected, in rospy's words where possible; empty if it is valid."""
     if "topic" in fields and "service" in fields:
         return "its header names a topic and a service; a connection is for one of them"
-    for kind, required in _REQUIRED.items():
-        if kind in fields:
-            for field in required:
-                if field not in fields:
-                    return f"Missing required '{field}' field"
-            try:
-                canonical_tool_id(fields["callerid"])
-            except InvalidNameError as error:
-                return str(error)
-            if kind == "topic" and rest:
-                return "sent data after its header; a connection is for one topic"
-            return too_long(fields)
-    return "its header names neither a topic nor a service"
+    if "topic" not in fields and "service" not in fields:
+        return "its header names neither a topic nor a service"
+    for field in _REQUIRED:
+        if field not in fields:
+            return f"Missing required '{field}' field"
+    try:
+        canonical_tool_id(fields["callerid"])
+    except InvalidNameError as error:
+        return str(error)
+    if "topic" in fields and rest:
+        return "sent data after its header; a connection is for one topic"
+    return too_long(fields)
 
 
 def missing(table: GrantTable, key: str, host: str, fields: Mapping[str, str]) -> str:

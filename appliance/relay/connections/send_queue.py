@@ -82,6 +82,8 @@ class SendQueue:
 
     def trim(self) -> int:
         """Drop the oldest frames, or all if the host's memory is exhausted; return how many."""
+        if not self.full:
+            return 0
         before = self.messages
         limit_messages, limit_size = self._limit_messages, self._limit_size
         if self._held.share.exhausted:

@@ -41,9 +41,6 @@ class TopicSubscriber(Protocol):
     def exhausted(self) -> bool:
         """Whether the memory of the subscriber's host is used up."""
 
-    @property
-    def full(self) -> bool: ...
-
     def trim(self) -> int:
         """Return how many messages were dropped."""
 
@@ -130,7 +127,6 @@ class ServedSubscribers:
 
     def trim(self, *, stalled: bool = False) -> None:
         for member in self.row:
-            if member.full:
-                self.dropped += member.trim()
+            self.dropped += member.trim()
             if stalled:
                 member.check_stall()

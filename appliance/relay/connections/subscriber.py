@@ -136,10 +136,6 @@ class Subscriber:
     def exhausted(self) -> bool:
         return self._share.exhausted
 
-    @property
-    def full(self) -> bool:
-        return self._queue.full
-
     def trim(self) -> int:
         return self._queue.trim()
 

@@ -80,11 +80,9 @@ class RecordedMember:
     def exhausted(self) -> bool:
         return False
 
-    @property
-    def full(self) -> bool:
-        return self.behind_since is not None
-
     def trim(self) -> int:
+        if self.behind_since is None:
+            return 0
         self.trimmed += 1
         return 3
 
