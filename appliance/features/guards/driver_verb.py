@@ -21,7 +21,13 @@ _VERB = "rosrv guard check-driver"
 def check_driver(
     appliance: Appliance,
     topic: Annotated[
-        str, typer.Argument(metavar="TOPIC", autocompletion=completion.topics, show_default=False)
+        str,
+        typer.Argument(
+            metavar="TOPIC",
+            help="The topic of the commands, such as /cmd_vel",
+            autocompletion=completion.topics,
+            show_default=False,
+        ),
     ],
     *,
     by: Annotated[

@@ -34,9 +34,20 @@ from rosmop.tool.tables import say_table, table_of
 from rosmop.tool.terminal import say
 
 _Name = Annotated[
-    str, typer.Argument(metavar="GUARD", autocompletion=completion.monitors, show_default=False)
+    str,
+    typer.Argument(
+        metavar="GUARD",
+        help="Name as in `rosrv guard list`",
+        autocompletion=completion.monitors,
+        show_default=False,
+    ),
 ]
-_Values = Annotated[list[str] | None, typer.Argument(metavar="PARAMETER=VALUE…", show_default=False)]
+_Values = Annotated[
+    list[str] | None,
+    typer.Argument(
+        metavar="PARAMETER=VALUE…", help="Parameters of the preset, such as silent=0.5", show_default=False
+    ),
+]
 _DryRun = Annotated[
     bool, typer.Option("--dry-run", help="Only report what would be loaded, changed and held")
 ]
@@ -106,9 +117,22 @@ def suggest(appliance: Appliance) -> None:
 @speaks
 def new(
     appliance: Appliance,
-    preset: Annotated[str, typer.Argument(metavar="PRESET", show_default=False)],
+    preset: Annotated[
+        str,
+        typer.Argument(
+            metavar="PRESET",
+            help="Kind of guard: `rosrv guard list` prints all, with their parameters",
+            show_default=False,
+        ),
+    ],
     topic: Annotated[
-        str, typer.Argument(metavar="TOPIC", autocompletion=completion.topics, show_default=False)
+        str,
+        typer.Argument(
+            metavar="TOPIC",
+            help="The topic of the commands, such as /cmd_vel",
+            autocompletion=completion.topics,
+            show_default=False,
+        ),
     ],
     values: _Values = None,
     *,
@@ -161,7 +185,14 @@ def new(
 def set_values(
     appliance: Appliance,
     name: _Name,
-    values: Annotated[list[str], typer.Argument(metavar="PARAMETER=VALUE…", show_default=False)],
+    values: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="PARAMETER=VALUE…",
+            help="Parameters of the preset, such as silent=0.5",
+            show_default=False,
+        ),
+    ],
     *,
     dry_run: Annotated[
         bool,

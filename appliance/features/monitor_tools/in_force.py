@@ -21,7 +21,13 @@ from rosmop.tool.tables import say_table, table_of
 from rosmop.tool.terminal import printable, say
 
 _Names = Annotated[
-    list[str], typer.Argument(metavar="MONITOR…", show_default=False, autocompletion=completion.monitors)
+    list[str],
+    typer.Argument(
+        metavar="MONITOR…",
+        help="Names as in `rosrv monitor list`",
+        show_default=False,
+        autocompletion=completion.monitors,
+    ),
 ]
 
 _SHADOW = "shadow mode"
@@ -139,7 +145,10 @@ def disable(
 @speaks
 def load(
     appliance: Appliance,
-    files: Annotated[list[Path], typer.Argument(readable=False, metavar="FILE…", show_default=False)],
+    files: Annotated[
+        list[Path],
+        typer.Argument(readable=False, metavar="FILE…", help="Specification files (.rv)", show_default=False),
+    ],
     msg: Annotated[
         list[Path] | None,
         typer.Option("--msg", metavar="DIR", help="Folder of message definitions (repeatable)"),
@@ -236,8 +245,18 @@ def resume(appliance: Appliance, names: _Names) -> None:
 @speaks
 def set_given(
     appliance: Appliance,
-    name: Annotated[str, typer.Argument(metavar="MONITOR", autocompletion=completion.monitors)],
-    values: Annotated[list[str] | None, typer.Argument(metavar="NAME=VALUE…", show_default=False)] = None,
+    name: Annotated[
+        str,
+        typer.Argument(
+            metavar="MONITOR", help="Name as in `rosrv monitor list`", autocompletion=completion.monitors
+        ),
+    ],
+    values: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="NAME=VALUE…", help="Constants that are given to it, such as vMax=0.3", show_default=False
+        ),
+    ] = None,
 ) -> None:
     """Set constants that are given to a monitor while it runs. Without values, print everything given to it.
 

@@ -41,7 +41,15 @@ from rosmop.tool.terminal import printable, refused, say
 if TYPE_CHECKING:
     from appliance.cli.connection.rest_orders import RestWay
 
-_Id = Annotated[str, typer.Argument(metavar="ID", show_default=False, autocompletion=completion.recordings)]
+_Id = Annotated[
+    str,
+    typer.Argument(
+        metavar="ID",
+        help="As in `rosrv record list`",
+        show_default=False,
+        autocompletion=completion.recordings,
+    ),
+]
 _SECOND = 1_000_000_000
 _BARS = " ▁▂▃▄▅▆▇█"
 _T = TypeVar("_T")

@@ -18,7 +18,9 @@ _OPENSSH = b"-----BEGIN OPENSSH PRIVATE KEY-----"
 
 
 def sign(
-    files: Annotated[list[Path], typer.Argument(metavar="FILE…", show_default=False)],
+    files: Annotated[
+        list[Path], typer.Argument(metavar="FILE…", help="Files whose text is signed", show_default=False)
+    ],
     key: Annotated[Path, typer.Option(metavar="KEY", help="The private key (ssh-keygen -t ed25519 -f KEY)")],
     as_json: Json = False,
 ) -> None:

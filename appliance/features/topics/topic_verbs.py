@@ -41,7 +41,13 @@ def _resolved(topic: str) -> str:
 
 _Topic = Annotated[
     str,
-    typer.Argument(metavar="TOPIC", show_default=False, autocompletion=completion.topics, callback=_resolved),
+    typer.Argument(
+        metavar="TOPIC",
+        help="Its name, such as /cmd_vel",
+        show_default=False,
+        autocompletion=completion.topics,
+        callback=_resolved,
+    ),
 ]
 
 

@@ -15,7 +15,7 @@ rollout = typer.Typer(
     help="Bring a signed bundle to the robots of a group, ring by ring.", no_args_is_help=True
 )
 
-Place = Annotated[str, typer.Argument(metavar="SITE/GROUP")]
+Place = Annotated[str, typer.Argument(metavar="SITE/GROUP", help="The site and the robot group")]
 Json = Annotated[bool, typer.Option("--json", metavar="", help="Machine-readable output")]
 _NO_BUNDLES = "; without the section `bundles` of its configuration, a collector has no rollouts"
 _GOOD = ("in force", "no bundle")

@@ -5,10 +5,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import typer
+from rosrv_fleet.cli import app as fleet_app
 from typer.testing import CliRunner
 
 from appliance.cli.lazy import loaded
 from appliance.cli.main import app
+from distribution import command_line_page
+from rosmop.tool.command import app as rosmop_app
 from tests.support.command import commands, table
 
 ROOT = Path(__file__).parents[3]
@@ -44,13 +48,21 @@ def test_every_verb_has_help_with_an_example(name: str, command: Any) -> None:
     assert any(f"rosrv {name}" in line for line in example), command.help
     if name != "demo":  # draws on the screen, prints nothing for a program
         assert any("--json" in one.opts for one in command.params), [one.opts for one in command.params]
-    for one in command.params:
-        if one.param_type_name == "option":
-            assert one.help, (name, one.opts)
     shown = CliRunner().invoke(app, [*name.split(), "-h"])
     assert "<bool>" not in shown.output, "a flag takes no value"
     assert shown.exit_code == 0
     assert "Usage: " in shown.output
+
+
+@pytest.mark.parametrize("program", [app, rosmop_app, fleet_app], ids=["rosrv", "rosmop", "rosrv-fleet"])
+def test_every_argument_and_option_has_help(program: typer.Typer) -> None:
+    """A name such as MONITOR or PRESET alone does not say which values exist."""
+    assert [
+        f"{' '.join(words)} {one.name}"
+        for words, command, context in command_line_page.commands(("",), program)
+        for one in command.get_params(context)
+        if not hasattr(command, "list_commands") and not one.hidden and not one.help
+    ] == []
 
 
 @pytest.mark.nightly
