@@ -81,7 +81,6 @@ class _Totals:
 class _Door:
     node: DoorNode
     lookout: Lookout
-    connections: DoorConnections
     memory: DoorMemory
 
 
@@ -99,6 +98,7 @@ class _Process:
         self._network: GivenNetwork | None = None
         self._types = KnownTypes(standard_definitions(), ValueLimits())
         self._door: _Door | None = None
+        self._connections: DoorConnections | None = None  # also before the node has started
         self._started = asyncio.Event()
         self._over = asyncio.Event()
         self._failure = ""
@@ -120,10 +120,10 @@ class _Process:
             (ended, asyncio.ensure_future(self._over.wait())), return_when=asyncio.FIRST_COMPLETED
         )
         await self._tasks.close()
-        if self._door is not None:
-            await self._door.connections.close()
-            if not ended.done():
-                await self._door.node.close()
+        if self._connections is not None:
+            await self._connections.close()
+        if self._door is not None and not ended.done():
+            await self._door.node.close()
         self._child.close()
         if self._failure:
             self._child.fail(self._failure, [])
@@ -140,6 +140,8 @@ class _Process:
         match message:
             case door_link.DoorGiven():
                 if self._given is None:
+                    limits = ConnectionLimits(message.connections, message.in_ten_seconds)
+                    self._connections = DoorConnections(limits)
                     self._network = GivenNetwork(message.address, self._child.tell)
                     self._tasks.start(self._start(message, self._network))
                 elif self._given.added != message.added:  # the slot has another door now
@@ -171,9 +173,9 @@ class _Process:
             case door_link.AgentListener(source):
                 self._listens = True
                 self._tasks.start(self._accept(socket.socket(fileno=descriptors[0]), source))
-            case door_link.ViewerGiven(peer, ticket):
+            case door_link.ViewerGiven(peer, ticket) if self._connections is not None:
                 self._tickets[ticket] += 1
-                self._tasks.start(self._view(descriptors[0], peer, ticket))
+                self._admit(self._connections, descriptors[0], peer, ticket)
 
     def _define(self, texts: dict[str, str]) -> None:
         try:
@@ -208,13 +210,7 @@ class _Process:
             door = DoorNode(
                 node, types, Rosapi(sight, types).answer, most_topics=DOOR_TOPICS.bounds.whole, calls=calls
             )
-            limits = ConnectionLimits(given.connections, given.in_ten_seconds)
-            self._door = _Door(
-                door,
-                Lookout(sight, types, door.learn),
-                DoorConnections(limits),
-                memory,
-            )
+            self._door = _Door(door, Lookout(sight, types, door.learn), memory)
         self._started.set()
 
     def _skip(self) -> None:
@@ -232,7 +228,7 @@ class _Process:
         loop = asyncio.get_running_loop()
         listener.setblocking(False)
         with listener:
-            while self._door is not None:
+            while self._connections is not None:
                 try:
                     connection, address = await loop.sock_accept(listener)
                 except OSError as error:
@@ -244,21 +240,16 @@ class _Process:
                     connection.close()
                     self._ended(str(peer), "", f"the agent's address is {source}")
                 else:
-                    self._admit(self._door, connection, str(peer), "")
+                    self._admit(self._connections, connection.detach(), str(peer), "")
 
-    async def _view(self, descriptor: int, peer: str, ticket: str) -> None:
-        connection = socket.socket(fileno=descriptor)
-        await self._started.wait()
-        if self._door is not None:
-            self._admit(self._door, connection, peer, ticket)
-
-    def _admit(self, door: _Door, connection: socket.socket, peer: str, ticket: str) -> None:
+    def _admit(self, connections: DoorConnections, descriptor: int, peer: str, ticket: str) -> None:
         serve, refused = partial(self._serve, peer, ticket), partial(self._ended, peer, ticket)
-        door.connections.adopt(connection.detach(), serve, refused, host=peer_key(peer))
+        connections.adopt(descriptor, serve, refused, host=peer_key(peer))
 
     async def _serve(
         self, peer: str, ticket: str, reader: asyncio.StreamReader, writer: ClientWriter
     ) -> None:
+        await self._started.wait()
         door, given = self._door, self._given
         if door is None or given is None or (ticket and ticket not in self._tickets):
             writer.close()
@@ -329,7 +320,7 @@ class _Process:
         totals = replace(self._totals)
         for client in self._clients:
             totals.add(client)
-        refused = self._door.connections.refused if self._door is not None else 0
+        refused = self._connections.refused if self._connections is not None else 0
         return door_link.DoorCounted(connections=len(self._clients), refused=refused, **asdict(totals))
 
 
