@@ -4,6 +4,7 @@ import shutil
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from appliance.channel.answers.limit_answers import LimitUse
@@ -68,7 +69,7 @@ class LimitQueries:
 
     def _stored(self) -> Iterator[LimitUse]:
         audit, folder = self.settings.audit, self.settings.state / "control"
-        size = sum(file.stat().st_size for file in folder.glob("audit.db*"))
+        size = sum(map(_size, folder.glob("audit.db*")))
         kept = None if audit.retention_bytes is None else int(audit.retention_bytes)
         allowed = size + shutil.disk_usage(folder).free if kept is None else kept
         yield LimitUse("bytes of audit records", size, allowed, "audit.retention_bytes, or the disk")
@@ -83,6 +84,13 @@ _MEMORY: dict[str, tuple[str, QuotaRow]] = {
 """The parts of a relay's memory. The answer shows the relay that holds most of each."""
 
 _WHOLE_MEMORY = sum(row.bounds.whole for _resource, row in _MEMORY.values())  # as `RelayMemory.of` divides it
+
+
+def _size(file: Path) -> int:
+    try:
+        return file.stat().st_size
+    except FileNotFoundError:  # SQLite removed its write-ahead log in the meantime
+        return 0
 
 
 def _by_host(

@@ -3,6 +3,8 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import pytest
+
 from appliance.channel.answers.limit_answers import LimitUse
 from appliance.configuration.config_sources import read
 from appliance.features.limits.limit_requests import LimitsWanted
@@ -47,6 +49,16 @@ def test_each_resource_has_its_use_and_the_host_with_most(tmp_path: Path) -> Non
     records = rows["bytes of audit records"]
     assert (records.used, records.allowed) == (1024, 4 << 20)
     assert rows["bytes of a feature"].used == 12
+
+
+def test_a_log_file_that_ends_while_it_is_measured_has_no_size(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "control"
+    folder.mkdir()
+    (folder / "audit.db").write_bytes(bytes(1000))
+    monkeypatch.setattr(Path, "glob", lambda *_names: iter([folder / "audit.db", folder / "audit.db-wal"]))
+    assert used(tmp_path, {})["bytes of audit records"].used == 1000
 
 
 def test_without_retention_the_disk_is_the_limit(tmp_path: Path) -> None:
