@@ -51,6 +51,7 @@ LOCAL = {
     "appliance/api/console/console_bundle.py": "the console's own files, at the start",
     "appliance/base/validation_messages.py": "sentences of our libraries about settings and bodies",
     "appliance/cli/": "a process of the operator",
+    "appliance/features/monitor_tools/sources_to_send.py": "a process of the operator",
     "appliance/features/policy_tools/": "a process of the operator",
     "appliance/features/selftest/": "a process of the operator",
     "appliance/features/topics/": "a process of the operator",

@@ -160,6 +160,7 @@ LOOKUPS = {
     "appliance/formats/bundle_verifier.py regular": _LIBRARY,
     "appliance/features/syslog/log_forwarder.py step": _TEXT,
     "appliance/features/table.py start_gate": _IMPORTED,
+    "appliance/features/table.py verb_function": "a feature uses a verb of another feature, which it may not import",
     "appliance/features/parts.py keep": _OF_FEATURES,
     "appliance/features/parts.py inherit": _IMPORTED,
     "appliance/features/views.py pair_view": _IMPORTED,
