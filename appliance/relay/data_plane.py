@@ -11,7 +11,6 @@ from appliance.channel import messages
 from appliance.relay.connections.admission import NOTHING, asked_for, bound_name, flaw, missing
 from appliance.relay.connections.headers import kept
 from appliance.relay.connections.incoming_connection import IncomingConnection, RefusedConnection
-from appliance.relay.connections.latched_message import LatchedMessage, make_room
 from appliance.relay.connections.listening_ports import ListeningPorts
 from appliance.relay.connections.message_sink import MessageSink
 from appliance.relay.connections.monitor_calls import OwnAnswer, ServiceCalls
@@ -212,7 +211,9 @@ class DataPlane:
             limited=lambda part, messages, size: self._reporter.limited(
                 (key, topic, part, host, name), messages, size
             ),
-            make_room=lambda size: make_room(self.memory.latched, host, size, self._latched()),
+            make_room=lambda size: self.memory.latched.make_room(
+                host, size, ((other.host, other.latch) for other in self.topics.values())
+            ),
             refused=self._reporter.send,
             sink=self._sink,
             over=self._loop.over,
@@ -250,9 +251,6 @@ class DataPlane:
         if node is not None and node.monitors:
             return None
         return self._flows.of(grant.limit, grant.topic, grant.host, grant.caller_id)
-
-    def _latched(self) -> Iterator[tuple[str, LatchedMessage]]:
-        return ((topic.host, topic.latch) for topic in self.topics.values())
 
     def _attach_monitors(self, relayed: RelayedTopic) -> None:
         interceptor, topic = self.interceptor, relayed.topic

@@ -1,9 +1,9 @@
 """The last message of a latching publisher, kept in the memory of the publisher's host."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 
 from appliance.relay.transport.frames import Batch
-from appliance.relay.transport.memory import HostMemory, MemoryPool
+from appliance.relay.transport.memory import HostMemory
 
 
 class LatchedMessage:
@@ -75,18 +75,3 @@ class LatchedMessage:
         before, self._refused_size = self._refused_size, size
         if before is None:
             self._refused(size)
-
-
-def make_room(pool: MemoryPool, host: str, size: int, kept: Iterable[tuple[str, LatchedMessage]]) -> None:
-    """Give up messages of hosts that hold more of the pool than `host` would with `size` more bytes.
-
-    `kept` has all latched messages, each with its host.
-    """
-    share, messages = pool.of(host), list(kept)
-    while share.refusal(size):
-        greatest, held = max(pool.holders(), key=lambda holder: holder[1], default=("", 0))
-        of_greatest = (message for owner, message in messages if owner == greatest)
-        largest = max(of_greatest, key=lambda message: message.size, default=None)
-        if held <= share.used + size or largest is None or not largest.size:
-            return
-        largest.give_up()

@@ -8,8 +8,9 @@ A frame is charged to the host that sends it, a queue to the slow host. Invarian
    is dropped when a host that holds less memory needs to latch one.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from typing import Protocol
 
 from appliance.quotas.pool import Pool, QuotaClass
 from appliance.quotas.table import RELAY_FRAMES, RELAY_HEADERS, RELAY_LATCHED, RELAY_QUEUES, QuotaRow
@@ -47,11 +48,31 @@ class HostMemory:
         return self._pool.total * 2 < self._pool.bounds.whole
 
 
+class KeptData(Protocol):
+    """Data in a pool that can be given up, such as a latched message."""
+
+    @property
+    def size(self) -> int: ...
+
+    def give_up(self) -> None: ...
+
+
 class MemoryPool(Pool[str]):
     """A pool of bytes, divided among hosts."""
 
     def of(self, host: str) -> HostMemory:
         return HostMemory(self, host)
+
+    def make_room(self, host: str, size: int, kept: Iterable[tuple[str, KeptData]]) -> None:
+        """Give up data of hosts that hold more than `host` would with `size` more; `kept` has all data by host."""
+        share, held_by = self.of(host), list(kept)
+        while share.refusal(size):
+            greatest, held = max(self.holders(), key=lambda holder: holder[1], default=("", 0))
+            of_greatest = (data for owner, data in held_by if owner == greatest)
+            largest = max(of_greatest, key=lambda data: data.size, default=None)
+            if held <= share.used + size or largest is None or not largest.size:
+                return
+            largest.give_up()
 
 
 @dataclass(frozen=True, slots=True)
