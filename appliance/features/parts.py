@@ -9,7 +9,6 @@ from appliance.features.table import FEATURES
 from appliance.hosts.tunnel_hosts import TunnelHosts
 
 if TYPE_CHECKING:
-    from appliance.audit.log.record import Severity
     from appliance.channel.answers.limit_answers import LimitUse
     from appliance.channel.link import Link
     from appliance.channel.messages import (
@@ -37,7 +36,9 @@ class FeatureParts:
         self._core = core
         self._no_hosts = TunnelHosts()
         self.kept: dict[str, KeptHosts] = {}
-        self._parts = [feature.make(core) for feature in FEATURES if feature.make is not None]
+        self._parts: list[FeaturePart] = []
+        for feature in FEATURES:
+            self.add(feature.make(core) if feature.make is not None else None)
 
     async def keep(self, store: Any, lifeline: Any) -> None:
         """Read the hosts in the state, before the policy comes into force."""
@@ -59,17 +60,20 @@ class FeatureParts:
 
     def operate(self, **later: Any) -> None:
         context = OperatorContext(self._core, **later, hosts=self.hosts(), kept=self.kept)
-        self._parts += [feature.operate(context) for feature in FEATURES if feature.operate is not None]
+        for feature in FEATURES:
+            self.add(feature.operate(context) if feature.operate is not None else None)
 
     async def inherit(self, foundation: Any, parts: Any) -> None:
         for feature in FEATURES:
             if feature.inherit is not None:
-                part: FeaturePart = await pkgutil.resolve_name(feature.inherit)(foundation, parts)
-                self._parts.append(part)
+                self.add(await pkgutil.resolve_name(feature.inherit)(foundation, parts))
 
     def add(self, part: FeaturePart | None) -> None:
-        if part is not None:
-            self._parts.append(part)
+        if part is None:
+            return
+        self._parts.append(part)
+        if part.details is not None:
+            self._core.trail.add_details(part.details)
 
     def link(self, role: str, index: int = 0) -> "tuple[Link, Any] | None":
         """Return the link to a process. The second process of a role has the name `ROLE-2`."""
@@ -87,15 +91,6 @@ class FeatureParts:
 
     def limits(self) -> "tuple[LimitUse, ...]":
         return tuple(use for part in self._parts for use in part.limits())
-
-    def details(
-        self, event: str, decision: str | None, severity: "Severity", host: str | None, now: int
-    ) -> dict[str, str]:
-        details: dict[str, str] = {}
-        for part in self._parts:
-            if part.details is not None:
-                details |= part.details(event, decision, severity, host, now)
-        return details
 
     async def called(self, call: "OwnServiceCalled") -> "OwnServiceAnswered":
         (called,) = (

@@ -360,6 +360,24 @@ class Policy:
         return _decided(False, None, reason, table.audit_only)
 
 
+class CurrentPolicy:
+    """The policy in force, which is replaced as a whole. It is false until the first one is set."""
+
+    def __init__(self) -> None:
+        self._policy: Policy | None = None
+
+    def __bool__(self) -> bool:
+        return self._policy is not None
+
+    def __call__(self) -> Policy:
+        if self._policy is None:
+            raise RuntimeError("no policy is in force yet")
+        return self._policy
+
+    def set(self, policy: Policy) -> None:
+        self._policy = policy
+
+
 def _keep(decisions: dict[K, Decision], key: K, request: Request, decision: Decision) -> None:
     if len(request.resource) <= _KEPT_NAME:
         if len(decisions) >= _KEPT_DECISIONS:

@@ -35,16 +35,17 @@ class AuditTrail:
     log cannot be written. While a host exceeds its log quota, its events without a decision are only counted.
     """
 
-    def __init__(
-        self, log: AuditLog, *, strict: bool, deny_when_failed: bool, details: RecordDetails
-    ) -> None:
+    def __init__(self, log: AuditLog, *, strict: bool, deny_when_failed: bool) -> None:
         self._log = log
         self._ids = log.ids
         self.strict = strict
         self._deny_when_failed = deny_when_failed
-        self._details = details
+        self._details: list[RecordDetails] = []
         self.revision = 0
         self.meter = Meter()
+
+    def add_details(self, details: RecordDetails) -> None:
+        self._details.append(details)
 
     @property
     def obstacle(self) -> str | None:
@@ -99,7 +100,8 @@ class AuditTrail:
             detail["approval"] = f"{decision.asks.category} {decision.asks.resource}"
         now, taken = clock.wall_ns(), clock.now_ns() - asker.arrived
         severity = Severity.INFO if decision.allowed and not decision.would_deny else Severity.WARNING
-        detail |= self._details("decision", word, severity, asker.host, now)
+        for details in self._details:
+            detail |= details("decision", word, severity, asker.host, now)
         unknown = self._marked(asker.host, word, detail)
         record = AuditRecord(
             id=self._ids.next(),
@@ -144,7 +146,9 @@ class AuditTrail:
         `reads`: repetitions are only counted. `whole`: every record is kept, even if the host is beyond its quota.
         """
         now, severity = clock.wall_ns(), severity or SEVERITIES.get(event, Severity.INFO)
-        detail = {**(more or {}), **detail, **self._details(event, decision, severity, host, now)}
+        detail = {**(more or {}), **detail}
+        for details in self._details:
+            detail |= details(event, decision, severity, host, now)
         unknown = self._marked(host, decision, detail)
         return self._log.record(
             AuditRecord(

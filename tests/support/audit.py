@@ -10,7 +10,7 @@ from tests.support.engines import let_pass
 
 class RecordingTrail(AuditTrail):
     def __init__(self, log: AuditLog) -> None:
-        super().__init__(log, strict=False, deny_when_failed=False, details=lambda *_: {})
+        super().__init__(log, strict=False, deny_when_failed=False)
         self.heard: list[tuple[str, dict[str, Any]]] = []
 
     def happened(self, event: str, reason: str, **fields: Any) -> str:

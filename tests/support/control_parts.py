@@ -407,7 +407,6 @@ class ControlParts:
                 self.subscribers,
                 self.entries,
                 self.relay,
-                self.relay.carried,
                 self.faces,
             ),
         )

@@ -17,7 +17,7 @@ OUTSIDE = frozenset(
     audit.log.disk_space audit.log.events audit.log.ids audit.log.lock_holders audit.proof.copies
     base.atomic_files base.clock base.counted base.engine_thread base.input_files base.validation_messages
     channel.channel channel.link channel.messages channel.messages.relay_link channel.rosout_address
-    configuration.settings control.assembly.current master.calls.monitor_calls
+    configuration.settings master.calls.monitor_calls
     master.calls.request_peek master.endpoints.delivery
     master.endpoints.node_ports master.endpoints.topic_taps_control master.endpoints.traffic
     master.parameter_charges master.reconcile.arrivals

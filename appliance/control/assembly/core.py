@@ -39,7 +39,7 @@ class Core:
 
 
 def make_core(base: Foundation) -> Core:
-    settings, registry, monitors = base.settings, base.registry, Current[SpecificationManager]()
+    settings, registry = base.settings, base.registry
     policy = base.policies.policy
 
     watchlist = Watchlist()
@@ -64,7 +64,7 @@ def make_core(base: Foundation) -> Core:
         gate=CallGate(policy, registry, limits),
         parameters=parameters,
         revocation=Revocation(registry, grants, graph, policy, tree),
-        monitors=monitors,
+        monitors=base.monitors,
     )
 
 

@@ -1,9 +1,7 @@
-"""Values and functions that are set after the parts of control that need them are made."""
+"""Values that are set after the parts of control that need them are made."""
 
-from collections.abc import Callable
-from typing import Generic, ParamSpec, TypeVar
+from typing import Generic, TypeVar
 
-P = ParamSpec("P")
 T = TypeVar("T")
 
 
@@ -23,14 +21,3 @@ class Current(Generic[T]):
         if not self._values:
             raise RuntimeError("this part of control is used before it is created")
         return self._values[0]
-
-
-class Later(Generic[P, T]):
-    """A function that is set after its callers are made."""
-
-    def __init__(self) -> None:
-        self._function = Current[Callable[P, T]]()
-        self.set = self._function.set
-
-    def __call__(self, *args: P.args, **kwargs: P.kwargs) -> T:
-        return self._function()(*args, **kwargs)

@@ -55,30 +55,8 @@ def make_endpoints(base: Foundation, core: Core) -> Endpoints:
     )
     nodes = NodeApiClient(core.registry, timeout=settings.limits.node_call_seconds)
     delivery = Delivery(nodes, troubled=core.watchlist.could_not_tell, quota_class=base.quota_class)
-    base.in_force.set(lambda: (policies.revision, core.monitors().revision))
-    allocation = Allocation(settings.relays, lambda text: base.store.save_setting(ALLOCATION, text))
     gate = Current[MonitorCallGate]()
-    relay = RelayControl(
-        core.registry,
-        core.grants,
-        places,
-        nodes,
-        core.carried,
-        allocation=allocation,
-        policy=core.policy,
-        monitors=core.monitors,
-        broken=core.watchlist.look_at,
-        own_header=_header_of_rosout() if settings.monitors_on_rosout else None,
-        own_call=lambda asked: (
-            gate().answer(asked)
-            if isinstance(asked, messages.MonitorCallWanted)
-            else base.features.approve(asked)
-            if isinstance(asked, messages.ApprovalWanted)
-            else base.features.called(asked)
-        ),
-        relay_all=settings.relaying == "all",
-        stand_ins=settings.mediation == "full",
-    )
+    relay = _make_relay(base, core, places, nodes, gate)
     rosmaster = RosMaster(
         settings.rosmaster_port,
         limits=limits_of_answers(value_limits(settings), int(settings.limits.parameter_bytes)),
@@ -99,7 +77,7 @@ def make_endpoints(base: Foundation, core: Core) -> Endpoints:
         may_read_value=core.rights.may_read_value,
     )
     stored = StoredGraph(core.grants, base.store)
-    sinks = Sinks(core.registry, (stored, subscribers, entries, relay, core.carried, faces))
+    sinks = Sinks(core.registry, (stored, subscribers, entries, relay, faces))
     gate.set(
         MonitorCallGate(
             core.registry,
@@ -143,6 +121,33 @@ def make_endpoints(base: Foundation, core: Core) -> Endpoints:
             refusals=_REFUSALS_OF_A_ROBOT if base.role.paired else _REFUSALS,
             shut_out=base.role.in_doubt,
         ),
+    )
+
+
+def _make_relay(
+    base: Foundation, core: Core, places: NodePorts, nodes: NodeApiClient, gate: Current[MonitorCallGate]
+) -> RelayControl:
+    settings, features = base.settings, base.features
+    return RelayControl(
+        core.registry,
+        core.grants,
+        places,
+        nodes,
+        core.carried,
+        allocation=Allocation(settings.relays, lambda text: base.store.save_setting(ALLOCATION, text)),
+        policy=core.policy,
+        monitors=core.monitors,
+        broken=core.watchlist.look_at,
+        own_header=_header_of_rosout() if settings.monitors_on_rosout else None,
+        own_call=lambda asked: (
+            gate().answer(asked)
+            if isinstance(asked, messages.MonitorCallWanted)
+            else features.approve(asked)
+            if isinstance(asked, messages.ApprovalWanted)
+            else features.called(asked)
+        ),
+        relay_all=settings.relaying == "all",
+        stand_ins=settings.mediation == "full",
     )
 
 

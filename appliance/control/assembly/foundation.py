@@ -2,8 +2,9 @@
 
 import asyncio
 import socket
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import structlog
 
@@ -12,8 +13,8 @@ from appliance.base.age_clock import AgeClock
 from appliance.channel.messages.api import TokenKept
 from appliance.configuration.settings import Settings
 from appliance.control.assembly.active_role import ActiveRole
-from appliance.control.assembly.current import Current, Later
-from appliance.control.assembly.host_authority import HostAuthority
+from appliance.control.assembly.current import Current
+from appliance.control.assembly.host_authority import HostAuthority, make_host_table
 from appliance.control.assembly.host_blocks import BlockTable
 from appliance.control.assembly.listener_limits import HostQuotaClass, ListenerLimits
 from appliance.control.assembly.open_audit import open_audit
@@ -24,13 +25,13 @@ from appliance.control.links.supervisor_link import ControlLifeline
 from appliance.features.feature import FeatureContext
 from appliance.features.parts import FeatureParts
 from appliance.hosts.host_table import HostTable
-from appliance.hosts.hosts_file import BUNDLED_HOSTS, DECLARED_HOSTS, DeclaredHosts
 from appliance.hosts.tunnel_state import Tunnels
 from appliance.master.graph.registry import Registry
 from appliance.master.reconcile.sinks import Enforcement
-from appliance.policy.policy import Policy
+from appliance.policy.policy import CurrentPolicy, Policy
 from appliance.rpc.server import listen
 from appliance.specifications.compiler_link import SpecificationCompiler
+from appliance.specifications.specification_manager import SpecificationManager
 from appliance.store.state_file import StateStore
 from appliance.telemetry.audit_trail import AuditTrail
 
@@ -53,8 +54,8 @@ class Foundation:
     receipts: ReceiptFloor
     trail: AuditTrail
     features: FeatureParts
-    in_force: Later[[], tuple[int, int]]
-    bearers: Later[[], list[TokenKept]]
+    monitors: Current[SpecificationManager]
+    bearers: Current[Callable[[], list[TokenKept]]]
     """Returns the usable tokens and sessions."""
     store: StateStore
     blocks: BlockTable
@@ -86,45 +87,20 @@ async def make_foundation(
 
     `tunnels` is set here, before the supervisor can report about tunnels.
     """
-    policy, registry = Current[Policy](), Registry(settings.limits.nodes_per_host)
+    policy, registry = CurrentPolicy(), Registry(settings.limits.nodes_per_host)
     quota_class = HostQuotaClass(policy, registry.registrations_of)
-    audit, enforcement = Current[AuditLog](), Current[Enforcement]()
-    signing = SignerRequests(audit)
-    receipts = ReceiptFloor(
-        settings.state,
-        int(settings.audit.reserve_bytes),
-        holding=any(section.holds_records for section in settings.sections.values.values()),
-    )
-    held_by = lifeline.log_held()
-    audit.set(
-        open_audit(
-            settings,
-            signing,
-            held_by,
-            class_of=quota_class.of_text,
-            kept_for=quota_class.has_reserve,
-            receipts=receipts,
-        )
-    )
-    in_force = Later[[], tuple[int, int]]()
-    details = Later[..., dict[str, str]]()
-    trail = AuditTrail(
-        audit(),
-        strict=settings.audit.durability == "strict",
-        deny_when_failed=settings.audit.on_audit_failure == "deny",
-        details=details,
-    )
+    monitors, enforcement = Current[SpecificationManager](), Current[Enforcement]()
+    signing, receipts, audit, trail = _open_log(settings, lifeline, quota_class)
     features = FeatureParts(
         FeatureContext(
             settings.sections,
             trail,
-            audit(),
+            audit,
             settings.name,
             charged_to=lambda host: charged_to(policy(), host),
-            in_force=in_force,
+            in_force=lambda: (trail.revision, monitors().revision),
         )
     )
-    details.set(features.details)
     store = StateStore(
         settings.state / "control", failed=lambda reason: _log.error("state is not written", reason=reason)
     )
@@ -166,12 +142,12 @@ async def make_foundation(
         compiler=compiler,
         signing=signing,
         host_authority=host_authority,
-        audit=audit(),
+        audit=audit,
         receipts=receipts,
         trail=trail,
         features=features,
-        in_force=in_force,
-        bearers=Later(),
+        monitors=monitors,
+        bearers=Current(),
         store=store,
         blocks=blocks,
         table=table,
@@ -187,10 +163,35 @@ async def make_foundation(
     )
 
 
-def make_host_table(settings: Settings, store: StateStore) -> HostTable:
-    kept = store.settings()
-    declared = DeclaredHosts(settings.hosts, kept.get(BUNDLED_HOSTS, ""), kept.get(DECLARED_HOSTS, ""))
-    return HostTable(store, settings.ipsec.pool, declared)
+class _OpenLog(NamedTuple):
+    """The audit log, and the parts that keep it."""
+
+    signing: SignerRequests
+    receipts: ReceiptFloor
+    audit: AuditLog
+    trail: AuditTrail
+
+
+def _open_log(settings: Settings, lifeline: ControlLifeline, quota_class: HostQuotaClass) -> _OpenLog:
+    log = Current[AuditLog]()
+    signing = SignerRequests(log)
+    receipts = ReceiptFloor(
+        settings.state,
+        int(settings.audit.reserve_bytes),
+        holding=any(section.holds_records for section in settings.sections.values.values()),
+    )
+    held_by = lifeline.log_held()
+    audit = open_audit(
+        settings,
+        signing,
+        held_by,
+        class_of=quota_class.of_text,
+        kept_for=quota_class.has_reserve,
+        receipts=receipts,
+    )
+    log.set(audit)
+    strict, deny = settings.audit.durability == "strict", settings.audit.on_audit_failure == "deny"
+    return _OpenLog(signing, receipts, audit, AuditTrail(audit, strict=strict, deny_when_failed=deny))
 
 
 def _open_listeners(settings: Settings, lifeline: ControlLifeline) -> dict[str, socket.socket]:

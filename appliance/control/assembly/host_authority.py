@@ -1,11 +1,13 @@
-"""Make the authority of hosts' certificates, and the table of the appliances to which hosts open their tunnels."""
+"""Make the table of hosts, the authority of their certificates, and the table of the appliances of their tunnels."""
 
 from typing import NamedTuple
 
 from appliance.channel.link import Link
+from appliance.configuration.settings import Settings
 from appliance.hosts.appliances import Appliances
 from appliance.hosts.certificate_requests import Authority
 from appliance.hosts.host_table import HostTable
+from appliance.hosts.hosts_file import BUNDLED_HOSTS, DECLARED_HOSTS, DeclaredHosts
 from appliance.hosts.stored_authority import StoredAuthority
 from appliance.store.state_file import StateStore
 from appliance.telemetry.audit_trail import AuditTrail
@@ -16,6 +18,12 @@ class HostAuthority(NamedTuple):
 
     authority: StoredAuthority
     appliances: Appliances
+
+
+def make_host_table(settings: Settings, store: StateStore) -> HostTable:
+    kept = store.settings()
+    declared = DeclaredHosts(settings.hosts, kept.get(BUNDLED_HOSTS, ""), kept.get(DECLARED_HOSTS, ""))
+    return HostTable(store, settings.ipsec.pool, declared)
 
 
 def make_host_authority(

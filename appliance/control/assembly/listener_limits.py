@@ -11,12 +11,11 @@ from functools import partial
 
 from appliance.audit.log.record import Severity
 from appliance.configuration.settings import Settings
-from appliance.control.assembly.current import Current
 from appliance.master.calls.call import with_record
 from appliance.master.calls.request_peek import asked_for
 from appliance.policy.host_sets import EVERYONE
 from appliance.policy.model import Address, address_of, text_for_caller
-from appliance.policy.policy import Policy
+from appliance.policy.policy import CurrentPolicy, Policy
 from appliance.quotas.descriptors import connections_within
 from appliance.quotas.pool import Bounds, QuotaClass
 from appliance.quotas.table import RVMASTER_BYTES, RVMASTER_CONNECTIONS, RVMASTER_REQUESTS
@@ -193,7 +192,7 @@ def _own_node(_host: Address) -> QuotaClass:
 class HostQuotaClass:
     """The quota class of hosts, by the policy in force and by their registrations."""
 
-    def __init__(self, policy: Current[Policy], registrations: Callable[[Address], int]) -> None:
+    def __init__(self, policy: CurrentPolicy, registrations: Callable[[Address], int]) -> None:
         self._policy = policy
         self._registrations = registrations
 

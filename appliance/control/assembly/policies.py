@@ -20,7 +20,6 @@ from appliance.base.withdrawal import take_effect
 from appliance.channel import admin
 from appliance.channel.answers import policy_answers as answers
 from appliance.channel.answers.policy_answers import Loaded
-from appliance.control.assembly.current import Current
 from appliance.control.assembly.policy_gate import (
     KeptPolicy,
     PolicyRefusedError,
@@ -35,7 +34,7 @@ from appliance.policy.host_sets import Network
 from appliance.policy.judgement import PolicyContext
 from appliance.policy.live_rights import LiveRight, deprived
 from appliance.policy.model import Address
-from appliance.policy.policy import Approval, Policy
+from appliance.policy.policy import Approval, CurrentPolicy, Policy
 from appliance.signing.fingerprints import fingerprint
 from appliance.signing.site_keys import signer
 from appliance.store.revisions import LIMITS, Revisions, reloaded_by
@@ -76,7 +75,7 @@ class Policies(Revisions[RevisionRow]):
         file: Path,
         store: StateStore,
         trail: AuditTrail,
-        policy: Current[Policy],
+        policy: CurrentPolicy,
         *,
         robot: Collection[Address | Network],
         hosts: Callable[[], Mapping[str, Address]],

@@ -18,7 +18,8 @@ import structlog
 
 from appliance.configuration.settings import Settings
 from appliance.control.assembly.active_role import STATE_ERRORS
-from appliance.control.assembly.foundation import make_host_table, open_listener
+from appliance.control.assembly.foundation import open_listener
+from appliance.control.assembly.host_authority import make_host_table
 from appliance.control.assembly.policies import kept_policy
 from appliance.control.assembly.policy_gate import policy_at_start
 from appliance.control.assembly.robot import robot_addresses

@@ -22,7 +22,7 @@ from appliance.master.endpoints.node_ports import NodePorts
 from appliance.master.endpoints.topic_taps_control import TapRequests
 from appliance.master.endpoints.traffic import RelayTraffic
 from appliance.master.graph.graph import Grants
-from appliance.master.graph.registry import Change, Incarnation, Kind, Life, RegistrationKey, Registry
+from appliance.master.graph.registry import ENDED, Change, Incarnation, Kind, Life, RegistrationKey, Registry
 from appliance.policy.model import Address, Category, address_of
 from appliance.policy.policy import Policy
 from appliance.policy.rate_limits import NO_LIMIT, LimitScope, Rate
@@ -210,6 +210,9 @@ class RelayControl:
         changes = list(changed)
         for post in self._posts:
             self._state_all(post, changes)
+        for node in changes:
+            if isinstance(node, Incarnation) and node.life in ENDED:
+                self.carried.forgotten(node.key)
 
     def compare(self) -> None:
         self.flush(self.registry.live())

@@ -1,7 +1,7 @@
 """Keep and record the connections and the traffic that the relays report."""
 
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import zip_longest
 
@@ -13,7 +13,7 @@ from appliance.base.counted import counted
 from appliance.channel import messages
 from appliance.channel.answers.graph_answers import Flow
 from appliance.channel.messages import TopicTraffic
-from appliance.master.graph.registry import ENDED, Change, Incarnation, Kind, Registry
+from appliance.master.graph.registry import Incarnation, Kind, Registry
 from appliance.policy.rate_limits import LimitRule
 from appliance.store.state_file import PermissionRow
 from appliance.telemetry.audit_trail import AuditTrail
@@ -131,11 +131,6 @@ class RelayTraffic:
         self.memory.pop(relay, None)
         for number in [connection for connection in self.connections if connection[0] == relay]:
             del self.connections[number]
-
-    def flush(self, changed: Iterable[Change]) -> None:
-        for node in changed:
-            if isinstance(node, Incarnation) and node.life in ENDED:
-                self.forgotten(node.key)
 
     def forgotten(self, key: str) -> None:
         for carried in [carried for carried in self.traffic if carried[0] == key]:

@@ -25,7 +25,7 @@ REASONS = {
 def test_every_report_is_recorded(tmp_path: Path, kind: str) -> None:
     log = open_log(tmp_path / "audit.db")
     records = MonitorRecords(
-        AuditTrail(log, strict=False, deny_when_failed=False, details=lambda *_: {}),
+        AuditTrail(log, strict=False, deny_when_failed=False),
         lambda _topic, _data: None,
         [],
     )

@@ -281,7 +281,7 @@ async def test_a_crash_of_control_changes_nothing(world: World, tmp_path: Path) 
     allocation.adopt(allocation.plan(revision(1, **files).checked))
     here = {name: allocation.of_file(f"{name}.rv") for name in files}
     log = open_log(tmp_path / "other.db")
-    trail = AuditTrail(log, strict=False, deny_when_failed=False, details=lambda *_: {})
+    trail = AuditTrail(log, strict=False, deny_when_failed=False)
     after = Fleet(trail).rollout
     await after.start(revision(1, **files), restarted=True, kept=kept[-1])
     assert {name: after.relay_of(name) for name in files} == here

@@ -9,7 +9,7 @@ from appliance.audit.log.record import Severity
 from appliance.base import clock
 from appliance.quotas.pool import QuotaClass
 from appliance.quotas.table import AUDIT_BYTES
-from appliance.telemetry.audit_trail import NOT_RECORDED, AuditTrail, RecordDetails
+from appliance.telemetry.audit_trail import NOT_RECORDED, AuditTrail
 
 GUEST, UNKNOWN = "10.0.0.66", "10.9.9.9"
 
@@ -30,12 +30,11 @@ class Log:
         return self.failed
 
 
-def trail(log: Log, *, deny: bool, details: RecordDetails = lambda *_: {}) -> AuditTrail:
+def trail(log: Log, *, deny: bool) -> AuditTrail:
     return AuditTrail(
         log,  # type: ignore[arg-type]  # stands for the log
         strict=True,
         deny_when_failed=deny,
-        details=details,
     )
 
 
@@ -91,7 +90,8 @@ def test_events_of_a_host_beyond_its_quota_are_counted() -> None:
 
 def test_details_of_features_are_added_to_a_record() -> None:
     log = Log()
-    one = trail(log, deny=False, details=lambda event, *_: {"kept": f"in {event}"})
+    one = trail(log, deny=False)
+    one.add_details(lambda event, *_: {"kept": f"in {event}"})
     one.happened("message dropped", "too fast", host="10.0.0.9", more={"kept": "forged"})
     assert [record.detail["kept"] for record in log.records] == ["in message dropped"]
 

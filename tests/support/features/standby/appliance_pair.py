@@ -60,7 +60,7 @@ class Member:
         requests.attach(Channel(ours, messages.SignerLink))
         self._requests = requests
         self.store = StateStore(self.state / "control", failed=lambda _reason: None, kind=InlineDatabase)
-        trail = AuditTrail(self.log, strict=False, deny_when_failed=False, details=lambda *_: {})
+        trail = AuditTrail(self.log, strict=False, deny_when_failed=False)
         self.trail = trail
         self.recorder = TakeoverRecorder(
             trail, self.log, self.store, self.signed, name=self.name, other=self.other

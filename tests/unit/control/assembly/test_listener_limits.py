@@ -35,7 +35,7 @@ async def test_an_idle_connection_is_closed_at_every_listener(tmp_path: Path, *,
     settings = dataclasses.replace(given, limits=dataclasses.replace(given.limits, idle_seconds=0.1))
     policy = compile_policy("[Nodes]\ndefault = *\n", file="a.ini")
     log = open_log(tmp_path / "audit.db")
-    trail = AuditTrail(log, strict=False, deny_when_failed=False, details=lambda *_: {})
+    trail = AuditTrail(log, strict=False, deny_when_failed=False)
     listener_limits = ListenerLimits(settings, trail, lambda: policy, lambda _host: QuotaClass.NAMED)
 
     async def answer(_request: HttpRequest) -> bytes:
@@ -74,7 +74,7 @@ def test_hosts_of_a_wildcard_share_processor_time() -> None:
 def everybodys(tmp_path: Path) -> Iterator[ListenerLimits]:
     policy = compile_policy("[Nodes]\ndefault = 10.0.0.1\n/guest/** = *\n", file="a.ini")
     log = open_log(tmp_path / "audit.db")
-    trail = AuditTrail(log, strict=False, deny_when_failed=False, details=lambda *_: {})
+    trail = AuditTrail(log, strict=False, deny_when_failed=False)
     yield ListenerLimits(
         Settings(),
         trail,
@@ -98,7 +98,7 @@ def test_hosts_of_a_wildcard_leave_a_named_host_its_slot(everybodys: ListenerLim
 def test_registered_hosts_of_a_wildcard_leave_the_robot_its_slots(tmp_path: Path) -> None:
     policy = compile_policy("[Nodes]\ndefault = 10.0.0.1\n/guest/** = *\n", file="a.ini")
     log = open_log(tmp_path / "audit.db")
-    trail = AuditTrail(log, strict=False, deny_when_failed=False, details=lambda *_: {})
+    trail = AuditTrail(log, strict=False, deny_when_failed=False)
     limits = ListenerLimits(Settings(), trail, lambda: policy, lambda _host: QuotaClass.REGISTERED)
     table = limits.connection_table
     for pool in (table.arriving, table.connected):
@@ -152,7 +152,7 @@ def test_a_blocked_host_is_refused_before_its_request_is_read(tmp_path: Path, te
     )
     blocked = dataclasses.replace(policy, blocks={ROBOT: "blocked by ann: odd"})
     log = open_log(tmp_path / "audit.db")
-    trail = AuditTrail(log, strict=False, deny_when_failed=False, details=lambda *_: {})
+    trail = AuditTrail(log, strict=False, deny_when_failed=False)
     limits = ListenerLimits(Settings(), trail, lambda: blocked, lambda _host: QuotaClass.NAMED)
     refusal = limits.refuse(Peer(ROBOT, "10.0.0.1", "10.0.0.9"))
     assert refusal is not None

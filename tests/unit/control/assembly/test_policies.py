@@ -18,13 +18,12 @@ from appliance.channel.admin import (
     PolicyRollback,
     PolicyWanted,
 )
-from appliance.control.assembly.current import Current
 from appliance.control.assembly.policies import Policies, RevisionChangedError
 from appliance.control.assembly.policy_gate import PolicyRefusedError
 from appliance.policy import judgement
 from appliance.policy.live_rights import LiveRight
 from appliance.policy.model import Address, Category, Request
-from appliance.policy.policy import Policy
+from appliance.policy.policy import CurrentPolicy, Policy
 from appliance.store.state_file import StateStore
 from tests.support.control_parts import OPEN, Records
 from tests.support.engines import InlineDatabase
@@ -63,8 +62,8 @@ class Appliance:
         store = StateStore(self.state, failed=fail, kind=InlineDatabase)
         self.records = Records()
         policies = Policies(
-            self.file, store, cast(Any, self.records), Current(), robot=(), hosts=hosts, blocks=blocks, holders=dict,
-            approved=frozenset, live=live, changed=changed, carried_out=at_once, site_keys=site_keys,
+            self.file, store, cast(Any, self.records), CurrentPolicy(), robot=(), hosts=hosts, blocks=blocks,
+            holders=dict, approved=frozenset, live=live, changed=changed, carried_out=at_once, site_keys=site_keys,
         )  # fmt: skip
         policies.start(restarted=restarted)
         try:

@@ -3,18 +3,17 @@ from dataclasses import replace
 
 from appliance.audit.log.budget import Budget
 from appliance.base.actors import APPLIANCE, ROBOT, UNKNOWN
-from appliance.control.assembly.current import Current
 from appliance.control.assembly.listener_limits import HostQuotaClass
 from appliance.control.assembly.robot import charged_to
-from appliance.policy.policy import Policy
+from appliance.policy.policy import CurrentPolicy, Policy
 from appliance.policy.policy_compiler import compile_policy
 from appliance.quotas.pool import QuotaClass
 
 NAMED, OTHER = ipaddress.ip_address("10.0.0.1"), ipaddress.ip_address("10.0.0.2")
 
 
-def in_force(policy: Policy) -> Current[Policy]:
-    current = Current[Policy]()
+def in_force(policy: Policy) -> CurrentPolicy:
+    current = CurrentPolicy()
     current.set(policy)
     return current
 
@@ -60,7 +59,7 @@ def test_the_last_of_the_disk_is_for_named_hosts_also_after_a_restart() -> None:
     rules = "[Groups]\nocus = 10.2.0.0/24\n[Nodes]\n/a = 10.0.0.1 ocus\ndefault = *\n"
     policy = compile_policy(rules, file="a.ini", robot=[ipaddress.ip_address("172.17.0.1")])
     registered: dict[object, int] = {ipaddress.ip_address("10.0.0.66"): 1}
-    current = Current[Policy]()
+    current = CurrentPolicy()
     quota_class = HostQuotaClass(current, lambda host: registered.get(host, 0))
     budget = Budget(quota_class.of_text, kept_for=quota_class.has_reserve)
     budget.room(1)

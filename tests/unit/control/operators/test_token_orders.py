@@ -31,7 +31,7 @@ class Lives:
     def __init__(self, home: Path) -> None:
         self.home = home
         self.log = open_log(home / "audit.db")
-        self.trail = AuditTrail(self.log, strict=False, deny_when_failed=False, details=lambda *_: {})
+        self.trail = AuditTrail(self.log, strict=False, deny_when_failed=False)
         self.store: StateStore | None = None
 
     def records(self, event: str) -> list[dict[str, Any]]:
@@ -277,7 +277,7 @@ async def _rotate_and_die(lives: Lives) -> None:
         os.kill(os.getpid(), signal.SIGKILL)
 
     store.settled = killed  # type: ignore[method-assign]  # killed instead of answering
-    trail = AuditTrail(lives.log, strict=False, deny_when_failed=False, details=lambda *_: {})
+    trail = AuditTrail(lives.log, strict=False, deny_when_failed=False)
     lives.log.record = lambda record: record.id  # type: ignore[method-assign]  # its thread is in the parent
     await TokenOrders(store, trail, Deadlines(), lambda: None).rotate(TokenRotate("alice"))
 

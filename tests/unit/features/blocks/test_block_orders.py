@@ -12,7 +12,6 @@ from appliance.base.clock import using
 from appliance.base.withdrawal import WithdrawnError, awaited
 from appliance.channel.admin import PolicyReload
 from appliance.control.assembly import host_blocks
-from appliance.control.assembly.current import Current
 from appliance.control.assembly.policies import Policies
 from appliance.control.errors import SenselessError, UnknownThingError
 from appliance.features.blocks import block_orders
@@ -27,7 +26,7 @@ from appliance.features.blocks.block_requests import (
 from appliance.hosts.host_table import HostRefusedError
 from appliance.master.graph.registry import Kind
 from appliance.policy.model import Category, Request, address_of
-from appliance.policy.policy import Policy
+from appliance.policy.policy import CurrentPolicy, Policy
 from appliance.store.state_file import StateStore
 from appliance.store.writer_thread import StoreError
 from tests.support.control_parts import OPEN, ControlParts
@@ -74,8 +73,9 @@ class Control(ControlParts):
         self.blocks = host_blocks.BlockTable(self.state, clock)
         self.remotes: dict[str, str] = {}
         self.policies = Policies(
-            state / "policy.ini", self.state, cast(Any, self.records), Current(), robot=[ipaddress.ip_network(ROBOT)],
-            hosts=dict, blocks=lambda: self.blocks.reasons, holders=dict, approved=frozenset, live=list,
+            state / "policy.ini", self.state, cast(Any, self.records), CurrentPolicy(),
+            robot=[ipaddress.ip_network(ROBOT)], hosts=dict, blocks=lambda: self.blocks.reasons, holders=dict,
+            approved=frozenset, live=list,
             changed=self.changed, carried_out=at_once, site_keys=(),
         )  # fmt: skip
         self.policies.start(restarted=False)

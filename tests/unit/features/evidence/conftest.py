@@ -83,7 +83,7 @@ class Recording(msgspec.Struct):
 class Control:
     def __init__(self, log: AuditLog) -> None:
         self.log = log
-        self.trail = AuditTrail(log, strict=False, deny_when_failed=False, details=lambda *_: {})
+        self.trail = AuditTrail(log, strict=False, deny_when_failed=False)
         self.orders = EvidenceOrders(log, self.trail, NAMES.robot)
         self.policies: dict[int, str] = {}
         self.specifications: dict[int, dict[str, str]] = {}

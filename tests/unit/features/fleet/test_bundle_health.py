@@ -46,7 +46,7 @@ def test_other_hosts_hide_no_illness_of_the_robot() -> None:
 def test_denials_are_counted_by_host() -> None:
     log = Log()
     log.budget = Budget(lambda host: QuotaClass.UNKNOWN if host.startswith("203.") else QuotaClass.NAMED)
-    trail = AuditTrail(log, strict=True, deny_when_failed=False, details=lambda *_: {})  # type: ignore[arg-type]  # stands for the log
+    trail = AuditTrail(log, strict=True, deny_when_failed=False)  # type: ignore[arg-type]  # stands for the log
     for host, allowed in (
         (ROBOT, True),
         ("10.0.0.66", False),

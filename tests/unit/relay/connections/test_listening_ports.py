@@ -3,13 +3,14 @@ import os
 from collections import Counter, deque
 from collections.abc import Callable
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import cast
 
 import pytest
 
 from appliance.quotas.pool import QuotaClass
 from appliance.relay.connections import listening_ports
 from appliance.relay.connections.listening_ports import ListeningPorts
+from appliance.relay.context import RelayContext
 from appliance.relay.loop import QUANTUM
 from appliance.relay.relay_limits import RelayLimits
 
@@ -67,11 +68,14 @@ class World:
             listening_ports, "socket", SimpleNamespace(socket=lambda *, fileno: Listening(self, fileno))
         )
         monkeypatch.setattr(listening_ports, "tune", self._tune)
-        self.ports = ListeningPorts(
-            cast(Any, loop),
-            RelayLimits(),
-            quota_class=lambda _host: QuotaClass.REGISTERED,
+        context = SimpleNamespace(
+            loop=loop,
+            limits=RelayLimits(),
+            table=SimpleNamespace(quota_class=lambda _host: QuotaClass.REGISTERED),
             payer=lambda host: f"payer of {host}",
+        )
+        self.ports = ListeningPorts(
+            cast(RelayContext, context),
             arrived=lambda _key, _sock, host: self.arrived.append(host),
             turned_away=lambda *_refusal: pytest.fail("no limit is reached"),
             make_room=lambda _host: False,
