@@ -27,7 +27,6 @@ from typing import NamedTuple, TypeVar
 
 import structlog
 
-from appliance.master.caller import Answer
 from appliance.master.graph.registry import Change, Incarnation, Kind, RegistrationKey, Registry
 from appliance.master.graph.revocation import CALLS
 from appliance.rpc.xmlrpc_client import BrokenOffError, CallFailedError, RefusedError, XmlRpcClient
@@ -37,6 +36,9 @@ from roswire.xmlrpc import Value, XmlRpcLimits
 
 LARGEST_MULTICALL = 64
 """The most parts of a multicall, because one slow part delays all others."""
+
+Answer = list[Value]
+"""The result of a call: `[code, message, value]`; code 1 done, 0 failed or denied, -1 the caller's error."""
 
 Wanted = tuple[str, tuple[Value, ...]]
 """A wanted call: the method, and its parameters."""

@@ -14,8 +14,8 @@ from typing import Any, NamedTuple, Self, cast
 
 from appliance.channel import messages
 from appliance.configuration import settings
-from appliance.master.caller import Answer, ApiUri, Caller
-from appliance.master.calls.parameter_rights import ParameterRights
+from appliance.master.calls.call import ApiUri, Caller
+from appliance.master.calls.parameter_calls import ParameterRights
 from appliance.master.endpoints.delivery import NodeApiClient, NodeCall
 from appliance.master.endpoints.node_ports import NodePorts
 from appliance.master.endpoints.relay_control import RelayControl
@@ -27,7 +27,7 @@ from appliance.master.reconcile.liveness import Liveness, Watchlist
 from appliance.master.reconcile.reconciler import Reconciler
 from appliance.master.reconcile.sinks import Enforcement, ProxyEndpoints, Sinks, StoredGraph
 from appliance.master.reconcile.subscribers import Subscribers
-from appliance.master.rosmaster import MasterRegistrations, RosMaster, Wanted
+from appliance.master.rosmaster import Answer, MasterRegistrations, RosMaster, Wanted
 from appliance.policy.model import Address, Decision
 from appliance.policy.policy_compiler import compile_policy
 from appliance.quotas.pool import QuotaClass

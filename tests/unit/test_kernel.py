@@ -20,7 +20,7 @@ OUTSIDE = frozenset(
     configuration.settings master.calls.monitor_calls
     master.calls.request_peek master.endpoints.delivery
     master.endpoints.node_ports master.endpoints.topic_taps_control master.endpoints.traffic
-    master.parameter_charges master.reconcile.arrivals
+    master.calls.arrivals master.parameter_charges
     master.reconcile.liveness master.rosmaster policy.policy_lint quotas.descriptors quotas.pool
     quotas.table relay.connections.introductions relay.connections.latched_message
     relay.connections.message_sink relay.connections.monitor_calls

@@ -10,6 +10,7 @@ from appliance.control.assembly.foundation import INNER, RVMASTER, Foundation
 from appliance.control.assembly.listener_limits import value_limits
 from appliance.control.assembly.monitor_states import published_now
 from appliance.master import rosout
+from appliance.master.calls.arrivals import Arrivals, ServeNode
 from appliance.master.calls.call import Table, served
 from appliance.master.calls.call_execution import Execution
 from appliance.master.calls.call_table import master_table
@@ -19,9 +20,8 @@ from appliance.master.calls.multicall import Multicall
 from appliance.master.calls.node_calls import NODE_CALLS, NodeCalls
 from appliance.master.calls.parameter_calls import ParameterCalls
 from appliance.master.calls.pipeline import Pipeline
+from appliance.master.calls.publisher import OwnPublisher
 from appliance.master.calls.registration import RegistrationCalls
-from appliance.master.reconcile.arrivals import Arrivals, ServeNode
-from appliance.master.reconcile.publisher import OwnPublisher
 from appliance.master.reconcile.reconciler import Reconciler
 from appliance.master.reconcile.reminders import RelayMoves, Reminders
 from appliance.master.rosmaster import own_parameters
@@ -86,6 +86,7 @@ def assemble(base: Foundation) -> Parts:
     publisher = OwnPublisher(
         core.registry,
         core.graph,
+        registration,
         name=settings.publish_as,
         inner_port=base.port(INNER),
         wanted=lambda: (
@@ -93,8 +94,6 @@ def assemble(base: Foundation) -> Parts:
             | core.monitors().checked.publications
         ),
         services=settings.own_services,
-        register=registration.register_publisher,
-        offer=registration.register_service,
     )
     monitors = _make_monitors(base, core, ends, publisher, reminders)
     core.monitors.set(monitors)

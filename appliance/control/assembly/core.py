@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from appliance.control.assembly.current import Current
 from appliance.control.assembly.foundation import Foundation
 from appliance.master.calls.gate import CallGate, HostLimits
-from appliance.master.calls.parameter_rights import ParameterRights
+from appliance.master.calls.parameter_calls import ParameterRights
 from appliance.master.endpoints.traffic import RelayTraffic
 from appliance.master.graph.graph import Grants, RosGraph
 from appliance.master.graph.registry import Registry

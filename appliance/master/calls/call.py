@@ -9,18 +9,47 @@ from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Generic, NamedTuple, TypeVar, cast, overload
 
-from appliance.master.caller import ApiUri, Caller
-from appliance.master.graph.registry import Kind
-from appliance.policy.commands import ALIASES, CALLS
+from appliance.master.graph.registry import Incarnation, Kind
+from appliance.policy.commands import ALIASES, CALLS, PolicyCall
 from appliance.policy.model import Category, Decision, Request, text_for_caller
 from appliance.policy.rights import request_of
+from appliance.rpc.server import Peer
+from appliance.telemetry.audit_trail import Asker
 from roswire import names
 from roswire.errors import InvalidNameError, PeerError, ProtocolError
 from roswire.names import canonical_caller_id, canonical_tool_id
-from roswire.uris import parse_node_uri, parse_service_uri
+from roswire.uris import NodeUri, parse_node_uri, parse_service_uri
 from roswire.xmlrpc import Value
 
 T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True)
+class ApiUri:
+    """A URI as received, and parsed."""
+
+    text: str
+    uri: NodeUri
+
+
+class Caller(NamedTuple):
+    """The peer, and the `caller_id` that the peer claims.
+
+    `own` marks the appliance's own nodes, which have a separate listener. `target` is the incarnation whose proxy
+    endpoint is called.
+    """
+
+    peer: Peer
+    caller_id: str
+    arrived: int
+    own: bool = False
+    target: Incarnation | None = None
+
+    @property
+    def asker(self) -> Asker:
+        return Asker(
+            self.peer.text, self.caller_id, self.arrived, None if self.target is None else self.target.name
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,14 +197,6 @@ B = TypeVar("B")
 C = TypeVar("C")
 
 
-class Identity(enum.Enum):
-    """The meaning of a call's `caller_id`, which determines its check."""
-
-    NODE = "node"  # a node of the graph: [Nodes] must grant the name, and no other host may hold it
-    FREE = "free"  # any name, even without a node; no other host may hold it
-    NOBODY = "nobody"  # the call has no caller_id
-
-
 class CallVerb(enum.StrEnum):
     """The effect of a call on its resource."""
 
@@ -235,32 +256,26 @@ class RosCall(Generic[S]):
     command: str | None = None
     tells: bool = False
     in_run: bool = False
-    identity: Identity = field(init=False)  # the check of the caller_id
     resource: int | None = field(init=False)  # the index of the parameter that is the call's resource
     api: int | None = field(init=False)  # the index of the caller's own URI
     policy_name: str = field(init=False)
-    category: Category = field(init=False)  # the category of the decision and the record
-    touches: Category | None = field(init=False)  # whether the call reads or writes its ROS parameter
+    row: PolicyCall = field(init=False)  # the call's row in the policy
 
     def __post_init__(self) -> None:
         parameters = self.method.parameters
-        name = self.command or ALIASES.get(self.name, self.name)
-        row = CALLS[name]
+        recorded = [place for place, parameter in enumerate(parameters) if parameter.recorded]
+        policy_name = self.command or ALIASES.get(self.name, self.name)
         derived = {
-            "identity": Identity.NOBODY if row.wire else Identity.NODE if row.node else Identity.FREE,
-            "resource": None
-            if self.kind is None
-            else next(place for place, parameter in enumerate(parameters) if parameter.recorded),
+            "resource": None if self.kind is None else recorded[0],
             "api": parameters.index(CALLER_API) if CALLER_API in parameters else None,
-            "policy_name": name,
-            "category": row.category,
-            "touches": row.touches,
+            "policy_name": policy_name,
+            "row": CALLS[policy_name],
         }
         for field_name, value in derived.items():
             object.__setattr__(self, field_name, value)
 
     def attempt(self, caller: Caller, params: Sequence[Value]) -> "Attempt":
-        if self.identity is Identity.NOBODY:
+        if self.row.wire:  # a call of the XML-RPC server has no caller_id
             check_arity(self.method.parameters, params)
             return Attempt(caller, self, canonicalise(self.method.parameters, "", params))
         if not params:
@@ -270,12 +285,12 @@ class RosCall(Generic[S]):
         caller_id = params[0]
         if not isinstance(caller_id, str):
             raise ProtocolError("caller_id must be a string")
-        if self.identity is Identity.NODE:
+        if self.row.node:
             caller_id = canonical_caller_id(caller_id)
         elif caller_id or self.verb not in {CallVerb.READ, CallVerb.CONNECT}:
             caller_id = canonical_tool_id(caller_id)
         arguments = canonicalise(self.method.parameters, caller_id, given)
-        return Attempt(caller.as_named(caller_id), self, arguments)
+        return Attempt(caller._replace(caller_id=caller_id), self, arguments)
 
 
 @dataclass(frozen=True, slots=True)
@@ -305,7 +320,7 @@ class Attempt:
     @property
     def about(self) -> dict[str, str]:
         """Return the recorded parameters of a command; its request has only the call's name."""
-        if self.call.category is not Category.COMMAND:
+        if self.call.row.category is not Category.COMMAND:
             return {}
         return {
             parameter.name: str(value)

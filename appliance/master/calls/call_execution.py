@@ -18,9 +18,10 @@ from typing import NamedTuple
 import structlog
 
 from appliance.audit.log.record import Severity
-from appliance.master.caller import Answer, Caller
+from appliance.master.calls.arrivals import NodeElsewhereError
 from appliance.master.calls.call import (
     Attempt,
+    Caller,
     CallVerb,
     RosCall,
     Table,
@@ -34,8 +35,8 @@ from appliance.master.calls.registration import given_up
 from appliance.master.endpoints.node_ports import NoPortError
 from appliance.master.graph.registry import HostFullError, Kind, Registry
 from appliance.master.parameter_charges import LimitReachedError
-from appliance.master.reconcile.arrivals import NodeElsewhereError
 from appliance.master.reconcile.liveness import Liveness, Probe
+from appliance.master.rosmaster import Answer
 from appliance.policy.model import Address, Category, Decision, Request
 from appliance.policy.policy import Policy
 from appliance.rpc.fair_queue import Bulk, LargeWrites, weigh
@@ -327,7 +328,7 @@ class Execution:
                     decision="deny",
                     host=caller.peer.text,
                     caller_id=caller.caller_id,
-                    category=call.category.value,
+                    category=call.row.category.value,
                     resource=call.name,
                     call=call.name,
                 )
@@ -335,7 +336,7 @@ class Execution:
             case NodeElsewhereError():
                 decision = Decision(False, None, str(error))
                 record = self.trail.decided(
-                    caller.asker, call.name, call.category.value, attempt.resource, decision
+                    caller.asker, call.name, call.row.category.value, attempt.resource, decision
                 )
                 return [0, self._denial_text(decision, record), call.denial]
             case PeerError():
@@ -350,7 +351,7 @@ class Execution:
         raise error
 
     def _unknown(self, caller: Caller, method: str, params: Sequence[Value]) -> Answer:
-        caller = caller.as_named(claimed_name(params))
+        caller = caller._replace(caller_id=claimed_name(params))
         decision = Decision(False, None, f"{method[:200]!r} is not a call that is served here")
         record = self.trail.decided(caller.asker, method, Category.COMMAND.value, method[:200], decision)
         return [0, self._denial_text(decision, record), 0]
@@ -362,7 +363,7 @@ class Execution:
             decision="deny",
             host=caller.peer.text,
             caller_id=claimed,
-            category=call.category.value,
+            category=call.row.category.value,
             resource=call.name,
             call=call.name,
         )

@@ -2,7 +2,6 @@
 
 from typing import Any
 
-from appliance.master.caller import Answer, Caller
 from appliance.master.calls.call import (
     CALLER_API,
     KEY,
@@ -18,6 +17,7 @@ from appliance.master.calls.call import (
     TOPIC,
     TOPIC_TYPE,
     VALUE,
+    Caller,
     CallVerb,
     RosCall,
     Table,
@@ -29,6 +29,7 @@ from appliance.master.calls.monitor_calls import MonitorCalls
 from appliance.master.calls.parameter_calls import ParameterCalls
 from appliance.master.calls.registration import RegistrationCalls
 from appliance.master.graph.registry import Kind
+from appliance.master.rosmaster import Answer
 
 
 class Introspection:

@@ -6,10 +6,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from appliance.base.counted import counted
-from appliance.master.caller import ApiUri, Caller
-from appliance.master.calls.call import Attempt, CallVerb, Identity
-from appliance.master.graph.own_node import OWN, PARAMETERS, ROSOUT, rosout_may_have
+from appliance.master.calls.call import ApiUri, Attempt, Caller, CallVerb
 from appliance.master.graph.registry import HostFullError, Incarnation, Kind, Life, Registry
+from appliance.master.graph.revocation import OWN, OWN_PARAMETERS, ROSOUT, rosout_may_have
 from appliance.master.reconcile.liveness import Presence, Probe
 from appliance.policy.model import Address, Category, Decision
 from appliance.policy.policy import Policy
@@ -49,14 +48,14 @@ class CallGate:
         caller, call = attempt.caller, attempt.call
         if caller.own:
             return _of_own_node(attempt)
-        asks = caller.target is not None and call.category is Category.SUBSCRIBE
+        asks = caller.target is not None and call.row.category is Category.SUBSCRIBE
         if asks and self.is_own_subscriber(caller, attempt.resource):
             return Decision(True, None, OWN)
         rights = rights_of_call(
             attempt.request, call.policy_name, attempt.resource or None, value=attempt.value, tree=tree
         )
         decision = decide(self._policy(), rights)
-        if not decision.allowed or call.identity is Identity.NOBODY or not caller.caller_id:
+        if not decision.allowed or call.row.wire or not caller.caller_id:
             return decision
         denial = None
         if attempt.api is not None:
@@ -156,7 +155,7 @@ def _of_own_node(attempt: Attempt) -> Decision:
         known = rosout_may_have(call.kind, attempt.resource)
         what = f"have the {call.kind} {attempt.resource}"
     elif call.verb is CallVerb.READ and attempt.resource:
-        known = attempt.resource in PARAMETERS
+        known = attempt.resource in OWN_PARAMETERS
         what = f"read the parameter {attempt.resource}"
     else:
         what = f"call {call.name}"

@@ -4,11 +4,12 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from appliance.master.caller import Answer, Caller
+from appliance.master.calls.call import Caller
 from appliance.master.endpoints.node_ports import AdvertisedAddresses
 from appliance.master.endpoints.relay_control import RelayControl
 from appliance.master.graph.graph import RosGraph
 from appliance.master.graph.registry import Kind, Registry
+from appliance.master.rosmaster import Answer
 from roswire.uris import node_uri, service_uri
 from roswire.xmlrpc import Value
 

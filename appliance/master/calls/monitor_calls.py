@@ -4,9 +4,10 @@ from dataclasses import dataclass
 from typing import cast
 
 from appliance.channel.admin import MonitorSwitch
-from appliance.master.caller import Answer, Caller
+from appliance.master.calls.call import Caller
 from appliance.master.endpoints.relay_control import RelayControl
 from appliance.master.graph.registry import Kind, Registry
+from appliance.master.rosmaster import Answer
 from appliance.specifications.specification_files import SpecificationsRefusedError
 from appliance.specifications.specification_manager import SpecificationManager, UnknownMonitorError
 from roswire.xmlrpc import Value

@@ -8,8 +8,7 @@ import os
 from collections import defaultdict
 from dataclasses import dataclass
 
-from appliance.master.caller import Answer, Caller
-from appliance.master.calls.call import MESSAGE, PROTOCOLS, TOPIC, CallVerb, RosCall, method
+from appliance.master.calls.call import MESSAGE, PROTOCOLS, TOPIC, Caller, CallVerb, RosCall, method
 from appliance.master.calls.gate import CallGate
 from appliance.master.endpoints.delivery import NodeApiClient
 from appliance.master.endpoints.node_ports import AdvertisedAddresses
@@ -18,6 +17,7 @@ from appliance.master.endpoints.traffic import Traffic
 from appliance.master.graph.graph import RosGraph
 from appliance.master.graph.registry import Incarnation, Kind, Registry
 from appliance.master.reconcile.liveness import Liveness
+from appliance.master.rosmaster import Answer
 from appliance.rpc.server import NoAnswerError
 from appliance.rpc.xmlrpc_client import CallFailedError
 from appliance.specifications.allocation import TOPIC as TOPIC_CONNECTION

@@ -2,24 +2,29 @@
 
 `searchParam` must not reveal the existence of unreadable parameters: a global key is decided before the search, and a
 search upwards skips unreadable keys. If nothing is found, the answer depends only on the policy.
+
+Parameters in answers and updates are checked again: they may contain more than the decision on the call covered.
 """
 
 import asyncio
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from appliance.master.caller import Answer, Caller
-from appliance.master.calls.call import Attempt
-from appliance.master.calls.parameter_rights import ParameterRights
-from appliance.master.graph.parameter_updates import settled
+from appliance.base import clock
+from appliance.master.calls.call import Attempt, Caller, denial_text
+from appliance.master.graph.registry import Incarnation
 from appliance.master.parameter_charges import APPLIANCE, NAME_WEIGHT, LimitReachedError, measure
 from appliance.master.parameter_mirror import ParameterMirror, Reservation
-from appliance.master.reconcile.subscribers import Subscribers
-from appliance.master.rosmaster import RosMaster, Wanted
-from appliance.policy.model import Address, Decision
+from appliance.master.reconcile.subscribers import Subscribers, settled
+from appliance.master.rosmaster import Answer, RosMaster, Wanted
+from appliance.policy.model import Address, Category, Decision, Request
+from appliance.policy.policy import Policy
+from appliance.policy.rights import decide_right, right_to_find, right_to_read
 from appliance.rpc.fair_queue import weigh
+from appliance.rpc.server import Peer
 from appliance.rpc.xmlrpc_client import CallFailedError
+from appliance.telemetry.audit_trail import AuditTrail
 from roswire.errors import EncodingError, ProtocolError
 from roswire.names import searched
 from roswire.parameter_tree import names_in, standing_at
@@ -28,6 +33,46 @@ from roswire.xmlrpc import Value
 _SEARCH = "searchParam"
 _NAMES_AT_ONCE = 500  # the names that are decided without a pause: a few milliseconds
 _TOGETHER_BYTES = 256 << 10  # the most bytes of values in one request to the ROS master
+
+
+@dataclass(frozen=True, slots=True)
+class ParameterRights:
+    """Checks parameters by the policy in force, and records denials."""
+
+    policy: Callable[[], Policy]
+    trail: AuditTrail
+
+    def hidden(self, caller: Caller, call: str, key: str, answer: Answer) -> str | None:
+        """Return a denial text if the caller may not read the answer's value.
+
+        The decision on the call used an earlier state of the parameters.
+        """
+        if answer[0] != 1 or not isinstance(answer[2], dict) or caller.own:
+            return None
+        decision = self._to_read(caller.peer.host, caller.caller_id, key, answer[2])
+        return None if decision.allowed else self.recorded(caller, call, key, decision)
+
+    def may_read_value(self, incarnation: Incarnation, key: str, value: Value) -> bool:
+        """Return whether a subscriber may read a new value (an empty namespace if it was deleted); record a denial."""
+        if incarnation.own:
+            return True
+        decision = self._to_read(incarnation.host, incarnation.name, key, value)
+        if not decision.allowed:
+            peer = Peer(incarnation.host, str(incarnation.host), incarnation.told)
+            self.recorded(Caller(peer, incarnation.name, clock.now_ns()), "paramUpdate", key, decision)
+        return decision.allowed
+
+    def to_find(self, caller: Caller, key: str) -> Decision:
+        request = Request(caller.peer.host, caller.caller_id, Category.READ, key)
+        return decide_right(self.policy(), right_to_find(request))
+
+    def recorded(self, caller: Caller, call: str, key: str, decision: Decision) -> str:
+        record = self.trail.decided(caller.asker, call, Category.READ.value, key, decision)
+        return denial_text(decision, record, self.policy().tell)
+
+    def _to_read(self, host: Address, caller_id: str, key: str, value: Value) -> Decision:
+        request = Request(host, caller_id, Category.READ, key)
+        return decide_right(self.policy(), right_to_read(request, value))
 
 
 class ParameterWrite(NamedTuple):

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 import structlog
 
 from appliance.base import clock
-from appliance.master.caller import Caller
-from appliance.master.calls.call import Attempt, Table
+from appliance.master.calls.call import Attempt, Caller, Table
 from appliance.master.calls.call_execution import Execution, ServedRequest
 from appliance.master.calls.multicall import LIMIT_FAULT, MULTICALL, PARSE_FAULT, Multicall
 from appliance.master.calls.request_peek import method_named

@@ -5,14 +5,14 @@ Each change is stored before it is answered, because a ROS 1 node never register
 
 from dataclasses import dataclass
 
-from appliance.master.caller import Answer, ApiUri, Caller
-from appliance.master.calls.call import Attempt
+from appliance.master.calls.arrivals import Arrivals
+from appliance.master.calls.call import ApiUri, Attempt, Caller
 from appliance.master.calls.parameter_calls import ParameterCalls
 from appliance.master.endpoints.relay_control import RelayControl
 from appliance.master.graph.graph import RosGraph
 from appliance.master.graph.registry import Incarnation, Kind, Life, Registry
-from appliance.master.reconcile.arrivals import Arrivals
 from appliance.master.reconcile.subscribers import Subscribers
+from appliance.master.rosmaster import Answer
 
 
 @dataclass(frozen=True, slots=True)

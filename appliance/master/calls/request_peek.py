@@ -7,8 +7,7 @@ import re
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from appliance.master.caller import Caller
-from appliance.master.calls.call import RosCall, claimed_name
+from appliance.master.calls.call import Caller, RosCall, claimed_name
 from appliance.master.calls.call_table import MASTER_CALLS
 from appliance.master.calls.multicall import MULTICALL
 from appliance.master.calls.node_calls import NODE_CALLS

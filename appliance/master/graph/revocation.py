@@ -1,13 +1,15 @@
 """Decide all registrations and grants again after a change of the policy, for live nodes and for lost nodes.
 
 A registration that is no longer allowed is kept for a later policy, because a ROS 1 node never registers twice.
+
+rosout, a C++ program that parses the log messages of all nodes, is the appliance's own node, and is not trusted. It may
+only make the registrations of an unmodified rosout, and read the parameters that roscpp reads at its start.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
 
 from appliance.master.graph.graph import Grants, RosGraph
-from appliance.master.graph.own_node import OWN, rosout_may_have
 from appliance.master.graph.registry import Incarnation, Kind, Life, NodeRegistration, Registry
 from appliance.policy.live_rights import LiveRight, live_by, may_keep
 from appliance.policy.model import Address, Decision, address_of
@@ -15,6 +17,30 @@ from appliance.policy.policy import Policy
 from appliance.specifications.allocation import TOPIC
 from appliance.store.state_file import PermissionRow
 from roswire.parameter_tree import Tree
+
+OWN = "the appliance's own node"
+ROSOUT = "/rosout"
+_RESOURCES = {
+    Kind.PUBLICATION: frozenset({"/rosout_agg"}),
+    Kind.SUBSCRIPTION: frozenset({"/rosout"}),
+    Kind.SERVICE: frozenset({"/rosout/get_loggers", "/rosout/set_logger_level"}),
+}
+OWN_PARAMETERS = frozenset(
+    {
+        "/enable_statistics",
+        "/statistics_window_max_elements",
+        "/statistics_window_max_size",
+        "/statistics_window_min_elements",
+        "/statistics_window_min_size",
+        "/tcp_keepalive",
+        "/use_sim_time",
+    }
+)
+
+
+def rosout_may_have(kind: Kind, resource: str) -> bool:
+    return resource in _RESOURCES.get(kind, ())
+
 
 CALLS = {
     Kind.PUBLICATION: ("registerPublisher", "unregisterPublisher"),

@@ -1,17 +1,22 @@
 """Keep the nodes informed of the lists of publishers and of the values of parameters that they subscribed to.
 
 Values are sent with each call that sets them, because a node may count the changes. The notifications of the ROS
-master are ignored, because they can be outdated, wrong, or partial.
+master are ignored, because they can be outdated, wrong, or partial. The updates are those of rosmaster's
+`compute_param_updates`, but depend on the canonical key that the policy allowed the caller to change, never on names in
+a value:
+
+1. Subscribers to the changed key, or to a key above it, get the changed key and its value.
+2. Subscribers to a key below it get their part of the new value, or `{}`, unless the value is not a namespace.
 """
 
 import sys
 from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 from appliance.master.endpoints.delivery import Delivery, NodeCall
 from appliance.master.endpoints.relay_control import RelayControl
 from appliance.master.graph.graph import Grants
-from appliance.master.graph.parameter_updates import settled, updates_of
 from appliance.master.graph.registry import Change, Incarnation, Kind, Life, RegistrationKey, Registry
 from appliance.rpc.fair_queue import weigh
 from appliance.specifications.allocation import TOPIC
@@ -180,3 +185,42 @@ class Subscribers:
 def _param_update(key: str, value: Value) -> NodeCall:
     """Like the ROS master, end the key with `/`, and send `{}` for an unset key."""
     return NodeCall("paramUpdate", (f"{key.rstrip('/')}/", value), weigh(value, sys.maxsize))
+
+
+class ParameterUpdate(NamedTuple):
+    """Subscribers to `subscribed` get this value of `key`."""
+
+    subscribed: str
+    key: str
+    value: Value
+
+
+def updates_of(key: str, value: Value, below: Iterable[str]) -> Iterator[ParameterUpdate]:
+    """Yield the updates for a new value (`{}` if deleted). `below` are the subscribed keys below `key`."""
+    for above in _upwards(key):
+        yield ParameterUpdate(above, key, value)
+    if isinstance(value, dict):
+        for subscribed in below:
+            yield ParameterUpdate(
+                subscribed, subscribed, _member(value, subscribed[len(key.rstrip("/")) + 1 :])
+            )
+
+
+def settled(value: Value) -> Value:
+    """Copy the namespaces of a value, because later calls change them in place."""
+    return {name: settled(member) for name, member in value.items()} if isinstance(value, dict) else value
+
+
+def _upwards(key: str) -> Iterator[str]:
+    while key != "/":
+        yield key
+        key = key.rpartition("/")[0] or "/"
+    yield key
+
+
+def _member(value: Value, path: str) -> Value:
+    for part in path.split("/"):
+        if not isinstance(value, dict) or part not in value:
+            return {}
+        value = value[part]
+    return value

@@ -207,10 +207,10 @@ def test_a_right_that_needed_an_approval_is_learned_behind_ask() -> None:
     "tree", [{}, {"arm": {"speed": 1}}, {"arm": {"speed": {"max": 1}}}], ids=["empty", "value", "namespace"]
 )
 def test_a_policy_learned_from_a_call_grants_it(call: RosCall[Any], tree: dict[str, Value]) -> None:
-    key = KEY_GIVEN if call.touches is not None else ""
+    key = KEY_GIVEN if call.row.touches is not None else ""
     learned = learn([Observation(deeds(call)[0], call.name, key)])
     assert not learned.left_out
     policy = compile_policy(learned.text, file="learned")
     assert gate_says(policy, call, tree).allowed
-    other = Request(ipaddress.ip_address("10.0.0.66"), NAME, call.category, deeds(call)[0].resource)
+    other = Request(ipaddress.ip_address("10.0.0.66"), NAME, call.row.category, deeds(call)[0].resource)
     assert not decide(policy, rights_of(other)).allowed

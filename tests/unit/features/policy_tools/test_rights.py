@@ -13,16 +13,16 @@ from hypothesis import strategies as st
 from appliance.features.policy_tools.decision_reasons import explain
 from appliance.features.policy_tools.diff import diff
 from appliance.features.policy_tools.grant import DecidedRequest, UngrantableError, grant
-from appliance.master.caller import ApiUri, Caller
 from appliance.master.calls.call import (
     CALLER_API,
     KEY,
     SERVICE_API,
     TOPIC,
+    ApiUri,
     Attempt,
+    Caller,
     CallParameter,
     CallVerb,
-    Identity,
     RosCall,
     method,
 )
@@ -110,7 +110,7 @@ def argument_of(parameter: CallParameter[Any]) -> Any:
 
 def gate_says(policy: Policy, call: RosCall[Any], tree: Tree) -> Decision:
     gate = CallGate(lambda: policy, Registry(), HostLimits())
-    name = "" if call.identity is Identity.NOBODY else NAME
+    name = "" if call.row.wire else NAME
     arguments = tuple(argument_of(one) for one in call.method.parameters)
     caller = Caller(Peer(HOST, str(HOST), "10.0.0.1"), name, 0)
     decision = gate.decide(Attempt(caller, call, arguments), tree)
@@ -126,11 +126,14 @@ def needed(call: RosCall[Any], missing: frozenset[str]) -> list[str]:
 def deeds(call: RosCall[Any]) -> list[Request]:
     found = [
         Request(
-            HOST, NAME, call.category, THING if call.category is not Category.COMMAND else call.policy_name
+            HOST,
+            NAME,
+            call.row.category,
+            THING if call.row.category is not Category.COMMAND else call.policy_name,
         )
     ]
-    if call.touches is not None:
-        found.append(Request(HOST, NAME, call.touches, KEY_GIVEN))
+    if call.row.touches is not None:
+        found.append(Request(HOST, NAME, call.row.touches, KEY_GIVEN))
     return found
 
 
@@ -208,8 +211,8 @@ def test_an_action_has_the_answer_of_its_call(rules: dict[str, dict[str, str] | 
     gate = CallGate(lambda: policy, Registry(), HostLimits())
     deeds_and_calls = [
         *((category, thing, MASTER_CALLS[call]) for category, call in CARRIED_OUT_BY.items() for thing in RESOURCES),
-        *((Category.COMMAND, row.policy_name, row) for row in ROWS if row.category is Category.COMMAND
-          and row.touches is None),
+        *((Category.COMMAND, row.policy_name, row) for row in ROWS if row.row.category is Category.COMMAND
+          and row.row.touches is None),
     ]  # fmt: skip
     for category, thing, row in deeds_and_calls:
         request = Request(ipaddress.ip_address(host), NAME, category, thing)
@@ -252,13 +255,13 @@ async def test_live_registrations_are_decided_as_their_calls(kind: Kind) -> None
 
 
 def test_every_command_can_be_granted() -> None:
-    named = {call.policy_name for call in ROWS if call.category is Category.COMMAND}
+    named = {call.policy_name for call in ROWS if call.row.category is Category.COMMAND}
     assert named | {"lookupService"} == COMMANDS
 
 
 def test_a_call_that_makes_a_node_binds_its_name() -> None:
     for call in ROWS:
-        assert needs_node(deeds(call)[0]) == (call.identity is Identity.NODE), call.name
+        assert needs_node(deeds(call)[0]) == (call.row.node), call.name
 
 
 def test_each_registering_call_has_an_unregistering_one() -> None:

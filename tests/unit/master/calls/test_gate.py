@@ -3,8 +3,7 @@ from typing import Any
 
 import pytest
 
-from appliance.master.caller import ApiUri, Caller
-from appliance.master.calls.call import CALLER_API, SERVICE_API, Attempt, Identity, RosCall
+from appliance.master.calls.call import CALLER_API, SERVICE_API, ApiUri, Attempt, Caller, RosCall
 from appliance.master.calls.call_table import MASTER_CALLS
 from appliance.master.calls.gate import CallGate, HostLimits, NameConflict, contested
 from appliance.master.calls.node_calls import NODE_CALLS
@@ -30,7 +29,7 @@ def held(name: str, host: str, *, own: bool) -> Registry:
 
 @pytest.mark.parametrize(
     "call",
-    [one for one in (*MASTER_CALLS.values(), *NODE_CALLS.values()) if one.identity is not Identity.NOBODY],
+    [one for one in (*MASTER_CALLS.values(), *NODE_CALLS.values()) if not one.row.wire],
     ids=lambda one: one.name,
 )
 def test_no_call_is_made_under_the_name_of_another_hosts_node(call: RosCall[Any]) -> None:

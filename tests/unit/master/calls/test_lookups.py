@@ -4,7 +4,7 @@ from typing import Any, cast
 
 import pytest
 
-from appliance.master.caller import Caller
+from appliance.master.calls.call import Caller
 from appliance.master.calls.lookups import LookupCalls
 from appliance.master.graph import registry
 from appliance.master.graph.registry import Incarnation, Kind, Registry

@@ -6,7 +6,7 @@ import pytest
 
 from appliance.channel.messages import ConnectionOpened
 from appliance.control.operators.overview import graph_of
-from appliance.master.caller import Caller
+from appliance.master.calls.call import Caller
 from appliance.master.calls.node_calls import NodeCalls
 from appliance.master.endpoints.traffic import RelayTraffic
 from appliance.master.graph.registry import Incarnation, Kind, Registry

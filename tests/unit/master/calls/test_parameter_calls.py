@@ -12,7 +12,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from appliance.master.caller import Caller
+from appliance.master.calls.call import Caller
 from appliance.master.calls.parameter_calls import ParameterCalls, ParameterWrite
 from appliance.master.parameter_charges import LimitReachedError, measure
 from appliance.master.parameter_mirror import ParameterMirror

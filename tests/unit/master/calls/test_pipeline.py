@@ -10,7 +10,7 @@ from typing import Any, cast
 import pytest
 
 from appliance.master.calls import pipeline
-from appliance.master.calls.parameter_rights import ParameterRights
+from appliance.master.calls.parameter_calls import ParameterRights
 from appliance.master.graph.graph import RosGraph
 from appliance.master.graph.registry import Incarnation, Kind, Registry
 from appliance.master.reconcile.subscribers import Subscribers

@@ -2,12 +2,11 @@ import ipaddress
 
 import pytest
 
-from appliance.master.caller import ApiUri, Caller
-from appliance.master.calls.call import CALLER_API, SERVICE_API, Attempt
+from appliance.master.calls.call import CALLER_API, SERVICE_API, ApiUri, Attempt, Caller
 from appliance.master.calls.call_table import MASTER_CALLS
 from appliance.master.calls.gate import CallGate, HostLimits
-from appliance.master.graph.own_node import rosout_may_have
 from appliance.master.graph.registry import Kind, Registry
+from appliance.master.graph.revocation import rosout_may_have
 from appliance.policy.model import Decision
 from appliance.policy.policy_compiler import compile_policy
 from appliance.rpc.server import Peer

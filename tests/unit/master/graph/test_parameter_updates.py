@@ -8,8 +8,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from appliance.master.graph.parameter_updates import settled, updates_of
 from appliance.master.graph.registry import Kind
+from appliance.master.reconcile.subscribers import settled, updates_of
 from roswire.xmlrpc import Value
 from tests.support.control_parts import OPEN, ControlParts
 from tests.support.examples import examples

@@ -10,11 +10,10 @@ from typing import Any
 import pytest
 
 from appliance.channel import messages
-from appliance.master.caller import Answer
 from appliance.master.endpoints.delivery import NodeCall
 from appliance.master.graph.registry import Incarnation, Kind, Life, Registry
 from appliance.master.reconcile.sinks import restore
-from appliance.master.rosmaster import stand_in
+from appliance.master.rosmaster import Answer, stand_in
 from appliance.store.state_file import StateStore
 from roswire.parameter_tree import standing_at
 from roswire.xmlrpc import Value

@@ -5,13 +5,14 @@ It needs no updates, so all calls of a master to its node API are only acknowled
 
 import asyncio
 import ipaddress
-from collections.abc import Awaitable, Callable, Collection
+from collections.abc import Callable, Collection
 from dataclasses import KW_ONLY, dataclass
 
 import structlog
 
 from appliance.base import clock
-from appliance.master.caller import Answer, ApiUri, Caller
+from appliance.master.calls.call import ApiUri, Caller
+from appliance.master.calls.registration import RegistrationCalls
 from appliance.master.endpoints.node_ports import NoPortError
 from appliance.master.graph.graph import RosGraph
 from appliance.master.graph.registry import PUBLISHER_PATH, Incarnation, Kind, Registry
@@ -30,13 +31,12 @@ class OwnPublisher:
 
     registry: Registry
     graph: RosGraph
+    registration: RegistrationCalls
     _: KW_ONLY
     name: str
     inner_port: int
     wanted: Callable[[], dict[str, str]]
     services: Collection[str]
-    register: Callable[[Caller, str, str, ApiUri], Awaitable[Answer]]
-    offer: Callable[[Caller, str, ApiUri, ApiUri], Awaitable[Answer]]
 
     def __post_init__(self) -> None:
         uri = node_uri(_LOOPBACK, self.inner_port, PUBLISHER_PATH)
@@ -70,11 +70,13 @@ class OwnPublisher:
                 if incarnation.api_text != self._api.text or resource not in wanted.get(kind, ()):
                     self.graph.unregistered(incarnation, kind, resource)
         for topic, type_name in published.items():
-            answer = await self.register(self._caller(), topic, type_name, self._api)
+            answer = await self.registration.register_publisher(self._caller(), topic, type_name, self._api)
             if answer[0] != 1:
                 raise CallFailedError(f"{self.name} cannot publish {topic}: {answer[1]!s}")
         for service in self.services:
-            answer = await self.offer(self._caller(), service, self._service_api, self._api)
+            answer = await self.registration.register_service(
+                self._caller(), service, self._service_api, self._api
+            )
             if answer[0] != 1:
                 raise CallFailedError(f"{self.name} cannot offer {service}: {answer[1]!s}")
 

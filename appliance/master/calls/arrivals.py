@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from appliance.base import clock
-from appliance.master.caller import ApiUri, Caller
+from appliance.master.calls.call import ApiUri, Caller
 from appliance.master.endpoints.node_ports import AdvertisedAddresses, NodePorts, NoPortError
 from appliance.master.graph.graph import RosGraph
 from appliance.master.graph.registry import Incarnation, Life, Registry, new_key

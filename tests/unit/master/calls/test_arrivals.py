@@ -3,10 +3,10 @@ from typing import Any, cast
 
 import pytest
 
+from appliance.master.calls.arrivals import Arrivals
 from appliance.master.endpoints import node_ports
 from appliance.master.endpoints.node_ports import NodePorts, NoPortError
 from appliance.master.graph.registry import Incarnation, Registry
-from appliance.master.reconcile.arrivals import Arrivals
 from appliance.master.reconcile.sinks import ProxyEndpoints
 from appliance.policy.model import Address
 from appliance.policy.policy_compiler import compile_policy
