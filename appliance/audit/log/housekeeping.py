@@ -99,16 +99,12 @@ class Housekeeping:
 
     # --- between two batches of records -----------------------------------------------------------------------
 
-    def after_batch(self, *, written: bool) -> None:
-        """Seal if it is due, and limit the lag of the full-text index: every search reads the unindexed records."""
+    def after_batch(self, *, written: bool, rest: bool, quiet_since: float, busy: Callable[[], bool]) -> None:
+        """Do the work that is due; `rest`: no further batch is due at once."""
         if written:
             self.attempt(self._seal_if_due)
-        self.attempt(self._index_backlog)
-
-    def at_rest(self, *, quiet_since: float, busy: Callable[[], bool]) -> None:
-        if not busy():
-            self.attempt(lambda writer: self._index(writer, quiet_since, busy))
-        if self._now() >= self.remover.due:
+        self.attempt(lambda writer: self._index(writer, quiet_since, busy))
+        if rest and self._now() >= self.remover.due:
             self.attempt(self.remover.step)
 
     # --- checkpoints ------------------------------------------------------------------------------------------
@@ -160,12 +156,10 @@ class Housekeeping:
     # --- the full-text index ----------------------------------------------------------------------------------
 
     def _index(self, writer: ChainWriter, quiet_since: float, busy: Callable[[], bool]) -> None:
+        if writer.text_lag > _TEXT_BACKLOG:
+            writer.index_text(_LARGEST_SLICE)  # every search reads the records that are not indexed
         # Committing the index for a single record is too expensive: wait for more records or for a quiet period.
         quiet = self._now() - quiet_since >= _IDLE_SECONDS / 2
         if quiet or writer.text_lag >= _TEXT_STEP:
             while not busy() and writer.index_text():
                 pass
-
-    def _index_backlog(self, writer: ChainWriter) -> None:
-        if writer.text_lag > _TEXT_BACKLOG:
-            writer.index_text(_LARGEST_SLICE)

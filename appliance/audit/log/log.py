@@ -243,23 +243,22 @@ class AuditLog:
             self._look_for_room(now)
         written = self._attempt()
         self._answer_waiting()
-        self.housekeeping.after_batch(written=written)
-        if more and written:
+        again = more and written
+        self.housekeeping.after_batch(
+            written=written, rest=not again, quiet_since=self._written_at, busy=lambda: bool(self._queue)
+        )
+        if again:
             return now
-        self.housekeeping.at_rest(quiet_since=self._written_at, busy=lambda: bool(self._queue))
         if closing:
             self._finish()
             return None
         if self._failed is not None:
-            return self._pause(now)
+            self._retry_at = now + _RETRY_SECONDS
+            return self._retry_at
         if not self._queue:
             self._caught_up = now
         dues = (now + _IDLE_SECONDS, self._folder.next_due(), self.housekeeping.next_due(now))
         return max(now + 0.001, min(due for due in dues if due is not None))
-
-    def _pause(self, now: float) -> float:
-        self._retry_at = now + _RETRY_SECONDS
-        return self._retry_at
 
     def _finish(self) -> None:
         self._held.extend(self._folder.finish())
@@ -346,8 +345,12 @@ class AuditLog:
         while writer and (self._held or self._folder.touched or self._failed_since):
             batch = self._held[:_LARGEST_BATCH]
             touched = tuple(self._folder.touched)
+            report = []
+            if self._failed_since:
+                detail = {"since": self._failed_since, "until": self._clock()}
+                report = [self._own("log failed", Severity.ALARM, self._failed or "", detail)]
             writer.append(
-                batch + self._report_of_failure(),
+                batch + report,
                 [(msgspec.json.encode(key), self._folder.state(key)) for key in touched],
             )
             self._continued = (writer.log_id, writer.sequence)
@@ -363,12 +366,6 @@ class AuditLog:
                 detail = {"count": lost.records, "first_time": lost.first_time, "last_time": lost.last_time}
                 self._held.append(self._own("records lost", Severity.ALARM, "the queue was full", detail))
         self._failed = None
-
-    def _report_of_failure(self) -> list[AuditRecord]:
-        if not self._failed_since:
-            return []
-        detail = {"since": self._failed_since, "until": self._clock()}
-        return [self._own("log failed", Severity.ALARM, self._failed or "", detail)]
 
     def _answer_waiting(self) -> None:
         result = self.failed if self._held or self._folder.touched else None
