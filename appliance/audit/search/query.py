@@ -62,10 +62,7 @@ def conditions(wanted: Filter) -> list[Condition]:
     """Return the conditions of a filter, except that on its text. Raises `FilterError`."""
     found: list[Condition] = []
     if wanted.decision:
-        marks = ", ".join("?" * len(wanted.decision))
-        found.append(
-            Condition(f"(decision IN ({marks}) AND decision IS NOT NULL)", wanted.decision, "record_decision")
-        )
+        found.append(_one_of("decision", wanted.decision))
     for column in ("host", "caller_id", "resource", "category", "event"):
         value = getattr(wanted, column)
         if value is not None:
@@ -75,7 +72,7 @@ def conditions(wanted: Filter) -> list[Condition]:
     if wanted.severity is not None:
         order = list(Severity)
         names = tuple(severity.value for severity in order[order.index(wanted.severity) :])
-        found.append(Condition(f"severity IN ({', '.join('?' * len(names))})", names, "record_severity"))
+        found.append(_one_of("severity", names))
     if wanted.rule is not None:
         pattern = checked_pattern("rule", wanted.rule)
         found.append(
@@ -96,12 +93,15 @@ def conditions(wanted: Filter) -> list[Condition]:
     return found
 
 
+def _one_of(column: str, values: tuple[str, ...]) -> Condition:
+    marks = ", ".join("?" * len(values))
+    return Condition(f"({column} IN ({marks}) AND {column} IS NOT NULL)", values, f"record_{column}")
+
+
 def _within(networks: tuple[str, ...]) -> Condition:
     """Return the condition that a host is in one of the networks; an index has only single addresses."""
     if all(network.endswith(("/32", "/128")) for network in networks):
-        addresses = tuple(network.rpartition("/")[0] for network in networks)
-        marks = ", ".join("?" * len(addresses))
-        return Condition(f"(host IN ({marks}) AND host IS NOT NULL)", addresses, "record_host")
+        return _one_of("host", tuple(network.rpartition("/")[0] for network in networks))
     return Condition(f"(host IS NOT NULL AND {IN_NETWORKS}(host, ?))", (" ".join(networks),))
 
 
