@@ -20,6 +20,7 @@ import structlog
 from psycopg import sql
 
 from appliance.audit.log.columns import StoredColumns
+from appliance.base import clock
 from appliance.formats.segments import SegmentError, SegmentReader
 from rosrv_fleet.config import FleetConfig
 from rosrv_fleet.database import IndexDatabase, migrate
@@ -33,6 +34,7 @@ LANES = ("pending", "large")
 """The markers of waiting segments. Each lane is indexed by a separate thread."""
 _IDLE_SECONDS = 1.0
 _PAUSE_SECONDS = 5.0
+_CHECK_SECONDS = 60.0  # without a segment to index, a failure of the database is noticed within this time
 _SECOND = 1_000_000_000
 _COLUMNS = ("day", "robot", "log", *StoredColumns._fields, "who")
 _LONGEST_ID, _LONGEST_NAME = 64, 512  # characters: a row of an index of PostgreSQL has at most 2,704 bytes
@@ -59,6 +61,7 @@ class Indexer:
         self._ending = threading.Event()
         self._wake = {lane: threading.Event() for lane in LANES}
         self._failures: dict[str, str | None] = dict.fromkeys(LANES, "the index was not reached yet")
+        self._checked = dict.fromkeys(LANES, 0.0)
         self._damage = ""
         self._killed = Counter[SegmentPlace]()
 
@@ -83,18 +86,26 @@ class Indexer:
     def run(self, lane: str) -> None:
         while not self._ending.is_set():
             self._wake[lane].clear()
-            try:
-                if self._failures[lane] is not None:
-                    with psycopg.connect(self._config.database, connect_timeout=5) as connection:
-                        migrate(connection)
-                more = self.step(lane)
-            except Exception as error:  # noqa: BLE001  after any failure, segments are indexed later
-                if not self._ending.is_set():
-                    self._failed(lane, failure_of(error))
-                self._ending.wait(_PAUSE_SECONDS)
-                continue
-            if not more:
-                self._wake[lane].wait(_IDLE_SECONDS)
+            pause = self.turn(lane)
+            waking = self._wake[lane] if self._failures[lane] is None else self._ending
+            waking.wait(pause)
+
+    def turn(self, lane: str) -> float:
+        """Index what waits, and return the seconds until the next turn. Note a failure for `trouble`.
+
+        Without segments the database is checked every minute, because its failure also ends searches.
+        """
+        try:
+            now = clock.now()
+            if self._failures[lane] is not None or now - self._checked[lane] >= _CHECK_SECONDS:
+                with psycopg.connect(self._config.database, connect_timeout=5) as connection:
+                    migrate(connection)
+                self._checked[lane] = now
+            return 0.0 if self.step(lane) else _IDLE_SECONDS
+        except Exception as error:  # noqa: BLE001  after any failure, segments are indexed later
+            if not self._ending.is_set():
+                self._failed(lane, failure_of(error))
+            return _PAUSE_SECONDS
 
     def step(self, lane: str) -> bool:
         """Index one segment of each robot, and return whether there were any.

@@ -19,6 +19,7 @@ from rosrv_fleet.robots import Robots
 from rosrv_fleet.segment_store import SegmentStore
 
 _EVERY_SECONDS = 3600.0
+_AGAIN_SECONDS = 60.0  # after a failure, which health reports until the next step
 _LOCK_MS = 3000  # searches wait behind this lock
 _DAY = 86_400 * 10**9
 _DAYS = """
@@ -34,7 +35,7 @@ _log = structlog.get_logger()
 
 
 class Pruner:
-    """Removes old data every hour, in its own thread."""
+    """Removes old data every hour, and after a failure every minute, in its own thread."""
 
     def __init__(
         self, store: SegmentStore, robots: Robots, database: IndexDatabase, retention: RetentionConfig
@@ -48,12 +49,17 @@ class Pruner:
 
     def run(self) -> None:
         while not self._ending.is_set():
-            try:
-                self.step()
-            except Exception as error:  # noqa: BLE001  after any failure, it tries again
-                self.trouble = f"retention: {failure_of(error)}"
-                _log.error("old data was not removed", reason=self.trouble)
-            self._ending.wait(_EVERY_SECONDS)
+            self._ending.wait(self.turn())
+
+    def turn(self) -> float:
+        """Remove old data, and return the seconds until the next turn. Note a failure in `trouble`."""
+        try:
+            self.step()
+        except Exception as error:  # noqa: BLE001  after any failure, it tries again
+            self.trouble = f"retention: {failure_of(error)}"
+            _log.error("old data was not removed", reason=self.trouble)
+            return _AGAIN_SECONDS
+        return _EVERY_SECONDS
 
     def stop(self) -> None:
         self._ending.set()

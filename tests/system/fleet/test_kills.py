@@ -112,3 +112,13 @@ def test_segments_are_accepted_without_a_database(own_cluster: PostgresCluster, 
         site.indexed()
         assert len(site.search(event="decision", limit=1000)) == 20
         robot.close()
+
+
+def test_a_missing_database_is_noticed_without_segments(own_cluster: PostgresCluster, tmp_path: Path) -> None:
+    database = own_cluster.create(f"test_{secrets.token_hex(6)}")
+    with running(FleetSite(tmp_path / "site", database)) as site:
+        site.indexed()
+        own_cluster.kill()
+        eventually(lambda: site.health()["trouble"], "the missing database is reported", 90)
+        own_cluster.start()
+        eventually(lambda: site.health()["trouble"] is None, "the database is back")

@@ -89,7 +89,7 @@ def test_retention_continues(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
         SegmentStore(tmp_path, 0), enrolled_robots(tmp_path, "arm1"), database, RetentionConfig(index_days=1)
     )
     drop = _Defect(work.stop)
-    monkeypatch.setattr(retention, "_EVERY_SECONDS", 0.0)
+    monkeypatch.setattr(retention, "_AGAIN_SECONDS", 0.0)
     monkeypatch.setattr(retention, "drop_partitions", drop)
     work.run()
     assert (drop.calls, work.trouble) == (2, f"retention: {_DEFECT}")
