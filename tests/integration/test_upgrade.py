@@ -1,7 +1,7 @@
-"""The appliance is upgraded in place: it starts on the state of version 0.2.0.
+"""The appliance is upgraded in place: it starts on the state of each earlier version.
 
-`state-0.2.0.sql` has a publisher, a subscriber, a service and its client, a policy and a specification that an
-operator loaded, and two tokens, one of them revoked.
+Each `state-*.sql` has a publisher, a subscriber, a service and its client, a policy and a specification that an
+operator loaded, and three tokens, one of them revoked. That of 0.3.0 has rows in every table of its version.
 """
 
 import hashlib
@@ -20,21 +20,41 @@ from appliance.signing.request_signing import keys_of
 from tests.integration.conformance.fake_nodes import FakeNodes
 from tests.support.appliance import Appliance
 
-DUMP = Path(__file__).with_name("state-0.2.0.sql")
+VERSIONS = ("0.2.0", "0.3.0")
 NODES = ("asker", "ears", "negator", "voice")
 NOBODY = "[Nodes]\n[Publishers]\n[Subscribers]\n[Commands]\n[Services]\n[Clients]\n"
 
 
+UNCHANGED = (
+    "authority", "door", "door_ticket", "enrolment_token", "host", "host_block", "host_certificate",
+    "host_ports", "monitor_revision", "parameter_owner", "policy_revision", "policy_signature", "revocation",
+    "revoked_certificate", "token", "token_keys",
+)  # fmt: skip
+"""The tables in which a start changes no row."""
+
+
 class Upgraded(NamedTuple):
+    version: str
+    before: dict[str, set[tuple[Any, ...]]]
+    """The rows of each table."""
     appliance: Appliance
     nodes: FakeNodes
     token: str
     revoked: str
 
 
-def old_state(directory: Path, nodes: FakeNodes) -> tuple[str, str]:
+def dump(version: str) -> str:
+    return Path(__file__).with_name(f"state-{version}.sql").read_text()
+
+
+def rows_of_tables(database: sqlite3.Connection) -> dict[str, set[tuple[Any, ...]]]:
+    tables = database.execute("SELECT name FROM sqlite_master WHERE type = 'table'").fetchall()
+    return {name: set(database.execute(f"SELECT * FROM {name}")) for (name,) in tables}  # noqa: S608  a table's name
+
+
+def old_state(version: str, directory: Path, nodes: FakeNodes) -> tuple[str, str]:
     directory.mkdir(parents=True)
-    sql = DUMP.read_text()
+    sql = dump(version)
     for name in NODES:
         sql = re.sub(rf"('/{name}','127.0.0.1',)'http://[^']*'", rf"\g<1>'{nodes.uri(name)}'", sql)
     with closing(sqlite3.connect(directory / "state.db")) as database:
@@ -55,14 +75,17 @@ def make_secret(database: sqlite3.Connection, name: str) -> str:
     return text
 
 
-@pytest.fixture(scope="module")
-def upgraded() -> Iterator[Upgraded]:
+@pytest.fixture(scope="module", params=VERSIONS)
+def upgraded(request: pytest.FixtureRequest) -> Iterator[Upgraded]:
     with FakeNodes() as nodes:
         appliance = Appliance(options=("--api", "127.0.0.1:0"), relays=2)
         try:
-            token, revoked = old_state(appliance.state / "control", nodes)
+            folder = appliance.state / "control"
+            token, revoked = old_state(request.param, folder, nodes)
+            with closing(sqlite3.connect(folder / "state.db")) as database:
+                before = rows_of_tables(database)
             appliance.start()
-            yield Upgraded(appliance, nodes, token, revoked)
+            yield Upgraded(request.param, before, appliance, nodes, token, revoked)
         finally:
             appliance.close()
 
@@ -126,3 +149,29 @@ def test_grants_survive(upgraded: Upgraded) -> None:
     with closing(sqlite3.connect(upgraded.appliance.state / "control" / "state.db")) as database:
         rows = set(database.execute("SELECT resource, caller_id FROM permission WHERE resource != '/rosout'"))
     assert rows == {("/negate", "/asker")}
+
+
+def test_rows_survive(upgraded: Upgraded) -> None:
+    with closing(sqlite3.connect(upgraded.appliance.state / "control" / "state.db")) as database:
+        after = rows_of_tables(database)
+    lost = {name: upgraded.before.get(name, set()) - after[name] for name in UNCHANGED}
+    assert {name: rows for name, rows in lost.items() if rows} == {}
+    assert upgraded.version == "0.2.0" or all(upgraded.before.values()), "a table without a row tests nothing"
+
+
+@pytest.mark.parametrize("upgraded", ["0.3.0"], indirect=True)
+def test_doors_hosts_and_blocks_survive(upgraded: Upgraded) -> None:
+    """Version 0.2.0 had no doors and no blocks."""
+    rest = upgraded.appliance.rest(upgraded.token)
+    doors = rest.get("/v1/doors").json["doors"]
+    assert {one["name"]: (one["address"], one["port"], one["source"], len(one["tickets"])) for one in doors} == {
+        "alice": ("198.19.240.2", None, "", 1), "agent-1": ("198.19.240.3", 9091, "10.0.0.7/32", 0),
+    }  # fmt: skip
+    hosts = {one["name"]: one for one in rest.get("/v1/hosts").json["hosts"]}
+    assert {name: (one["address"], one["revoked"] is None) for name, one in hosts.items()} == {
+        "robot2": ("10.78.0.2", True), "away": ("10.78.0.3", False), "robot3": ("10.78.0.4", True),
+    }  # fmt: skip
+    assert hosts["robot2"]["renewing"] and hosts["robot2"]["ports"]["open"] == [11_311, 40_001]
+    assert hosts["robot3"]["token_by"] == "first"  # noqa: S105  a name
+    [block] = rest.get("/v1/blocks").json["blocks"]
+    assert (block["address"], block["note"], block["until"]) == ("10.9.9.9", "lost", None)
