@@ -17,6 +17,11 @@ from roswire.definitions import Definitions
 from roswire.errors import DefinitionError
 from roswire.standard import standard_definitions
 
+__all__ = [
+    "BESIDE", "Specifications", "definition_folders", "definition_texts", "load", "read_definitions",
+    "read_for_recordings", "read_specifications", "topics_of",
+]  # fmt: skip
+
 BESIDE = "msg"
 _RECORDINGS = (b"#ROSBAG ", b"\x89MCAP")
 

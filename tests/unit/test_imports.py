@@ -20,7 +20,6 @@ def test_no_module_needs_one_that_needs_it(imports: dict[str, set[str]]) -> None
 
 
 PUBLIC = {
-    "batch.replay_job": "the job of `rosrv monitor replay`",
     "check.sources": "compiling texts",
     "fast.build": "certifying a set, and making the parts that relays run",
     "fast.load": "loading such a part",

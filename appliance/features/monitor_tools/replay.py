@@ -11,13 +11,12 @@ from appliance.channel import admin
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.monitor_program import MONITOR
 from appliance.features.table import recorded_messages
-from rosmop.batch.replay_job import Specifications
 from rosmop.form.findings import SpecificationError
 from rosmop.tool.batch_session import RecordingsOptions, batch_session
 from rosmop.tool.options import BagSets, Folders, On, ReportFile, Resume, ShowProgress, Workers
 from rosmop.tool.replay_report import ReplayReport
 from rosmop.tool.run_command import run_batch, run_spans
-from rosmop.tool.specification_input import read_for_recordings, topics_of
+from rosmop.tool.specification_input import Specifications, read_for_recordings, topics_of
 from rosmop.tool.terminal import refused
 
 
