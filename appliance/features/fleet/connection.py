@@ -279,7 +279,8 @@ def robot_context(ca: Path, certificate: Path, key: Path) -> ssl.SSLContext:
         with path_for_library(certificate) as chain, path_for_library(key) as private:
             context.load_cert_chain(chain, private)
     except OSError as error:
-        raise OSError(error.errno, f"cannot be used: {error.strerror or error}", str(certificate)) from error
+        lost = error.filename or str(certificate)
+        raise OSError(error.errno, f"cannot be used: {error.strerror or error}", lost) from error
     fault = untimely(read_given(certificate, _LONGEST_CERTIFICATE), "this machine")
     if fault:
         raise CollectorError(
