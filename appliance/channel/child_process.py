@@ -36,6 +36,8 @@ class Child:
         self._memory_given = memory_given
         self._control = Link(said, lost, took)
         self.ended = asyncio.Event()
+        self.stopped = False
+        """Whether the supervisor ended this process in order; it then ends all others as well."""
 
     def attach(self, ready: Ready) -> None:
         self._lifeline.attach(asyncio.get_running_loop(), self._supervisor_said, self.ended.set)
@@ -64,6 +66,7 @@ class Child:
             case Ping(number):
                 self._answer(Pong(number))
             case Stop():
+                self.stopped = True
                 self.ended.set()
             case LinkOpened(role="control"):
                 self._control.attach(Channel(socket.socket(fileno=descriptors[0]), self._link))

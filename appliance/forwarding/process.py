@@ -28,8 +28,8 @@ class Forwarder(Protocol):
     def step(self) -> float:
         """Forward a part; return the seconds to wait before the next call."""
 
-    def close(self) -> None:
-        """Close the connection."""
+    def close(self, *, stopped: bool = False) -> None:
+        """Close the connection. `stopped`: the whole appliance is stopped in order."""
 
 
 class ForwardingProcess:
@@ -69,7 +69,7 @@ class ForwardingProcess:
     def _forward(self) -> None:
         while not self._ending.is_set():
             self._ending.wait(self._forwarder.step())
-        self._forwarder.close()
+        self._forwarder.close(stopped=self._child.stopped)
 
 
 class ProgressReports:

@@ -62,18 +62,20 @@ def make_collector(config: FleetConfig) -> Collector:
     database = IndexDatabase(
         config.database, connections=_BUNDLE_CONNECTIONS, statement_seconds=limits.search_seconds
     )
+    presence = RobotPresence(config.data / "heard")
     workers = Workers(SHORT_CHECKS + LONG_CHECKS + _EVIDENCE_CHECKS + len(LANES))
     bundles = None
     if config.bundles is not None:
         bundles = BundleService(
-            config.bundles.folder, config.bundles.timestamp_key, RolloutStore(database), robots.groups
-        )
+            config.bundles.folder, config.bundles.timestamp_key, RolloutStore(database), robots.groups,
+            off=lambda: {name for name, robot in robots.known().items() if presence.off(robot)},
+        )  # fmt: skip
     return Collector(
         config=config,
         searches=Searches(searching, limits.searches),
         database=database,
         robots=robots,
-        presence=RobotPresence(config.data / "heard"),
+        presence=presence,
         tokens=OperatorTokens(config.data / "tokens.json"),
         store=store,
         evidence=EvidenceStore(config.data / "evidence"),

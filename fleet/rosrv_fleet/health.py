@@ -15,8 +15,8 @@ _MOST_MARKS = 1000
 class RobotState(msgspec.Struct, frozen=True, kw_only=True):
     """A robot's newest segment (log, number, seconds since its arrival), and its problems.
 
-    `heard_seconds` has the time since each appliance was heard; the robot is silent if one of them is. `gaps` and
-    `forks` are counted up to 1,000.
+    `heard_seconds` has the time since each appliance was heard. The robot is silent if one of them is, or `off` if one
+    was switched off in order and none is silent. `gaps` and `forks` are counted up to 1,000.
     """
 
     name: str
@@ -26,6 +26,7 @@ class RobotState(msgspec.Struct, frozen=True, kw_only=True):
     certificate_seconds: float
     heard_seconds: dict[str, float | None]
     silent: bool
+    off: bool
     gaps: int
     forks: int
 
@@ -65,10 +66,14 @@ def health_of(collector: Collector) -> FleetHealth:
 
 def _state(collector: Collector, robot: Robot, gaps: int, forks: int) -> RobotState:
     newest = collector.store.newest(robot.name)
-    now, presence = clock.wall(), collector.presence
-    heard = {name: presence.last(robot.name, name) for name in robot.connecting}
-    since = (
-        max(heard[name] or 0.0, one.added / _SECOND, presence.began) for name, one in robot.connecting.items()
+    now, monotonic = clock.wall(), clock.now()
+    heard = {name: collector.presence.last(robot.name, name) for name in robot.connecting}
+    off = collector.presence.off(robot)
+    silent = any(
+        monotonic - max(sign.now if sign else 0.0, collector.robots.accepted_since(one.fingerprint))
+        > collector.config.silent_seconds
+        for (name, one), sign in zip(robot.connecting.items(), heard.values(), strict=True)
+        if name not in off
     )
     arrived, place = (None, None) if newest is None else newest
     return RobotState(
@@ -77,8 +82,9 @@ def _state(collector: Collector, robot: Robot, gaps: int, forks: int) -> RobotSt
         number=place and place.number,
         age_seconds=None if arrived is None else max(0.0, now - arrived / _SECOND),
         certificate_seconds=min(one.certificate_ends for one in robot.connecting.values()) - now,
-        heard_seconds={name: None if at is None else max(0.0, now - at) for name, at in heard.items()},
-        silent=now - min(since) > collector.config.silent_seconds,
+        heard_seconds={name: max(0.0, now - sign.at) if sign else None for name, sign in heard.items()},
+        silent=silent,
+        off=bool(off) and not silent,
         gaps=gaps,
         forks=forks,
     )

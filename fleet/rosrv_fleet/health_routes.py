@@ -37,7 +37,7 @@ def health_router(collector: Collector) -> APIRouter:
     def metrics() -> Response:
         """Return the same state as metrics."""
         registry = CollectorRegistry()
-        registry.register(_Source(health_of(collector)))
+        registry.register(RobotMetrics(health_of(collector)))
         if collector.bundles is not None:
             registry.register(_RolloutMetrics(collector.bundles))
         return Response(generate_latest(registry), media_type="text/plain; version=0.0.4; charset=utf-8")
@@ -45,7 +45,7 @@ def health_router(collector: Collector) -> APIRouter:
     return router
 
 
-class _Source(MetricSource):
+class RobotMetrics(MetricSource):
     """The metrics of robots for one scrape."""
 
     def __init__(self, health: FleetHealth) -> None:
@@ -59,6 +59,9 @@ class _Source(MetricSource):
         age = gauge("segment_age_seconds", "seconds since the robot's newest segment arrived")
         ends = gauge("certificate_seconds", "seconds until the robot's certificate ends")
         silent = gauge("robot_silent", "1 while an appliance of the robot was not heard for silent_seconds")
+        off = gauge(
+            "robot_off", "1 while an appliance of the robot is switched off in order, and none is silent"
+        )
         heard = GaugeMetricFamily(
             "rosrv_fleet_heard_seconds",
             "seconds since an appliance pushed a segment or stated that nothing waits",
@@ -71,12 +74,13 @@ class _Source(MetricSource):
                 age.add_metric([robot.name], robot.age_seconds)
             ends.add_metric([robot.name], robot.certificate_seconds)
             silent.add_metric([robot.name], robot.silent)
+            off.add_metric([robot.name], robot.off)
             for appliance, seconds in robot.heard_seconds.items():
                 if seconds is not None:
                     heard.add_metric([robot.name, appliance], seconds)
             gaps.add_metric([robot.name], robot.gaps)
             forks.add_metric([robot.name], robot.forks)
-        yield from (age, ends, silent, heard, gaps, forks)
+        yield from (age, ends, silent, off, heard, gaps, forks)
         yield GaugeMetricFamily(
             "rosrv_fleet_waiting", "stored segments that the index does not have", health.waiting
         )

@@ -37,10 +37,10 @@ def push_router(collector: Collector) -> APIRouter:
     uploads = _Uploads(collector)
     RobotCaller = Annotated[Robot, Depends(robot_of(collector.robots))]  # noqa: N806  a type
 
-    def heard(request: Request, robot: Robot) -> None:
+    def heard(request: Request, robot: Robot, *, off: bool = False) -> None:
         appliance = robot.appliance_with(certificate_of(request) or b"")
         if appliance:
-            collector.presence.heard(robot.name, appliance)
+            collector.presence.heard(robot.name, appliance, off=off)
 
     @router.get("")
     def head(
@@ -50,15 +50,16 @@ def push_router(collector: Collector) -> APIRouter:
         upto: Annotated[int, Query(ge=0, lt=10**18)] = 10**18 - 1,
         *,
         idle: bool = False,
+        off: bool = False,
     ) -> Response:
         """Return the newest stored checkpoint of the robot's log with a number up to `upto`; number 0: none.
 
         `hashes` has more than one hash if the robot signed several checkpoints with this number, and none if
         the disk has damaged the segment; then the robot sends it again. With `idle` the robot reports that it
-        has nothing to push.
+        has nothing to push, and with `off` that it is being switched off.
         """
-        if idle:
-            heard(request, robot)
+        if idle or off:
+            heard(request, robot, off=off)
         found = collector.store.head(robot.name, log, upto)
         same = [] if found is None else collector.store.numbered(robot.name, log, found.number)
         hashes = [checkpoint_hash(header.end.text()) for header in collector.store.headers(same)]

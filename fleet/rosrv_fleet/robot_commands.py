@@ -146,13 +146,14 @@ def list_robots(config: Config = DEFAULT_CONFIG, *, as_json: Json = False) -> No
     presence = RobotPresence(robots.folder.parent / "heard")
     for robot in robots.known().values():
         for name, one in robot.appliances.items():
+            sign = presence.last(robot.name, name)
             fields: dict[str, str | None] = {
                 "name": robot.name,
                 "state": "enrolled" if name in robot.connecting else "removed",
                 "group": robot.group,
                 "key": one.key,
                 "certificate": one.fingerprint,
-                "heard": _utc(presence.last(robot.name, name)),
+                "heard": _utc(sign and sign.at),
                 "certificate_ends": _utc(one.certificate_ends),
                 "appliance": name,
             }

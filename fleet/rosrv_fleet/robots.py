@@ -62,6 +62,7 @@ class Robots:
         self._again = 0.0
         self._robots: dict[str, Robot] = {}
         self._connecting: dict[str, Robot] = {}
+        self._since: dict[str, float] = {}
         self.unreadable: dict[str, str] = {}
 
     @property
@@ -103,7 +104,12 @@ class Robots:
         self._connecting = {
             one.fingerprint: robot for robot in robots.values() for one in robot.connecting.values()
         }
+        self._since = {one: self._since.get(one, clock.now()) for one in self._connecting}
         self._robots, self.unreadable = robots, unreadable
+
+    def accepted_since(self, fingerprint: str) -> float:
+        """Return the monotonic time since which a certificate was accepted by this process."""
+        return self._since.get(fingerprint, clock.now())
 
     def with_certificate(self, der: bytes) -> Robot | None:
         self.known()

@@ -5,9 +5,11 @@
 3. A segment counts as pushed only with a receipt on this disk that the collector's key has signed.
 4. On each new connection the collector reports what it has: it may have been restored from a backup.
 5. If the log was restored from a copy, pushing continues from the last checkpoint that log and collector share.
-6. While nothing waits, the robot reports so every minute, because a robot without records is not silent.
+6. While nothing waits, the robot reports so every minute, because a robot without records is not silent. When it is
+   switched off in order, it reports that as well, unless pushing fails.
 """
 
+import contextlib
 import gzip
 import os
 import random
@@ -24,6 +26,7 @@ from appliance.audit.log.log_database import LogUnreadableError, reading
 from appliance.audit.proof.copies import signed_checkpoints
 from appliance.base import clock
 from appliance.base.atomic_files import write_whole
+from appliance.base.system_errors import without_number
 from appliance.channel.messages import ForwardingReported
 from appliance.features.fleet.connection import CollectorConnection, CollectorError
 from appliance.formats.receipts import SegmentReceipt
@@ -84,7 +87,11 @@ class SegmentPusher:
         self._failures = 0
         return 0.0 if more else _IDLE_SECONDS
 
-    def close(self) -> None:
+    def close(self, *, stopped: bool = False) -> None:
+        if stopped and not self.progress.trouble:
+            # Without an answer, the collector will report this robot as silent.
+            with contextlib.suppress(CollectorError, OSError, ValueError):
+                self._report_presence(self._position or PushPosition(_NO_LOG), "&off=true")
         self.collector.close()
 
     def _begin(self) -> PushPosition:
@@ -128,13 +135,16 @@ class SegmentPusher:
         now = clock.now()
         if now < self._presence_due:
             return False
-        asked = f"v1/logs/{position.log}?upto={position.number}&idle=true"
-        head = msgspec.json.decode(self.collector.get(asked), type=StoredHead)
+        head = self._report_presence(position)
         self._presence_due = now + _PRESENCE_SECONDS * (0.8 + 0.4 * self.jitter())
         if head.number != position.number or (head.number and not head.hashes):
             self._position = None
         self.progress = msgspec.structs.replace(self.progress, trouble="")
         return False
+
+    def _report_presence(self, position: PushPosition, more: str = "") -> StoredHead:
+        asked = f"v1/logs/{position.log}?upto={position.number}&idle=true{more}"
+        return msgspec.json.decode(self.collector.get(asked), type=StoredHead)
 
     def _push_next(self) -> bool:
         position = self._position or self._begin()
@@ -247,7 +257,7 @@ class SegmentPusher:
         """Note the failure, and return a pause that grows, with jitter, so that robots do not return together."""
         self.collector.close()
         self._position = None
-        reason = str(error) or type(error).__name__
+        reason = without_number(error) or type(error).__name__
         if not self._failures:
             _log.error("segments are not pushed to the collector; it is tried again and again", reason=reason)
         pause = min(_LONGEST_PAUSE, _FIRST_PAUSE * 2.0 ** min(self._failures, 10))

@@ -87,7 +87,7 @@ class LogForwarder:
         self._failures = 0
         return 0.0 if more else _IDLE_SECONDS
 
-    def close(self) -> None:
+    def close(self, *, stopped: bool = False) -> None:  # noqa: ARG002  syslog has no message for it
         self.receiver.close()
         try:
             self._save(0.0)

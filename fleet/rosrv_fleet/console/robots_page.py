@@ -35,12 +35,14 @@ _TONES: dict[str, Tone] = {
     "never seen": "warn",
     "behind": "warn",
     "no segment yet": "warn",
+    "off": "plain",
     "complete": "good",
     "in force": "good",
 }
 _RENEWAL_SECONDS = 30 * 86_400.0
 _PROBLEMS = ("fork", "gap", "unhealthy", "silent", "certificate ends", "never seen", "behind")
 """The words for problems, the worst first."""
+_SHOWN = (*_PROBLEMS, "off", "in force")
 
 
 class RobotRow(NamedTuple):
@@ -58,6 +60,7 @@ class RobotRow(NamedTuple):
             ("gap", self.state.gaps),
             ("silent", self.state.silent),
             ("certificate ends", self.state.certificate_seconds < _RENEWAL_SECONDS),
+            ("off", self.state.off),
         )
         wrong = [word for word, wrong in found if wrong]
         return wrong or ["no segment yet" if self.state.number is None else "complete"]
@@ -122,7 +125,7 @@ def _summary(rows: Sequence[RobotRow], health: FleetHealth) -> str:
     found = Counter(word for one in rows for word in one.words)
     problems = sum(one.rank[0] < len(_PROBLEMS) for one in rows)
     numbers = [("", "enrolled", len(rows)), ("problems", "with problems", problems)]
-    numbers += [(word, word, found[word]) for word in (*_PROBLEMS, "in force") if found[word]]
+    numbers += [(word, word, found[word]) for word in _SHOWN if found[word]]
     items = "".join(
         f"<li>{link('/', f'{count:,} {label}', state=state)}</li>" for state, label, count in numbers
     )
@@ -132,7 +135,7 @@ def _summary(rows: Sequence[RobotRow], health: FleetHealth) -> str:
 
 def _filter(rows: Sequence[RobotRow], asked: Mapping[str, str]) -> str:
     groups = sorted({one.group for one in rows if one.group})
-    words = [("", "any"), ("problems", "any problem"), *((word, word) for word in (*_PROBLEMS, "in force"))]
+    words = [("", "any"), ("problems", "any problem"), *((word, word) for word in _SHOWN)]
     return (
         '<form class="filter" action="/" role="search" aria-label="Robots">'
         + field("name", asked["name"])

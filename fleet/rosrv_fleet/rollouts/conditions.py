@@ -1,7 +1,7 @@
 """Determine whether each robot of a group has the bundle that it should have. No I/O."""
 
 import enum
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import NamedTuple
 
 from rosrv_fleet.rollouts.machine import BundleRollout, HealthGates, RobotSeen, selected, unhealthy
@@ -16,6 +16,7 @@ class ConditionKind(enum.StrEnum):
     BEHIND = "behind"
     IN_FORCE = "in force"
     NO_BUNDLE = "no bundle"
+    OFF = "off"
 
 
 class RobotCondition(NamedTuple):
@@ -26,9 +27,9 @@ class RobotCondition(NamedTuple):
 
 
 def conditions(
-    rollout: BundleRollout | None, robots: Mapping[str, RobotSeen], now: float
+    rollout: BundleRollout | None, robots: Mapping[str, RobotSeen], now: float, off: Collection[str] = ()
 ) -> dict[str, RobotCondition]:
-    """Return the condition of each robot. `rollout` is the group's last one.
+    """Return the condition of each robot. `rollout` is the group's last one; `off` robots are switched off.
 
     After a revert, reports about the reverted bundle no longer count.
     """
@@ -39,6 +40,8 @@ def conditions(
         wanted = "" if rollout is None else selected(rollout, robot, seen)
         if not seen.seen:
             found[robot] = RobotCondition(ConditionKind.NEVER_SEEN, "it never reported")
+        elif now - seen.seen > silent and robot in off:
+            found[robot] = RobotCondition(ConditionKind.OFF, "it was switched off in order")
         elif now - seen.seen > silent:
             found[robot] = RobotCondition(ConditionKind.SILENT, f"no report for {now - seen.seen:.0f} s")
         elif robot in sick:

@@ -6,7 +6,7 @@ collector or the database was down counts neither as silence nor as health of ro
 
 import asyncio
 import datetime
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -63,7 +63,8 @@ class SelectionListener:
 class BundleService:
     """The published bundles and their rollouts. Orders raise `RolloutRefusedError`.
 
-    `folder` has the operator's publication; `key` is the file of the timestamp's key.
+    `folder` has the operator's publication; `key` is the file of the timestamp's key. `off` returns the robots that
+    were switched off in order.
     """
 
     def __init__(
@@ -73,12 +74,15 @@ class BundleService:
         store: RolloutStore,
         members: Members,
         clock: Callable[[], float] = clock.wall,
+        *,
+        off: Callable[[], Collection[str]] = frozenset,
     ) -> None:
         self.folder = folder
         self.store = store
         self._key = key
         self._members = members
         self._clock = clock
+        self._off = off
         self._ticked = 0.0  # the time of the last tick that reached the database
         self._deaf = (0.0, 0.0)  # the beginning of the last time in which no robot was heard, and its seconds
         self.publication: PublishedBundles | None = None
@@ -220,7 +224,7 @@ class BundleService:
     def conditions(self, group: RobotGroup) -> dict[str, RobotCondition]:
         stored = self.rollouts.get(group)
         rollout = None if stored is None else stored.rollout
-        return conditions(rollout, self._heard(group), self._clock())
+        return conditions(rollout, self._heard(group), self._clock(), self._off())
 
     # --- inside ---
 

@@ -186,3 +186,20 @@ def test_a_silent_robot_is_reported(site: FleetSite, make_robot: MakeRobot) -> N
     site.start()
     eventually(lambda: site.health()["robots"][0]["silent"], "the robot is silent")
     assert 'rosrv_fleet_robot_silent{robot="arm1"} 1.0' in site.get("/metrics").text
+
+
+def test_a_robot_that_was_switched_off_is_off(site: FleetSite, make_robot: MakeRobot) -> None:
+    robot = make_robot("arm1")
+    robot.record(5)
+    robot.push()
+    pusher = robot.pusher()
+    pusher.close(stopped=True)
+    site.stop()
+    site.write_config(silent_seconds=0.1)
+    site.start()
+    state = site.health()["robots"][0]
+    assert (state["silent"], state["off"]) == (False, True)
+    assert 'rosrv_fleet_robot_off{robot="arm1"} 1.0' in site.get("/metrics").text
+    robot.push()
+    assert not site.health()["robots"][0]["off"]
+    eventually(lambda: site.health()["robots"][0]["silent"], "the robot is silent")

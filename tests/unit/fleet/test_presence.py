@@ -9,63 +9,97 @@ from rosrv_fleet.presence import RobotPresence
 from rosrv_fleet.robots import Robots
 from rosrv_fleet.segment_store import SegmentStore
 
+from appliance.base.clock import wall
 from tests.support.enrolled_robots import JoiningAppliance, enrolled_robots
-from tests.support.virtual_clock import let_time_pass
+from tests.support.virtual_clock import let_time_pass, set_wall
 
 
-def state_of(data: Path, presence: RobotPresence) -> RobotState:
-    up = SimpleNamespace(trouble=None)
-    parts = SimpleNamespace(
-        store=SegmentStore(data, 0), robots=Robots(data / "robots"), presence=presence, indexer=up, pruner=up,
-        config=SimpleNamespace(silent_seconds=600.0),
-    )  # fmt: skip
-    (state,) = health_of(cast(Collector, parts)).robots
-    return state
+class RunningCollector:
+    """The parts of a collector that judge silence, as after its start."""
+
+    def __init__(self, data: Path) -> None:
+        self._store = SegmentStore(data, 0)
+        self._robots = Robots(data / "robots")
+        self._robots.known()
+        self.presence = RobotPresence(data / "heard")
+
+    def state(self) -> RobotState:
+        up = SimpleNamespace(trouble=None)
+        parts = SimpleNamespace(
+            store=self._store, robots=self._robots, presence=self.presence, indexer=up, pruner=up,
+            config=SimpleNamespace(silent_seconds=600.0),
+        )  # fmt: skip
+        (state,) = health_of(cast(Collector, parts)).robots
+        return state
 
 
 def test_a_quiet_robot_is_not_silent(tmp_path: Path) -> None:
     enrolled_robots(tmp_path, "arm7")
-    presence = RobotPresence(tmp_path / "heard")
+    collector = RunningCollector(tmp_path)
     let_time_pass(599)
-    assert not state_of(tmp_path, presence).silent
+    assert not collector.state().silent
     let_time_pass(2)
-    assert state_of(tmp_path, presence).silent
-    presence.heard("arm7", "a")
+    assert collector.state().silent
+    collector.presence.heard("arm7", "a")
     let_time_pass(5)
-    for one in (presence, RobotPresence(tmp_path / "heard")):
-        state = state_of(tmp_path, one)
-        assert not state.silent
-        assert state.heard_seconds == pytest.approx({"a": 5})
+    for one in (collector, RunningCollector(tmp_path)):
+        assert not one.state().silent
+        assert one.state().heard_seconds == pytest.approx({"a": 5})
     let_time_pass(601)
-    assert state_of(tmp_path, presence).silent
+    assert collector.state().silent
 
 
 def test_the_time_of_a_stopped_collector_is_not_silence(tmp_path: Path) -> None:
     enrolled_robots(tmp_path, "arm7")
     let_time_pass(86_400)
-    presence = RobotPresence(tmp_path / "heard")
-    assert not state_of(tmp_path, presence).silent
+    collector = RunningCollector(tmp_path)
+    assert not collector.state().silent
     let_time_pass(601)
-    assert state_of(tmp_path, presence).silent
+    assert collector.state().silent
+
+
+@pytest.mark.parametrize("years", [-3, 3], ids=["back", "ahead"])
+def test_a_set_clock_makes_no_robot_silent_and_hides_none(years: float, tmp_path: Path) -> None:
+    enrolled_robots(tmp_path, "arm7")
+    collector = RunningCollector(tmp_path)
+    collector.presence.heard("arm7", "a")
+    set_wall(wall() + years * 365 * 86_400)
+    assert not collector.state().silent
+    let_time_pass(601)
+    assert collector.state().silent
+
+
+def test_a_robot_that_was_switched_off_is_not_silent(tmp_path: Path) -> None:
+    enrolled_robots(tmp_path, "arm7")
+    collector = RunningCollector(tmp_path)
+    collector.presence.heard("arm7", "a", off=True)
+    let_time_pass(86_400)
+    for one in (collector, RunningCollector(tmp_path)):
+        assert (one.state().silent, one.state().off) == (False, True)
+    collector.presence.heard("arm7", "a")
+    for one in (collector, RunningCollector(tmp_path)):
+        assert not one.state().off
+    let_time_pass(601)
+    assert (collector.state().silent, collector.state().off) == (True, False)
 
 
 def test_each_appliance_of_a_pair_is_heard(tmp_path: Path) -> None:
     robots = Robots(tmp_path / "robots")
     JoiningAppliance().join(robots)
     JoiningAppliance().join(robots, "b")
-    presence = RobotPresence(tmp_path / "heard")
+    collector = RunningCollector(tmp_path)
     let_time_pass(700)
-    presence.heard("arm7", "b")
-    state = state_of(tmp_path, presence)
-    assert (state.silent, state.heard_seconds) == (True, {"a": None, "b": 0})
-    presence.heard("arm7", "a")
-    assert not state_of(tmp_path, presence).silent
+    collector.presence.heard("arm7", "b", off=True)
+    state = collector.state()
+    assert (state.silent, state.off, state.heard_seconds) == (True, False, {"a": None, "b": 0})
+    collector.presence.heard("arm7", "a")
+    assert (collector.state().silent, collector.state().off) == (False, True)
 
 
 def test_a_full_disk_makes_no_robot_silent(tmp_path: Path) -> None:
     enrolled_robots(tmp_path, "arm7")
     (tmp_path / "heard").write_text("a file, so that no folder can be made")
-    presence = RobotPresence(tmp_path / "heard")
+    collector = RunningCollector(tmp_path)
     let_time_pass(700)
-    presence.heard("arm7", "a")
-    assert not state_of(tmp_path, presence).silent
+    collector.presence.heard("arm7", "a")
+    assert not collector.state().silent

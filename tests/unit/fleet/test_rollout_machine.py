@@ -210,6 +210,8 @@ def test_the_condition_is_the_worst_that_applies(seen: RobotSeen, kind: str, why
 
 
 def test_without_a_rollout_a_robot_is_not_behind() -> None:
+    off = conditions(None, {"r2": RobotSeen(5), "r3": RobotSeen(1000)}, 1000, {"r2", "r3"})
+    assert [one.kind for one in off.values()] == ["off", "no bundle"]
     found = conditions(None, {"r0": RobotSeen(1000), "r1": RobotSeen(1000, OLD), "r2": RobotSeen(5)}, 1000)
     assert [one.kind for one in found.values()] == ["no bundle", "in force", "silent"]
 

@@ -31,6 +31,7 @@ class Collector(CollectorConnection):
         self.pushed: list[int] = []
         self.asked = 0
         self.idle: list[str] = []  # the logs whose robot stated that nothing waits
+        self.off: list[str] = []  # those whose robot is switched off
         self.head: Callable[[int], dict[str, Any]] = self.honest_head
         self.changes: dict[str, Any] = {}
         self.refusal: CollectorError | None = None
@@ -49,6 +50,7 @@ class Collector(CollectorConnection):
         log, _, query = path.removeprefix("v1/logs/").partition("?")
         asked = dict(word.split("=") for word in query.split("&"))
         self.idle += [log] if "idle" in asked else []
+        self.off += [log] if "off" in asked else []
         return json.dumps({"robot": "arm1", "log": ""} | self.head(int(asked["upto"]))).encode()
 
     def put(self, path: str, content: Iterator[bytes], size: int, headers: Any = ()) -> bytes:
@@ -249,3 +251,27 @@ def test_a_standby_without_a_log_is_present(collector: Collector, make: Make, pa
     (path.parent / "state" / "position.json").write_text("{}")
     pusher.step()
     assert "there is no audit log yet" in pusher.progress.trouble
+
+
+def test_a_robot_that_is_switched_off_reports_it(collector: Collector, make: Make) -> None:
+    """The end of the process alone does not mean this: the supervisor may have been killed."""
+    pusher = make()
+    while pusher.step() == 0:
+        pass
+    pusher.close()
+    assert collector.off == []
+    pusher.close(stopped=True)
+    assert len(collector.off) == 1
+    collector.refusal = CollectorError("gone")
+    pusher.close(stopped=True)
+    assert len(collector.off) == 1
+
+
+def test_a_robot_whose_log_is_not_collected_does_not_excuse_its_silence(
+    collector: Collector, make: Make
+) -> None:
+    collector.changes = {"segment": "0" * 64}
+    pusher = make()
+    pusher.step()
+    pusher.close(stopped=True)
+    assert (pusher.progress.trouble != "", collector.off) == (True, [])
