@@ -37,7 +37,7 @@ class Child:
         self._control = Link(said, lost, took)
         self.ended = asyncio.Event()
         self.stopped = False
-        """Whether the supervisor ended this process in order; it then ends all others as well."""
+        """Whether the supervisor ended this process because the whole appliance is stopped by order."""
 
     def attach(self, ready: Ready) -> None:
         self._lifeline.attach(asyncio.get_running_loop(), self._supervisor_said, self.ended.set)
@@ -65,8 +65,8 @@ class Child:
         match message:
             case Ping(number):
                 self._answer(Pong(number))
-            case Stop():
-                self.stopped = True
+            case Stop(failed):
+                self.stopped = not failed
                 self.ended.set()
             case LinkOpened(role="control"):
                 self._control.attach(Channel(socket.socket(fileno=descriptors[0]), self._link))

@@ -29,7 +29,7 @@ class Forwarder(Protocol):
         """Forward a part; return the seconds to wait before the next call."""
 
     def close(self, *, stopped: bool = False) -> None:
-        """Close the connection. `stopped`: the whole appliance is stopped in order."""
+        """Close the connection. `stopped`: the whole appliance is stopped by order."""
 
 
 class ForwardingProcess:

@@ -17,23 +17,24 @@ _LAST_SECONDS = 1.0
 log = structlog.get_logger()
 
 
-async def end_all(slots: Sequence[ProcessSlot], process_died: asyncio.Event) -> None:
+async def end_all(slots: Sequence[ProcessSlot], process_died: asyncio.Event, *, failed: bool = False) -> None:
     """End all processes; no process may start. `process_died` is set after each death, when its slot is free."""
+    stop = Stop(failed)
     for slot in slots:
         if slot.due is not None:
             slot.due.cancel()
-    await _end([slot for slot in slots if not slot.role.outlives_control], _STOP_SECONDS, process_died)
-    await _end(slots, _LAST_SECONDS, process_died)
+    await _end([slot for slot in slots if not slot.role.outlives_control], stop, _STOP_SECONDS, process_died)
+    await _end(slots, stop, _LAST_SECONDS, process_died)
 
 
-async def _end(slots: Sequence[ProcessSlot], seconds: float, process_died: asyncio.Event) -> None:
+async def _end(slots: Sequence[ProcessSlot], stop: Stop, seconds: float, process_died: asyncio.Event) -> None:
     for slot in slots:
         if slot.process is None:
             continue
         if slot.process.is_program:
             slot.process.kill(signal.SIGTERM)
         else:
-            slot.process.send(Stop())
+            slot.process.send(stop)
     if await _all_gone(slots, seconds, process_died):
         return
     _signal(slots, signal.SIGTERM)

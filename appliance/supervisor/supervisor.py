@@ -667,13 +667,14 @@ class Supervisor:
     # --- ending -------------------------------------------------------------------------------------------
 
     async def end(self) -> None:
+        failed = self.failure is not None or not self.stopping.is_set()
         self.stopping.set()
         for task in self._tasks:
             task.cancel()
         for slot in self.slots if self._gate.suspended else ():
             if slot.process is not None and slot.role.serves_robot:
                 slot.process.kill()  # it is stopped, and cannot end in order
-        await end_all(self.slots, self._process_died)
+        await end_all(self.slots, self._process_died, failed=failed)
 
 
 def _log_fault(_loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:

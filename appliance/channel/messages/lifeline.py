@@ -23,7 +23,9 @@ class Pong(Message):
 
 
 class Stop(Message):
-    """The child must end within 3 s."""
+    """The child must end within 3 s. `failed`: the whole appliance ends because of a failure, not by order."""
+
+    failed: bool = False
 
 
 class Ready(Message):

@@ -79,6 +79,8 @@ def test_an_appliance_pushes_its_log(site: FleetSite) -> None:
         )  # the next one seals that
         eventually(lambda: collector_state(appliance)["sequence"] >= last, "every record is collected")
         assert "rosrv_collector_up 1.0" in appliance.rest().get("/metrics").body.decode()
+        assert not site.health()["robots"][0]["off"]
+    assert site.health()["robots"][0]["off"]  # it was stopped in order
     (proof,) = map(json.loads, site.run("verify", "--json").stdout.splitlines())
     assert (proof["ok"], proof["missing"]) == (True, 0)
     assert proof["last"] >= last

@@ -77,6 +77,16 @@ def test_it_answers_pings_and_stops() -> None:
         assert await bench.heard.get() == Pong(7)
         bench.lifeline.send(Stop())
         await bench.child.ended.wait()
+        assert bench.child.stopped
+
+    run(work)
+
+
+def test_a_failure_of_the_appliance_is_not_a_stop_by_order() -> None:
+    async def work(bench: Bench) -> None:
+        bench.lifeline.send(Stop(failed=True))
+        await bench.child.ended.wait()
+        assert not bench.child.stopped
 
     run(work)
 
@@ -85,6 +95,7 @@ def test_it_ends_with_its_supervisor() -> None:
     async def work(bench: Bench) -> None:
         bench.lifeline.close()
         await bench.child.ended.wait()
+        assert not bench.child.stopped
 
     run(work)
 

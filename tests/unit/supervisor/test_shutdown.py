@@ -4,6 +4,7 @@ from typing import cast
 
 import pytest
 
+from appliance.channel.messages import Stop
 from appliance.supervisor import shutdown
 from appliance.supervisor.process_handle import ProcessHandle
 from appliance.supervisor.process_slot import ProcessSlot
@@ -18,6 +19,7 @@ class Crowd:
         self.slots: list[ProcessSlot] = []
         self.died = asyncio.Event()
         self.done: list[tuple[str, str]] = []
+        self.messages: list[object] = []
 
     def add(self, name: str, ends_by: str, *, is_program: bool = False, last: bool = False) -> None:
         role = Role(name=name, user="rosrv", part=name, outlives_control=last)
@@ -37,6 +39,7 @@ class Process:
         self.crowd, self.slot, self.ends_by, self.is_program = crowd, slot, ends_by, is_program
 
     def send(self, message: object) -> None:
+        self.crowd.messages.append(message)
         self._suffer(type(message).__name__)
 
     def kill(self, number: signal.Signals = signal.SIGKILL) -> None:
@@ -82,6 +85,12 @@ def test_an_unkillable_process_does_not_delay_the_end(crowd: Crowd) -> None:
     done = crowd.end()
     assert ("control", "SIGKILL") in done
     assert done.index(("rosmaster", "Stop")) > done.index(("control", "SIGKILL"))
+
+
+def test_each_process_learns_of_a_failure(crowd: Crowd) -> None:
+    crowd.add("fleet", "Stop")
+    autojump.run(shutdown.end_all(crowd.slots, crowd.died, failed=True))
+    assert crowd.messages == [Stop(failed=True)]
 
 
 async def test_a_pending_restart_is_cancelled(crowd: Crowd) -> None:

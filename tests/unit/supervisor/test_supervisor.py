@@ -222,3 +222,21 @@ async def _end_by_themselves(supervisor: Supervisor, monkeypatch: pytest.MonkeyP
     assert slot.due is not None  # each death is followed by a new start
     slot.due.cancel()
     supervisor.kept.close()
+
+
+@pytest.mark.parametrize(("end", "failed"), [("order", False), ("failure", True), ("defect", True)], ids=str)
+async def test_the_processes_learn_whether_the_appliance_is_stopped_by_order(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, end: str, failed: bool
+) -> None:
+    """Only then the pusher reports to the collector that the robot is switched off."""
+    found: list[bool] = []
+
+    async def end_all(*_processes: object, failed: bool) -> None:
+        found.append(failed)
+
+    monkeypatch.setattr(module, "end_all", end_all)
+    supervisor = made(tmp_path, CONTROL)
+    if end != "defect":
+        supervisor.stop("no master" if end == "failure" else None)
+    await supervisor.end()
+    assert found == [failed]
