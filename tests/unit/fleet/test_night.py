@@ -73,7 +73,11 @@ class _Events:
         return lambda: robot.record(self._chance.randint(1, 20))
 
     def _set_clock(self, seconds: float) -> Callable[[], None]:
-        return lambda: self._night.clock.set_wall(self._night.clock.wall_ns() / 1e9 + seconds)
+        def set_clock() -> None:
+            self._night.clock.set_wall(self._night.clock.wall_ns() / 1e9 + seconds)
+            self._night.pass_time(1)  # a scrape before the robots are due again
+
+        return set_clock
 
     def _restart(self, at: float) -> None:
         down = self._chance.choice((0, 2 * _STEP))
