@@ -93,9 +93,14 @@ def routes(services: Services, answers: Mapping[str, Answer]) -> Routes:
     assert answers.keys() <= {one.name for one in OPERATIONS}  # noqa: S101  no name is misspelt
     for operation in sorted(OPERATIONS, key=lambda one: "{" in one.path):  # literal paths before parameters
         own = answers.get(operation.name)
-        if operation.name and (own is not None or not operation.dry_run):  # only an answer of its own can try
+        if is_offered(operation, own):
             _add(router, services, operation, own)
     return router
+
+
+def is_offered(operation: Operation, own: Answer | None) -> bool:
+    """Whether the operation is a route. Only an answer of its own tells a dry run from a load."""
+    return bool(operation.name) and (own is not None or not operation.dry_run)
 
 
 def _add(router: Routes, services: Services, operation: Operation, own: Answer | None) -> None:
