@@ -100,6 +100,7 @@ class FeaturePart:
     """
     limits: "Callable[[], tuple[LimitUse, ...]]" = lambda: ()
     details: "RecordDetails | None" = None
+    """Returns more details of denials and of records above info."""
     called: "Mapping[str, Callable[[OwnServiceCalled], Awaitable[OwnServiceAnswered]]]" = field(
         default_factory=dict
     )

@@ -1,6 +1,6 @@
 """Make audit records of events in control, and block answers while the log cannot be written."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from appliance.audit.log.events import SEVERITIES
@@ -24,8 +24,13 @@ class Asker(NamedTuple):
     node: str | None = None
 
 
+_ORDINARY = frozenset({Severity.DEBUG, Severity.INFO})
+
 RecordDetails = Callable[[str, str | None, Severity, str | None, int], dict[str, str]]
-"""Returns what features add to the details of a record, by event, decision, severity, host and time."""
+"""Returns what features add to the details of a record, by event, decision, severity, host and time.
+
+Only denials and records above info have such details, so an allowed call runs no code of a feature.
+"""
 
 
 class AuditTrail:
@@ -100,7 +105,7 @@ class AuditTrail:
             detail["approval"] = f"{decision.asks.category} {decision.asks.resource}"
         now, taken = clock.wall_ns(), clock.now_ns() - asker.arrived
         severity = Severity.INFO if decision.allowed and not decision.would_deny else Severity.WARNING
-        for details in self._details:
+        for details in self._completing(word, severity):
             detail |= details("decision", word, severity, asker.host, now)
         unknown = self._marked(asker.host, word, detail)
         record = AuditRecord(
@@ -147,7 +152,7 @@ class AuditTrail:
         """
         now, severity = clock.wall_ns(), severity or SEVERITIES.get(event, Severity.INFO)
         detail = {**(more or {}), **detail}
-        for details in self._details:
+        for details in self._completing(decision, severity):
             detail |= details(event, decision, severity, host, now)
         unknown = self._marked(host, decision, detail)
         return self._log.record(
@@ -169,6 +174,9 @@ class AuditTrail:
                 folds=reads or not (whole or decision or host is None or not self.owing(host)),
             )
         )
+
+    def _completing(self, decision: str | None, severity: Severity) -> Sequence[RecordDetails]:
+        return self._details if decision == "deny" or severity not in _ORDINARY else ()
 
     def _marked(self, host: str | None, decision: str | None, detail: dict[str, Any]) -> bool:
         if host is None or decision != "deny" or self._log.budget.quota_class(host) is not QuotaClass.UNKNOWN:

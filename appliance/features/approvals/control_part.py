@@ -24,7 +24,7 @@ async def inherit(base: "Foundation", parts: "Parts") -> FeaturePart:
     The first number is random, so an operator who answers after a restart does not approve another call.
     """
     relay, policy = parts.endpoints.relay, base.policies.policy
-    stop = MotionStop(relay.stop, base.trail, policy)
+    stop = MotionStop(relay.taps.stop, base.trail, policy)
     lost: Commands = set()
     if any(rule.asked for rule in policy().rules(Category.PUBLISH)):
         lost = published_before(base.store, lambda host, topic: _asks(policy(), host, topic))
@@ -37,7 +37,7 @@ async def inherit(base: "Foundation", parts: "Parts") -> FeaturePart:
         decide_again=base.policies.decide_again,
         carried_out=relay.carried_out,
         bearers=lambda: base.bearers()(),  # noqa: PLW0108  set later
-        guards=relay.guards,
+        guards=relay.taps.guards,
     )
 
     return FeaturePart(

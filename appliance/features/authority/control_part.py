@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 async def inherit(base: "Foundation", parts: "Parts") -> FeaturePart:
     """Begin without a holder of any group, and stop motions that earlier holders commanded."""
     relay, policy = parts.endpoints.relay, base.policies.policy
-    stop = MotionStop(relay.stop, base.trail, policy)
+    stop = MotionStop(relay.taps.stop, base.trail, policy)
     lost: Commands = set()
     if policy().authority:
         lost = published_before(base.store, lambda _host, topic: policy().commanded(topic) is not None)

@@ -45,7 +45,7 @@ class TopicLooks:
                 f"the messages of {topic.name} do not pass the appliance (relaying: monitored), so it cannot show them"
             )
         self._record_look(topic.name, who)
-        seen = await self._parts.endpoints.relay.look(
+        seen = await self._parts.endpoints.relay.taps.look(
             topic.name, request.messages, request.seconds, latched=request.latched
         )
         registry = self._parts.core.registry

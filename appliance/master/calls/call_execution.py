@@ -158,7 +158,7 @@ class Execution:
                 return await visit.bulk.in_thread(call.attempt, visit.caller, params)
             return call.attempt(visit.caller, params)
         except PeerError as error:
-            return self._malformed(call, visit.caller, claimed_name(params), error)
+            return self._malformed(call, visit.caller._replace(caller_id=claimed_name(params)), error)
 
     async def answer(self, visit: ServedRequest, attempt: Attempt) -> Value:
         if attempt.call.tells and self.parameters.weight_of_answer(attempt) >= self.large:
@@ -321,17 +321,7 @@ class Execution:
         caller, call = attempt.caller, attempt.call
         match error:
             case HostFullError() | NoPortError() | LimitReachedError():
-                record = self.trail.happened(
-                    "limit exceeded",
-                    str(error),
-                    severity=Severity.ALARM,
-                    decision="deny",
-                    host=caller.peer.text,
-                    caller_id=caller.caller_id,
-                    category=call.row.category.value,
-                    resource=call.name,
-                    call=call.name,
-                )
+                record = self._rejected("limit exceeded", error, call, caller, Severity.ALARM)
                 return [0, with_record(str(error), record), call.denial]
             case NodeElsewhereError():
                 decision = Decision(False, None, str(error))
@@ -340,10 +330,9 @@ class Execution:
                 )
                 return [0, self._denial_text(decision, record), call.denial]
             case PeerError():
-                return self._malformed(call, caller, caller.caller_id, error)
+                return self._malformed(call, caller, error)
             case EncodingError():
-                wrong = ProtocolError(f"cannot be forwarded: {error}")
-                return self._malformed(call, caller, caller.caller_id, wrong)
+                return self._malformed(call, caller, ProtocolError(f"cannot be forwarded: {error}"))
             case CallFailedError():
                 # The text contains the hidden ROS master's address, so it is only logged.
                 _log.error("call failed", call=call.name, caller_id=caller.caller_id, error=str(error))
@@ -356,15 +345,26 @@ class Execution:
         record = self.trail.decided(caller.asker, method, Category.COMMAND.value, method[:200], decision)
         return [0, self._denial_text(decision, record), 0]
 
-    def _malformed(self, call: RosCall[object], caller: Caller, claimed: str, error: PeerError) -> Answer:
-        self.trail.happened(
-            "malformed",
+    def _malformed(self, call: RosCall[object], caller: Caller, error: PeerError) -> Answer:
+        self._rejected("malformed", error, call, caller)
+        return [-1, str(error), call.denial]
+
+    def _rejected(
+        self,
+        event: str,
+        error: Exception,
+        call: RosCall[object],
+        caller: Caller,
+        severity: Severity | None = None,
+    ) -> str:
+        return self.trail.happened(
+            event,
             str(error),
+            severity=severity,
             decision="deny",
             host=caller.peer.text,
-            caller_id=claimed,
+            caller_id=caller.caller_id,
             category=call.row.category.value,
             resource=call.name,
             call=call.name,
         )
-        return [-1, str(error), call.denial]

@@ -102,13 +102,14 @@ class RelayControl:
     _posts: tuple[RelayOutbox, ...] = field(init=False)
     _asking: set[asyncio.Task[None]] = field(default_factory=set)
     _moving: set[Resource] = field(default_factory=set)
-    _taps: TapRequests = field(default_factory=TapRequests)
+    taps: TapRequests = field(init=False)
 
     def __post_init__(self) -> None:
         self._posts = tuple(
             RelayOutbox(index, partial(self._received, index), partial(self._lost, index))
             for index in range(self.allocation.relays)
         )
+        self.taps = TapRequests(lambda topic: self._post(TOPIC, topic).send)
 
     @property
     def presence(self) -> str:
@@ -179,20 +180,6 @@ class RelayControl:
             await asyncio.sleep(_AGAIN_SECONDS)
         if waiting := [order for post in posts for order in post.orders()]:
             await asyncio.wait(waiting)
-
-    async def stop(self, topic: str) -> list[str]:
-        """Return the names of the monitors that have a safe message and send it."""
-        return await self._taps.stop(topic, self._post(TOPIC, topic).send, begin=True) or []
-
-    async def guards(self, topic: str) -> list[str] | None:
-        """Return the names of monitors with a safe message; None if the relay does not answer."""
-        return await self._taps.stop(topic, self._post(TOPIC, topic).send, begin=False)
-
-    async def look(
-        self, topic: str, count: int, seconds: float, *, latched: bool
-    ) -> list[messages.MessageSeen]:
-        send = self._post(TOPIC, topic).send
-        return await self._taps.look(topic, count, seconds, send, latched=latched)
 
     def live_resources(self) -> set[Resource]:
         return {
@@ -343,39 +330,21 @@ class RelayControl:
                 if (node := self.registry.by_key(message.key)) is not None:
                     self.carried.upstream_lost(message, str(node.host))
                     self.broken(node)
-            case messages.LatchRefused() | messages.MessagesLimited():
-                self._held_back(message)
-            case messages.TrafficReported():
-                self.carried.reported(message.rows, message.over)
-                self.carried.unrecorded(message.unrecorded)
-                self.carried.memory[post.index] = message.memory
-            case messages.ConnectionOpened():
-                self.carried.opened(post.index, message)
-            case messages.ConnectionClosed():
-                self.carried.closed(post.index, message)
-            case messages.ConnectionRefused():
-                self.carried.refused(message)
+            case messages.MessagesLimited():
+                for row in message.rows:
+                    self.carried.limited(row, self.policy().limit_rule(row.topic) if row.topic else None)
             case messages.OrdersCarriedOut():
                 post.carried_out()
             case messages.MessageSeen() | messages.StopBegun():
-                self._taps.seen(message)
-            case messages.PublicationRefused():
-                self.carried.publication_refused(message)
-            case _:
-                self.monitors().received(message, post.index)
+                self.taps.seen(message)
+            case _ if not self.carried.received(index, message):
+                self.monitors().received(message, index)
 
     async def _answer(self, post: RelayOutbox, asked: messages.UpstreamWanted | OwnCall) -> None:
         if isinstance(asked, OwnCall):
             post.send(await self.own_call(asked))
         else:
             await self._find_upstream(post, asked.key, asked.topic)
-
-    def _held_back(self, message: messages.LatchRefused | messages.MessagesLimited) -> None:
-        if isinstance(message, messages.MessagesLimited):
-            for row in message.rows:
-                self.carried.limited(row, self.policy().limit_rule(row.topic) if row.topic else None)
-        elif (node := self.registry.by_key(message.key)) is not None:
-            self.carried.latch_refused(message, str(node.host))
 
     async def _find_upstream(self, post: RelayOutbox, key: str, topic: str) -> None:
         incarnation = self.registry.by_key(key)

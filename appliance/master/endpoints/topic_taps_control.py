@@ -16,25 +16,24 @@ class TooManyTapsError(Exception):
 
 
 class TapRequests:
-    """The open taps, and the open requests for the safe messages of monitors."""
+    """The open taps, and the open requests for the safe messages of monitors.
 
-    def __init__(self) -> None:
+    `sender(topic)` returns the function that sends a message to the relay that carries the topic.
+    """
+
+    def __init__(self, sender: Callable[[str], Callable[[messages.Message], bool]]) -> None:
+        self._sender = sender
         self._number = 0
         self._open: dict[int, tuple[int, list[messages.MessageSeen], asyncio.Event]] = {}
         self._stops: dict[int, asyncio.Future[list[str]]] = {}
 
     async def look(
-        self,
-        topic: str,
-        count: int,
-        seconds: float,
-        send: Callable[[messages.Message], bool],
-        *,
-        latched: bool,
+        self, topic: str, count: int, seconds: float, *, latched: bool
     ) -> list[messages.MessageSeen]:
         """Return the next messages, fewer after the time limit. Raises `TooManyTapsError`."""
         if len(self._open) >= MOST:
             raise TooManyTapsError(f"{MOST} queries of topics' messages are running: try again")
+        send = self._sender(topic)
         self._number += 1
         number, seen, enough = self._number, list[messages.MessageSeen](), asyncio.Event()
         self._open[number] = count, seen, enough
@@ -49,16 +48,21 @@ class TapRequests:
             send(messages.LookEnded(number))
         return seen
 
-    async def stop(
-        self, topic: str, send: Callable[[messages.Message], bool], *, begin: bool
-    ) -> list[str] | None:
-        """Return the monitors with a safe message, which they send if `begin`; None if the relay does not answer."""
+    async def stop(self, topic: str) -> list[str]:
+        """Return the names of the monitors that have a safe message and send it."""
+        return await self._safe_messages(topic, begin=True) or []
+
+    async def guards(self, topic: str) -> list[str] | None:
+        """Return the names of monitors with a safe message; None if the relay does not answer."""
+        return await self._safe_messages(topic, begin=False)
+
+    async def _safe_messages(self, topic: str, *, begin: bool) -> list[str] | None:
         self._number += 1
         number = self._number
         begun: asyncio.Future[list[str]] = asyncio.get_running_loop().create_future()
         self._stops[number] = begun
         try:
-            if not send(messages.StopWanted(number, topic, begin)):
+            if not self._sender(topic)(messages.StopWanted(number, topic, begin)):
                 return None
             async with asyncio.timeout(_STOP_SECONDS):
                 return await begun

@@ -137,6 +137,28 @@ class RelayTraffic:
             name = carried[1] if carried[1] in self.past or len(self.past) < MOST_RESOURCES else OTHERS
             self.past.setdefault(name, Traffic()).include(self.traffic.pop(carried))
 
+    def received(self, relay: int, message: messages.Message) -> bool:
+        """Take a report of a relay; return False for another message."""
+        match message:
+            case messages.TrafficReported():
+                self.reported(message.rows, message.over)
+                self.unrecorded(message.unrecorded)
+                self.memory[relay] = message.memory
+            case messages.ConnectionOpened():
+                self.opened(relay, message)
+            case messages.ConnectionClosed():
+                self.closed(relay, message)
+            case messages.ConnectionRefused():
+                self.refused(message)
+            case messages.PublicationRefused():
+                self.publication_refused(message)
+            case messages.LatchRefused():
+                if (node := self._registry.by_key(message.key)) is not None:
+                    self.latch_refused(message, str(node.host))
+            case _:
+                return False
+        return True
+
     def reported(self, rows: list[TopicTraffic], over: float = 1.0) -> None:
         now = clock.now()
         for row in rows:

@@ -92,8 +92,16 @@ def test_details_of_features_are_added_to_a_record() -> None:
     log = Log()
     one = trail(log, deny=False)
     one.add_details(lambda event, *_: {"kept": f"in {event}"})
-    one.happened("message dropped", "too fast", host="10.0.0.9", more={"kept": "forged"})
-    assert [record.detail["kept"] for record in log.records] == ["in message dropped"]
+    for severity in (Severity.NOTICE, Severity.INFO):
+        one.happened(
+            "message dropped", "too fast", severity=severity, host="10.0.0.9", more={"kept": "forged"}
+        )
+    one.happened("malformed", "no XML", decision="deny", host="10.0.0.9")
+    assert [record.detail["kept"] for record in log.records] == [
+        "in message dropped",
+        "forged",
+        "in malformed",
+    ]
 
 
 def test_records_that_the_log_has_yet_to_count_are_not_owed() -> None:

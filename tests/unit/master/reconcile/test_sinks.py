@@ -120,7 +120,7 @@ async def test_an_order_reaches_a_relay_that_does_not_read() -> None:
     world = await ControlParts.begun()
     world.full = True
     order = asyncio.ensure_future(world.relay.carried_out())
-    stop = asyncio.ensure_future(world.relay.stop("/t"))
+    stop = asyncio.ensure_future(world.relay.taps.stop("/t"))
     await asyncio.sleep(1)
     assert {messages.OrdersAsked, messages.StopWanted} <= {type(seen) for seen in world.seen}
     world.start_relay()
