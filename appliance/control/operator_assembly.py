@@ -41,7 +41,7 @@ def make_operators(base: Foundation, parts: Parts) -> Operators:
     tokens = TokenOrders(
         base.store, trail, ends_of_tokens, lambda: rest().state_tokens(), sessions=base.features.sessions
     )
-    base.bearers.set(tokens.usable)
+    base.features.bearers.set(tokens.usable)
     clock = ClockCheck(trail, lambda: base.audit.ids.ahead)
     switched_off = SwitchedOffWatch(
         parts.monitors, base.policies, base.store, trail, settings.forgotten_after

@@ -4,6 +4,7 @@ import pkgutil
 from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING, Any
 
+from appliance.control.assembly.current import Current
 from appliance.features.feature import FeatureContext, FeaturePart, KeptHosts, OperatorContext
 from appliance.features.table import FEATURES
 from appliance.hosts.tunnel_hosts import TunnelHosts
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
         OwnServiceAnswered,
         OwnServiceCalled,
     )
+    from appliance.channel.messages.api import TokenKept
     from appliance.control.operators.request_method import RequestMethod
     from appliance.control.operators.sessions import Sessions
     from appliance.policy.model import Address, Request
@@ -36,6 +38,8 @@ class FeatureParts:
         self._core = core
         self._no_hosts = TunnelHosts()
         self.kept: dict[str, KeptHosts] = {}
+        self.bearers: Current[Callable[[], list[TokenKept]]] = Current()
+        """Returns the usable tokens and sessions."""
         self._parts: list[FeaturePart] = []
         for feature in FEATURES:
             self.add(feature.make(core) if feature.make is not None else None)

@@ -23,7 +23,6 @@ from rosrv_fleet.config import FleetConfigError, load_config
 from rosrv_fleet.database import migrate
 from rosrv_fleet.enrolment import EnrolmentError
 from rosrv_fleet.evidence.commands import evidence
-from rosrv_fleet.evidence.store import EvidenceStore
 from rosrv_fleet.indexer import NOT_INDEXABLE, index
 from rosrv_fleet.options import DEFAULT_CONFIG, Config, Json
 from rosrv_fleet.output import configure_log
@@ -146,23 +145,6 @@ def list_tokens(config: Config = DEFAULT_CONFIG) -> None:
 
 def _tokens(config: Path) -> OperatorTokens:
     return OperatorTokens(load_config(config).data / "tokens.json")
-
-
-@evidence.command("remove")
-def remove_evidence(
-    evidence_id: Annotated[str, typer.Argument(metavar="ID", help="Its SHA-256, as in `evidence list`")],
-    config: Config = DEFAULT_CONFIG,
-) -> None:
-    """Remove an evidence bundle from the collector, on the collector's machine.
-
-    Example: rosrv-fleet evidence remove 5d0f…
-    """
-    removed = EvidenceStore(load_config(config).data / "evidence").remove(evidence_id)
-    if removed is None:
-        raise FileNotFoundError(
-            errno.ENOENT, "no evidence bundle has this ID, see rosrv-fleet evidence list", evidence_id
-        )
-    typer.echo(f"{removed.id} is removed: evidence of {removed.robot}, {removed.bytes} bytes")
 
 
 @app.command(cls=FilteredCommand)

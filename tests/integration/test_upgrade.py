@@ -1,7 +1,7 @@
 """The appliance is upgraded in place: it starts on the state of each earlier version.
 
 Each `state-*.sql` has a publisher, a subscriber, a service and its client, a policy and a specification that an
-operator loaded, and three tokens, one of them revoked. That of 0.3.0 has rows in every table of its version.
+operator loaded, and three tokens, one of them revoked. The state of 0.3.0 has rows in every table of its version.
 """
 
 import hashlib

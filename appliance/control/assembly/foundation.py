@@ -2,7 +2,7 @@
 
 import asyncio
 import socket
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -10,7 +10,6 @@ import structlog
 
 from appliance.audit.log.log import AuditLog
 from appliance.base.age_clock import AgeClock
-from appliance.channel.messages.api import TokenKept
 from appliance.configuration.settings import Settings
 from appliance.control.assembly.active_role import ActiveRole
 from appliance.control.assembly.current import Current
@@ -55,8 +54,6 @@ class Foundation:
     trail: AuditTrail
     features: FeatureParts
     monitors: Current[SpecificationManager]
-    bearers: Current[Callable[[], list[TokenKept]]]
-    """Returns the usable tokens and sessions."""
     store: StateStore
     blocks: BlockTable
     table: HostTable
@@ -147,7 +144,6 @@ async def make_foundation(
         trail=trail,
         features=features,
         monitors=monitors,
-        bearers=Current(),
         store=store,
         blocks=blocks,
         table=table,

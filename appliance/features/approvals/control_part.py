@@ -36,7 +36,7 @@ async def inherit(base: "Foundation", parts: "Parts") -> FeaturePart:
         first=10_000 + secrets.randbelow(80_000),
         decide_again=base.policies.decide_again,
         carried_out=relay.carried_out,
-        bearers=lambda: base.bearers()(),  # noqa: PLW0108  set later
+        bearers=lambda: base.features.bearers()(),  # noqa: PLW0108  set later
         guards=relay.taps.guards,
     )
 

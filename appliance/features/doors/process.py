@@ -48,7 +48,7 @@ _log = structlog.get_logger()
 
 
 def main(lifeline_fd: int, _index: int) -> None:
-    uvloop.run(_Process(lifeline_fd).run())
+    uvloop.run(DoorProcess(lifeline_fd).run())
 
 
 @dataclass(slots=True)
@@ -84,7 +84,9 @@ class _Door:
     memory: DoorMemory
 
 
-class _Process:
+class DoorProcess:
+    """The process of one door."""
+
     def __init__(self, lifeline_fd: int) -> None:
         self._child = Child(
             Channel(socket.socket(fileno=lifeline_fd), messages.Lifeline),

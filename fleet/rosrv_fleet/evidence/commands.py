@@ -1,4 +1,4 @@
-"""`rosrv-fleet evidence`: add, list and get evidence bundles over the collector's REST."""
+"""`rosrv-fleet evidence`: add, list and get bundles over the collector's REST, and remove one on its machine."""
 
 import errno
 import hashlib
@@ -13,7 +13,10 @@ from appliance.audit.log.record_format import rfc3339
 from appliance.base.atomic_files import name_to_make
 from appliance.base.counted import counted
 from appliance.base.input_files import open_given
+from rosrv_fleet.config import load_config
+from rosrv_fleet.evidence.store import EvidenceStore
 from rosrv_fleet.operator_client import NO_TOKEN, Authority, Token, Url, answer_to
+from rosrv_fleet.options import DEFAULT_CONFIG, Config
 from rosrv_fleet.output import say, say_json
 
 evidence = typer.Typer(help="Add evidence bundles of robots, list and get them.", no_args_is_help=True)
@@ -111,3 +114,20 @@ def get(
     finally:
         part.unlink(missing_ok=True)
     say(f"{output}: {output.stat().st_size} bytes; verify it: rosrv evidence verify {output} --key audit.pub")
+
+
+@evidence.command()
+def remove(
+    evidence_id: Annotated[str, typer.Argument(metavar="ID", help="Its SHA-256, as in `evidence list`")],
+    config: Config = DEFAULT_CONFIG,
+) -> None:
+    """Remove an evidence bundle from the collector, on the collector's machine.
+
+    Example: rosrv-fleet evidence remove 5d0f…
+    """
+    removed = EvidenceStore(load_config(config).data / "evidence").remove(evidence_id)
+    if removed is None:
+        raise FileNotFoundError(
+            errno.ENOENT, "no evidence bundle has this ID, see rosrv-fleet evidence list", evidence_id
+        )
+    say(f"{removed.id} is removed: evidence of {removed.robot}, {removed.bytes} bytes")

@@ -291,7 +291,9 @@ def test_the_certifier_shares_no_code_with_the_compilers() -> None:
             for node in ast.walk(ast.parse(file.read_text()))
             if isinstance(node, ast.ImportFrom)
         }
-        ours = {module for module in imported if module.startswith(("rosmop", "roswire"))}
+        ours = {module for module in imported if module.startswith(("rosmop", "roswire"))} - {
+            "roswire.counted"
+        }
         assert "rosmop.fast.wasm" not in ours, file
         if file.name not in receiving:
             assert all(module.startswith("rosmop.certify") for module in ours), file

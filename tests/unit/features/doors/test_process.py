@@ -1,11 +1,13 @@
 import asyncio
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import pytest
 
 from appliance.features.doors import door_link, process
 from appliance.features.doors.connections import DoorConnections
+from appliance.features.doors.process import DoorProcess
+from roswire.node.network import OwnedTasks
 from tests.support.features.doors.door_world import WebSocketClient
 from tests.support.memory_network import MemoryNetwork
 
@@ -32,26 +34,32 @@ async def test_viewers_that_wait_for_the_node_are_bounded_like_connections(
         await asyncio.sleep(3600)
 
     tasks: list[asyncio.Future[None]] = []
-    sent = SimpleNamespace(tell=lambda _message: True)
-    monkeypatch.setattr(process, "Child", lambda *_wires, **_calls: sent)
+    orders: dict[str, Any] = {}
+
+    def child(*_wires: Any, **calls: Any) -> SimpleNamespace:
+        orders.update(calls)
+        return SimpleNamespace(tell=lambda _message: True)
+
+    owned = OwnedTasks()
+    monkeypatch.setattr(process, "OwnedTasks", lambda: owned)
+    monkeypatch.setattr(process, "Child", child)
     monkeypatch.setattr(process, "Channel", lambda *_wires: None)
     monkeypatch.setattr(process, "socket", SimpleNamespace(socket=lambda **_of: None))
-    monkeypatch.setattr(process._Process, "_start", waits)
+    monkeypatch.setattr(DoorProcess, "_start", waits)
     monkeypatch.setattr(DoorConnections, "adopt", adopt)
-    door = cast(Any, process._Process(0))
-    door._heard(GIVEN)
+    DoorProcess(0)
+    orders["said"](GIVEN)
     clients = []
     for number in range(100):
         host = f"10.0.1.{number % hosts}"
         clients.append(WebSocketClient(*network.connect(host, ("10.0.0.2", 9090))))
         await asyncio.sleep(0)
         await asyncio.sleep(0)
-        door._took(door_link.ViewerGiven(host, "ticket"), (3,))
+        orders["took"](door_link.ViewerGiven(host, "ticket"), (3,))
     await asyncio.sleep(1)
     refused = [client.response for client in clients if client.response is not None]
     assert [one.status_code for one in refused] == [503] * (100 - most)
     assert sum(not task.done() for task in tasks) == most
-    assert door._tickets == {"ticket": most}
     for task in tasks:
         task.cancel()
-    await door._tasks.close()
+    await owned.close()
