@@ -132,12 +132,17 @@ class Deliveries:
         self.told: list[tuple[str, str, tuple[Value, ...]]] = []
         self._note = note
         self._removed: dict[tuple[str, str], frozenset[str]] = {}
+        self._lists: dict[tuple[str, str], tuple[str, ...]] = {}
 
     def push(self, incarnation: Incarnation, call: NodeCall) -> None:
         self.told.append((incarnation.name, call.method, call.parameters))
         self._note(Told(incarnation, call))
 
+    def list_of(self, incarnation: Incarnation, topic: str) -> tuple[str, ...] | None:
+        return self._lists.get((incarnation.key, topic))
+
     def push_list(self, incarnation: Incarnation, topic: str, publishers: tuple[str, ...]) -> None:
+        self._lists[incarnation.key, topic] = publishers
         if removed := self._removed.pop((incarnation.key, topic), None):
             without: list[Value] = [one for one in publishers if one not in removed]
             self.push(incarnation, NodeCall("publisherUpdate", (topic, without)))
@@ -147,12 +152,16 @@ class Deliveries:
         self._removed[incarnation.key, topic] = publishers
 
     def answered(self, incarnation: Incarnation, topic: str, publishers: tuple[str, ...]) -> None:
-        """Act as `Delivery`."""
+        self._lists[incarnation.key, topic] = publishers
 
     def drop_list(self, incarnation: Incarnation, topic: str) -> None:
-        """Act as `Delivery`."""
+        self._lists.pop((incarnation.key, topic), None)
+
+    def forget_lists(self, incarnation: Incarnation) -> None:
+        self._lists = {key: one for key, one in self._lists.items() if key[0] != incarnation.key}
 
     def drop(self, incarnation: Incarnation) -> None:
+        self.forget_lists(incarnation)
         self._note(Ended("drop what waits for", incarnation))
 
 

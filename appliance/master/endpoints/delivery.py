@@ -124,25 +124,25 @@ class _List:
 
     topic: str
     weight: int = 0  # of the waiting call, as that of a NodeCall; 0: none waits
-    _wanted: tuple[str, ...] | None = None  # None: unknown; the answer to the registration had the list
+    wanted: tuple[str, ...] | None = None  # None: unknown; the answer to the registration had the list
     _untold: frozenset[str] | None = frozenset()  # removed since the last list that was sent; None: all
     _removed: frozenset[str] | None = frozenset()  # None: all
     _free: float = 0.0
 
     def want(self, publishers: tuple[str, ...], *, answered: bool = False) -> None:
         """`answered`: the node has this list already."""
-        if self._wanted is None:
+        if self.wanted is None:
             self._untold = frozenset() if publishers or answered else None
         else:
-            self.remove(frozenset(self._wanted).difference(publishers))
-        self._wanted = publishers
+            self.remove(frozenset(self.wanted).difference(publishers))
+        self.wanted = publishers
 
     def remove(self, publishers: frozenset[str]) -> None:
         self._untold = _united(self._untold, publishers)
 
     def next(self) -> tuple[str, ...]:
         """Return the list to send next: the wanted one, or first that without the publishers to remove."""
-        return _without(self._wanted or (), self._untold)
+        return _without(self.wanted or (), self._untold)
 
     def wait(self) -> float:
         following = self.next()
@@ -151,7 +151,7 @@ class _List:
 
     @property
     def call(self) -> NodeCall:
-        return _call(self.topic, self._wanted or ())
+        return _call(self.topic, self.wanted or ())
 
     def take(self) -> "_Taken":
         taken = _Taken(self, self.next(), self._untold)
@@ -169,7 +169,7 @@ class _List:
         if taken.removes is None or taken.removes:
             self._removed = _united(self._removed, taken.removes)
             self._free = now + _APART_SECONDS
-        return taken.publishers != self._wanted
+        return taken.publishers != self.wanted
 
 
 @dataclass(frozen=True, slots=True)
@@ -253,6 +253,11 @@ class Delivery:
         queue.calls.append(call)
         self._weigh(queue, call.weight)
         self._start(queue)
+
+    def list_of(self, incarnation: Incarnation, topic: str) -> tuple[str, ...] | None:
+        """Return the list that the node has, or will get; None without one."""
+        one = self._lists.get(incarnation.key, {}).get(topic)
+        return None if one is None else one.wanted
 
     def push_list(self, incarnation: Incarnation, topic: str, publishers: tuple[str, ...]) -> None:
         one = self._list(incarnation, topic)

@@ -24,8 +24,6 @@ from appliance.store.state_file import PermissionRow
 from roswire.parameter_tree import Tree, standing_at
 from roswire.xmlrpc import Value
 
-_Stated = dict[tuple[Kind, str], tuple[str, ...]]
-
 
 @dataclass(frozen=True, slots=True)
 class Subscribers:
@@ -37,8 +35,8 @@ class Subscribers:
     delivery: Delivery
     tree: Callable[[], Tree]
     may_read_value: Callable[[Incarnation, str, Value], bool]
-    _stated: dict[Incarnation, _Stated] = field(default_factory=dict, init=False)
-    """The lists that each node has; for a parameter, the node has its value."""
+    _valued: dict[Incarnation, set[str]] = field(default_factory=dict, init=False)
+    """The parameters whose value each node has; `delivery` keeps the lists."""
 
     def flush(self, changed: Iterable[Change]) -> None:
         topics: dict[str, None] = {}
@@ -60,32 +58,36 @@ class Subscribers:
             for kind, resource in (*node.registrations, *node.shelf):
                 self._state(node, kind, resource)
             return
-        self._stated.pop(node, None)
+        self._valued.pop(node, None)
         self.delivery.drop(node)
         if node.life is Life.REPLACED:
             reason = f"[{node.name}] Reason: new node registered with same name"
             self.delivery.push(node, NodeCall("shutdown", (reason,)))
 
-    def _state(self, node: Incarnation, kind: Kind, resource: str) -> None:
-        if kind not in (Kind.SUBSCRIPTION, Kind.PARAMETER) or node.life is not Life.LIVE:
+    def _state(self, node: Incarnation, kind: Kind, resource: str, *, again: bool = False) -> None:
+        if node.life is not Life.LIVE:
             return
-        wanted = self._wanted(node, kind, resource)
-        stated = self._stated.setdefault(node, {})
-        if wanted is None:
-            stated.pop((kind, resource), None)
-            if kind is Kind.SUBSCRIPTION:
+        if kind is Kind.PARAMETER:
+            self._state_value(node, resource)
+        elif kind is Kind.SUBSCRIPTION:
+            wanted = self._wanted(node, resource)
+            if wanted is None:
                 self.delivery.drop_list(node, resource)
-        elif stated.get((kind, resource)) != wanted:
-            stated[kind, resource] = wanted
-            if kind is Kind.SUBSCRIPTION:
+            elif again or self.delivery.list_of(node, resource) != wanted:
                 self.delivery.push_list(node, resource, wanted)
-            else:
-                self._tell_parameter(node, resource)
 
-    def _wanted(self, node: Incarnation, kind: Kind, resource: str) -> tuple[str, ...] | None:
-        if (kind, resource) in node.registrations:
-            return self._publishers_for(node, resource) if kind is Kind.SUBSCRIPTION else ()
-        return () if kind is Kind.SUBSCRIPTION and (kind, resource) in node.shelf else None
+    def _wanted(self, node: Incarnation, topic: str) -> tuple[str, ...] | None:
+        if (Kind.SUBSCRIPTION, topic) in node.registrations:
+            return self._publishers_for(node, topic)
+        return () if (Kind.SUBSCRIPTION, topic) in node.shelf else None
+
+    def _state_value(self, node: Incarnation, key: str) -> None:
+        valued = self._valued.setdefault(node, set())
+        if (Kind.PARAMETER, key) not in node.registrations:
+            valued.discard(key)
+        elif key not in valued:
+            valued.add(key)
+            self._tell_parameter(node, key)
 
     def _publishers_for(self, subscriber: Incarnation, topic: str) -> tuple[str, ...]:
         hidden = self.relay.hides_publishers(topic)
@@ -95,7 +97,6 @@ class Subscribers:
 
     def list_for(self, subscriber: Incarnation, topic: str) -> tuple[str, ...]:
         uris = self._publishers_for(subscriber, topic)
-        self._stated.setdefault(subscriber, {})[Kind.SUBSCRIPTION, topic] = uris
         self.delivery.answered(subscriber, topic, uris)
         return uris
 
@@ -110,8 +111,7 @@ class Subscribers:
                     self.remind(node, topic)
 
     def remind(self, subscriber: Incarnation, topic: str) -> None:
-        self._stated.get(subscriber, {}).pop((Kind.SUBSCRIPTION, topic), None)
-        self._state(subscriber, Kind.SUBSCRIPTION, topic)
+        self._state(subscriber, Kind.SUBSCRIPTION, topic, again=True)
 
     def renew_all(self, topic: str) -> None:
         """Have every subscriber drop a topic's publishers and connect again, at their new ports."""
@@ -151,7 +151,7 @@ class Subscribers:
     # --- values of parameters ---
 
     def value_given(self, subscriber: Incarnation, key: str) -> None:
-        self._stated.setdefault(subscriber, {})[Kind.PARAMETER, key] = ()
+        self._valued.setdefault(subscriber, set()).add(key)
 
     def parameter_deleted(self, key: str) -> None:
         self.parameter_set(key, {}, None)

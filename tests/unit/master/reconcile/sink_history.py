@@ -76,10 +76,12 @@ class SlowNodes(Deliveries):
     def push(self, incarnation: Incarnation, call: NodeCall) -> None:
         self.waiting.append(Told(incarnation, call))
 
-    def answered(self, incarnation: Incarnation, topic: str, _publishers: tuple[str, ...]) -> None:
+    def answered(self, incarnation: Incarnation, topic: str, publishers: tuple[str, ...]) -> None:
         self.drop_list(incarnation, topic)
+        super().answered(incarnation, topic, publishers)
 
     def drop_list(self, incarnation: Incarnation, topic: str) -> None:
+        super().drop_list(incarnation, topic)
         self.waiting = [
             one
             for one in self.waiting
@@ -87,6 +89,7 @@ class SlowNodes(Deliveries):
         ]
 
     def drop(self, incarnation: Incarnation) -> None:
+        self.forget_lists(incarnation)
         self.waiting = [one for one in self.waiting if one.node is not incarnation]
 
     def arrive(self) -> None:
