@@ -18,6 +18,7 @@ import itertools
 import json
 import os
 import random
+import re
 import shutil
 import tempfile
 import time
@@ -39,7 +40,7 @@ from tests.system.fleet.postgres import PostgresCluster, postgres
 _SCRAPE_SECONDS = 15.0
 _PLANTED_SECONDS = 1500.0
 _BACK_SECONDS = 180.0  # until a robot has surely been heard again
-_LAST_SECONDS = 90.0  # for the planted full disk
+_LAST_SECONDS = 180.0  # for the planted full disk
 _YEARS = 3 * 365 * 86_400.0
 _SILENT = "RosrvFleetRobotSilent"
 
@@ -140,7 +141,7 @@ class _Night:
             untrue = [name for name in silent if now - self._reachable.get(name, now) > _BACK_SECONDS]
             self._untrue += len(untrue)
             troubles = {robot.name: robot.report.trouble for robot in self._robots if robot.report.trouble}
-            self._troubles.update(troubles.values())
+            self._troubles.update(re.sub("[0-9]+", "N", reason) for reason in troubles.values())
             self._scrapes += 1
             self._count_processor_time()
             self._say(
@@ -318,11 +319,11 @@ class _Night:
     async def _fill_disk(self) -> None:
         await self._collector.acquire()
         self._say("planted", fault="disk full")
+        self._planted[Alert("RosrvFleetDiskFull")] = self._now
         await asyncio.to_thread(self._site.stop)
         self._site.write_config(limits={"reserve_bytes": 1 << 60})
         await asyncio.to_thread(self._site.start)
         self._collector.release()
-        self._planted[Alert("RosrvFleetDiskFull")] = self._now
 
     # --- the end ---
 
