@@ -13,7 +13,6 @@ Invariants:
 
 import re
 
-from roswire.counted import counted
 from roswire.errors import InvalidNameError, quoted
 
 MAX_NAME_LENGTH = 1024
@@ -138,7 +137,7 @@ def _refusal(name: str, grammar: re.Pattern[str]) -> str:
     if not name:
         return "empty name: a ROS name has at least one character"
     if len(name) > MAX_NAME_LENGTH:
-        return f"name {quoted(name)} has {counted(len(name), 'character')}; at most {MAX_NAME_LENGTH} are allowed"
+        return f"name {quoted(name)} has {len(name)} characters; at most {MAX_NAME_LENGTH} are allowed"
     for position, character in enumerate(name):
         if character != "~" and grammar.match(f"/a{character}a") is None:
             allowed = (

@@ -10,7 +10,6 @@ import re
 from dataclasses import dataclass
 from functools import lru_cache
 
-from roswire.counted import counted
 from roswire.errors import InvalidUriError, quoted
 
 MAX_URI_LENGTH = 1024
@@ -56,9 +55,7 @@ def service_uri(host: str, port: int) -> str:
 
 def _parse(text: str, scheme: str, what: str, form: str) -> NodeUri:
     if len(text) > MAX_URI_LENGTH:
-        raise InvalidUriError(
-            f"{what} URI of {counted(len(text), 'character')}; at most {MAX_URI_LENGTH} are allowed"
-        )
+        raise InvalidUriError(f"{what} URI of {len(text)} characters; at most {MAX_URI_LENGTH} are allowed")
     found = _URI.match(text)
     if found is None:
         raise InvalidUriError(f"{what} URI {quoted(text)} {_complaint(text)}; write {form}")

@@ -10,7 +10,6 @@ from typing import Literal
 
 import yaml
 
-from appliance.base.counted import counted
 from appliance.base.validation_messages import meant, not_yaml
 from appliance.policy.actions import BadWordError, find_hosts, parse_action
 from appliance.policy.host_sets import canonical_address
@@ -72,9 +71,7 @@ def run_cases(policy: Policy, text: str, file: str) -> list[CaseResult]:
 
 def _compose(text: str, findings: Findings) -> _Node | None:
     if len(text) > MAXIMUM_CHARACTERS:
-        findings.error(
-            Place(), f"the file has {counted(len(text), 'character')}; the limit is {MAXIMUM_CHARACTERS}"
-        )
+        findings.error(Place(), f"the file has {len(text)} characters; the limit is {MAXIMUM_CHARACTERS}")
         return None
     try:
         return yaml.compose(text, Loader=yaml.SafeLoader)

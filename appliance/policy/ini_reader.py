@@ -7,7 +7,6 @@ import re
 from collections.abc import Hashable, MutableMapping
 from dataclasses import dataclass, field
 
-from appliance.base.counted import counted
 from appliance.policy.policy_findings import Findings, Place, quoted
 
 MAXIMUM_CHARACTERS = 2 * 1024 * 1024
@@ -58,9 +57,7 @@ def is_repeated(
 def read(text: str, findings: Findings) -> list[SectionText]:
     """Return the sections; skip unreadable lines, and report them in `findings`."""
     if len(text) > MAXIMUM_CHARACTERS:
-        findings.error(
-            Place(), f"the file has {counted(len(text), 'character')}; the limit is {MAXIMUM_CHARACTERS}"
-        )
+        findings.error(Place(), f"the file has {len(text)} characters; the limit is {MAXIMUM_CHARACTERS}")
         return []
     sections: list[SectionText] = []
     for number, raw in enumerate(text.removeprefix("\ufeff").split("\n"), start=1):

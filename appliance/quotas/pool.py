@@ -77,11 +77,8 @@ class Bounds:
         left = self.whole - total
         if not self.share or mine <= max(1, self.share * left):
             return ""
-        most = "as many" if self.share == 1 else f"{self.share} times as many"
-        return (
-            f"{host} would use {mine} {what}, leaving {left} for all others;"
-            f" a host may use at most {most} as it leaves"
-        )
+        most = f"at most {'' if self.share == 1 else f'{self.share} times '}as many as it leaves"
+        return f"{host} would use {mine} {what}, leaving {left} for all others; a host may use {most}"
 
 
 class Pool(Generic[Holder]):

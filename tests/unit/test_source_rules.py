@@ -421,7 +421,7 @@ def shown_habits(source: Source) -> Iterator[tuple[int, str]]:
 
 
 MISCOUNTED = re.compile(
-    r" (?:(?:more|further|new|other) )?(?:arguments|bundles|calls|cases|changes|characters|checkpoints|commands|"
+    r" (?:(?:more|further|new|other) )?(?:arguments|bundles|calls|cases|changes|checkpoints|commands|"
     r"connections|denials|elements|errors|events|files|findings|forks|gaps|hosts|lines|messages|migrations|monitors|nodes|"
     r"parts|ports|processes|records|registrations|reports|restarts|robots|rows|rules|searches|segments|sessions|times|"
     r"topics|transitions|trials|values|warnings)\b"

@@ -11,7 +11,6 @@ from typing import Annotated, Any, NamedTuple
 import msgspec
 
 from appliance.audit.log.record import SCHEMA_VERSION, AuditRecord, RuleReference, Severity
-from appliance.base.counted import counted
 from appliance.signing import log_proof
 
 LARGEST_DETAIL = 65_536
@@ -161,7 +160,7 @@ def _plain_dict(value: dict[Any, Any], depth: int) -> dict[str, Any]:
 def _text(value: object) -> str:
     value = value if type(value) is str else str(value)
     if len(value) > LONGEST_TEXT:
-        value = f"{value[: LONGEST_TEXT - 64]}... ({counted(len(value), 'character')})"
+        value = f"{value[: LONGEST_TEXT - 64]}... ({len(value)} characters)"
     return value.encode("utf-8", "backslashreplace").decode()
 
 

@@ -50,7 +50,7 @@ async def inherit(base: Foundation, parts: Any) -> FeaturePart:
     table = kept.table
     ends = StoredDeadlines(base.store)
     tickets = DoorTickets(base.store, ends)
-    visits = DoorVisits(lambda: frozenset(row.name for row in base.features.bearers()()))
+    visits = DoorVisits(lambda: {row.id: row.name for row in base.features.bearers()()})
     processes = DoorProcesses(
         base,
         table,

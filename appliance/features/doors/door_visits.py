@@ -1,10 +1,10 @@
 """The visits of signed-in people: the console opens the caller's own door, with a ticket for one connection.
 
-Nothing is stored. A visit ends with control's process, and with the last token and session of its person's name. A
-person has at most `_MOST_OF_PERSON` visits; beyond them, a new visit ends the oldest.
+Nothing is stored. A visit ends with control's process, and with the last of the tokens and sessions that its person
+had. A person has at most `_MOST_OF_PERSON` visits; beyond them, a new visit ends the oldest.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from appliance.base import clock
@@ -18,14 +18,15 @@ _MOST_OF_PERSON = 8
 @dataclass(slots=True)
 class _Visit:
     row: TicketRow
+    credentials: frozenset[str]
     until: float | None  # seconds since the boot, until the ticket is used
     over: bool = False
 
 
 class DoorVisits:
-    """All visits. `bearers()` returns the names of the tokens and sessions that may be used now."""
+    """All visits. `bearers()` returns the names of the usable tokens and sessions by their ids."""
 
-    def __init__(self, bearers: Callable[[], frozenset[str]]) -> None:
+    def __init__(self, bearers: Callable[[], Mapping[str, str]]) -> None:
         self._bearers = bearers
         self._visits: dict[str, _Visit] = {}
 
@@ -34,7 +35,8 @@ class DoorVisits:
         for visit in own[: max(0, len(own) + 1 - _MOST_OF_PERSON)]:
             visit.over = True
         row, text = new_ticket(door, _OPEN_SECONDS, who)
-        self._visits[row.id] = _Visit(row, clock.since_boot() + _OPEN_SECONDS)
+        credentials = frozenset(number for number, name in self._bearers().items() if name == who)
+        self._visits[row.id] = _Visit(row, credentials, clock.since_boot() + _OPEN_SECONDS)
         return row, text
 
     def find(self, door: str, text: str) -> TicketRow | None:
@@ -63,7 +65,9 @@ class DoorVisits:
         ended = [
             one
             for one in self._visits.values()
-            if one.over or one.row.who not in bearers or (one.until is not None and not self._may_open(one))
+            if one.over
+            or one.credentials.isdisjoint(bearers)
+            or (one.until is not None and not self._may_open(one))
         ]
         for visit in ended:
             del self._visits[visit.row.id]
@@ -74,5 +78,5 @@ class DoorVisits:
             visit.until is not None
             and not visit.over
             and clock.since_boot() < visit.until
-            and visit.row.who in self._bearers()
+            and not visit.credentials.isdisjoint(self._bearers())
         )

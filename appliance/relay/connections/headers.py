@@ -5,7 +5,6 @@ Received headers are not trusted: the sender gets its registered name, and field
 
 from collections.abc import Mapping
 
-from appliance.base.counted import counted
 from roswire.errors import InvalidNameError
 from roswire.names import canonical_tool_id
 
@@ -35,7 +34,7 @@ def canonical(fields: dict[str, str]) -> dict[str, str]:
 def too_long(fields: Mapping[str, str]) -> str:
     for name in _OF_PEER:
         if len(fields.get(name, "")) > _LONGEST:
-            return f"its header has a {name} of {counted(len(fields[name]), 'character')}"
+            return f"its header has a {name} of {len(fields[name])} characters"
     return ""
 
 

@@ -1,4 +1,5 @@
 import asyncio
+from collections.abc import Coroutine
 from types import SimpleNamespace
 from typing import Any
 
@@ -6,9 +7,7 @@ import pytest
 
 from appliance.features.doors import door_link, process
 from appliance.features.doors.connections import DoorConnections
-from appliance.features.doors.process import DoorProcess
-from roswire.node.network import OwnedTasks
-from tests.support.features.doors.door_world import WebSocketClient
+from tests.support.features.doors.door_world import DOOR, WebSocketClient
 from tests.support.memory_network import MemoryNetwork
 
 pytestmark = pytest.mark.anyio
@@ -16,50 +15,72 @@ SLOTS = 32
 GIVEN = door_link.DoorGiven("alice", 1.0, "10.0.0.2", 11311, [], SLOTS, 200, ["ticket"])
 
 
+class Control:
+    """Control's end of the link to the process of a door, in which the node never starts."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.network = MemoryNetwork()
+        self.reports: list[Any] = []
+        self.serving: list[asyncio.Task[None]] = []
+        self._arrived: asyncio.Queue[Any] = asyncio.Queue()
+        self.network.listen(DOOR[0], lambda *streams: self._arrived.put(streams), DOOR[1])
+        started: list[Coroutine[Any, Any, None]] = []
+        monkeypatch.setattr(process, "Child", self._linked)
+        monkeypatch.setattr(process, "Channel", lambda *_wires: None)
+        monkeypatch.setattr(process, "socket", SimpleNamespace(socket=lambda **_of: None))
+        monkeypatch.setattr(process, "uvloop", SimpleNamespace(run=started.append))
+        monkeypatch.setattr(process, "RosNode", lambda *_of, **_more: SimpleNamespace(start=self._waits))
+        monkeypatch.setattr(DoorConnections, "adopt", self._adopted())
+        process.main(0, 0)
+        self.running = asyncio.ensure_future(started[0])
+
+    def _linked(self, _lifeline: Any, _messages: Any, *, said: Any, took: Any, **_more: Any) -> Any:
+        self.say, self.give, self.ended = said, took, asyncio.Event()
+        return SimpleNamespace(
+            attach=lambda _first: None,
+            tell=self._told,
+            ended=self.ended,
+            close=lambda: None,
+        )
+
+    def _told(self, report: Any) -> bool:
+        self.reports.append(report)
+        return True
+
+    @staticmethod
+    async def _waits() -> None:
+        await asyncio.sleep(3600)
+
+    def _adopted(self) -> Any:
+        def adopt(limited: DoorConnections, _number: int, serve: Any, refused: Any, *, host: str) -> None:
+            work = limited.serve(serve, *self._arrived.get_nowait(), refused=refused, host=host)
+            self.serving.append(asyncio.ensure_future(work))
+
+        return adopt
+
+    async def pass_on(self, host: str) -> WebSocketClient:
+        client = WebSocketClient(*self.network.connect(host, DOOR))
+        while self._arrived.empty():
+            await asyncio.sleep(0)
+        self.give(door_link.ViewerGiven(host, "ticket"), (3,))
+        return client
+
+
 @pytest.mark.parametrize(("hosts", "most"), [(1, 24), (100, SLOTS)])
 async def test_viewers_that_wait_for_the_node_are_bounded_like_connections(
     monkeypatch: pytest.MonkeyPatch, hosts: int, most: int
 ) -> None:
     """Each has a valid ticket. Those beyond the limits get the reason before the node has started."""
-    network, arrived = MemoryNetwork(), asyncio.Queue[Any]()
-    network.listen("10.0.0.2", lambda *streams: arrived.put(streams), 9090)
-
-    def adopt(connections: DoorConnections, _descriptor: int, serve: Any, refused: Any, *, host: str) -> None:
-        reader, writer = arrived.get_nowait()
-        tasks.append(
-            asyncio.ensure_future(connections.serve(serve, reader, writer, refused=refused, host=host))
-        )
-
-    async def waits(*_given: Any) -> None:
-        await asyncio.sleep(3600)
-
-    tasks: list[asyncio.Future[None]] = []
-    orders: dict[str, Any] = {}
-
-    def child(*_wires: Any, **calls: Any) -> SimpleNamespace:
-        orders.update(calls)
-        return SimpleNamespace(tell=lambda _message: True)
-
-    owned = OwnedTasks()
-    monkeypatch.setattr(process, "OwnedTasks", lambda: owned)
-    monkeypatch.setattr(process, "Child", child)
-    monkeypatch.setattr(process, "Channel", lambda *_wires: None)
-    monkeypatch.setattr(process, "socket", SimpleNamespace(socket=lambda **_of: None))
-    monkeypatch.setattr(DoorProcess, "_start", waits)
-    monkeypatch.setattr(DoorConnections, "adopt", adopt)
-    DoorProcess(0)
-    orders["said"](GIVEN)
-    clients = []
-    for number in range(100):
-        host = f"10.0.1.{number % hosts}"
-        clients.append(WebSocketClient(*network.connect(host, ("10.0.0.2", 9090))))
-        await asyncio.sleep(0)
-        await asyncio.sleep(0)
-        orders["took"](door_link.ViewerGiven(host, "ticket"), (3,))
-    await asyncio.sleep(1)
-    refused = [client.response for client in clients if client.response is not None]
-    assert [one.status_code for one in refused] == [503] * (100 - most)
-    assert sum(not task.done() for task in tasks) == most
-    for task in tasks:
+    control = Control(monkeypatch)
+    control.say(GIVEN)
+    clients = [await control.pass_on(f"10.0.1.{number % hosts}") for number in range(100)]
+    await asyncio.sleep(3)
+    refused = [client.response.status_code for client in clients if client.response is not None]
+    assert refused == [503] * (100 - most)
+    assert sum(not task.done() for task in control.serving) == most
+    changes = [one for one in control.reports if isinstance(one, door_link.ConnectionsChanged)]
+    assert (sum(one.began for one in changes), sum(one.ended for one in changes)) == (0, 100 - most)
+    for task in control.serving:
         task.cancel()
-    await owned.close()
+    control.ended.set()
+    await control.running
