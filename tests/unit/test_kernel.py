@@ -9,7 +9,7 @@ ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "dev" / "architecture.md").read_text()
 SECTION = PAGE.split("\n## The kernel", 1)[1].split("\n## ", 1)[0]
 SIZES = {path: int(lines) for path, lines in re.findall(r"`([\w/]+\.pyx?)` (\d+)", SECTION)}
-BUDGET = 11_262  # lines of code: lower this number with the kernel, and never raise it
+BUDGET = 11_234  # lines of code: lower this number with the kernel, and never raise it
 
 # The modules outside the kernel that the kernel may import.
 OUTSIDE = frozenset(
