@@ -10,7 +10,7 @@ from rosrv_fleet.verification import prove
 
 from appliance.audit.proof.copies import signed_checkpoints
 from tests.support.alert_rules import Alert
-from tests.support.fleet_night import FleetNight, NightRobot
+from tests.support.features.fleet.fleet_night import FleetNight, NightRobot
 
 _EVENING = 1_800_036_000.0  # 18:00 UTC: the day changes in the night
 _HOUR = 3600.0
