@@ -321,7 +321,17 @@ class Execution:
         caller, call = attempt.caller, attempt.call
         match error:
             case HostFullError() | NoPortError() | LimitReachedError():
-                record = self._rejected("limit exceeded", error, call, caller, Severity.ALARM)
+                record = self.trail.happened(
+                    "limit exceeded",
+                    str(error),
+                    severity=Severity.ALARM,
+                    decision="deny",
+                    host=caller.peer.text,
+                    caller_id=caller.caller_id,
+                    category=call.row.category.value,
+                    resource=call.name,
+                    call=call.name,
+                )
                 return [0, with_record(str(error), record), call.denial]
             case NodeElsewhereError():
                 decision = Decision(False, None, str(error))
@@ -346,21 +356,9 @@ class Execution:
         return [0, self._denial_text(decision, record), 0]
 
     def _malformed(self, call: RosCall[object], caller: Caller, error: PeerError) -> Answer:
-        self._rejected("malformed", error, call, caller)
-        return [-1, str(error), call.denial]
-
-    def _rejected(
-        self,
-        event: str,
-        error: Exception,
-        call: RosCall[object],
-        caller: Caller,
-        severity: Severity | None = None,
-    ) -> str:
-        return self.trail.happened(
-            event,
+        self.trail.happened(
+            "malformed",
             str(error),
-            severity=severity,
             decision="deny",
             host=caller.peer.text,
             caller_id=caller.caller_id,
@@ -368,3 +366,4 @@ class Execution:
             resource=call.name,
             call=call.name,
         )
+        return [-1, str(error), call.denial]
