@@ -157,7 +157,7 @@ def test_a_gap_and_a_fork_are_counted_when_they_are_removed(site: FleetSite, mak
     _restart_with_retention(site)
     eventually(lambda: len(_segments(site, "arm1")) == 2, "old segments are removed")
     assert site.health()["robots"][0]["gaps"] == 0
-    assert "2 segments with 1 gaps and 0 forks" in site.run("verify", "arm1").stdout
+    assert "2 segments with 1 gap and 0 forks" in site.run("verify", "arm1").stdout
 
 
 def _opened(database: str) -> IndexDatabase:
