@@ -2,7 +2,7 @@
 
 rospy reconnects only for a list that arrives *after* it noticed the broken connection. roscpp reconnects to a port
 that stayed open, but after a restart of the appliance it gives up and ignores an unchanged list. So a subscriber that
-is still absent after the first reminders gets a list without the publisher, and then one with it. This also helps a
+is still absent after the first reminder gets a list without the publisher, and then one with it. This also helps a
 subscriber whose grant was withdrawn and restored without its knowledge.
 """
 
@@ -17,7 +17,7 @@ from appliance.master.graph.registry import Registry
 from appliance.master.reconcile.subscribers import Subscribers
 from appliance.specifications.allocation import TOPIC, Move, Resource
 
-_GENTLE = 2  # the reminders before a subscriber must drop the publisher and connect again
+_GENTLE = 1  # the reminders before a subscriber must drop the publisher and connect again
 _LASTING_SECONDS = 5.0
 _LONGEST_SECONDS = 600.0
 _PAUSES = (0.5, 0.5, 1.0, 1.0, 2.0, 4.0, 8.0, 16.0)  # the seconds before each check

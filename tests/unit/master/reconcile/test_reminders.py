@@ -36,7 +36,7 @@ def node(registry: Registry, name: str, kind: Kind) -> Incarnation:
     return node
 
 
-@pytest.mark.parametrize(("absent_for", "reminded", "renewed"), [(0, 0, 0), (2, 2, 0), (99, 2, 6)])
+@pytest.mark.parametrize(("absent_for", "reminded", "renewed"), [(0, 0, 0), (1, 1, 0), (99, 1, 7)])
 async def test_reminded_until_back(
     monkeypatch: pytest.MonkeyPatch, absent_for: int, reminded: int, renewed: int
 ) -> None:
