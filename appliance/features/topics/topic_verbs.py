@@ -180,7 +180,7 @@ def _show(message: TopicMessage, field: str | None, *, as_json: bool) -> None:
 
 
 def part_of(fields: Any, path: str) -> Any:
-    """Return the field at `path`, or the sign of one that was left out. Other paths end with status 2."""
+    """Return the field at `path`, or the sign that it was left out. An unknown path ends with status 2."""
     value = fields
     for name in path.split("."):
         if isinstance(value, Mapping) and name in value:

@@ -488,7 +488,7 @@ def roles_of(dependant: Any) -> Iterator[str | None]:
 
 
 def test_a_role_is_judged_before_the_request() -> None:
-    """Only those who may make a request learn what is wrong with it."""
+    """A request is checked only for a caller that may make it."""
     judged = 0
     for path, roles in routes().items():
         method, _, target = path.partition(" ")
