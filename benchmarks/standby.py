@@ -27,14 +27,13 @@ from typing import Self
 from rich.console import Console
 from rich.table import Table
 
-from appliance.cli.connection.admin_client import NotRunningError
 from appliance.features.standby import standby_requests
 from examples.landshark.lab import Lab
 from tests.support.appliance import Appliance
 from tests.support.features.standby.standby_robot import StandbyRobot
 from tests.support.features.standby.standby_site import MASTER, StandbySite
 from tests.support.processes import Process
-from tests.support.waiting import eventually
+from tests.support.waiting import NoAnswerError, eventually
 
 _AFTER = 1.0  # seconds of service after the takeover that are also watched
 _RATE = 50  # messages a second
@@ -179,9 +178,8 @@ def one_takeover(site: StandbySite, robot: StandbyRobot, *, planned: bool) -> di
     active, passive = site.pair()
     with Watch(robot) as watch:
         if planned:
-            with contextlib.suppress(
-                NotRunningError
-            ):  # the answer may be lost: its appliance is the standby then
+            # The answer may be lost: its appliance is the standby then.
+            with contextlib.suppress(NoAnswerError):
                 site.appliances[active].ask(standby_requests.StandbyPromote())
         else:
             site.cut(active)

@@ -131,10 +131,10 @@ class _List:
 
     def want(self, publishers: tuple[str, ...], *, answered: bool = False) -> None:
         """`answered`: the node has this list already."""
-        if self.wanted is None:
-            self._untold = frozenset() if publishers or answered else None
+        if self.wanted is None and not answered:
+            self._untold = self._untold if publishers else None
         else:
-            self.remove(frozenset(self.wanted).difference(publishers))
+            self.remove(frozenset(self.wanted or ()).difference(publishers))
         self.wanted = publishers
 
     def remove(self, publishers: frozenset[str]) -> None:

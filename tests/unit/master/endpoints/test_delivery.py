@@ -167,6 +167,16 @@ async def test_a_list_that_did_not_arrive_told_no_removal() -> None:
     assert [publishers for _topic, publishers in post.node.lists] == [["a", "b"], ["b"], ["a", "b"]]
 
 
+async def test_a_removal_comes_first_also_if_the_node_has_an_unknown_list() -> None:
+    """After a takeover, `Delivery` knows no list, and roscpp would ignore an unchanged one."""
+    post = Post()
+    post.node.answers.set()
+    post.delivery.remove_first(post.incarnation, "/t", frozenset({"a"}))
+    post.push("/t", publishers=["a", "b"])
+    await asyncio.sleep(1)
+    assert [publishers for _topic, publishers in post.node.lists] == [["b"], ["a", "b"]]
+
+
 async def test_no_list_is_sent_for_a_topic_that_is_not_subscribed_to_any_more() -> None:
     post = Post()
     post.push("/t", "/other", publishers=["a"])
@@ -195,7 +205,9 @@ async def test_a_node_sees_each_removal_and_ends_with_the_newest_list(seed: int)
     for _ in range(60):
         topic = random.choice(list(wanted))
         publishers: list[Value] = [one for one in "abcd" if random.random() < 0.6]
-        gone[topic] |= {one for one in wanted[topic] if one not in publishers}
+        removed = frozenset(one for one in "abcd" if random.random() < 0.1)
+        post.delivery.remove_first(post.incarnation, topic, removed)
+        gone[topic] |= {one for one in wanted[topic] if one not in publishers} | removed
         wanted[topic] = publishers
         post.delivery.push_list(post.incarnation, topic, tuple(map(str, publishers)))
         assert post.delivery.waiting <= 2
