@@ -214,14 +214,15 @@ async def _restore(base: Foundation, parts: Parts) -> None:
     restore(core.registry, base.store)
     core.grants.restore(base.store.permissions())
     claimed: set[int] = set()
+    ends.places.reserve(port for node in core.registry.all() for port in node.ports)
     for incarnation in core.registry.all():
         if incarnation.life is Life.REPLACED:
             continue
         try:
             await ends.faces.reopen(incarnation, parts.serve(incarnation))
         except NoPortError as error:
-            _log.error("a node cannot be restored", node=incarnation.name, error=str(error))
-            core.registry.forget(incarnation)
+            core.graph.lost(incarnation, str(error))
+            core.graph.forgotten(incarnation)
             continue
         claimed |= set(incarnation.ports)
     ends.places.close_unclaimed(claimed)

@@ -117,24 +117,32 @@ class NodePorts:
         if port in self.unused:
             self.unused.remove(port)
 
-    def reopen(self, incarnation: Incarnation) -> bool:
-        opened: list[sockets.socket] = []
-        for port in incarnation.ports[: self._each]:
-            if f"port:{port}" in self._sockets:
-                continue
+    def reserve(self, ports: Iterable[int]) -> None:
+        """Until `close_unclaimed`, use these ports of restored nodes for no other node."""
+        reserved = set(ports)
+        self.unused = deque(port for port in self.unused if port not in reserved)
+
+    def reopen(self, incarnation: Incarnation) -> None:
+        """Open a restored node's ports, and unused ones instead of those that another program has.
+
+        Raises `NoPortError`.
+        """
+        ports = [
+            port if self._reopened(port) else self._open(1)[0] for port in incarnation.ports[: self._each]
+        ]
+        incarnation.outer_port, incarnation.relay_port, *more = *ports, *self._open(self._each - len(ports))
+        incarnation.more_relay_ports = tuple(more)
+        self._own(incarnation.ports, incarnation.host)
+
+    def _reopened(self, port: int) -> bool:
+        name = f"port:{port}"
+        if name not in self._sockets:
             try:
-                opened.append(listen(self._host, port))
+                sock = listen(self._host, port)
             except OSError:
-                for sock in opened:
-                    sock.close()
                 return False
-        for sock in opened:
-            name = f"port:{sock.getsockname()[1]}"
             self.adopt(name, sock)
             self._keep(name, sock)
-        known = incarnation.more_relay_ports[: self._each - 2]
-        incarnation.more_relay_ports = known + self._open(self._each - 2 - len(known))
-        self._own(incarnation.ports, incarnation.host)
         return True
 
     def close(self, incarnation: Incarnation) -> None:
@@ -153,15 +161,13 @@ class NodePorts:
     def close_unclaimed(self, claimed: set[int]) -> None:
         """Close kept sockets that no incarnation claims. The next new ports are above the claimed ports."""
         for name, sock in list(self._sockets.items()):
-            port = sock.getsockname()[1]
-            if port not in claimed:
+            if sock.getsockname()[1] not in claimed:
                 del self._sockets[name]
                 sock.close()
                 self._drop(name)
-                if port in self._range:  # the range may have changed in the meantime
-                    self.unused.append(port)
         last = max(claimed, default=0)
-        self.unused = deque(sorted(self.unused, key=lambda port: (port <= last, port)))
+        unused = (port for port in self._range if port not in claimed)
+        self.unused = deque(sorted(unused, key=lambda port: (port <= last, port)))
 
     def listen(self) -> sockets.socket:
         for _ in range(len(self.unused)):

@@ -214,8 +214,7 @@ class ProxyEndpoints:
 
     async def reopen(self, incarnation: Incarnation, handler: Handler) -> None:
         ports = incarnation.ports
-        if not self.places.reopen(incarnation):
-            raise NoPortError(f"a port of {incarnation.name} is in use by another program")
+        self.places.reopen(incarnation)
         await self.open(incarnation, handler)
         if incarnation.ports != ports:
             self.registry.mark(incarnation)

@@ -1,6 +1,7 @@
 import contextlib
 import os
 import signal
+import socket
 import threading
 import xmlrpc.client
 from collections.abc import Iterator
@@ -124,3 +125,16 @@ def test_the_whole_appliance_restarts(battlefield: Field) -> None:
         assert field.call(field.robot, "getParam", "/looker", "/kept/over")[2] == {"a": [1, 2.5, "x"]}
         nodes = field.ros.run("rosnode", "list").stdout.split()
         assert {"/voice", "/ear", "/python_ear", "/cpp_ear", "/burst_restart_0"} <= set(nodes)
+
+
+def test_another_program_took_a_nodes_port_while_the_appliance_was_off(battlefield: Field) -> None:
+    field = battlefield
+    heard = field.ros.on(field.ocu).listener("roscpp", "/chatter")
+    heard.wait_for(event="received", publisher="/voice")
+    uri = field.call(field.robot, "lookupNode", "/looker", "/voice")[2]
+    field.appliance.stop()
+    mark, port = heard.mark(), int(uri.rpartition(":")[2].rstrip("/"))
+    with field.middle.run(lambda: socket.create_server(("", port))):
+        field.appliance.start()
+        heard.wait_for(event="received", publisher="/voice", since=mark)
+        assert field.call(field.robot, "lookupNode", "/looker", "/voice")[2] not in {uri, ""}

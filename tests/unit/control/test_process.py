@@ -7,14 +7,14 @@ from typing import Any, cast
 import pytest
 
 from appliance.control.process import _end_others, _restore
-from appliance.master.endpoints.node_ports import NodePorts
-from appliance.master.graph.graph import Grants
+from appliance.master.endpoints.node_ports import NodePorts, NoPortError
+from appliance.master.graph.graph import Grants, RosGraph
 from appliance.master.graph.registry import Incarnation, Kind, Registry
-from appliance.master.reconcile.sinks import ProxyEndpoints, StoredGraph
+from appliance.master.reconcile.sinks import StoredGraph
 from appliance.store.state_file import StateStore
 from roswire.uris import parse_node_uri
 from tests.support.engines import InlineDatabase
-from tests.support.idle import idle, idle_class
+from tests.support.idle import idle
 
 pytestmark = pytest.mark.anyio
 URI = "http://10.0.0.5:4000/"
@@ -24,41 +24,66 @@ def fail(reason: str) -> None:
     raise AssertionError(reason)
 
 
-class Ports(idle_class(ProxyEndpoints)):  # type: ignore[misc]  # it is made
-    async def reopen(self, _incarnation: Incarnation, _handler: object) -> None:
-        """Act as `ProxyEndpoints`."""
+class Restored:
+    """Control after a restart with a stored node that published /secret."""
+
+    def __init__(self, folder: Path) -> None:
+        self.store = StateStore(folder, failed=fail, kind=InlineDatabase)
+        before, host = Registry(), ipaddress.ip_address("10.0.0.5")
+        node = Incarnation("key", "/n", host, parse_node_uri(URI), URI, "10.0.0.1", 19001, 19002)
+        before.add(node)
+        before.register(node, Kind.PUBLICATION, "/secret", "std_msgs/String")
+        StoredGraph(idle(Grants), self.store).flush(before.take_changes())
+        self.registry, self.refusal = Registry(), ""
+        self.decided: list[tuple[object, list[str]]] = []
+        self.records: list[tuple[str, str, str]] = []
+
+    async def restore(self) -> None:
+        await self.store.settled()
+        trail = SimpleNamespace(happened=self._happened)
+        grants = Grants(lambda _row: None, set)
+        parts = SimpleNamespace(
+            core=SimpleNamespace(
+                registry=self.registry,
+                grants=grants,
+                graph=RosGraph(self.registry, grants, cast(Any, trail)),
+            ),
+            serve=lambda _node: None,
+            endpoints=SimpleNamespace(
+                faces=SimpleNamespace(reopen=self._reopen),
+                places=idle(NodePorts),
+                enforcement=SimpleNamespace(policy_changed=self._changed),
+            ),
+        )
+        policies = SimpleNamespace(current="the new policy")
+        base = SimpleNamespace(sockets={}, store=self.store, policies=policies)
+        await _restore(cast(Any, base), cast(Any, parts))
+        self.store.close()
+
+    async def _reopen(self, _node: Incarnation, _handler: object) -> None:
+        if self.refusal:
+            raise NoPortError(self.refusal)
+
+    def _happened(self, event: str, reason: str, **fields: Any) -> None:
+        self.records.append((event, reason, fields["caller_id"]))
+
+    def _changed(self, policy: object) -> int:
+        self.decided.append((policy, [resource.resource for _node, resource in self.registry.in_order()]))
+        return 1
 
 
 async def test_restored_nodes_follow_the_policy_in_force(tmp_path: Path) -> None:
-    store = StateStore(tmp_path, failed=fail, kind=InlineDatabase)
-    before = Registry()
-    host = ipaddress.ip_address("10.0.0.5")
-    node = Incarnation("key", "/n", host, parse_node_uri(URI), URI, "10.0.0.1", 19001, 19002)
-    before.add(node)
-    before.register(node, Kind.PUBLICATION, "/secret", "std_msgs/String")
-    StoredGraph(idle(Grants), store).flush(before.take_changes())
-    await store.settled()
-    registry = Registry()
-    decided: list[tuple[object, list[str]]] = []
+    control = Restored(tmp_path)
+    await control.restore()
+    assert (control.decided, control.records) == ([("the new policy", ["/secret"])], [])
 
-    def changed(policy: object) -> int:
-        decided.append((policy, [resource.resource for _node, resource in registry.in_order()]))
-        return 1
 
-    policies = SimpleNamespace(current="the new policy")
-    parts = SimpleNamespace(
-        core=SimpleNamespace(registry=registry, grants=idle(Grants)),
-        serve=lambda _node: None,
-        endpoints=SimpleNamespace(
-            faces=Ports(),
-            places=idle(NodePorts),
-            enforcement=SimpleNamespace(policy_changed=changed),
-        ),
-    )
-    base = SimpleNamespace(sockets={}, store=store, policies=policies)
-    await _restore(cast(Any, base), cast(Any, parts))
-    store.close()
-    assert decided == [("the new policy", ["/secret"])]
+async def test_a_node_that_finds_no_port_is_recorded_as_lost(tmp_path: Path) -> None:
+    control = Restored(tmp_path)
+    control.refusal = "all ports are in use"
+    await control.restore()
+    assert control.registry.all() == []
+    assert control.records == [("node lost", "all ports are in use", "/n")]
 
 
 def test_requests_in_progress_are_stored_before_the_end(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@ import errno
 import ipaddress
 import os
 import socket
+from collections import deque
 from collections.abc import Callable
 
 import pytest
@@ -92,12 +93,40 @@ def test_another_number_of_relays_after_a_restart() -> None:
     had = node.ports
     before.close_unclaimed(set())
     more = places(relays=3)
-    assert more.reopen(node)
+    more.reopen(node)
     assert (node.ports[:3], len(set(node.ports))) == (had, 4)
     more.close_unclaimed(set())
     fewer = places(relays=1)
-    assert fewer.reopen(node)
+    fewer.reopen(node)
     assert node.ports == had[:2]
+
+
+def test_a_restored_node_whose_port_another_program_has_gets_an_unused_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Such as a process of the earlier appliance that has not ended yet: a ROS 1 node never registers twice."""
+    taken = {FIRST, FIRST + 1, FIRST + 3}
+
+    def busy(host: str, port: int) -> Listening:
+        if port in taken:
+            raise OSError(errno.EADDRINUSE, os.strerror(errno.EADDRINUSE))
+        return Listening(host, port)
+
+    monkeypatch.setattr(node_ports, "listen", busy)
+    here = places()
+    first, second = incarnation((FIRST, FIRST + 1)), incarnation((FIRST + 2, FIRST + 3), HOSTS[1])
+    here.reserve((*first.ports, *second.ports))
+    here.reopen(first)
+    here.reopen(second)
+    assert (first.ports, second.ports) == ((FIRST + 4, FIRST + 5), (FIRST + 2, FIRST + 6))
+    here.close_unclaimed({*first.ports, *second.ports})
+    taken.clear()
+    assert [here.open(HOSTS[2]), here.taken.total] == [(FIRST + 7, FIRST), 6]
+    lost = incarnation((FIRST + 20, FIRST + 21))
+    with monkeypatch.context() as patch, pytest.raises(NoPortError, match="in use"):
+        taken.update(range(FIRST, FIRST + 30))
+        patch.setattr(here, "unused", deque([FIRST + 1]))
+        here.reopen(lost)
 
 
 def test_no_port_is_lost_while_none_can_be_opened(monkeypatch: pytest.MonkeyPatch) -> None:
