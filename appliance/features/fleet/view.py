@@ -43,7 +43,7 @@ _COLLECTOR_METRICS = (
 _BUNDLE_METRICS = (
     gauge(
         "rosrv_bundle_version",
-        "version of the fleet's bundle in force, or 0 if there is none; absent without a fleet",
+        "version of the bundle in force; 0 without one. Only robots of a fleet have this metric",
     ),
     gauge("rosrv_bundle_refused", "1 while the last bundle that was offered is refused"),
     gauge("rosrv_bundle_changed", "1 while a part of the bundle in force is changed on this robot"),
