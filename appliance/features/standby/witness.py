@@ -73,6 +73,7 @@ _FREEBIND, _SO_MARK = (
 )  # socket options that Python 3.5 does not name; FREEBIND: the network may be down
 _PROGRAM_SECONDS = 20.0  # at a boot, the first rule loads kernel modules from a slow disk
 _CHECK_SECONDS = 1.0
+_NETFILTER, _CT_DELETE, _NLM_REQUEST = 12, 0x102, 1
 _RESET_SECONDS, _RESET_ROUNDS = 0.6, 8  # a kernel answers one segment outside the window each half second
 _BATCH = 64  # datagrams of unknown sources between two checks of the time, and of the sockets of known ones
 _EACH = 8  # datagrams of each known source in this time, so that a flood of one delays no renewal of another
@@ -868,11 +869,34 @@ def segment(connection: Ends, flags: int, number: int) -> bytes:
     return header + ends + tcp[:16] + struct.pack("!H", checksum) + tcp[18:]
 
 
+def forgetting(connection: Ends) -> bytes:
+    """Return the message that deletes a connection from the kernel's connection tracker (ctnetlink)."""
+    own, own_port, peer, peer_port = connection
+    addresses = _attribute(1, socket.inet_aton(own)) + _attribute(2, socket.inet_aton(peer))
+    ports = _attribute(2, struct.pack("!H", own_port)) + _attribute(3, struct.pack("!H", peer_port))
+    ends = _nested(1, addresses) + _nested(2, _attribute(1, struct.pack("!B", socket.IPPROTO_TCP)) + ports)
+    body = struct.pack("!BBH", socket.AF_INET, 0, 0) + _nested(1, ends)
+    return struct.pack("=IHHII", 16 + len(body), _CT_DELETE, _NLM_REQUEST, 0, 0) + body
+
+
+def _attribute(kind: int, value: bytes) -> bytes:
+    return struct.pack("=HH", 4 + len(value), kind) + value + b"\0" * (-len(value) % 4)
+
+
+def _nested(kind: int, attributes: bytes) -> bytes:
+    return _attribute(kind | 0x8000, attributes)
+
+
 class IdleConnections:
-    """Resets local connections with an appliance that is no longer admitted, even idle ones."""
+    """Resets local connections with an appliance that is no longer admitted, even idle ones.
+
+    For ten seconds after a reset, the connection tracker would lead a new connection from the same port to the earlier
+    appliance, so it is told to forget it.
+    """
 
     def __init__(self, settings: WitnessSettings) -> None:
         self._settings = settings
+        self._tracker = socket.socket(socket.AF_NETLINK, socket.SOCK_RAW, _NETFILTER)
         self._raw = socket.socket(socket.AF_INET, socket.SOCK_RAW, socket.IPPROTO_RAW)
         self._raw.setsockopt(socket.SOL_SOCKET, _SO_MARK, MARK)
         self._raw.setblocking(False)
@@ -900,6 +924,10 @@ class IdleConnections:
         peers, tables = {peer for _, _, peer, _ in self._left}, _socket_tables()
         present = dict.fromkeys(sockets_with(peers, tables), _ACK)
         present.update((ends, _SYN) for ends in sockets_with(peers, tables, _CONNECTING))
+        for ends in self._left:
+            if ends not in present:
+                with contextlib.suppress(OSError):  # a kernel without a tracker's interface
+                    self._tracker.send(forgetting(ends))
         self._left = [ends for ends in self._left if ends in present]
         self._rounds -= 1
         for ends in self._left:

@@ -1,3 +1,4 @@
+import contextlib
 import os
 import select
 import signal
@@ -21,11 +22,13 @@ from appliance.features.standby.witness import EXPIRY
 from examples.landshark.lab import Host
 from tests.support.appliance import Appliance
 from tests.support.features.standby.standby_robot import StandbyRobot
-from tests.support.features.standby.standby_site import ADDRESSES, MASTER_PORT, OCU, ROBOT, StandbySite
+from tests.support.features.standby.standby_site import ADDRESSES, FIXED, MASTER_PORT, OCU, ROBOT, StandbySite
 from tests.support.rest import Answer, Rest
 from tests.support.waiting import allowed, eventually
 
 REST = "https://127.0.0.1:8443"
+_SOURCE_PORT = 40_000
+_TRACKED_SECONDS = 10.0  # that the kernel's connection tracker knows a connection after its reset
 ROLES = ("control", "relay", "rosmaster", "signer", "api", "lease")
 
 
@@ -60,6 +63,29 @@ def test_a_power_cut_of_the_active_appliance(site: StandbySite, robot: StandbyRo
     site.restore(active)
     site.until_both_in_sync()
     assert site.holder() == passive
+
+
+def test_a_port_of_an_earlier_connection_can_be_used_again(site: StandbySite, robot: StandbyRobot) -> None:
+    """The connection tracker would lead the new connection to the earlier appliance, which the robot shuts out."""
+
+    def connect() -> socket.socket:
+        return socket.create_connection((FIXED, MASTER_PORT), EXPIRY, ("", _SOURCE_PORT))
+
+    active, passive = site.pair()
+    with site.robot.run(connect) as before:
+        site.cut(active)
+        site.until_taken_over(passive)
+        before.settimeout(10 * EXPIRY)
+        with pytest.raises(ConnectionResetError):
+            before.recv(1)
+    eventually(lambda: _answers(site, connect), site.story, _TRACKED_SECONDS / 2)
+    site.restore(active)
+
+
+def _answers(site: StandbySite, connect: Callable[[], socket.socket]) -> bool:
+    with contextlib.suppress(ConnectionRefusedError), site.robot.run(connect):
+        return True
+    return False
 
 
 def test_the_death_of_one_process(site: StandbySite, robot: StandbyRobot) -> None:

@@ -1,6 +1,7 @@
 import ast
 import json
 import re
+import struct
 import subprocess
 import sys
 from collections.abc import Callable
@@ -25,6 +26,7 @@ from appliance.features.standby.witness import (
     WitnessGate,
     WitnessSettings,
     chosen_backend,
+    forgetting,
     main,
     seal,
     sockets_with,
@@ -474,6 +476,16 @@ def test_connections_are_found_in_the_tables_of_the_kernel() -> None:
         ("10.0.0.1", 0xD431, "10.0.0.2", 11311),
         ("10.0.0.1", 0xD434, "10.0.0.2", 11311),
     ]
+
+
+def test_the_connection_tracker_is_told_to_forget_a_connection() -> None:
+    """The attributes of nfnetlink_conntrack.h are nested, and each is padded to four bytes."""
+    message = forgetting(("10.0.0.1", 0xD431, "10.0.0.2", 11311))
+    assert struct.unpack("=IHHII", message[:16]) == (len(message), 0x102, 1, 0, 0)
+    tuple_of = (
+        "3400018014000180080001000a000001080002000a0000021c000280050001000600000006000200d431000006000300"
+    )
+    assert message[16:].hex() == "02000000" + tuple_of + "2c2f0000"
 
 
 # ---- The file runs on the robot as it is
