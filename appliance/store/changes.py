@@ -170,6 +170,8 @@ class LeftBehind(NamedTuple):
 
     changes: list[tuple[int, Change]]
     statements: list[tuple[str, list[Any]]]
+    goes_on: bool = False
+    """Whether the database has an earlier change of the process that made these."""
 
 
 class WriteAheadClosedError(OSError):
@@ -202,7 +204,9 @@ class WriteAhead:
         if data[:1] < b"\x80":
             return LeftBehind([], list(_earlier_statements(data)))
         decoder = msgspec.msgpack.Decoder(Change)
-        return LeftBehind([(number, decoder.decode(body)) for number, body in _after(stored, data)], [])
+        found = list(_after(stored, data))
+        changes = [(number, decoder.decode(body)) for number, _previous, body in found]
+        return LeftBehind(changes, [], goes_on=bool(found) and found[0][1] > 0)
 
     def append(self, changes: Sequence[Encoded]) -> None:
         """Append changes. Raises `OSError`, for example if the disk is full; then the file has none of them."""
@@ -248,7 +252,8 @@ class WriteAhead:
                 self._open_descriptor = -1
 
 
-def _after(stored: int, data: bytes) -> Iterator[Encoded]:
+def _after(stored: int, data: bytes) -> Iterator[tuple[int, int, bytes]]:
+    """Yield the changes after `stored`: number, number of the process's change before it (0: none), and body."""
     position = 0
     while position + _HEAD.size + _NUMBERS.size <= len(data):
         marked, checksum = _HEAD.unpack_from(data, position)
@@ -261,7 +266,7 @@ def _after(stored: int, data: bytes) -> Iterator[Encoded]:
             return
         if number > stored:
             stored = number
-            yield Encoded(number, data[begin + _NUMBERS.size : position])
+            yield number, previous, data[begin + _NUMBERS.size : position]
 
 
 def _earlier_statements(data: bytes) -> Iterator[tuple[str, list[Any]]]:

@@ -3,8 +3,8 @@
 A killed process loses no change: a separate file holds queued changes until the database has them (`ahead`). A
 power failure loses no change that was awaited (`settled`). The table `journal` has the number of the last change,
 so after a crash the database neither repeats nor skips a change. Numbers identify changes within a *history*
-only, which each process that changes the file begins, because an earlier process may have passed on changes that
-it then lost in a crash.
+only, which each process begins with its first change, because an earlier process may have passed on changes that
+it then lost in a crash. The changes that a killed process left belong to its own history.
 """
 
 import asyncio
@@ -317,7 +317,8 @@ class Database:
         last = queued[-1].number
         try:
             statement = self.tables.statement
-            self._execute([statement(change) for item in queued for change in item.changes], last)
+            statements = [statement(change) for item in queued for change in item.changes]
+            self._execute(statements, self.history, last)
         except sqlite3.Error as error:
             if self._connection.in_transaction:
                 self._connection.execute("ROLLBACK")
@@ -352,23 +353,25 @@ class Database:
             self._told.add(reason)
             self._failed(reason)
 
-    def _execute(self, statements: list[tuple[str, list[Value]]], number: int) -> None:
+    def _execute(self, statements: list[tuple[str, list[Value]]], history: str, number: int) -> None:
         self._connection.execute("BEGIN")
         for sql, values in statements:
             self._connection.execute(sql, values)
-        self._connection.execute(_NOTE_NUMBER, (self.history, number))
+        self._connection.execute(_NOTE_NUMBER, (history, number))
         self._connection.execute("COMMIT")
 
     def _catch_up(self) -> int:
         """Apply the changes that a killed process left, before anything is read; return the last number."""
-        number = max((row[0] for row in self._connection.execute("SELECT number FROM journal")), default=0)
+        kept = self._connection.execute("SELECT history, number FROM journal").fetchone()
+        number = kept[1] if kept else 0
         left = self._ahead.left(number)
+        history = kept[0] if kept and left.goes_on else self.history
         for _number, change in left.changes:
             self.tables.check(change)
         if left.changes or left.statements:
             number = left.changes[-1][0] if left.changes else number
             statements = [self.tables.statement(change) for _number, change in left.changes]
-            self._execute(left.statements + statements, number)
+            self._execute(left.statements + statements, history, number)
         self._ahead.clear()
         return number
 

@@ -573,6 +573,27 @@ def test_numbers_continue_after_each_start_and_each_start_has_its_own_history(tm
     database.close()
 
 
+@pytest.mark.parametrize("committed", [False, True])
+def test_the_changes_that_a_killed_process_left_belong_to_its_history(
+    tmp_path: Path, *, committed: bool
+) -> None:
+    """Unless its first change is among them: the history in the database is then that of an earlier process."""
+    earlier = Database(tmp_path / "state.db", SCHEMA, failed=pytest.fail, drive=ByHand)
+    earlier.put("thing", "a", 1)
+    earlier.close()
+    killed = Database(tmp_path / "state.db", SCHEMA, failed=pytest.fail, drive=ByHand)
+    killed.put("thing", "b", 1)
+    if committed:
+        killed.turn(0.0)
+    killed.put("thing", "c", 1)
+    Database(tmp_path / "state.db", SCHEMA, failed=pytest.fail, drive=ByHand).close()
+    with contextlib.closing(sqlite3.connect(tmp_path / "state.db")) as reader:
+        ((history, number),) = reader.execute("SELECT history, number FROM journal")
+    assert number == 3
+    assert (history == killed.history) is committed
+    assert history != earlier.history
+
+
 @pytest.mark.nightly
 def test_a_copy_is_of_one_moment_and_leaves_no_file(tmp_path: Path) -> None:
     (tmp_path / "state.new").write_bytes(b"a part")
