@@ -18,6 +18,7 @@ from appliance.configuration.config_sources import resolve
 from appliance.configuration.settings import Settings, load_resolved
 from appliance.features.standby.kit import Kits, PairPlan, make_kits
 from appliance.features.standby.membership import (
+    LEFT_FILE,
     Membership,
     MembershipError,
     load_membership,
@@ -41,8 +42,8 @@ class JoinOptions:
     other: str
     witness: str
     fixed: str
-    name: str
-    other_name: str
+    name: str | None
+    other_name: str | None
     followers: tuple[str, ...]
     ports: str | None
     port: int
@@ -56,6 +57,7 @@ def join_first(options: JoinOptions, *, as_json: bool) -> None:
     path = path_of(options.state)
     _require_state(options.state)
     earlier = existing_membership(path)
+    left = existing_membership(path.with_name(LEFT_FILE)) if earlier is None else None
     if earlier is not None and not options.again:
         raise refused(
             [
@@ -63,7 +65,7 @@ def join_first(options: JoinOptions, *, as_json: bool) -> None:
                 f" ({earlier.other_address}); --again makes new keys, and all machines must be set up again"
             ]
         )
-    plan = _plan(options, _settings(options))
+    plan = _plan(options, _settings(options), earlier or left)
     try:
         kits = make_kits(plan)
     except ValueError as error:
@@ -135,7 +137,7 @@ def _settings(options: JoinOptions) -> Settings:
     return resolve(options.config, os.environ, {"state": options.state})
 
 
-def _plan(options: JoinOptions, settings: Settings) -> PairPlan:
+def _plan(options: JoinOptions, settings: Settings, earlier: Membership | None) -> PairPlan:
     if settings.isolation == "none":
         raise refused(
             [
@@ -153,10 +155,13 @@ def _plan(options: JoinOptions, settings: Settings) -> PairPlan:
         epoch = stored_epoch(options.state / "lease" / EPOCH)
     except (OSError, ValueError) as error:
         raise refused([f"{_VERB}: {error}"]) from None
+    # Its audit log and the state of its monitors have the appliance's name.
+    name = options.name or (earlier.name if earlier is not None else "a")
+    other = earlier.other if earlier is not None and earlier.name == name else "a" if name == "b" else "b"
     return PairPlan(
-        name=options.name,
+        name=name,
         address=options.address,
-        other=options.other_name,
+        other=options.other_name or other,
         other_address=options.other,
         witness=options.witness,
         fixed=options.fixed,

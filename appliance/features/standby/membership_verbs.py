@@ -42,8 +42,12 @@ def join(
         str | None,
         typer.Option(help="Unused address in the robot's network, at which nodes reach the active appliance"),
     ] = None,
-    name: Annotated[str, typer.Option(help="Name of this appliance")] = "a",
-    other_name: Annotated[str, typer.Option(help="Name of the other appliance")] = "b",
+    name: Annotated[
+        str | None, typer.Option(help="Name of this appliance (default: its name in an earlier pair, or a)")
+    ] = None,
+    other_name: Annotated[
+        str | None, typer.Option(help="Name of the other appliance (default: as in an earlier pair, or b)")
+    ] = None,
     follower: Annotated[
         list[str] | None,
         typer.Option(
