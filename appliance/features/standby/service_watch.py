@@ -6,8 +6,8 @@ the lease is given away when control reports an obstacle (a full disk), is silen
 A control that died has `RESTART_SECONDS`, because topics and monitors need no control. After a lapse there are no
 relays, so the other appliance takes over sooner, unless a monitor would lose its state and hold its topics.
 
-If the lease is given away soon, all limits are doubled the next time, so that two appliances that cannot serve do not
-keep passing it back and forth.
+If the lease is given away soon, all limits are doubled until this appliance serves steadily, so that two appliances
+that cannot serve do not keep passing it back and forth.
 """
 
 from appliance.features.standby.witness import EXPIRY
@@ -42,6 +42,8 @@ class ServiceWatch:
         if not obstacle:
             self._served, self._serves, self._cold = now, True, False
             self._ready = now if self._ready is None else self._ready
+            if now - self._ready > STEADY_SECONDS:
+                self._doublings = 0
         elif not self._obstacle:
             self._obstacle_since = now
         self._obstacle = obstacle
@@ -74,4 +76,5 @@ class ServiceWatch:
         if self._cold:
             return  # the other one stands by, and nothing was tried here
         steady = self._ready is not None and self._served - self._ready > STEADY_SECONDS
-        self._doublings = 0 if steady else min(self._doublings + 1, _MOST_DOUBLINGS)
+        if not steady:
+            self._doublings = min(self._doublings + 1, _MOST_DOUBLINGS)

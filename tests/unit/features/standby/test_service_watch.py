@@ -65,3 +65,15 @@ def test_two_appliances_do_not_pass_the_lease_back_and_forth(seconds: float, fac
     assert watch.fault(200.0, active=False) == watch.fault(200.0, active=True) == ""
     assert watch.fault(200.0 + factor * START_SECONDS, active=True) == ""
     assert watch.fault(200.1 + factor * START_SECONDS, active=True)
+
+
+def test_steady_service_ends_the_doubled_times() -> None:
+    """After a month of service, a full disk is not tolerated for 38 s because of earlier short activations."""
+    watch = serving()
+    for start in (200.0, 300.0, 400.0, 500.0, 600.0):
+        watch.given_away()
+        assert watch.fault(start - 1, active=False) == watch.fault(start, active=True) == ""
+        watch.reported(start + 1, "", keeps_state=False)
+    watch.reported(601.1 + STEADY_SECONDS, "", keeps_state=False)
+    watch.reported(700.0, "full", keeps_state=False)
+    assert watch.fault(700.1 + OBSTACLE_SECONDS, active=True) == "full"
