@@ -257,6 +257,20 @@ def test_a_boot_of_the_robot(site: StandbySite, robot: StandbyRobot) -> None:
     assert site.pair() == pair
 
 
+def test_a_boot_of_the_robot_while_the_standby_is_off(site: StandbySite, robot: StandbyRobot) -> None:
+    """The state in memory stays, such as holders of groups: no other appliance can have been active."""
+    active, passive = site.pair()
+    site.cut(passive)
+    eventually(lambda: site.in_sync() == {active}, site.story)
+    epoch, before = site.lease.read().epoch, site.pids(active)
+    robot.cut()
+    wait(15.0)
+    robot.boot()
+    assert (site.lease.read().epoch, site.pids(active)) == (epoch, before)
+    site.restore(passive)
+    site.until_both_in_sync()
+
+
 @pytest.mark.parametrize("order", ["robot first", "appliances first"])
 def test_a_power_cut_of_all_three(site: StandbySite, robot: StandbyRobot, order: str) -> None:
     for name in ADDRESSES:

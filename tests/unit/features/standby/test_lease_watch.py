@@ -92,6 +92,19 @@ def test_a_renewal_in_the_same_epoch_ends_a_lapse() -> None:
     run(work)
 
 
+def test_a_boot_of_the_robot_ends_nothing() -> None:
+    """While the standby is off, no other appliance can be active, and the state in memory stays the newest."""
+
+    async def work(role: Role) -> None:
+        role.watch.held(clock.since_boot() + 0.05, 5)
+        await role.until_stopped()
+        await asyncio.sleep(120.0)
+        role.watch.held(clock.since_boot() + 0.05, 5)
+        assert role.orders == [5, "suspended", "resumed"]
+
+    run(work)
+
+
 @pytest.mark.parametrize("end", ["ended", "not_renewable", "later epoch", "time"])
 def test_a_lapse_that_no_renewal_ends(end: str) -> None:
     async def work(role: Role) -> None:
