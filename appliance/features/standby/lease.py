@@ -126,6 +126,9 @@ class ApplianceLease:
         self._other_witnessed: float | None = None
         self._next_removal = now
         self._expired = False
+        self.sole = False  # whether the witness's in-sync set names only this appliance
+        self.expired_since: float | None = None  # according to the witness, without a silence of one expiry
+        self._told_expiry = now
         self._last_add = 0
         self._witnessed = epoch  # the greatest epoch of the witness
         self._rumoured = (
@@ -231,6 +234,8 @@ class ApplianceLease:
             return ()
         self._witnessed = answer.epoch
         self._expired = answer.expired
+        self.sole = answer.in_sync == {self._name}
+        self._note_expiry(request.sent, expired=answer.expired)
         if answer.holder != self._name or not answer.ok:
             self._learn(
                 answer.epoch
@@ -248,6 +253,13 @@ class ApplianceLease:
         if request.operation == "release" and self._switching_until is not None:
             self._released = True
         return ()
+
+    def _note_expiry(self, now: float, *, expired: bool) -> None:
+        if not expired:
+            self.expired_since = None
+        elif self.expired_since is None or now - self._told_expiry > EXPIRY:
+            self.expired_since = now
+        self._told_expiry = now
 
     def received(self, now: float, message: PeerMessage) -> Outgoing:
         match message:

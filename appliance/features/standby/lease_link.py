@@ -35,6 +35,10 @@ class LeaseState(Message):
     """Why the other appliance could not claim now."""
     trouble: str
     """Why the witness could not save a takeover."""
+    sole: bool = False
+    """Whether the witness's in-sync set names only this appliance."""
+    expired_since: float | None = None
+    """The time since which the witness has said that no appliance holds the lease."""
 
 
 class HandOverAnswered(Message):

@@ -22,11 +22,11 @@ from appliance.features.standby.link_certificates import replication_context
 from appliance.features.standby.membership import Membership
 from appliance.features.standby.passive_rest import PassiveRest, ReplicatedTokens
 from appliance.features.standby.replica import Replica
-from appliance.features.standby.replica_sync import ReplicaSync
+from appliance.features.standby.replica_sync import ReplicaSync, StateComparison, is_recovered
 from appliance.features.standby.replication import Pair, host_endpoint, state_of
 from appliance.features.standby.replication_frames import ReplicationError
 from appliance.features.standby.replication_receiver import ReplicationReceiver
-from appliance.features.standby.replication_transport import follow_at
+from appliance.features.standby.replication_transport import ReplicationListener, follow_at
 from appliance.features.standby.standby_answers import OtherAppliance, StandbyState
 from appliance.features.standby.standby_orders import StandbyAdministration
 from appliance.features.standby.standby_tunnels import StandbyTunnels
@@ -66,6 +66,7 @@ class PassiveControl:
         self.tunnels = StandbyTunnels()
         endpoint = host_endpoint(settings, membership)
         self._replica_sync = ReplicaSync(self._replica, self._folder)
+        self._comparison = StateComparison(lambda: self._replica.position)
         self._check = TakeoverCheck(settings, membership, compiler.check_at_start, compiler.parts)
         self._complete = False  # whether no acknowledged change is missing
         self._receiver = ReplicationReceiver(
@@ -79,7 +80,7 @@ class PassiveControl:
         self._epoch = 0
         self._connected = False
         self._away_since = clock.now()
-        self._reason = ""
+        self._reason = self._unlistened = ""
         self._rest = PassiveRest(
             StandbyAdministration(self, orders=False), ReplicatedTokens(self._folder / "state.db")
         )
@@ -102,8 +103,10 @@ class PassiveControl:
         self._lifeline.hear(self._heard)
         active = self._lifeline.hear_tunnels(self.tunnels.answered)
         self._lifeline.say(messages.Ready({"stands_by": True}))
+        comparing = begin("the comparison with the other appliance", self._compare)
         tasks += [
-            begin("the copy of the state", self._sync),
+            comparing,
+            begin("the copy of the state", partial(self._sync, comparing.cancel)),
             begin("the age of the copies of monitors", self.copies.run),
             begin("the check of a takeover", partial(self._check.run, self._state_presence)),
         ]
@@ -120,15 +123,16 @@ class PassiveControl:
             await asyncio.wait([*tasks, stating])
             await asyncio.to_thread(self._replica.close)
 
-    async def _sync(self) -> None:
+    async def _sync(self, completed: Callable[[], object]) -> None:
         def complete() -> None:
+            completed()
             self._complete = True
             self._state_presence()
 
         reason = ""
         while True:
             try:
-                await self._replica_sync.run(lambda: self._receiver.followed, complete)
+                await self._replica_sync.run(self._is_recovered, complete)
             except (StoreError, OSError) as error:
                 if reason != str(error):
                     reason = str(error)
@@ -200,6 +204,24 @@ class PassiveControl:
             self.tunnels.attach(Channel(socket.socket(fileno=descriptors[0]), messages.TunnelLink))
         else:
             self._lifeline.queue(message, descriptors)
+
+    def _is_recovered(self) -> bool:
+        return is_recovered(
+            self._membership.name, self._lease.state, self._comparison, followed=self._receiver.followed
+        )
+
+    async def _compare(self) -> None:
+        """Answer the other appliance if it follows this one because it is not active either."""
+        while True:
+            try:
+                context = replication_context(self._membership, self._folder, server=True)
+                with socket.create_server(("", self._membership.port)) as listening:
+                    await ReplicationListener(self._comparison, context).run(listening)
+            except OSError as error:
+                if self._unlistened != str(error):
+                    self._unlistened = str(error)
+                    _log.warning("the states of the appliances are not compared", reason=self._unlistened)
+            await asyncio.sleep(_AGAIN_SECONDS)
 
     async def _follow(self) -> None:
         context: ssl.SSLContext | None = None

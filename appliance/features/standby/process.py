@@ -199,6 +199,8 @@ class LeaseProcess:
         state = lease_link.LeaseState(
             until=lease.valid_until if active else 0.0,
             epoch=lease.epoch,
+            sole=lease.sole,
+            expired_since=lease.expired_since,
             alone=active and self._alone and lease.answers_alone,  # not after the order to add the standby
             permission=self._permission,
             in_sync=answer is not None and self._membership.other in answer.in_sync,

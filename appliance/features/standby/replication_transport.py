@@ -3,12 +3,12 @@
 import asyncio
 import socket
 import ssl
+from typing import Protocol
 
 import structlog
 
 from appliance.features.standby.replication_frames import ReplicationError
 from appliance.features.standby.replication_receiver import ReplicationReceiver
-from appliance.features.standby.replication_sender import ReplicationSender
 
 _HANDSHAKE_SECONDS = 5.0
 _PAUSE_SECONDS = 1.0
@@ -17,11 +17,15 @@ _MOST_CONNECTIONS = 8  # one is in use; others are in their handshake, or replac
 _log = structlog.get_logger()
 
 
-class ReplicationListener:
-    """Accepts the standby's connections, and sends to the last one."""
+class _Server(Protocol):
+    async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None: ...
 
-    def __init__(self, sender: ReplicationSender, context: ssl.SSLContext) -> None:
-        self._sender = sender
+
+class ReplicationListener:
+    """Accepts the other appliance's connections."""
+
+    def __init__(self, server: _Server, context: ssl.SSLContext) -> None:
+        self._server = server
         self._context = context
         self._connections: set[asyncio.Task[None]] = set()
 
@@ -62,7 +66,7 @@ class ReplicationListener:
             return
         writer = asyncio.StreamWriter(transport, protocol, reader, loop)
         try:
-            await self._sender.serve(reader, writer)
+            await self._server.serve(reader, writer)
         except ReplicationError as error:
             _log.warning("the replication to the standby ended", reason=str(error))
 

@@ -13,6 +13,7 @@ from typing import Any, Self
 from appliance.features.standby import witness
 from appliance.features.standby.kit import PairPlan, make_kits
 from appliance.features.standby.membership import PORT, Membership, path_of, save_membership
+from appliance.features.standby.replica_sync import MARK
 from appliance.features.standby.witness import LeaseRecord
 from appliance.network import interfaces
 from examples.landshark.lab import INTERFACE, Host, Lab
@@ -150,8 +151,12 @@ class StandbySite:
         eventually(lambda: self.in_sync() == {"a", "b"}, self.story)
 
     def cut(self, name: str) -> None:
+        """Cut the power of an appliance, whose next start follows a boot of its machine."""
         interfaces.set_link(self.lab.hosts[name].namespace, INTERFACE, up=False)
         self.signal(name, signal.SIGKILL)
+        mark = self.appliances[name].state / "control" / MARK
+        assert mark.exists()
+        mark.write_text("an earlier boot", "ascii")
 
     def restore(self, name: str) -> None:
         one = self.appliances[name]

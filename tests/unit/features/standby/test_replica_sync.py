@@ -4,7 +4,6 @@ from pathlib import Path
 
 import pytest
 
-from appliance.features.standby import replica_sync
 from appliance.features.standby.replica import Replica
 from appliance.features.standby.replica_sync import ReplicaSync
 from appliance.store.state_file import SCHEMA
@@ -43,13 +42,4 @@ async def test_after_a_reboot_it_waits_for_the_active_appliance(replica: Replica
     assert not await complete(replica, tmp_path, "boot 2", followed=False, seconds=0.5)
     assert not await complete(replica, tmp_path, "boot 2", followed=False, seconds=0.5)
     assert await complete(replica, tmp_path, "boot 2", followed=True, seconds=LIMIT)
-    assert await complete(replica, tmp_path, "boot 2", followed=False, seconds=LIMIT)
-
-
-async def test_two_appliances_without_power_start_again(
-    replica: Replica, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """If no active appliance appears, both lost their power, and one of them must serve the robot."""
-    assert await complete(replica, tmp_path, "boot 1", followed=False, seconds=LIMIT)
-    monkeypatch.setattr(replica_sync, "WAIT_SECONDS", 0.2)
     assert await complete(replica, tmp_path, "boot 2", followed=False, seconds=LIMIT)
