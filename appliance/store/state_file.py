@@ -1,4 +1,8 @@
-"""The tables of control's state file: registry, parameters, policy revisions, tokens, hosts, settings."""
+"""The tables of control's state file: registry, parameters, policy revisions, tokens, hosts, settings.
+
+A table of a released version keeps its columns: while a pair is upgraded, a standby of the new version stores the rows
+of an active appliance of the old one. A new value gets a new table.
+"""
 
 import math
 from collections.abc import Callable, Mapping

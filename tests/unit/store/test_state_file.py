@@ -1,7 +1,9 @@
+import contextlib
 import copy
 import os
 import random
 import signal
+import sqlite3
 import traceback
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -13,6 +15,7 @@ from appliance.policy.model import address_of
 from appliance.store.changes import Encoded, WriteAhead
 from appliance.store.state_file import (
     LARGEST_CHANGE,
+    SCHEMA,
     IncarnationRow,
     PermissionRow,
     RegistrationRow,
@@ -23,6 +26,8 @@ from roswire.parameter_tree import Tree
 from roswire.xmlrpc import Value
 from tests.support.engines import InlineDatabase
 from tests.support.parameters import mirror, put
+
+INTEGRATION = Path(__file__).parents[2] / "integration"
 
 
 def incarnation(key: str) -> IncarnationRow:
@@ -51,6 +56,26 @@ def killed_after(work: Callable[[StateStore], None], directory: Path) -> None:
             traceback.print_exc()
             os._exit(1)
     assert os.WTERMSIG(os.waitpid(child, 0)[1]) == signal.SIGKILL
+
+
+def columns_of(script: str) -> dict[str, list[tuple[str, str, int, int]]]:
+    found: dict[str, list[tuple[str, str, int, int]]] = {}
+    with contextlib.closing(sqlite3.connect(":memory:")) as connection:
+        connection.executescript(script)
+        for table, *column in connection.execute(
+            'SELECT t.name, c.name, c.type, c."notnull", c.pk FROM sqlite_master AS t'
+            " JOIN pragma_table_info(t.name) AS c WHERE t.type = 'table' ORDER BY t.name, c.cid"
+        ):
+            found.setdefault(table, []).append((column[0], column[1], column[2], column[3]))
+    return found
+
+
+def test_the_tables_of_a_released_version_keep_their_columns() -> None:
+    """A standby of the next version stores the rows of the active appliance; new values need a new table."""
+    released = columns_of((INTEGRATION / "state-0.3.0.sql").read_text())
+    released.pop("journal")
+    present = columns_of(SCHEMA)
+    assert released == {table: present.get(table) for table in released}
 
 
 def test_the_registry_comes_back_as_it_was(tmp_path: Path) -> None:
