@@ -1,6 +1,7 @@
-"""Check on a standby that control could start if this appliance took over now.
+"""Check on a standby that control could start if this appliance took over now, and would not give the lease away.
 
-The check also writes to the disk of the state, and compiles the specifications, so that a takeover need not. It
+The check also writes to the disk of the state and to the audit log, and compiles the specifications, so that a
+takeover need not. It
 is repeated, because the appliance's own files, disk and ports may change. While it fails, this appliance does not
 claim the lease, but still follows the active one and stays in the in-sync set.
 """
@@ -16,6 +17,9 @@ from typing import Any
 
 import structlog
 
+from appliance.audit.log import log_database
+from appliance.audit.log.log_database import LogUnreadableError
+from appliance.audit.log.log_writer import ChainWriter
 from appliance.configuration.settings import Settings
 from appliance.control.assembly.active_role import STATE_ERRORS
 from appliance.control.assembly.foundation import open_listener
@@ -114,6 +118,8 @@ class TakeoverCheck:
     async def _load(self) -> None:
         settings = self._settings
         await asyncio.to_thread(_require_room, self._folder)
+        if settings.audit.on_audit_failure == "deny":
+            await asyncio.to_thread(_require_log, self._folder / "audit.db")
         last, said = await asyncio.to_thread(self._load_state)
         switches = Switches(settings.enable)
         switches.restore(said)
@@ -160,3 +166,16 @@ def _require_room(folder: Path) -> None:
         raise OSError(reason)
     with tempfile.TemporaryFile(dir=folder) as file:  # it has no name, so nothing stays
         file.write(b"\0")
+
+
+def _require_log(path: Path) -> None:
+    """Raise `OSError` unless the audit log, if it exists, can be continued. Its records stay as they are."""
+    if not path.exists():
+        return
+    try:
+        ChainWriter(path, 0).close()
+        with contextlib.closing(log_database.open_for_writing(path)) as connection:
+            connection.execute(f"PRAGMA user_version = {log_database.LAYOUT_VERSION}")  # as before
+    except (LogUnreadableError, sqlite3.Error, OSError) as error:
+        name = "" if str(path) in str(error) else f"{path}: "
+        raise OSError(f"the audit log cannot be written: {name}{error}") from error

@@ -9,9 +9,11 @@ from typing import Any
 import msgspec
 import pytest
 
+from appliance.audit.log import log_database
+from appliance.audit.log.log_writer import ChainWriter
 from appliance.base.actors import DISK
 from appliance.channel import messages
-from appliance.configuration.settings import Settings
+from appliance.configuration.settings import Audit, Settings
 from appliance.features.standby.membership import Membership
 from appliance.features.standby.standby_summary import UNCHECKED
 from appliance.features.standby.takeover_check import TakeoverCheck
@@ -193,6 +195,26 @@ async def test_a_damaged_certificate(standby: Standby) -> None:
     damaged = msgspec.structs.replace(standby.membership, certificate="")
     async with standby.checked(membership=damaged) as checked:
         assert "the certificates of the two appliances cannot be used" in await checked.next_obstacle()
+
+
+async def test_an_audit_log_that_cannot_be_written(standby: Standby) -> None:
+    """With `deny` nothing would be granted, so the new active appliance would give the lease away again."""
+    path = standby.home / "control" / "audit.db"
+    log_database.create(path, 1)
+    refused = f"the audit log cannot be written: {path}: "
+    async with standby.checked(again=0.05) as checked:
+        assert await checked.next_obstacle() == ""
+        with contextlib.closing(ChainWriter(path, 1)):
+            assert await checked.next_obstacle() == f"{refused}another process writes this log"
+        assert await checked.next_obstacle() == ""
+        path.with_name("audit.db-wal").mkdir()
+        assert await checked.next_obstacle() == f"{refused}unable to open database file"
+        path.with_name("audit.db-wal").rmdir()
+        assert await checked.next_obstacle() == ""
+        path.write_bytes(b"not a log")
+        assert (await checked.next_obstacle()).startswith(refused)
+    async with standby.checked(audit=Audit(on_audit_failure="allow")) as checked:
+        assert await checked.next_obstacle() == ""
 
 
 class OwnCompiler(SpecificationCompiler):
