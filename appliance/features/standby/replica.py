@@ -6,7 +6,8 @@ cannot grow beyond `LARGEST_STATE`. Changes must follow each other without a gap
 smaller epoch.
 
 A stored change survives the death of all processes, but not a power cut before the next `sync`. So after a power
-cut, a standby must catch up before it takes over.
+cut, a standby must catch up before it takes over. After a `sync` that failed, nothing is stored until one succeeds.
+Then a snapshot is needed, because the kernel may have dropped the changes that it could not write.
 
 All tables are copied: tokens are there only as hashes, and the robot's nodes expect `parameters` from either
 appliance. Private keys are never in this database.
@@ -50,6 +51,8 @@ class Replica:
         self._lock = threading.Lock()
         self._snapshot: SnapshotBegin | None = None
         self._rows = 0
+        self.unsynced = ""
+        """Why the last `sync` failed, or empty."""
         with self._explained():
             self._connection = sqlite3.connect(path, check_same_thread=False, isolation_level=None)
             self._connection.execute("PRAGMA synchronous=NORMAL")
@@ -83,7 +86,11 @@ class Replica:
             with self._path.with_name(f"{self._path.name}-wal").open("rb") as log:
                 os.fsync(log.fileno())
         except OSError as error:
-            raise StoreError(f"{self._path}: {error}; free space there") from error
+            self.unsynced = f"{self._path} cannot be written to the disk: {error}"
+            raise StoreError(self.unsynced) from error
+        if self.unsynced:
+            with self._lock:
+                self.unsynced, self.position = "", Stored(self.position.epoch, "", 0)
 
     def abandon_snapshot(self) -> None:
         with self._lock:
@@ -95,6 +102,8 @@ class Replica:
             self._connection.close()
 
     def _take(self, message: FromActive) -> None:
+        if self.unsynced:
+            raise StoreError(self.unsynced)
         match message:
             case SnapshotRows() if self._snapshot is not None:
                 self._execute(message.rows)

@@ -1,4 +1,5 @@
 import contextlib
+import errno
 import os
 import sqlite3
 from collections.abc import Iterator
@@ -81,6 +82,31 @@ def test_a_sync_brings_what_is_stored_to_the_disk(tmp_path: Path, monkeypatch: p
     replica.sync()
     assert [Path(name).name for name in synced] == ["state.db-wal"]
     replica.close()
+
+
+def test_after_a_failed_sync_it_stores_nothing_until_one_succeeds_and_then_needs_a_snapshot(
+    replica: Replica, tmp_path: Path
+) -> None:
+    """Otherwise the active appliance would answer, and a power cut of both would lose more than the last 0.1 s."""
+
+    def fails(_file: int) -> None:
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    replica.take(changes(thing("a")))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "fsync", fails)
+        with pytest.raises(StoreError, match="Input/output error"):
+            replica.sync()
+        for message in (changes(first=9), SnapshotBegin(3, "h", 9)):
+            with pytest.raises(StoreError, match=r"state\.db cannot be written to the disk"):
+                replica.take(message)
+    replica.sync()
+    assert (replica.unsynced, replica.position) == ("", Stored(3, "", 0))
+    with pytest.raises(ReplicationError, match="another history"):
+        replica.take(changes(thing("b"), first=9))
+    for snapshot in (BEGIN, SnapshotRows([thing("b")]), SnapshotEnd(1)):
+        replica.take(snapshot)
+    assert names(tmp_path) == ["b"]
 
 
 BAD: list[tuple[FromActive, str]] = [
