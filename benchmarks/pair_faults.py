@@ -191,7 +191,7 @@ def until_whole(site: StandbySite, robot: StandbyRobot) -> None:
     eventually(lambda: robot.admitted() == {ADDRESSES[site.holder()]}, site.story)
     wanted = standby_requests.StandbyWanted()
     for one in site.appliances.values():
-        eventually(partial(lambda it: not [*standby_troubles(it.ask(wanted))], one), site.story)
+        eventually(partial(lambda it: not it.ask(wanted).troubles, one), site.story)
 
 
 def one(

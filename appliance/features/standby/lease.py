@@ -108,6 +108,8 @@ class ApplianceLease:
         self.held: int | None = None
         self.answers_alone = False
         self.refusal = ""
+        self.disowned = False  # whether the witness refuses because it does not know this epoch
+        self.seen: WitnessAnswer | None = None  # the last answer that knew it
         self.ready = True  # False: this appliance could not serve, so it does not claim
         self._name = name
         self._other = other
@@ -151,14 +153,36 @@ class ApplianceLease:
     def other_witnessed(self) -> float | None:
         return self._other_witnessed
 
+    def takeover_obstacle(self, now: float) -> str:
+        """Return why the appliance that is not active could not claim the lease now."""
+        if self.is_active(now):
+            return self.handover_obstacle(now)
+        if self.disowned:
+            return self._disowned()
+        if self.seen is None or now - self._witnessed_at > EXPIRY:
+            return (
+                "the witness on the robot does not answer this appliance; check the network between the two"
+            )
+        if self._name not in self.seen.in_sync:
+            return f"{self._name} lacks changes that {self._other} has acknowledged; wait until it has them"
+        return self._unsaved()
+
     def handover_obstacle(self, now: float) -> str:
         other = self._other
+        if self.disowned:
+            return self._disowned()
         if self.answers_alone or now - self._heard > SILENCE:
             return f"{other} is not ready to take over; wait until it answers and has all data"
         if not self._other_able:
             return f"{other} could not serve after a takeover; `rosrv standby status` there says why"
         if self._other_witnessed is None or now - self._other_witnessed > EXPIRY:
             return f"the witness on the robot does not answer {other}; check the network between {other} and the robot"
+        return self._unsaved()
+
+    def _disowned(self) -> str:
+        return f"the witness on the robot refuses this appliance: {self.refusal}"
+
+    def _unsaved(self) -> str:
         return f"the witness could not save the takeover: {self._trouble}" if self._trouble else ""
 
     def is_active(self, now: float) -> bool:
@@ -219,20 +243,23 @@ class ApplianceLease:
 
     def answered(self, request: WitnessRequest, answer: WitnessAnswer) -> Outgoing:
         self.refusal, self._trouble = answer.reason, answer.trouble
-        self._witnessed_at = max(self._witnessed_at, request.sent)
         if self.epoch and answer.epoch - self.epoch > FARTHEST:
             self.refusal = (
                 f"the witness has epoch {answer.epoch}, this appliance {self.epoch}: if an operator chose that of the"
                 " witness, stop this appliance and run `rosrv standby repair`"
             )
+            self.disowned = True
             return ()
         if answer.epoch < self.epoch and request.sequence > self._rumoured:
             self.epoch = max(
                 answer.epoch, self._witnessed
             )  # what the other appliance claimed was never granted
+        self.disowned = answer.epoch < self.epoch and bool(answer.reason)
+        if not self.disowned:  # otherwise it would grant nothing
+            self._witnessed_at = max(self._witnessed_at, request.sent)
         if answer.epoch < self.epoch:
             return ()
-        self._witnessed = answer.epoch
+        self._witnessed, self.seen = answer.epoch, answer
         self._expired = answer.expired
         self.sole = answer.in_sync == {self._name}
         self._note_expiry(request.sent, expired=answer.expired)

@@ -67,10 +67,6 @@ class LeaseClient:
     def active(self) -> bool:
         return self.state is not None and clock.since_boot() < self.state.until
 
-    def hears_witness(self) -> bool:
-        answered = None if self.state is None else self.state.answered
-        return answered is not None and clock.since_boot() - answered <= EXPIRY
-
     async def standby_hears_witness(self) -> bool:
         asked = clock.since_boot()
         with contextlib.suppress(TimeoutError):

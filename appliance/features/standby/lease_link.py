@@ -24,6 +24,7 @@ class LeaseState(Message):
     permission: int
     """Counts the times at which `alone` was granted."""
     in_sync: bool
+    """Whether the appliance that is not active has all acknowledged changes, as the witness last reported."""
     holder: str
     refusal: str
     answered: float | None
@@ -31,8 +32,8 @@ class LeaseState(Message):
     heard: float | None
     """The time of the other appliance's last message."""
     other_witnessed: float | None
-    handover_obstacle: str
-    """Why the other appliance could not claim now."""
+    takeover_obstacle: str
+    """Why the appliance that is not active could not claim now."""
     trouble: str
     """Why the witness could not save a takeover."""
     sole: bool = False

@@ -22,7 +22,7 @@ from appliance.features.standby.link_certificates import replication_context
 from appliance.features.standby.membership import Membership
 from appliance.features.standby.passive_rest import PassiveRest, ReplicatedTokens
 from appliance.features.standby.replica import Replica
-from appliance.features.standby.replica_sync import ReplicaSync, StateComparison, is_recovered
+from appliance.features.standby.replica_sync import INCOMPLETE, ReplicaSync, StateComparison, is_recovered
 from appliance.features.standby.replication import Pair, host_endpoint, state_of
 from appliance.features.standby.replication_frames import ReplicationError
 from appliance.features.standby.replication_receiver import ReplicationReceiver
@@ -73,7 +73,7 @@ class PassiveControl:
             self._replica,
             self._accepts,
             lambda: self.tunnels.introduction(endpoint, self._rest.pin),
-            lambda: self._check.obstacle,
+            lambda: self.obstacle,
             self._check.news.set,
         )
         self.copies = CopyAge(self._replica.setting)
@@ -134,10 +134,16 @@ class PassiveControl:
             try:
                 await self._replica_sync.run(self._is_recovered, complete)
             except (StoreError, OSError) as error:
+                self._state_presence()  # `complete` ends this
                 if reason != str(error):
                     reason = str(error)
                     _log.error("the copy of the state is not on the disk", reason=reason)
                 await asyncio.sleep(_AGAIN_SECONDS)
+
+    @property
+    def obstacle(self) -> str:
+        """Why this appliance could not take over, although it may follow."""
+        return self._check.obstacle or self._replica.unsynced or ("" if self._complete else INCOMPLETE)
 
     @property
     def away_seconds(self) -> float | None:
@@ -150,10 +156,10 @@ class PassiveControl:
         return self.copies.at(clock.now() if self._connected else self._away_since)
 
     def _state_presence(self) -> None:
-        if self._complete and self._check.obstacle == "":
-            self._lease.present()
-        else:
+        if self.obstacle:
             self._lease.withdraw()
+        else:
+            self._lease.present()
 
     def state(self) -> StandbyState:
         lease = self._lease.state
@@ -175,17 +181,13 @@ class PassiveControl:
             role="standby",
             since=self._since,
             other=other,
-            obstacle=self._check.obstacle,
+            obstacle=self.obstacle,
         )
 
     async def hand_over(self) -> None:
-        if self._check.obstacle:
-            raise HandOverError(f"this appliance cannot take over: {self._check.obstacle}")
-        if not self._lease.hears_witness():
-            raise HandOverError(
-                f"the witness on the robot ({self._membership.witness}) does not answer this appliance, so it could not"
-                " take over; check the network between the two"
-            )
+        troubles = self.state().troubles
+        if troubles and (self._connected or self.obstacle):
+            raise HandOverError(troubles[0])
         try:
             refusal = await self._receiver.want_switchover()
         except ReplicationError as error:

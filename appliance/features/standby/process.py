@@ -28,7 +28,6 @@ from appliance.features.standby.lease import (
     ApplianceLease,
     LeaseError,
     Outgoing,
-    WitnessAnswer,
     WitnessRequest,
 )
 from appliance.features.standby.membership import Membership, load_membership
@@ -82,7 +81,6 @@ class LeaseProcess:
         self._permission = 0
         self._alone = False
         self._reported: messages.LeaseHeld | messages.LeaseEnded = messages.LeaseEnded()
-        self._answer: WitnessAnswer | None = None
         self._answered: float | None = None
         self._told: lease_link.LeaseState | None = None
         self._told_at = 0.0
@@ -170,7 +168,7 @@ class LeaseProcess:
     def witness_sent(self, datagram: bytes, address: str) -> None:
         found = self._witness.read(datagram) if address == self._membership.witness else None
         if found is not None:
-            self._answered, self._answer = clock.since_boot(), found[1]
+            self._answered = clock.since_boot()
             self._after(self._lease.answered(*found))
 
     def peer_sent(self, datagram: bytes, address: str) -> None:
@@ -195,7 +193,10 @@ class LeaseProcess:
     def _tell_control(self) -> None:
         lease, now = self._lease, clock.since_boot()
         active = lease.is_active(now)
-        answer = self._answer
+        seen, standby = (
+            lease.seen,
+            self._membership.other if lease.held is not None else self._membership.name,
+        )
         state = lease_link.LeaseState(
             until=lease.valid_until if active else 0.0,
             epoch=lease.epoch,
@@ -203,14 +204,14 @@ class LeaseProcess:
             expired_since=lease.expired_since,
             alone=active and self._alone and lease.answers_alone,  # not after the order to add the standby
             permission=self._permission,
-            in_sync=answer is not None and self._membership.other in answer.in_sync,
-            holder=answer.holder if answer is not None else "",
+            in_sync=seen is not None and standby in seen.in_sync,
+            holder=seen.holder if seen is not None else "",
             refusal=lease.refusal,
             answered=self._answered,
             heard=lease.heard,
             other_witnessed=lease.other_witnessed,
-            handover_obstacle=lease.handover_obstacle(now) if active else "",
-            trouble=answer.trouble if answer is not None else "",
+            takeover_obstacle=lease.takeover_obstacle(now),
+            trouble=seen.trouble if seen is not None else "",
         )
         if state != self._told or now - self._told_at >= _CONTROL_SECONDS:
             self._told, self._told_at = state, now

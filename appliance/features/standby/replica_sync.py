@@ -26,6 +26,9 @@ from appliance.features.standby.replication_frames import (
 )
 from appliance.features.standby.witness import BOOT_ID
 
+INCOMPLETE = "it has restarted with its machine, and has not followed the active appliance since"
+"""The obstacle of a standby that may lack the last changes, because its machine lost its power."""
+
 WAIT_SECONDS = 10.0
 _SYNC_SECONDS = 0.1
 _POSITION_SECONDS = 5.0

@@ -14,6 +14,7 @@ from collections.abc import Callable, Coroutine
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
+import msgspec
 import structlog
 
 from appliance.base import clock
@@ -28,6 +29,7 @@ from appliance.features.standby.replication_frames import Introduction, Replicat
 from appliance.features.standby.replication_sender import ReplicationSender
 from appliance.features.standby.replication_transport import ReplicationListener
 from appliance.features.standby.standby_answers import OtherAppliance, StandbyState, WitnessSeen
+from appliance.features.standby.standby_summary import UNCHECKED, takeover_obstacles
 from appliance.features.standby.standby_tunnels import StandbyTunnels
 from appliance.store.writer_thread import Database, StoreError
 
@@ -96,7 +98,7 @@ def state_of(
     obstacle: str,
 ) -> StandbyState:
     now = clock.since_boot()
-    return StandbyState(
+    state = StandbyState(
         name=membership.name,
         address=membership.address,
         role=role,
@@ -111,11 +113,14 @@ def state_of(
             if lease is None or lease.answered is None
             else round(now - lease.answered, 3),
             holder=lease.holder if lease is not None else "",
-            refusal=lease.refusal if lease is not None else "the process `lease` has not reported yet",
+            refusal=lease.refusal if lease is not None else "",
             trouble=lease.trouble if lease is not None else "",
         ),
         obstacle=obstacle,
+        troubles=[],
     )
+    found = takeover_obstacles(state, lease.takeover_obstacle if lease is not None else "")
+    return msgspec.structs.replace(state, troubles=found)
 
 
 def host_endpoint(settings: Settings, membership: Membership) -> str:
@@ -254,17 +259,8 @@ class Replication:
 
         The witness must answer the standby after the order, because its cable may just have been unplugged.
         """
-        if not self._in_sync() or not self._connected():
-            raise HandOverError(
-                f"{self._membership.other} does not have all changes; wait until `rosrv standby status` says that it is"
-                " in sync"
-            )
-        obstacle = self.sender.lag().obstacle
-        if obstacle:
-            raise HandOverError(f"{self._membership.other} cannot take over: {obstacle}")
-        lease = self._lease.state
-        if lease is not None and lease.handover_obstacle:
-            raise HandOverError(lease.handover_obstacle)
+        if troubles := self.state().troubles:
+            raise HandOverError(troubles[0])
         if not await self._lease.standby_hears_witness():
             other = self._membership.other
             raise HandOverError(
@@ -295,7 +291,7 @@ class Replication:
 
     async def _report_always(self) -> None:
         while True:
-            if self._in_sync() and self._connected():
+            if self._in_sync() and self._connected() and self.sender.lag().obstacle != UNCHECKED:
                 self._trouble_since = None
             elif self._trouble_since is None:
                 self._trouble_since = asyncio.get_running_loop().time()

@@ -13,7 +13,7 @@ class OtherAppliance(msgspec.Struct, frozen=True):
     name: str
     address: str
     connected: Annotated[bool, doc("whether the replication between both is open")]
-    in_sync: Annotated[bool, doc("whether it has all acknowledged changes")]
+    in_sync: Annotated[bool, doc("whether the standby has all acknowledged changes")]
     behind_changes: Annotated[int, doc("changes of the state that it lacks; on a standby always 0")]
     behind_bytes: Annotated[int, doc("bytes of these changes that are kept in memory")]
     waiting_seconds: Annotated[
@@ -22,7 +22,10 @@ class OtherAppliance(msgspec.Struct, frozen=True):
     reason: Annotated[str, doc("why the last replication ended, or empty if it is open, or never began")]
     trouble_seconds: Annotated[
         float | None,
-        doc("how long it has been away, or (on the active appliance) not in sync, or null if neither"),
+        doc(
+            "how long it has been away, or (on the active appliance) not in sync or not checked, or null if none"
+            " of them"
+        ),
     ]
     witness_seconds: Annotated[
         float | None,
@@ -68,4 +71,7 @@ class StandbyState(msgspec.Struct, frozen=True):
         doc(
             "why the standby cannot take over, although it follows, or empty if its last check found no reason"
         ),
+    ]
+    troubles: Annotated[
+        list[str], doc("why the standby could not take over now, with the remedies, or empty if it could")
     ]

@@ -3,13 +3,13 @@
 from rich.text import Text
 
 from appliance.features.standby.standby_answers import OtherAppliance, StandbyState, WitnessSeen
-from appliance.features.standby.standby_summary import is_silent, lag_of, lasting, standby_troubles
+from appliance.features.standby.standby_summary import is_silent, lag_of, lasting
 
 
 def standby_line(state: StandbyState) -> Text:
     other, witness = lag_in_words(state.other), answer_in_words(state.witness)
     line = f"{state.name} is {state.role}; {state.other.name}: {other}; witness: {witness}"
-    return Text(line, style="yellow" if any(standby_troubles(state)) else "")
+    return Text(line, style="yellow" if state.troubles else "")
 
 
 def lag_in_words(other: OtherAppliance) -> str:
@@ -22,7 +22,9 @@ def answer_in_words(witness: WitnessSeen) -> str:
     seconds = witness.answered_seconds
     if seconds is None:
         return "has never answered"
-    return f"silent for {lasting(seconds)}" if is_silent(witness) else "answers"
+    if is_silent(witness):
+        return f"silent for {lasting(seconds)}"
+    return "refuses" if witness.refusal else "answers"
 
 
 def connection(other: OtherAppliance) -> str:

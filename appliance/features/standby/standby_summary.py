@@ -1,4 +1,8 @@
-"""Judge the state of two appliances for alarms, metrics and `rosrv standby status`. No I/O."""
+"""Judge whether the standby could take over now. No I/O.
+
+Commands, REST, the console and metrics report these troubles, alarms those that last, and the order to switch over is
+refused with the first.
+"""
 
 from collections.abc import Iterator
 
@@ -16,8 +20,15 @@ UNCHECKED = "it has just started, and still checks whether it could serve"
 """The obstacle of a standby before its first check ends, which takes as long as its specifications need."""
 
 
+def takeover_obstacles(state: StandbyState, lease: str) -> list[str]:
+    """Return why the standby could not take over now. `lease` is the judgement of the process `lease`, which notices
+    a silent appliance sooner.
+    """
+    return [trouble.text for trouble in standby_troubles(state)] or ([lease] if lease else [])
+
+
 def standby_troubles(state: StandbyState, patience: float = 0.0) -> Iterator[Trouble]:
-    other = state.other
+    other, seconds = state.other, state.other.trouble_seconds or 0.0
     if both_active(state):
         holder = state.witness.holder
         text = (
@@ -25,13 +36,14 @@ def standby_troubles(state: StandbyState, patience: float = 0.0) -> Iterator[Tro
             f" only {holder}; stop this appliance, then start it again"
         )
         yield Trouble("alarm", "both-active", text)
-    if state.obstacle and not (patience and state.obstacle == UNCHECKED):
+    if state.obstacle and (state.obstacle != UNCHECKED or seconds >= patience):
         yield _unready(state)
-    lasting = other.trouble_seconds
-    if lasting is not None and lasting >= patience:
-        yield _away(state, lasting) if not other.connected else _behind(other, lasting)
+    if not (other.connected and other.in_sync) and seconds >= patience:
+        yield _behind(state, seconds) if other.connected else _away(state, seconds)
     if is_silent(state.witness):
         yield _silent(state.witness)
+    elif state.witness.refusal and not both_active(state):
+        yield _refused(state.witness)
     elif is_blind(other):
         yield _blind(state)
     elif state.witness.trouble:
@@ -87,11 +99,11 @@ def _unready(state: StandbyState) -> Trouble:
     return Trouble("alarm", "standby-unready", text)
 
 
-def _behind(other: OtherAppliance, seconds: float) -> Trouble:
-    text = (
-        f"the standby {other.name} has been {lag_of(other)} for {lasting(seconds)}, so it cannot take over;"
-        " check the disk and the load of its machine"
-    )
+def _behind(state: StandbyState, seconds: float) -> Trouble:
+    other, remedy = state.other, "so it cannot take over; check the disk and the load of its machine"
+    text = f"the standby {other.name} has been {lag_of(other)} for {lasting(seconds)}, {remedy}"
+    if state.role == "standby":
+        text = f"the standby {state.name} ({state.address}) lacks changes of {other.name}, {remedy}"
     return Trouble("warning", "standby-behind", text)
 
 
@@ -103,6 +115,14 @@ def _silent(witness: WitnessSeen) -> Trouble:
         " systemctl status rosrv-witness"
     )
     return Trouble("warning", "witness-silent", text)
+
+
+def _refused(witness: WitnessSeen) -> Trouble:
+    text = (
+        f"the witness on the robot ({witness.address}) refuses this appliance, so no takeover is possible:"
+        f" {witness.refusal}"
+    )
+    return Trouble("alarm", "witness-refuses", text)
 
 
 def _blind(state: StandbyState) -> Trouble:

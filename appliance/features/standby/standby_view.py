@@ -11,15 +11,12 @@ from appliance.cli.output import moment
 from appliance.cli.status_watch import StatusView
 from appliance.features.standby.standby_answers import StandbyState
 from appliance.features.standby.standby_line import answer_in_words, connection, lag_in_words
-from appliance.features.standby.standby_summary import standby_troubles
 
 _RED = "bold red"
 
 
 def standby_view(state: StandbyState) -> StatusView:
-    troubles = [trouble.text for trouble in standby_troubles(state)]
-    fields = {**in_full(state), "troubles": troubles}
-    return StatusView(1 if troubles else 0, StandbyScreen(state, troubles), fields)
+    return StatusView(1 if state.troubles else 0, StandbyScreen(state), in_full(state))
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,12 +24,11 @@ class StandbyScreen:
     """The state as text, problems first."""
 
     state: StandbyState
-    troubles: list[str]
 
     def __rich_console__(self, _console: Console, _options: ConsoleOptions) -> RenderResult:
-        for trouble in self.troubles:
-            yield Text(f"! {trouble}", style=_RED)
         state = self.state
+        for trouble in state.troubles:
+            yield Text(f"! {trouble}", style=_RED)
         other, witness = state.other, state.witness
         grid = Table.grid(padding=(0, 2))
         role = f"{state.role} since {moment(state.since)}, epoch {state.epoch}"

@@ -17,6 +17,10 @@ _METRICS = (
     ),
     gauge("rosrv_standby_connected", "1 while the replication between the two appliances is open"),
     gauge("rosrv_standby_in_sync", "1 while the standby has all changes; only on the active appliance"),
+    gauge(
+        "rosrv_standby_can_take_over",
+        "1 while the standby could take over now, as `rosrv standby status` reports",
+    ),
     gauge("rosrv_standby_obstacle", "1 while the standby follows, but could not start if it took over"),
     gauge("rosrv_standby_behind_changes", "changes that the standby lacks; only on the active appliance"),
     gauge("rosrv_standby_behind_bytes", "bytes of these changes in memory; only on the active appliance"),
@@ -30,7 +34,8 @@ _METRICS = (
     ),
     gauge(
         "rosrv_standby_witness_trouble",
-        "1 while the witness could not save a takeover, such as on a disk that cannot be written",
+        "1 while the witness could not save a takeover, such as on a disk that cannot be written, or refuses this"
+        " appliance",
     ),
     gauge(
         "rosrv_standby_both_active",

@@ -1,3 +1,4 @@
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -5,9 +6,11 @@ import pytest
 
 from appliance.features.standby.membership import load_membership, path_of, save_membership
 from examples.landshark.lab import Lab
+from tests.support.appliance import Appliance
 from tests.support.features.standby.standby_robot import StandbyRobot
 from tests.support.features.standby.standby_site import ADDRESSES, ROBOT, StandbySite
 from tests.support.nodes import has_ros
+from tests.support.processes import Process
 from tests.support.requirements import need_program, need_root, needs
 from tests.support.small_disk import filled, small_disk
 from tests.support.waiting import eventually
@@ -76,4 +79,55 @@ def test_a_full_disk_of_the_active_appliance(site: StandbySite, robot: StandbyRo
     with filled(site.appliances["a"].state):
         site.until_taken_over("b")
         robot.serves_newcomers()
+    until_able(site)
+
+
+def refuse(site: StandbySite, words: str) -> None:
+    """Require that both appliances report these words, and refuse to switch over with them."""
+    epoch = site.lease.read().epoch
+    for one in site.appliances.values():
+
+        def reports(one: Appliance = one) -> bool:
+            done = one.rosrv("standby", "status", check=False)
+            return done.returncode == 1 and words in " ".join(done.stdout.split())
+
+        eventually(reports, site.story)
+    for one in site.appliances.values():
+        done = one.rosrv("standby", "promote", check=False)
+        assert (done.returncode, words in done.stderr) == (1, True), done
+    assert site.lease.read().epoch == epoch
+
+
+def test_an_audit_log_that_the_standby_could_not_write(site: StandbySite) -> None:
+    """With it, an active appliance grants nothing, and gives the lease away."""
+    until_able(site)
+    standby, other = site.pair()
+    site.promote(standby)
+    site.until_taken_over(other)
+    site.until_active(other)
+    until_able(site)
+    log = site.appliances[standby].state / "control" / "audit.db"
+    moved = log.rename(log.with_name("moved"))
+    log.mkdir()
+    try:
+        refuse(site, "the audit log cannot be written")
+    finally:
+        log.rmdir()
+        moved.rename(log)
+    until_able(site)
+
+
+def test_a_restored_disk_of_the_robot(site: StandbySite) -> None:
+    """With an older lease, the robot admits neither appliance, so a switchover would end the service."""
+    until_able(site)
+    record = site.lease.read()
+    site.stop_witness()
+    site.lease.write(record._replace(epoch=record.epoch - 1))
+    site.boot_robot()
+    refuse(site, f"the witness knows only epoch {record.epoch - 1}: run witness.py begin")
+    site.stop_witness()
+    words = ("begin", "--in-sync", "a,b", "--epoch", str(record.epoch + 1))
+    with Process(site.robot, site.command(*words), env=dict(os.environ), label="begin") as begun:
+        assert begun.wait() == 0, begun.story()
+    site.start_witness()
     until_able(site)

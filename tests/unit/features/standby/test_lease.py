@@ -1,3 +1,5 @@
+from typing import Any
+
 import pytest
 
 from appliance.features.standby.lease import (
@@ -370,6 +372,68 @@ def test_a_lease_is_given_up_only_to_an_appliance_that_could_claim_it(
     else:
         lease.lease.switch_over(lease.now)
     assert lease.active() == bool(reason)
+
+
+OLDER: dict[str, Any] = {
+    "ok": False, "reason": "the witness knows only epoch 1", "epoch": 1, "holder": "b", "in_sync": ALONE,
+}  # fmt: skip
+
+
+def test_a_witness_with_an_older_lease_makes_no_switchover_possible() -> None:
+    """It admits neither appliance, so an appliance that gave its lease up could not get it back."""
+    lease = active_lease()
+    lease.answered(lease.later(0.3).request("renew"))
+    asked = asked_by(lease.later(0.3))
+    lease.lease.received(lease.now, ClaimPromise(asked.epoch, asked.session, asked.number))
+    assert lease.lease.handover_obstacle(lease.now) == ""
+    seen = lease.lease.seen
+    lease.answered(lease.later(0.3).request("renew"), **OLDER)
+    obstacle = lease.lease.takeover_obstacle(lease.now)
+    assert obstacle == "the witness on the robot refuses this appliance: the witness knows only epoch 1"
+    with pytest.raises(LeaseError, match="knows only epoch 1"):
+        lease.lease.switch_over(lease.now)
+    assert lease.active()
+    assert lease.lease.seen == seen, "the holder and the set of an older lease are not those of this pair"
+    lease.answered(lease.later(0.3).request("renew"))
+    assert "refuses" not in lease.lease.takeover_obstacle(lease.now)
+
+
+@pytest.mark.parametrize(
+    ("answer", "silence", "obstacle"),
+    [
+        ({"ok": False, "holder": "a"}, 0.3, ""),
+        (OLDER, 0.3, "the witness on the robot refuses this appliance: the witness knows only epoch 1"),
+        ({"ok": False, "holder": "a", "in_sync": ALONE}, 0.3, "b lacks changes that a has acknowledged"),
+        (
+            {"ok": False, "holder": "a", "trouble": "full"},
+            0.3,
+            "the witness could not save the takeover: full",
+        ),
+        (
+            {"ok": False, "holder": "a"},
+            EXPIRY + 0.1,
+            "the witness on the robot does not answer this appliance",
+        ),
+    ],
+)
+def test_a_standby_knows_why_it_could_not_claim(
+    answer: dict[str, object], silence: float, obstacle: str
+) -> None:
+    standby = Lease(epoch=2)
+    standby.lease = ApplianceLease("b", "a", "session", 2, standby.now)
+    assert "does not answer" in standby.lease.takeover_obstacle(standby.now)
+    standby.answered(standby.later(EXPIRY).request("claim"), **answer)
+    found = standby.lease.takeover_obstacle(standby.later(silence).now)
+    assert found.startswith(obstacle) and bool(found) == bool(obstacle)
+
+
+def test_a_standby_that_the_witness_refuses_does_not_count_as_answered() -> None:
+    standby = Lease(epoch=2)
+    for _ in range(6):
+        due = standby.later(0.3).tick()
+        standby.answered(next(one for one in due if isinstance(one, WitnessRequest)), **OLDER)
+    (promise,) = standby.lease.received(standby.now, PromiseRequest(2, "other", 1))
+    assert isinstance(promise, ClaimPromise) and promise.unheard > EXPIRY
 
 
 # ---- The datagrams

@@ -2,6 +2,7 @@ import msgspec
 
 from appliance.features.standby.samples import samples_of
 from appliance.features.standby.standby_answers import StandbyState
+from appliance.features.standby.standby_summary import UNCHECKED
 from tests.support.answers import example
 
 
@@ -26,6 +27,7 @@ def test_the_active_appliance_has_the_lag_of_the_standby() -> None:
         'role{role="standby"}': 0,
         "connected": 1,
         "in_sync": 0,
+        "can_take_over": 1,
         "obstacle": 1,
         "behind_changes": 12,
         "behind_bytes": 3400,
@@ -38,14 +40,18 @@ def test_the_active_appliance_has_the_lag_of_the_standby() -> None:
 
 
 def test_a_standby_has_its_own_metrics() -> None:
-    state = example(StandbyState, name="b", role="standby", epoch=4, other={"name": "a"})
+    state = example(
+        StandbyState, name="b", role="standby", epoch=4, other={"name": "a"}, obstacle=UNCHECKED,
+        witness={"refusal": "the witness knows only epoch 3"}, troubles=[UNCHECKED],
+    )  # fmt: skip
     assert {name.removeprefix("rosrv_standby_"): value for name, value in numbers(state).items()} == {
         'role{role="active"}': 0,
         'role{role="standby"}': 1,
         "connected": 0,
-        "obstacle": 0,
+        "can_take_over": 0,
+        "obstacle": 1,
         "witness_age_seconds": float("inf"),
-        "witness_trouble": 0,
+        "witness_trouble": 1,
         "takeovers_total": 4,
     }
     assert samples_of(msgspec.structs.replace(state, epoch=0))["rosrv_standby_takeovers_total"] == []

@@ -1,0 +1,118 @@
+"""One judgement of a pair: what it finds is reported by status, REST, console and metrics, and refuses a switchover."""
+
+from typing import Any
+
+import pytest
+
+from appliance.channel.alarms import open_alarms
+from appliance.features.standby.samples import samples_of
+from appliance.features.standby.standby_answers import StandbyState
+from appliance.features.standby.standby_summary import UNCHECKED, standby_troubles, takeover_obstacles
+from appliance.features.standby.standby_view import standby_view
+from tests.support.answers import example
+from tests.unit.channel.test_alarms import changed
+
+ACTIVE: dict[str, Any] = {
+    "name": "a",
+    "address": "10.0.0.1",
+    "role": "active",
+    "other": {"name": "b", "address": "10.0.0.2", "connected": True, "in_sync": True},
+    "witness": {"address": "10.0.0.10", "answered_seconds": 0.2, "holder": "a"},
+}
+STANDBY: dict[str, Any] = ACTIVE | {
+    "name": "b",
+    "address": "10.0.0.2",
+    "role": "standby",
+    "other": {"name": "a", "address": "10.0.0.1", "connected": True, "in_sync": True},
+}
+SMALLER = "the witness knows only epoch 3: run witness.py begin with a greater epoch"
+
+
+def state(of: dict[str, Any], more: dict[str, Any]) -> StandbyState:
+    return example(StandbyState, **{name: _with(of.get(name), value) for name, value in (of | more).items()})
+
+
+def _with(given: Any, value: Any) -> Any:
+    return given | value if isinstance(value, dict) else value
+
+
+@pytest.mark.parametrize("of", [ACTIVE, STANDBY])
+def test_a_whole_pair_has_no_trouble(of: dict[str, Any]) -> None:
+    assert [*standby_troubles(state(of, {}))] == []
+    assert takeover_obstacles(state(of, {}), "b could not serve") == ["b could not serve"]
+
+
+@pytest.mark.parametrize(
+    ("of", "more", "text"),
+    [
+        (
+            ACTIVE, {"other": {"connected": False, "reason": "the connection was reset"}},
+            "the standby b (10.0.0.2) has been away for 0 s: the connection was reset; check that it runs, and the"
+            " network between the two",
+        ),
+        (
+            ACTIVE,
+            {"other": {"in_sync": False, "behind_changes": 12, "behind_bytes": 3400, "trouble_seconds": 90}},
+            "the standby b has been 12 changes (3400 bytes) behind for 1 min, so it cannot take over; check the disk"
+            " and the load of its machine",
+        ),
+        (
+            STANDBY, {"other": {"in_sync": False}},
+            "the standby b (10.0.0.2) lacks changes of a, so it cannot take over; check the disk and the load of its"
+            " machine",
+        ),
+        *(
+            (
+                of, {"obstacle": "policy.ini:1:1: error: it has no signature of the site"},
+                "the standby b (10.0.0.2) cannot take over: policy.ini:1:1: error: it has no signature of the site;"
+                " once this is corrected, b notices it within seconds",
+            )
+            for of in (ACTIVE, STANDBY)
+        ),
+        *(
+            (of, {"obstacle": UNCHECKED}, f"the standby b (10.0.0.2) cannot take over: {UNCHECKED}")
+            for of in (ACTIVE, STANDBY)
+        ),
+        *(
+            (
+                of, {"witness": {"refusal": SMALLER}},
+                f"the witness on the robot (10.0.0.10) refuses this appliance, so no takeover is possible: {SMALLER}",
+            )
+            for of in (ACTIVE, STANDBY)
+        ),
+        (
+            ACTIVE, {"other": {"witness_seconds": 16.2}},
+            "the witness on the robot (10.0.0.10) has not answered the standby b (10.0.0.2) for 16 s, so the standby"
+            " cannot take over; check the network between both",
+        ),
+        (
+            ACTIVE, {"witness": {"trouble": "Read-only file system"}},
+            "the witness on the robot (10.0.0.10) could not save a takeover: Read-only file system; correct that on"
+            " the robot",
+        ),
+        (
+            ACTIVE, {"witness": {"holder": "b"}},
+            "both appliances claim to be active: this one does, but the witness names b, and the robot admits only"
+            " b; stop this appliance, then start it again",
+        ),
+    ],
+)  # fmt: skip
+def test_each_trouble_is_reported_everywhere(of: dict[str, Any], more: dict[str, Any], text: str) -> None:
+    found = takeover_obstacles(state(of, more), "as the process `lease` found sooner")
+    assert found == [text]
+    reported = state(of, more | {"troubles": found})
+    assert standby_view(reported).exit_status == 1
+    assert [*samples_of(reported)["rosrv_standby_can_take_over"]] == [((), False)]
+    assert [*samples_of(state(of, {}))["rosrv_standby_can_take_over"]] == [((), True)]
+
+
+def test_a_lease_of_another_time_is_not_taken_for_two_active_appliances() -> None:
+    """The witness with a smaller epoch admits neither appliance, so its holder is not another active one."""
+    (trouble,) = standby_troubles(state(ACTIVE, {"witness": {"refusal": SMALLER}}))
+    assert (trouble.severity, trouble.kind) == ("alarm", "witness-refuses")
+
+
+@pytest.mark.parametrize(("seconds", "kinds"), [(59.0, []), (60.0, ["standby-unchecked"])])
+def test_a_check_that_never_ends_becomes_an_alarm(seconds: float, kinds: list[str]) -> None:
+    more = {"obstacle": UNCHECKED, "other": ACTIVE["other"] | {"trouble_seconds": seconds}}
+    assert [alarm.kind for alarm in open_alarms(changed("standby", ACTIVE | more))] == kinds
