@@ -11,7 +11,7 @@ import { useStore } from "#console/store.js";
 import { SwitchOver } from "./switch.js";
 
 const SILENT = 5; // seconds, as in features/standby/standby_summary.py
-const GRAVE = ["both-active", "standby-unready", "standby-away", "standby-behind", "witness-silent", "standby-blind", "witness-disk"];
+const GRAVE = ["both-active", "standby-unready", "standby-unchecked", "standby-away", "standby-behind", "witness-refuses", "witness-silent", "standby-blind", "witness-disk"];
 
 /** The panel on Now. @param {{status: any}} given */
 export function PairNow({ status }) {
@@ -20,13 +20,13 @@ export function PairNow({ status }) {
 
 /** The panel. @param {{state: any, orders?: boolean}} given `orders`: with the button for the switchover */
 export function Pair({ state, orders = false }) {
-  const { other, witness, obstacle } = state;
+  const { other, witness, obstacle, troubles } = state;
   const active = state.role === "active";
   return html`<section class="panel" aria-labelledby="pair"><div class="panel-head"><h2 id="pair">Two appliances</h2>
       ${orders && html`<span class="end"><${SwitchOver} state=${state} /></span>`}</div>
     <div class="table-wrap"><table class="table"><thead><tr><th>Appliance</th><th>State</th></tr></thead><tbody>
       <tr><${Name} name=${state.name} address=${state.address} more="this one" /><td><${Badge} word=${state.role} tone=${active ? "allow" : "note"} /><div class="muted small">since <${Moment} at=${state.since} />, epoch ${state.epoch}</div>${active ? null : html`<${Obstacle} text=${obstacle} />`}</td></tr>
-      <tr><${Name} name=${other.name} address=${other.address} /><td>${active ? html`<${Follower} other=${other} obstacle=${obstacle} />` : html`<${Leader} other=${other} />`}</td></tr>
+      <tr><${Name} name=${other.name} address=${other.address} /><td>${active ? html`<${Follower} other=${other} troubles=${troubles} />` : html`<${Leader} other=${other} />`}</td></tr>
       <tr><${Name} name="Witness" address=${witness.address} more="on the robot" /><td><${Witness} witness=${witness} name=${state.name} active=${active} /></td></tr>
     </tbody></table></div>
     <div class="panel-body small muted">Nodes reach the active appliance at <${Given} value=${state.fixed} mono />.${active ? ` ${waits(state)}` : ""}</div></section>`;
@@ -35,7 +35,12 @@ export function Pair({ state, orders = false }) {
 /** The most urgent condition of the two appliances. */
 export function PairBanner() {
   const alarm = useStore(live, (one) => one.alarms.find(({ kind }) => GRAVE.includes(kind)));
-  return alarm ? html`<div class="banner" role="status"><${Icon} name="warn" /><span><${Given} value=${alarm.text} most=${400} /></span></div>` : null;
+  return alarm ? html`<${Banner} text=${alarm.text} />` : null;
+}
+
+/** A condition of the two appliances. */
+export function Banner(/** @type {{text: string}} */ { text }) {
+  return html`<div class="banner" role="status"><${Icon} name="warn" /><span><${Given} value=${text} most=${400} /></span></div>`;
 }
 
 function Name(/** @type {{name: string, address: string, more?: string}} */ { name, address, more }) {
@@ -43,11 +48,9 @@ function Name(/** @type {{name: string, address: string, more?: string}} */ { na
 }
 
 /** The standby, as the active appliance sees it. */
-function Follower(/** @type {{other: any, obstacle: string}} */ { other, obstacle }) {
+function Follower(/** @type {{other: any, troubles: string[]}} */ { other, troubles }) {
   if (!other.connected) return html`<${Away} other=${other} />`;
-  if (obstacle) return html`<${Obstacle} text=${obstacle} />`;
-  if (other.witness_seconds >= SILENT) return html`<${Obstacle} text=${`the witness has not answered it for ${lasting(other.witness_seconds)}`} />`;
-  if (other.in_sync) return html`<${Badge} word="in sync" tone="allow" /><div class="muted small">can take over</div>`;
+  if (other.in_sync) return troubles.length ? html`<${Obstacle} text=${troubles[0]} />` : html`<${Badge} word="in sync" tone="allow" /><div class="muted small">can take over</div>`;
   const lag = other.behind_changes ? `${counted(other.behind_changes, "change")}, ${counted(other.behind_bytes, "byte")}` : "the last changes";
   return html`<${Badge} word="behind" tone="warn" /><div class="muted small">lacks ${lag}; cannot take over</div>`;
 }
@@ -67,11 +70,12 @@ function Away(/** @type {{other: any}} */ { other }) {
 }
 
 function Witness(/** @type {{witness: any, name: string, active: boolean}} */ { witness, name, active }) {
-  const { answered_seconds: seconds, holder } = witness;
+  const { answered_seconds: seconds, holder, refusal, trouble } = witness;
   const silent = seconds === null || seconds >= SILENT;
   const wrong = active && !silent && holder !== "" && holder !== name;
-  const words = silent ? (seconds === null ? "it has never answered" : `no answer for ${lasting(seconds)}`) : holder ? html`the lease is held by <${Given} value=${holder} most=${40} />` : "no appliance holds the lease";
-  return html`<${Badge} word=${silent ? "silent" : wrong ? "names the other" : "answers"} tone=${silent || wrong ? "deny" : "allow"} /><div class="muted small">${words}</div>`;
+  const held = holder ? html`the lease is held by <${Given} value=${holder} most=${40} />` : "no appliance holds the lease";
+  const words = silent ? (seconds === null ? "it has never answered" : `no answer for ${lasting(seconds)}`) : refusal || trouble ? html`<${Given} value=${refusal || trouble} most=${200} />` : held;
+  return html`<${Badge} word=${silent ? "silent" : wrong ? "names the other" : refusal ? "refuses" : trouble ? "cannot save" : "answers"} tone=${silent || wrong || refusal || trouble ? "deny" : "allow"} /><div class="muted small">${words}</div>`;
 }
 
 function waits(/** @type {any} */ state) {

@@ -12,9 +12,8 @@ import { ask } from "#console/rest.js";
 /** The button that opens the dialog. @param {{state: any}} given */
 export function SwitchOver({ state }) {
   const [open, setOpen] = useState(false);
-  const { other, obstacle } = state;
-  const ready = other.connected && other.in_sync && !obstacle;
-  return html`<${Button} small role="admin" disabled=${!ready} why=${obstacle ? `${other.name} cannot take over: ${obstacle}` : `${other.name} does not have all changes`} onClick=${() => setOpen(true)}>Switch over…</${Button}>
+  const { other, troubles } = state;
+  return html`<${Button} small role="admin" disabled=${troubles.length > 0} why=${troubles[0]} onClick=${() => setOpen(true)}>Switch over…</${Button}>
     ${open && html`<${Confirm} name=${state.name} other=${other} close=${() => setOpen(false)} />`}`;
 }
 
