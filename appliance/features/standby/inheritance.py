@@ -22,7 +22,8 @@ from appliance.store.state_file import StateStore
 
 _ACTIVE = "active appliance"
 _COPIES = "copies of monitors"
-_LEAVE_SECONDS = 2.0
+_RELAY_SECONDS = 2.0
+_LEAVE_SECONDS = 1.0  # messages do not pass
 _COPY_SECONDS = 0.2
 _LOOK_SECONDS = 0.25
 _NOTE_SECONDS = 1.0  # between two notes that the copies are up to date
@@ -103,18 +104,43 @@ class StateCopies:
         self._followed = followed
         self._complete = False  # whether the stored copies are those of all relays
         self._noted = 0.0
+        self._copying = asyncio.Lock()
 
     async def run(self) -> None:
         while True:
             await asyncio.sleep(await self.copy_once())
 
+    async def rehearse(self) -> None:
+        """Copy all states, which are as much as `leave_state` will store. Raises `HandOverError`."""
+        if not self._rollout.has_state():
+            return
+        copied = False
+        try:
+            async with asyncio.timeout(_LEAVE_SECONDS), self._copying:
+                copies = await self._rollout.copies(_LEAVE_SECONDS, full=True)
+                copied = all(
+                    copy.at for copy in copies
+                )  # otherwise a state cannot be copied while messages pass
+                if copied:
+                    contents = enumerate(copy.content or b"" for copy in copies)
+                    _save_copies(self._store, self._epoch, contents, max(copy.at for copy in copies))
+        except (TimeoutError, ConnectionError) as error:
+            raise HandOverError("a relay does not answer; try again") from error
+        finally:
+            if not copied:  # relays that did answer send their changes only once
+                self._void()
+
     async def copy_once(self) -> float:
         """Copy the changed states, and return the seconds until the next copy."""
+        async with self._copying:
+            return await self._copy_changed()
+
+    async def _copy_changed(self) -> float:
         if not self._rollout.has_state() or not self._followed():
             self._void()
             return _COPY_SECONDS
         try:
-            copies = await self._rollout.copies(_LEAVE_SECONDS, full=not self._complete)
+            copies = await self._rollout.copies(_RELAY_SECONDS, full=not self._complete)
         except (TimeoutError, ConnectionError):
             self._void()
             return _COPY_SECONDS

@@ -4,13 +4,14 @@
    standby from the in-sync set.
 2. Without a valid lease nothing is answered.
 3. The lease is given up only after the standby, which is in sync, has stored every change.
+4. Before a switchover pauses anything, the standby has stored as much as the switchover will write.
 """
 
 import asyncio
 import contextlib
 import os
 import socket
-from collections.abc import Callable, Coroutine
+from collections.abc import Awaitable, Callable, Coroutine
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -31,6 +32,7 @@ from appliance.features.standby.replication_transport import ReplicationListener
 from appliance.features.standby.standby_answers import OtherAppliance, StandbyState, WitnessSeen
 from appliance.features.standby.standby_summary import UNCHECKED, takeover_obstacles
 from appliance.features.standby.standby_tunnels import StandbyTunnels
+from appliance.features.standby.witness import EXPIRY
 from appliance.store.writer_thread import Database, StoreError
 
 _GAP_SECONDS = 0.9  # without an answer of the witness; less than the confidence of a follower
@@ -64,7 +66,9 @@ class RobotAdmission:
 _REPORT_SECONDS = 0.1
 _SYNC_SECONDS = 0.1
 _BACKLOG = 8
-_SETTLE_SECONDS = 2.0
+_REHEARSAL_SECONDS = EXPIRY
+_SETTLE_SECONDS = 1.0  # topics are paused
+_LOOK_SECONDS = 0.01
 _ANSWER_SECONDS = 5.0
 _LEAST_BYTES_A_SECOND = 20 << 20  # that a standby stores
 _PORT_SECONDS = 1.0  # until the port of the replication is tried again
@@ -254,28 +258,47 @@ class Replication:
             self.sender.lag().connected and heard is not None and clock.since_boot() - heard < _ANSWER_SECONDS
         )
 
-    async def require_ready(self) -> None:
-        """Raise `HandOverError` unless the standby can take over.
+    async def require_ready(self, rehearse: Callable[[], Awaitable[None]]) -> None:
+        """Raise `HandOverError` unless the standby can take over; `rehearse` writes as much as the switchover.
 
         The witness must answer the standby after the order, because its cable may just have been unplugged.
         """
-        if troubles := self.state().troubles:
-            raise HandOverError(troubles[0])
-        if not await self._lease.standby_hears_witness():
+        self._require_no_trouble()
+        heard, _ = await asyncio.gather(
+            self._lease.standby_hears_witness(), self._settle(_REHEARSAL_SECONDS, rehearse)
+        )
+        if not heard:
             other = self._membership.other
             raise HandOverError(
                 f"the witness on the robot does not answer {other}; check the network between {other} and the robot"
             )
+        self._require_no_trouble()
+
+    def _require_no_trouble(self) -> None:
+        if troubles := self.state().troubles:
+            raise HandOverError(troubles[0])
 
     async def hand_over(self) -> None:
-        try:
-            async with asyncio.timeout(_SETTLE_SECONDS):
-                await self.sender.acknowledged(self._database.number)
-        except (TimeoutError, ReplicationError) as error:
-            raise HandOverError(
-                f"{self._membership.other} does not store the last changes: {error}"
-            ) from error
+        await self._settle(_SETTLE_SECONDS)
         await self._lease.hand_over()
+
+    async def _settle(self, seconds: float, write: Callable[[], Awaitable[None]] | None = None) -> None:
+        """Wait until the standby has stored all changes, and first those of `write`.
+
+        Nodes wait for none of these changes, so a slow standby stays in the in-sync set.
+        """
+        try:
+            async with asyncio.timeout(seconds):
+                if write is not None:
+                    await write()
+                number = self._database.number
+                while self._database.number - self.sender.lag().changes < number:
+                    await asyncio.sleep(_LOOK_SECONDS)
+        except TimeoutError:
+            raise HandOverError(
+                f"{self._membership.other} has not stored the last changes after {seconds:g} s, so topics would pause"
+                f" for longer; check the network between both, and the disk of {self._membership.other}"
+            ) from None
 
     def _lease_changed(self, state: lease_link.LeaseState) -> None:
         if state.answered is not None:

@@ -25,9 +25,7 @@ from appliance.store.writer_thread import StoreError
 _INTRODUCED_SECONDS = 3600.0
 _FEW = 16  # changes
 _SMALL = 16 << 10  # bytes of one value
-_REFUSAL_SECONDS = (
-    4.0  # the active appliance waits 1.2 s for the witness, and 2 s until its changes are stored here
-)
+_REFUSAL_SECONDS = 4.0  # the active appliance refuses after 1.2 s, and gives up after 2.5 s of a pause
 _SILENCE_SECONDS = 10.0  # the active appliance sends something every second
 
 

@@ -66,10 +66,21 @@ async def begin(base: Foundation, parts: Parts) -> FeaturePart:
         return _part(StandbyOrders(SingleAppliance(), base.trail))
     pair, replication, rollout = role.pair, role.replication, parts.monitors.rollout
     recorder = await _begin_epoch(base, parts, pair)
+    copies = StateCopies(pair, base.store, rollout, replication.followed)
+
+    def save_parameters() -> None:
+        mirror = parts.core.parameters
+        if mirror.unnoted:  # the standby has all other changes of parameters
+            mirror.unnoted = False
+            base.store.save_parameters(mirror.tree)
+
+    async def rehearsing() -> None:
+        save_parameters()
+        await copies.rehearse()
 
     async def leaving() -> None:
         await leave_state(pair, base.store, rollout)
-        base.store.save_parameters(parts.core.parameters.tree)
+        save_parameters()
         try:
             async with asyncio.timeout(_SEAL_SECONDS):
                 await recorder.handed_over(pair.epoch)
@@ -80,12 +91,12 @@ async def begin(base: Foundation, parts: Parts) -> FeaturePart:
         await parts.reconciler.ready.wait()
         await pair.lease.report_service(ServiceReport(base, parts).now)
 
-    active = ActiveAppliance(replication, leaving, partial(keep_state, base.store, rollout))
+    active = ActiveAppliance(replication, rehearsing, leaving, partial(keep_state, base.store, rollout))
     orders = StandbyOrders(active, base.trail)
     work: dict[str, Callable[[], Awaitable[None]]] = {
         "the replication": replication.run,
         "the readings of the clocks": partial(note_times, base.store, pair, base.blocks.age_now),
-        "the copies of monitors' state": StateCopies(pair, base.store, rollout, replication.followed).run,
+        "the copies of monitors' state": copies.run,
         "the orders of the standby": partial(
             orders.obey, replication.switchover_wanted, replication.sender.refuse_switchover
         ),

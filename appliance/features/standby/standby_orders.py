@@ -45,10 +45,12 @@ class ActiveAppliance:
     def __init__(
         self,
         replication: Replication,
+        rehearsing: Callable[[], Awaitable[None]],  # writes as much as `leaving`, and pauses nothing
         leaving: Callable[[], Awaitable[None]],  # makes the last changes before the switchover
         staying: Callable[[], None],  # called if the switchover fails
     ) -> None:
         self._replication = replication
+        self._rehearsing = rehearsing
         self._leaving = leaving
         self._staying = staying
 
@@ -56,7 +58,7 @@ class ActiveAppliance:
         return self._replication.state()
 
     async def hand_over(self) -> None:
-        await self._replication.require_ready()
+        await self._replication.require_ready(self._rehearsing)
         try:
             await self._leaving()
             await self._replication.hand_over()

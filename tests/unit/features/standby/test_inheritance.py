@@ -14,7 +14,7 @@ from appliance.features.standby.inheritance import (
     keep_state,
     leave_state,
 )
-from appliance.features.standby.lease_client import LeaseClient
+from appliance.features.standby.lease_client import HandOverError, LeaseClient
 from appliance.features.standby.replication import Pair
 from appliance.features.standby.standby_tunnels import StandbyTunnels
 from appliance.specifications.rollout import Rollout
@@ -76,6 +76,7 @@ class Relays:
         self.state = True
         self.hangs = False
         self.at = 5
+        self.fully: list[bool] = []
 
     def has_state(self) -> bool:
         return self.state
@@ -84,6 +85,7 @@ class Relays:
         return [content or b"" for content in self.contents]
 
     async def copies(self, _seconds: float, *, full: bool) -> list[StateLeft]:
+        self.fully.append(full)
         if self.hangs:
             raise TimeoutError
         if None in self.contents and full:
@@ -159,6 +161,36 @@ def test_a_copy_that_is_not_up_to_date_is_not_used(pairs: Pairs, why: str) -> No
     elif why == "no state":
         relays.at = 0
     asyncio.run(copies.copy_once())
+    assert pairs.active("b")[1] == ()
+
+
+def test_a_rehearsal_stores_as_much_as_the_switchover_while_messages_pass(pairs: Pairs) -> None:
+    pairs.active("a")
+    relays = Relays(b"of relay 0", b"of relay 1")
+    copies = StateCopies(pairs.present, pairs.store, cast(Rollout, relays), lambda: True)
+    asyncio.run(copies.copy_once())
+    relays.contents = (b"later", b"of relay 1")
+    asyncio.run(copies.rehearse())
+    assert relays.fully == [True, True]
+    assert pairs.active("b")[1] == (b"later", b"of relay 1")
+
+
+def test_a_rehearsal_that_fails_refuses_the_switchover_and_is_followed_by_a_whole_copy(pairs: Pairs) -> None:
+    """A relay that did answer sends its last changes only once, so a copy of later changes would lack them."""
+    pairs.active("a")
+    relays = Relays(b"of relay 0", b"of relay 1")
+    copies = StateCopies(pairs.present, pairs.store, cast(Rollout, relays), lambda: True)
+    asyncio.run(copies.copy_once())
+    relays.hangs = True
+    with pytest.raises(HandOverError, match="a relay does not answer"):
+        asyncio.run(copies.rehearse())
+    relays.hangs = False
+    asyncio.run(copies.copy_once())
+    asyncio.run(copies.copy_once())
+    assert relays.fully == [True, True, True, False]
+    relays.hangs = True
+    with pytest.raises(HandOverError, match="a relay does not answer"):
+        asyncio.run(copies.rehearse())
     assert pairs.active("b")[1] == ()
 
 
