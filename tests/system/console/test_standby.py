@@ -208,7 +208,7 @@ def _switch_over(page: Page, name: str) -> None:
     button.click()
     dialog = page.get_by_role("dialog", name=f"Switch over to {name}?")
     order = dialog.get_by_role("button", name="Switch over", exact=True)
-    late = dialog.get_by_role("alert").filter(has_text="does not store the last changes")
+    late = dialog.get_by_role("alert").filter(has_text="has not stored the last changes")
 
     def closed() -> bool:
         if late.is_visible():

@@ -200,13 +200,21 @@ class StandbySite:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, number)
 
+    def without_link(self, *pairs: tuple[str, str]) -> contextlib.AbstractContextManager[None]:
+        return self._filtered("drop", *pairs)
+
+    def slow_link(self, kilobytes_a_second: int) -> contextlib.AbstractContextManager[None]:
+        """Slow down the replication, but not the promises."""
+        rate = f"limit rate over {kilobytes_a_second} kbytes/second burst 16 kbytes"
+        return self._filtered(f"ip protocol tcp {rate} drop", (ADDRESSES["a"], ADDRESSES["b"]))
+
     @contextlib.contextmanager
-    def without_link(self, *pairs: tuple[str, str]) -> Iterator[None]:
+    def _filtered(self, rule: str, *pairs: tuple[str, str]) -> Iterator[None]:
         ways = [way for here, there in pairs for way in ((here, there), (there, here))]
         self._switch(
             "add table bridge lost",
             "add chain bridge lost some { type filter hook forward priority 0 ; }",
-            *(f"add rule bridge lost some ip saddr {one} ip daddr {other} drop" for one, other in ways),
+            *(f"add rule bridge lost some ip saddr {one} ip daddr {other} {rule}" for one, other in ways),
         )
         try:
             yield

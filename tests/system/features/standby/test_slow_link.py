@@ -1,0 +1,36 @@
+import json
+import time
+
+from tests.support.appliance import Appliance
+from tests.support.features.standby.standby_robot import StandbyRobot
+from tests.support.features.standby.standby_site import StandbySite
+from tests.support.waiting import eventually
+
+LACKS = "so it cannot take over; check the disk and the load of its machine"
+
+
+def reports(one: Appliance) -> bool:
+    done = one.rosrv("standby", "status", check=False)
+    return done.returncode == 1 and LACKS in " ".join(done.stdout.split())
+
+
+def test_a_standby_that_lacks_changes_is_reported_by_both_and_a_refused_order_pauses_nothing(
+    site: StandbySite, robot: StandbyRobot
+) -> None:
+    site.until_both_in_sync()
+    active, _passive = site.pair()
+    with site.slow_link(50):
+        robot.parameters.send(json.dumps({"do": "set", "key": "/slow", "value": "x" * 400_000}))
+        eventually(lambda: site.in_sync() == {active}, site.story)
+        for one in site.appliances.values():
+            eventually(lambda one=one: reports(one), site.story)  # type: ignore[misc]  # mypy infers no type for a lambda's default
+        had, began = [len(one.seen(event="received")) for one in robot.listeners], time.monotonic()
+        for one in site.appliances.values():
+            done = one.rosrv("standby", "promote", check=False)
+            assert (done.returncode, LACKS in done.stderr) == (1, True), done
+        seconds = time.monotonic() - began
+        assert site.in_sync() == {active}
+    heard = [len(listener.seen(event="received")) for listener in robot.listeners]
+    assert min(now - before for now, before in zip(heard, had, strict=True)) > 0.7 * robot.rate * seconds
+    site.until_both_in_sync()
+    robot.lost_nothing()
