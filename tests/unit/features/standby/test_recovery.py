@@ -2,6 +2,7 @@
 
 import asyncio
 import struct
+from collections.abc import Iterator
 from typing import Any
 
 import msgspec
@@ -55,7 +56,7 @@ class Rebooted:
 
 
 @pytest.fixture
-def rebooted() -> Rebooted:
+def rebooted() -> Iterator[Rebooted]:
     with clock.using(VirtualClock(now=100.0)):
         yield Rebooted()
 
