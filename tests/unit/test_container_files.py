@@ -4,6 +4,7 @@ from pathlib import Path
 import yaml
 
 from appliance.configuration.config_sources import resolve
+from appliance.network.close_ports import RANGE_FILE
 from appliance.supervisor.privileges import SUPERVISOR_CAPABILITIES
 from appliance.supervisor.roles import ROLES
 from appliance.supervisor.users import NUMERIC_IDS
@@ -79,3 +80,12 @@ def test_a_flood_ends_in_the_container() -> None:
     settings = resolve(None, environment(), {})
     others = 500 << 20  # docs/reference/network.md
     assert 4 * settings.relay.memory_bytes + others < 2 << 30
+
+
+def test_the_container_closes_the_ports_of_its_machine() -> None:
+    """A container has its own local port range, whatever the range of its machine is."""
+    texts = [path.read_text() for path in ((ROOT / "compose.host.yaml"), *(ROOT / "docs").rglob("*.md"))]
+    command = r"exec -T appliance rosrv protect (.*?)nft -f -"
+    options = [found for text in texts for found in re.findall(command, text, re.DOTALL)]
+    assert len(options) >= 3
+    assert all('--ports "$(' in found and f"< {RANGE_FILE})" in found for found in options), options

@@ -48,7 +48,8 @@ def protect(
     ports: Annotated[
         str | None,
         typer.Option(
-            metavar="FIRST-LAST", help="The ports to close (default: this machine's local port range)."
+            metavar="FIRST-LAST",
+            help="The ports to close or check (default: the local port range of the machine or container that runs this).",
         ),
     ] = None,
     apply: Annotated[
@@ -102,6 +103,11 @@ def protect(
             _remove(running.as_json)
         else:
             _make(appliance or [_own(running)], chosen, services, apply, running.as_json)
+            if ports is None and not apply:
+                sys.stderr.write(
+                    f"rosrv: note: {chosen} is the local port range here; for another machine, or the machine of this"
+                    " container, give its own: --ports\n"
+                )
     except (ValueError, NetworkError) as error:
         _fail(str(error))
 
