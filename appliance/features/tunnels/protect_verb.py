@@ -49,7 +49,7 @@ def protect(
         str | None,
         typer.Option(
             metavar="FIRST-LAST",
-            help="The ports to close or check (default: the local port range of the machine or container that runs this).",
+            help="The ports to close or check (default: the local port range here, of this machine or container).",
         ),
     ] = None,
     apply: Annotated[
@@ -83,12 +83,7 @@ def protect(
       rosrv protect --check 192.168.1.10 --api https://192.168.1.20:8443
 
     \b
-    The rules last until the next boot. To keep them, install the file:
-      rosrv protect --appliance 192.168.1.20 | \\
-        sudo tee /etc/rosrv-protect.nft
-      echo 'include "/etc/rosrv-protect.nft"' | \\
-        sudo tee -a /etc/nftables.conf
-      sudo systemctl enable --now nftables
+    The rules last until the next boot; docs/close-the-ports.md has a unit that keeps them.
 
     The check tries TCP. Run it on a machine other than the appliance, which is allowed in.
     """

@@ -1,3 +1,6 @@
+import re
+from pathlib import Path
+
 import pytest
 
 from appliance.network.close_ports import (
@@ -9,6 +12,7 @@ from appliance.network.close_ports import (
 )
 from appliance.network.firewall.firewall_rules import PortRange
 
+ROOT = Path(__file__).parents[3]
 RANGE = PortRange(32768, 60999)
 
 
@@ -64,3 +68,16 @@ def test_an_address_that_no_appliance_can_have_is_named(text: str) -> None:
 def test_the_default_range_is_the_kernels() -> None:
     found = local_port_range()
     assert 1 <= found.first < found.last <= 65535
+
+
+def test_the_rules_are_loaded_after_the_firewalls_that_flush_all_rules() -> None:
+    for place in ("docs/close-the-ports.md", "appliance/features/tunnels/kit_files/join.sh"):
+        units = re.findall(r"^\[Unit\]\n.*?^UNIT$", (ROOT / place).read_text(), re.DOTALL | re.MULTILINE)
+        (ours,) = [unit for unit in units if "ExecStart=/usr/sbin/nft -f " in unit]
+        assert "\nAfter=nftables.service netfilter-persistent.service ufw.service\n" in ours
+
+
+def test_no_page_flushes_the_rules_of_a_machine() -> None:
+    """Starting Debian's service `nftables` deletes all rules, such as those that Docker added since the boot."""
+    flushing = re.compile(r"systemctl (?:enable --now|start|restart|reload) nftables")
+    assert [page.name for page in (ROOT / "docs").rglob("*.md") if flushing.search(page.read_text())] == []

@@ -72,6 +72,7 @@ write_units() {
     cat > /etc/systemd/system/rosrv-protect.service <<'UNIT'
 [Unit]
 Description=Closes the ROS ports of this machine to all but the ROSRV appliance
+After=nftables.service netfilter-persistent.service ufw.service
 Before=network-pre.target
 Wants=network-pre.target
 
