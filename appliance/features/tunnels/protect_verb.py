@@ -1,6 +1,6 @@
 """The command `rosrv protect`.
 
-Exit status: 0 done, or closed; 1 a port is open; 2 failed, or no answer.
+Exit status: 0 done, or closed; 1 a port is open; 2 failed, no answer, or closed but not reported.
 """
 
 import json
@@ -186,15 +186,29 @@ def _check(checked: _CheckTarget, running: Appliance) -> None:
         "addresses": addresses,
     }
     _say(running.as_json, report, "".join(_sentence(result, checked.ports) for result in results))
-    if running.said:
-        found = sorted({port for result in results for port in result.open})[:_MOST_TOLD]
-        name = checked.name or results[0].address
-        body = running.ask_or_exit(HostPorts(name, state, found, clock.wall()))
-        sys.stderr.write(f"rosrv: reported to the appliance: the ports of {body.name or name} are {state}\n")
+    found = sorted({port for result in results for port in result.open})[:_MOST_TOLD]
+    result = HostPorts(checked.name or results[0].address, state, found, clock.wall())
+    reported = not running.said or _report(running, result)
     if opened:
         raise typer.Exit(OPEN_STATUS)
-    if unknown:
+    if unknown or not reported:
         raise typer.Exit(ERROR_STATUS)
+
+
+def _report(running: Appliance, result: HostPorts) -> bool:
+    """Report the result to the appliance, and print whether it was accepted."""
+    try:
+        answer = running.ask(result)
+    except NotRunningError as error:
+        trouble = str(error)
+    else:
+        trouble = "" if answer.ok else "; ".join((answer.error, *answer.findings))
+    if trouble:
+        sys.stderr.write(f"rosrv: the result was not reported: {printable(trouble)}\n")
+    else:
+        name = answer.given().name or result.name
+        sys.stderr.write(f"rosrv: reported to the appliance: the ports of {name} are {result.state}\n")
+    return not trouble
 
 
 def _own(running: Appliance) -> str:
