@@ -1,7 +1,8 @@
 """Find the TCP ports of a machine that accept a connection from here.
 
-If a connection fails before a packet leaves (no route, a rule of this machine), it is unknown whether the port is
-open; only the result of `connect` shows this.
+1. If a connection fails before a packet leaves (no route, a rule of this machine), it is unknown whether the port is
+   open; only the result of `connect` shows this.
+2. If some ports answer, each silent port is tried once more: the first packet may have been lost.
 """
 
 import errno
@@ -30,7 +31,7 @@ class ScanResult:
     address: str
     open: tuple[int, ...]
     refused: int  # ports that answered with a reset
-    silent: int  # ports without an answer in time, or unreachable
+    silent: int  # ports without an answer in time, or unreachable; if others answered, at two attempts
     untried: int = 0  # ports to which no packet could be sent from here
     obstacle: str = ""  # why the last untried port could not be tried
 
@@ -57,9 +58,26 @@ def addresses_of(host: str) -> tuple[str, ...]:
 
 def scan(address: str, ports: Iterable[int], seconds: float) -> ScanResult:
     """Try to connect to each port. Raises `NetworkError` for an unusable address."""
+    first, silent = _scan(address, ports, seconds)
+    if not (first.answered and silent):
+        return first
+    again, _ = _scan(address, silent, seconds)
+    return ScanResult(
+        address,
+        tuple(sorted((*first.open, *again.open))),
+        first.refused + again.refused,
+        again.silent,
+        first.untried + again.untried,
+        again.obstacle or first.obstacle,
+    )
+
+
+def _scan(address: str, ports: Iterable[int], seconds: float) -> tuple[ScanResult, list[int]]:
+    """Try each port once; return also the silent ports."""
     wanted = list(ports)
     opened: list[int] = []
-    refused = silent = untried = 0
+    silent: list[int] = []
+    refused = untried = 0
     obstacle = ""
     pool = ThreadPoolExecutor(_at_once(), "scan")
     try:
@@ -73,14 +91,14 @@ def scan(address: str, ports: Iterable[int], seconds: float) -> ScanResult:
             elif outcome not in _SILENT:
                 raise NetworkError(f"scanning {address} port {port}: {os.strerror(outcome)}")
             elif sent:
-                silent += 1
+                silent.append(port)
             else:
                 untried, obstacle = untried + 1, os.strerror(outcome)
     except OSError as error:
         raise NetworkError(f"scanning {address}: {error.strerror}") from error
     finally:
         pool.shutdown(cancel_futures=True)
-    return ScanResult(address, tuple(sorted(opened)), refused, silent, untried, obstacle)
+    return ScanResult(address, tuple(sorted(opened)), refused, len(silent), untried, obstacle), silent
 
 
 def longest(ports: int, seconds: float) -> float:

@@ -244,7 +244,8 @@ def _sentence(result: ScanResult, ports: PortRange) -> str:
             f"{result.address}: no port of {ports} answered: the machine is off, or drops packets silently; "
             "its ports may be open\n"
         )
-    return f"{result.address}: closed: no port of {ports} accepts a connection from here\n"
+    silent = f"; {counted(result.silent, 'port')} gave no answer at two attempts" if result.silent else ""
+    return f"{result.address}: closed: no port of {ports} accepts a connection from here{silent}\n"
 
 
 def _say(as_json: bool, report: dict[str, Any], words: str) -> None:
