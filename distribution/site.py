@@ -2,8 +2,8 @@
 
     python -m distribution.site [OPTIONS OF docker build …]
 
-The archive has the image with its list of parts, the files in `BESIDE`, and checksums of everything. Its use is in
-docs/install.md.
+The archive has the image with its list of parts, the files in `BESIDE`, `site.env` as `.env`, and checksums of
+everything. Its use is in docs/install.md.
 """
 
 import hashlib
@@ -20,7 +20,7 @@ BESIDE = ("compose.yaml", "compose.host.yaml", "LICENSE", "docs", "ipsec", "moni
 
 
 def pack(parts: tuple[Path, ...], *, moment: int) -> Path:
-    files = {part.name: part for part in parts}
+    files = {part.name: part for part in parts} | {".env": ROOT / "distribution" / "site.env"}
     for name in BESIDE:
         found = [path for path in (ROOT / name).rglob("*") if path.is_file()] or [ROOT / name]
         files |= {str(path.relative_to(ROOT)): path for path in found}

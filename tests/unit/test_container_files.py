@@ -1,4 +1,5 @@
 import re
+import tarfile
 from pathlib import Path
 
 import yaml
@@ -8,7 +9,7 @@ from appliance.network.close_ports import RANGE_FILE
 from appliance.supervisor.privileges import SUPERVISOR_CAPABILITIES
 from appliance.supervisor.roles import ROLES
 from appliance.supervisor.users import NUMERIC_IDS
-from distribution.site import BESIDE
+from distribution.site import BESIDE, pack
 
 ROOT = Path(__file__).parents[2]
 TRUE = Path("/bin/true")
@@ -31,6 +32,17 @@ def test_the_archive_of_a_site_has_what_its_compose_files_mount() -> None:
         beside = {mount.removeprefix("./") for mount in mounts if mount.startswith(".")}
         assert beside <= set(BESIDE), name
         assert not any("env_file" in one or "secrets" in one for one in services), name
+
+
+def test_the_next_archive_of_a_site_uses_the_same_volume(tmp_path: Path) -> None:
+    """Compose names a volume after its project, by default the folder: this has the version."""
+    image = tmp_path / "rosrv-image_1_amd64.tar"
+    image.touch()
+    with tarfile.open(pack((image,), moment=0)) as archive:
+        (name,) = [name for name in archive.getnames() if name.endswith("/.env")]
+        content = archive.extractfile(name)
+        assert content is not None
+        assert b"COMPOSE_PROJECT_NAME=rosrv\n" in content.readlines()
 
 
 def test_each_appliance_has_a_name() -> None:
