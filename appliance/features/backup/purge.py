@@ -4,6 +4,7 @@ Copies of an overwritten file may remain in a journal, or in spare blocks of fla
 disk and destroy its key.
 """
 
+import errno
 import os
 import shutil
 from pathlib import Path
@@ -15,7 +16,10 @@ from appliance.supervisor.state_directory import StateDirectory, foreign
 
 
 def purge(state: Path) -> tuple[int, int]:
-    """Erase the state directory; return how many files were removed, and how many of them were overwritten."""
+    """Erase the state directory; return how many files were removed, and how many of them were overwritten.
+
+    A mount point stays as an empty folder. Raises `BackupError`.
+    """
     state = state.absolute()
     try:
         reason = foreign(state)
@@ -43,7 +47,12 @@ def purge(state: Path) -> tuple[int, int]:
         ) from error
     finally:
         lock.close()
-    state.rmdir()
+    try:
+        state.rmdir()
+    except OSError as error:
+        if error.errno == errno.ENOTEMPTY:
+            raise BackupError(f"{state}: it has new files; run this again") from error
+        # A mount point, or a folder in one that this user may not write: it stays, empty.
     return counts
 
 

@@ -1,5 +1,7 @@
+import errno
 import os
 from pathlib import Path
+from typing import Any
 
 import pytest
 from typer.testing import CliRunner
@@ -36,6 +38,32 @@ def test_all_of_it_is_removed_and_nothing_else(state: Path, tmp_path: Path) -> N
     assert (files, written) == (5, 2)  # including the lock
     assert not state.exists()
     assert (tmp_path / "mine").read_bytes() == KEY
+
+
+@pytest.mark.parametrize("number", [errno.EBUSY, errno.EROFS, errno.EACCES])
+def test_a_mount_point_stays_empty(state: Path, monkeypatch: pytest.MonkeyPatch, number: int) -> None:
+    """The volume of a container, or an encrypted partition."""
+    kept(state, monkeypatch, number)
+    done = CliRunner().invoke(app, ["purge", "--state", str(state), "--confirm", str(state)])
+    assert (done.exit_code, "is erased: 5 files" in done.output) == (0, True)
+    assert list(state.iterdir()) == []
+
+
+def test_new_files_are_reported(state: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    kept(state, monkeypatch, errno.ENOTEMPTY)
+    with pytest.raises(BackupError, match="it has new files; run this again"):
+        purge(state)
+
+
+def kept(state: Path, monkeypatch: pytest.MonkeyPatch, number: int) -> None:
+    remove = os.rmdir
+
+    def refused(path: Path, **options: Any) -> None:
+        if path == state:
+            raise OSError(number, os.strerror(number), str(path))
+        remove(path, **options)
+
+    monkeypatch.setattr(os, "rmdir", refused)
 
 
 def test_not_while_an_appliance_uses_it(state: Path) -> None:
