@@ -82,6 +82,19 @@ def test_a_silenced_alarm_is_a_notice_for_its_time(robot: Robot, passed: float, 
     assert alarm.severity == severity
 
 
+@pytest.mark.parametrize(("left", "severity"), [(1, "notice"), (-1, "warning")])
+def test_a_clock_that_is_set_back_does_not_extend_a_silence(robot: Robot, left: float, severity: str) -> None:
+    clock = VirtualClock()
+    with using(clock):
+        robot.silence(7200)
+        clock.advance(5400)
+        clock.set_wall(clock.wall_ns() / 1e9 - 3600)
+        clock.advance(1800 - left)
+        alarm = robot.alarm()
+    assert alarm is not None
+    assert alarm.severity == severity
+
+
 def test_a_silence_is_ended_by_an_order(robot: Robot) -> None:
     robot.silence(3600)
     robot.silence(None)
