@@ -12,14 +12,16 @@
 
 import errno
 import os
+import signal
 import sqlite3
 import stat
 import tarfile
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
+from types import FrameType
 from typing import BinaryIO
 
 from appliance.backup.contents import (
@@ -54,6 +56,36 @@ def back_up(state: Path, file: Path) -> list[str]:
         raise BackupError(
             f"{state} has no audit log: it is not the state directory of an appliance (--state)"
         )
+    with _signals_interrupt():
+        return _back_up(state, file)
+
+
+@contextmanager
+def _signals_interrupt() -> Iterator[None]:
+    """Raise `KeyboardInterrupt` for the first signal of `docker stop`, of systemd, or of a closed terminal.
+
+    Later ones are ignored, because a shell and the kernel both send SIGHUP. With `nohup` it stays ignored.
+    """
+    ours = [
+        number for number in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(number) == signal.SIG_DFL
+    ]
+
+    def set_all(handler: Callable[[int, FrameType | None], None] | signal.Handlers) -> None:
+        for number in ours:
+            signal.signal(number, handler)
+
+    def interrupt(_number: int, _frame: FrameType | None) -> None:
+        set_all(signal.SIG_IGN)
+        raise KeyboardInterrupt
+
+    set_all(interrupt)
+    try:
+        yield
+    finally:
+        set_all(signal.SIG_DFL)
+
+
+def _back_up(state: Path, file: Path) -> list[str]:
     try:
         descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
     except FileExistsError:
@@ -69,7 +101,7 @@ def back_up(state: Path, file: Path) -> list[str]:
             archive.close()
             raw.flush()
             os.fsync(raw.fileno())
-    except BaseException as error:  # also Ctrl-C
+    except BaseException as error:  # also Ctrl-C and signals
         file.unlink()
         if isinstance(error, (OSError, sqlite3.Error)):
             reason = f"{error}; {_ADVICE}"

@@ -1,5 +1,6 @@
 import os
 import shutil
+import signal
 import sqlite3
 import stat
 import subprocess
@@ -9,6 +10,7 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
@@ -259,6 +261,51 @@ def test_an_interrupted_backup_leaves_no_file(
     with pytest.raises(KeyboardInterrupt):
         back_up(state, tmp_path / "backup.tar.gz")
     assert [one.name for one in tmp_path.iterdir()] == ["state"]
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_leaves_no_file(
+    state: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
+) -> None:
+    """A closed terminal sends two: the second does not interrupt the removal."""
+    unlink = Path.unlink
+
+    def send() -> None:
+        assert signal.getsignal(number) != signal.SIG_DFL
+        signal.raise_signal(number)
+
+    def removed(path: Path, **options: bool) -> None:
+        send()
+        unlink(path, **options)
+
+    def interrupted(*_: object) -> None:
+        monkeypatch.setattr(Path, "unlink", removed)
+        send()
+
+    monkeypatch.setattr(backup, "_copy_file", interrupted)
+    before = signal.signal(number, signal.SIG_DFL)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            back_up(state, tmp_path / "backup.tar.gz")
+        assert signal.getsignal(number) == signal.SIG_DFL
+    finally:
+        signal.signal(number, before)
+    assert [one.name for one in tmp_path.iterdir()] == ["state"]
+
+
+def test_nohup_protects_a_backup(state: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    copied = backup._copy_file
+
+    def hung_up(*arguments: Any) -> None:
+        signal.raise_signal(signal.SIGHUP)
+        copied(*arguments)
+
+    monkeypatch.setattr(backup, "_copy_file", hung_up)
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        assert back_up(state, tmp_path / "backup.tar.gz")
+    finally:
+        signal.signal(signal.SIGHUP, before)
 
 
 def test_a_half_restored_state_is_not_backed_up(state: Path, tmp_path: Path) -> None:
