@@ -361,7 +361,9 @@ class Settings:
         " signed is refused",
     )
     state: Path = key(
-        default=Path("/var/lib/rosrv"), description="directory of all data that must survive a restart"
+        default=Path("/var/lib/rosrv"),
+        description="directory of all data that must survive a restart; only `up` and `selftest` read this key, others"
+        " use --state or ROSRV_STATE",
     )
     listen: Annotated[str, AfterValidator(_checked_address)] = key(
         default="0.0.0.0:11311", description="address where nodes find their master"
