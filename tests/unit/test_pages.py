@@ -247,6 +247,12 @@ def test_the_quickstart_is_quick() -> None:
     assert (text.count("\n## "), len(denied), len(words) <= 250) == (5, 1, True), len(words)
 
 
+def test_the_first_hour_does_not_use_the_state_of_the_service() -> None:
+    """It starts with revision 1 and a first token, and its monitor is gone with it."""
+    scripts = "".join(step.script for step in steps("first-hour.md"))
+    assert set(re.findall(r"(?:--state |STATE=)(\S+)", scripts)) == {"/var/lib/rosrv-hour"}
+
+
 def test_the_changelog_is_short() -> None:
     section = re.split(r"^## ", (ROOT / "CHANGELOG.md").read_text(), flags=re.MULTILINE)[1]
     notes, bullets = section.split("### Security")[0], re.findall(r"^- (?:.|\n  )*", section, re.MULTILINE)
