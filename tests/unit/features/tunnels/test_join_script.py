@@ -14,6 +14,8 @@ import pytest
 from appliance.features.tunnels.enrolment_kit import filled
 from appliance.ipsec.certificate_authority import CertificateAuthority
 from appliance.ipsec.requests import make_key, signing_request
+from appliance.network.close_ports import RANGE_FILE, protection
+from appliance.network.firewall.firewall_rules import PortRange
 
 pytestmark = pytest.mark.nightly
 
@@ -74,6 +76,25 @@ def test_any_other_certificate_is_replaced(tmp_path: Path, openssl: str, name: s
     machine.put("kit", "laptop", 10)
     machine.put("etc", name, days)
     assert not machine.keeps_what_is_in_place()
+
+
+@pytest.mark.parametrize(
+    ("own", "warned"),
+    [("32768\t60999", False), ("40000\t50000", False), ("1024\t60999", True), ("32768\t65535", True)],
+)
+def test_a_machine_with_other_ports_than_the_kit_is_warned(tmp_path: Path, own: str, warned: bool) -> None:
+    text = filled("join.sh", defaultdict(str, name="laptop"))
+    begin, end = text.index("closed=$("), text.index("\nfi\n", text.index("closed=$(")) + 4
+    say = "".join(line for line in text.splitlines(True) if line.startswith("say()"))
+    rules = protection(["10.113.11.1"], PortRange(32768, 60999), (), tunnelled=True)
+    (tmp_path / "protect.nft").write_text(rules)
+    (tmp_path / "range").write_text(own + "\n")
+    script = say + text[begin:end].replace(str(RANGE_FILE), "range")
+    done = subprocess.run(
+        ["dash", "-eu", "-c", script], cwd=tmp_path, capture_output=True, text=True, check=True
+    )
+    assert done.stderr == ""
+    assert (f"--ports {own.replace('	', '-')}" in done.stdout) == ("warning" in done.stdout) == warned
 
 
 @pytest.mark.parametrize(("sas", "status"), [("ros{1}: INSTALLED", 0), ("", 1)])
