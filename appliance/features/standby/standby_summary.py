@@ -38,8 +38,11 @@ def standby_troubles(state: StandbyState, patience: float = 0.0) -> Iterator[Tro
         yield Trouble("alarm", "both-active", text)
     if state.obstacle and (state.obstacle != UNCHECKED or seconds >= patience):
         yield _unready(state)
-    if not (other.connected and other.in_sync) and seconds >= patience:
-        yield _behind(state, seconds) if other.connected else _away(state, seconds)
+    if not other.connected and seconds >= patience:
+        yield _away(state, seconds)
+    # A witness that refuses does not report who is in sync.
+    if other.connected and not other.in_sync and not state.witness.refusal and seconds >= patience:
+        yield _behind(state, seconds)
     if is_silent(state.witness):
         yield _silent(state.witness)
     elif state.witness.refusal and not both_active(state):

@@ -207,6 +207,13 @@ def test_a_smaller_epoch_of_the_witness_grants_nothing(site: Site) -> None:
         site.serve()
     site.read()
     assert not site.held() and site.record.epoch == 1
+    state = [message for message, _ in site.control.receive() if isinstance(message, lease_link.LeaseState)][
+        -1
+    ]
+    assert (
+        "the witness on the robot refuses this appliance: the witness knows only" in state.takeover_obstacle
+    )
+    assert (state.holder, state.in_sync) == ("", False)
 
 
 def test_it_claims_only_while_control_is_ready(site: Site) -> None:

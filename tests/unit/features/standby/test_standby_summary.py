@@ -75,7 +75,7 @@ def test_a_whole_pair_has_no_trouble(of: dict[str, Any]) -> None:
         ),
         *(
             (
-                of, {"witness": {"refusal": SMALLER}},
+                of, {"witness": {"refusal": SMALLER}, "other": {"in_sync": False}},
                 f"the witness on the robot (10.0.0.10) refuses this appliance, so no takeover is possible: {SMALLER}",
             )
             for of in (ACTIVE, STANDBY)
