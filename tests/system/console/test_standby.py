@@ -129,7 +129,7 @@ def test_both_appliances_are_shown(pair: PairConsoles, theme: str, width: int) -
 
 
 def test_a_silent_witness_is_a_banner_on_every_view(pair: PairConsoles) -> None:
-    page = pair.open("a", "viewer").go("graph")
+    page, other = pair.open("a", "admin").go("graph"), pair.open("b", "viewer").go("now", heading="Standby")
     banner = page.locator(".banner").filter(has_text="the witness on the robot")
     expect(page.locator("[data-standing=live]")).to_be_visible()
     expect(page.locator(".banner")).to_have_count(0)
@@ -139,9 +139,17 @@ def test_a_silent_witness_is_a_banner_on_every_view(pair: PairConsoles) -> None:
     page.get_by_role("link", name="Now").click()
     expect(page.get_by_role("region", name="Open alarms")).to_contain_text("systemctl status rosrv-witness")
     expect(panel(page).get_by_role("row").nth(3)).to_contain_text("silent")
+    expect(panel(page).get_by_role("row").nth(2)).to_contain_text("cannot take over")
+    button = panel(page).get_by_role("button", name="Switch over…")
+    expect(button).to_have_attribute("title", re.compile("the witness on the robot .* has not answered"))
+    expect(other.locator(".standby .banner")).to_contain_text(
+        "the witness on the robot (10.79.0.10) has not answered"
+    )
     pair.site.start_witness()
     expect(page.locator(".banner")).to_have_count(0)
     expect(panel(page).get_by_role("row").nth(3)).to_contain_text("answers")
+    expect(panel(page).get_by_role("row").nth(2)).to_contain_text("can take over")
+    expect(other.locator(".standby .banner")).to_have_count(0)
 
 
 def test_a_standby_that_could_not_start_is_shown_on_both(pair: PairConsoles) -> None:
