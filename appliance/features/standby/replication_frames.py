@@ -6,6 +6,7 @@ after each message. The active appliance sends the later `Changes`, at least one
 
 import asyncio
 import contextlib
+import math
 import struct
 from typing import Annotated, Any, Generic, TypeVar
 
@@ -133,6 +134,9 @@ class ReplicationLink(Generic[M]):
         self._encoder = msgspec.msgpack.Encoder()
         self._sending = asyncio.Lock()
         self._decoder: msgspec.msgpack.Decoder[M] = msgspec.msgpack.Decoder(received)
+        self._taken = (
+            -math.inf
+        )  # when the other appliance last took something, by the clock of the event loop
 
     async def send(self, message: Any) -> None:
         body = self._encoder.encode(message)
@@ -156,14 +160,21 @@ class ReplicationLink(Generic[M]):
             raise ReplicationError(f"the other appliance took nothing for {_WRITE_SECONDS:g} s") from error
         except OSError as error:
             raise ReplicationError(f"the link was lost: {error}") from error
+        self._taken = asyncio.get_running_loop().time()
 
     async def receive(self, seconds: float) -> M:
+        """Return the next message. A large frame may take longer than `seconds`, while its bytes are sent."""
         try:
-            async with asyncio.timeout(seconds):
-                (length,) = _LENGTH.unpack(await self._reader.readexactly(_LENGTH.size))
-                if length > LARGEST_FRAME:
-                    raise ReplicationError(f"a frame of {length} bytes; at most {LARGEST_FRAME} are allowed")
-                body = await self._reader.readexactly(length)
+            (length,) = _LENGTH.unpack(await self._header(seconds))
+            if length > LARGEST_FRAME:
+                raise ReplicationError(f"a frame of {length} bytes; at most {LARGEST_FRAME} are allowed")
+            body = bytearray()
+            while len(body) < length:
+                async with asyncio.timeout(seconds):
+                    piece = await self._reader.read(length - len(body))
+                if not piece:
+                    raise asyncio.IncompleteReadError(bytes(body), length)
+                body += piece
         except TimeoutError as error:
             raise ReplicationError(f"the other appliance sent nothing for {seconds:g} s") from error
         except asyncio.IncompleteReadError as error:
@@ -174,6 +185,18 @@ class ReplicationLink(Generic[M]):
             return self._decoder.decode(body)
         except (ValueError, RecursionError) as error:
             raise ReplicationError(f"a message is malformed: {error}") from error
+
+    async def _header(self, seconds: float) -> bytes:
+        """An appliance that takes a large frame cannot answer before it has the whole."""
+        left, loop = seconds, asyncio.get_running_loop()
+        while True:
+            try:
+                async with asyncio.timeout(left):
+                    return await self._reader.readexactly(_LENGTH.size)
+            except TimeoutError:
+                left = seconds - (loop.time() - self._taken)
+                if left <= 0:
+                    raise
 
     async def close(self) -> None:
         self._writer.transport.abort()
