@@ -3,9 +3,10 @@
 All times are from the appliance's own clock, which must run while the machine sleeps (CLOCK_BOOTTIME); clocks are
 never compared.
 
-1. The active appliance stays active for 0.8 of an expiry after it *sent* a renewal that was granted, or a request for
-   a promise that was given. The witness and the other appliance count a whole expiry from a later time.
-2. A passive appliance becomes active only by a grant of the witness, and after the end of its promise not to claim.
+1. An appliance is active in its epoch for 0.8 of an expiry after it *sent* a renewal that was granted, or a request for
+   a promise that was given. The witness and the other appliance count a whole expiry from a later time. Both also end
+   a lapse: an appliance that knows a later epoch promises nothing, and is active in its own only after its promise.
+2. Only a grant of the witness begins an epoch, and no appliance is active before its promise not to claim has ended.
 3. A passive appliance gives no promise while the witness says that the lease has expired: the active appliance is cut
    off from the robot, which then needs this one. So it asks the witness even during a promise.
 4. An appliance that starts may have given a promise before, so it claims one expiry later.
@@ -107,8 +108,7 @@ class ApplianceLease:
         self.epoch = epoch
         self.held: int | None = None
         self.answers_alone = False
-        self.refusal = ""
-        self.disowned = False  # whether the witness refuses because it does not know this epoch
+        self.refusal = ""  # why the witness grants this appliance nothing until an operator acts
         self.seen: WitnessAnswer | None = None  # the last answer that knew it
         self.ready = True  # False: this appliance could not serve, so it does not claim
         self._name = name
@@ -157,33 +157,34 @@ class ApplianceLease:
         """Return why the appliance that is not active could not claim the lease now."""
         if self.is_active(now):
             return self.handover_obstacle(now)
-        if self.disowned:
-            return self._disowned()
+        if self.refusal:
+            return self._refused()
         if self.seen is None or now - self._witnessed_at > EXPIRY:
             return (
                 "the witness on the robot does not answer this appliance; check the network between the two"
             )
         if self._name not in self.seen.in_sync:
             return f"{self._name} lacks changes that {self._other} has acknowledged; wait until it has them"
-        return self._unsaved()
+        return self._refused()
 
     def handover_obstacle(self, now: float) -> str:
         other = self._other
-        if self.disowned:
-            return self._disowned()
+        if self.refusal or self._trouble:
+            return self._refused()
         if self.answers_alone or now - self._heard > SILENCE:
             return f"{other} is not ready to take over; wait until it answers and has all data"
         if not self._other_able:
             return f"{other} could not serve after a takeover; `rosrv standby status` there says why"
         if self._other_witnessed is None or now - self._other_witnessed > EXPIRY:
             return f"the witness on the robot does not answer {other}; check the network between {other} and the robot"
-        return self._unsaved()
+        return ""
 
-    def _disowned(self) -> str:
-        return f"the witness on the robot refuses this appliance: {self.refusal}"
-
-    def _unsaved(self) -> str:
-        return f"the witness could not save the takeover: {self._trouble}" if self._trouble else ""
+    def _refused(self) -> str:
+        if self.refusal:
+            return f"the witness on the robot refuses this appliance: {self.refusal}"
+        return (
+            f"the witness on the robot could not grant the takeover: {self._trouble}" if self._trouble else ""
+        )
 
     def is_active(self, now: float) -> bool:
         return self.held is not None and self._promised_until <= now < self._valid_until
@@ -231,9 +232,8 @@ class ApplianceLease:
         if self._is_cut_off(now):
             self._give_up(now, released=True)  # the lease has expired at the witness
             return ()
-        due: list[WitnessRequest | PeerMessage] = [self._to_witness("renew", now)]
+        due: list[WitnessRequest | PeerMessage] = [self._to_witness("renew", now), self._ask(now)]
         if self.is_active(now):
-            due.append(self._ask(now))
             due += self._remove(now, waiting_since)
             if self.answers_alone and caught_up:
                 self.answers_alone = False
@@ -242,20 +242,20 @@ class ApplianceLease:
         return due
 
     def answered(self, request: WitnessRequest, answer: WitnessAnswer) -> Outgoing:
-        self.refusal, self._trouble = answer.reason, answer.trouble
+        self.refusal, self._trouble = "", answer.trouble
         if self.epoch and answer.epoch - self.epoch > FARTHEST:
             self.refusal = (
                 f"the witness has epoch {answer.epoch}, this appliance {self.epoch}: if an operator chose that of the"
                 " witness, stop this appliance and run `rosrv standby repair`"
             )
-            self.disowned = True
             return ()
         if answer.epoch < self.epoch and request.sequence > self._rumoured:
             self.epoch = max(
                 answer.epoch, self._witnessed
             )  # what the other appliance claimed was never granted
-        self.disowned = answer.epoch < self.epoch and bool(answer.reason)
-        if not self.disowned:  # otherwise it would grant nothing
+        if not answer.epoch or answer.epoch < min(request.epoch, self._witnessed):
+            self.refusal = answer.reason
+        else:
             self._witnessed_at = max(self._witnessed_at, request.sent)
         if answer.epoch < self.epoch:
             return ()
@@ -301,15 +301,15 @@ class ApplianceLease:
                     self._promised_to = (
                         message  # an earlier request that arrives late is not the last promise
                     )
-                unheard = now - self._witnessed_at
-                return (ClaimPromise(message.epoch, message.session, message.number, self.ready, unheard),)
+                able, unheard = self.ready and not (self.refusal or self._trouble), now - self._witnessed_at
+                return (ClaimPromise(message.epoch, message.session, message.number, able, unheard),)
             case ClaimPromise(epoch, session, number):
                 asked = self._asked.get(number)
                 if session == self._session and epoch == self.held and asked is not None:
                     if asked >= self._heard:
                         self._other_able, self._other_witnessed = message.able, asked - message.unheard
                     self._heard = max(self._heard, asked)
-                    if self.is_active(now) and number > self._void_number:
+                    if number > self._void_number:
                         self._valid_until = max(self._valid_until, asked + CONFIDENCE)
             case TakeOver(epoch, session, number):
                 promised = self._promised_to

@@ -35,7 +35,7 @@ class LeaseState(Message):
     takeover_obstacle: str
     """Why the appliance that is not active could not claim now."""
     trouble: str
-    """Why the witness could not save a takeover."""
+    """Why the witness could not carry out a takeover."""
     sole: bool = False
     """Whether the witness's in-sync set names only this appliance."""
     expired_since: float | None = None

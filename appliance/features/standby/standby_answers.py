@@ -45,7 +45,7 @@ class WitnessSeen(msgspec.Struct, frozen=True):
     holder: Annotated[str, doc("the appliance that has the lease, or empty if none has it yet")]
     refusal: Annotated[str, doc("why it refused the last request, or empty if it did not")]
     trouble: Annotated[
-        str, doc("why it could not save a takeover, such as a full disk, or empty if it could")
+        str, doc("why it could not carry out a takeover, such as a full disk, or empty if it could")
     ]
 
 

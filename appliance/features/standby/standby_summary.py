@@ -139,7 +139,7 @@ def _blind(state: StandbyState) -> Trouble:
 
 def _unsaved(witness: WitnessSeen) -> Trouble:
     text = (
-        f"the witness on the robot ({witness.address}) could not save a takeover: {witness.trouble}; correct"
+        f"the witness on the robot ({witness.address}) could not carry out a takeover: {witness.trouble}; correct"
         " that on the robot"
     )
     return Trouble("alarm", "witness-disk", text)

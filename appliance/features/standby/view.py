@@ -34,7 +34,7 @@ _METRICS = (
     ),
     gauge(
         "rosrv_standby_witness_trouble",
-        "1 while the witness could not save a takeover, such as on a disk that cannot be written, or refuses this"
+        "1 while the witness could not carry out a takeover, such as on a disk that cannot be written, or refuses this"
         " appliance",
     ),
     gauge(

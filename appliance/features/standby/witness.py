@@ -15,8 +15,10 @@ This file runs alone, with the standard library of Python 3.5 to 3.12 and the pr
 3. Every start waits one expiry before the first grant. After a reboot both appliances are shut out; a renewal of
    the holder admits it again, since no other appliance has had a grant.
 4. A damaged or missing lease shuts out both appliances, until an operator runs `begin`.
-5. A full disk prevents no change: the file of the lease keeps its size. Each answer says why a regular write
-   failed: a disk that cannot be written would prevent the next takeover.
+5. A full disk prevents no change: the file of the lease keeps its size. Each answer says why the next takeover would
+   fail: a disk that cannot be written, or a program that cannot list the rules. Both stop no renewal of the holder.
+6. After a change that may be on the disk or not, each appliance counts as in sync for the holder, and the lease is
+   saved again before the next change.
 
 The firewall translates one fixed address to the holder, and rejects all other traffic of the other appliance with TCP
 resets. For an idle connection, the witness sends its local socket a segment outside its window; the firewall rejects
@@ -96,6 +98,10 @@ Ends = Tuple[str, int, str, int]  # of a connection: the own address and port, t
 
 class WitnessError(Exception):
     """A request, a setting or the system that prevents an operation; the message has the remedy."""
+
+
+class UncertainError(WitnessError):
+    """The change may have been made, or a part of it."""
 
 
 LeaseRecord = NamedTuple(
@@ -229,6 +235,9 @@ class LeaseFile:
             raise ValueError("its holder is not in sync")
         return record
 
+    def check_disk(self) -> None:
+        write_synced(self.path + ".check", b" " * _COPY)
+
     def has_room(self) -> bool:
         try:
             return os.stat(self.path).st_size == 2 * _COPY
@@ -236,7 +245,7 @@ class LeaseFile:
             return False
 
     def write(self, record: LeaseRecord) -> None:
-        """Save the lease. After a `WitnessError` the old lease stays; any other error leaves it uncertain."""
+        """Save the lease. After a `WitnessError` that is not an `UncertainError`, the old lease stays."""
         body = {
             "epoch": record.epoch,
             "holder": record.holder,
@@ -251,17 +260,20 @@ class LeaseFile:
             self._replace(2 * copy)
 
     def _overwrite(self, copy: bytes) -> None:
+        failure = WitnessError
         try:
             descriptor = os.open(self.path, os.O_WRONLY)
+            try:
+                for offset in (0, _COPY):
+                    written = os.pwrite(descriptor, copy, offset)
+                    failure = UncertainError
+                    if written != _COPY:
+                        raise OSError("a part was written")
+                    os.fsync(descriptor)
+            finally:
+                os.close(descriptor)
         except OSError as error:
-            raise self._unsaved(error) from error
-        try:
-            for offset in (0, _COPY):
-                if os.pwrite(descriptor, copy, offset) != _COPY:
-                    raise OSError("the lease %s was written in part" % self.path)
-                os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
+            raise failure(self._unsaved(error)) from error
 
     def _replace(self, content: bytes) -> None:
         folder, new = os.path.dirname(os.path.abspath(self.path)), self.path + ".new"
@@ -269,19 +281,22 @@ class LeaseFile:
             with contextlib.suppress(FileNotFoundError):
                 os.unlink(new)
             write_synced(new, content)
+            os.rename(new, self.path)
         except OSError as error:
             with contextlib.suppress(OSError):
                 os.unlink(new)
-            raise self._unsaved(error) from error
-        os.rename(new, self.path)
-        descriptor = os.open(folder, os.O_RDONLY)
+            raise WitnessError(self._unsaved(error)) from error
         try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
+            descriptor = os.open(folder, os.O_RDONLY)
+            try:
+                os.fsync(descriptor)
+            finally:
+                os.close(descriptor)
+        except OSError as error:
+            raise UncertainError(self._unsaved(error)) from error
 
-    def _unsaved(self, error: OSError) -> WitnessError:
-        return WitnessError("the lease %s cannot be saved: %s" % (self.path, error))
+    def _unsaved(self, error: OSError) -> str:
+        return "the lease %s cannot be saved: %s" % (self.path, error)
 
 
 def write_synced(path: str, content: bytes) -> None:
@@ -294,52 +309,49 @@ def write_synced(path: str, content: bytes) -> None:
         os.close(descriptor)
 
 
-class DiskCheck:
-    """Checks regularly that the disk of the lease can be written, in a thread: a slow disk delays no answer."""
+class RegularCheck:
+    """Checks something regularly in a thread, so that neither a slow disk nor a slow program delays an answer.
 
-    def __init__(self, lease: LeaseFile, clock: Callable[[], float]) -> None:
-        self._lease = lease
+    `check` raises `OSError` or `WitnessError`, and `failure` is the text about that.
+
+    """
+
+    def __init__(self, failure: str, check: Callable[[], Any], clock: Callable[[], float]) -> None:
+        self._text = failure
+        self._check = check
         self._clock = clock
         self._began = None  # type: Optional[float]
         self._failure = ""
 
-    def start(self) -> None:
-        threading.Thread(target=self._check_always, daemon=True).start()
+    def start(self, seconds: float) -> None:
+        threading.Thread(target=self._run_always, args=(seconds,), daemon=True).start()
 
-    def _check_always(self) -> None:
+    def _run_always(self, seconds: float) -> None:
         while True:
-            self.check()
-            select.select([], [], [], _DISK_SECONDS)
+            self.run()
+            select.select([], [], [], seconds)
 
-    def check(self) -> None:
+    def run(self) -> None:
         self._began = self._clock()
         try:
-            write_synced(self._lease.path + ".check", b" " * _COPY)
+            self._check()
             self._failure = ""
-        except OSError as error:
-            self._failure = "the disk of the lease %s cannot be written: %s" % (
-                self._lease.path,
-                error.strerror or error,
-            )
+        except (OSError, WitnessError) as error:
+            self._failure = "%s: %s" % (self._text, error)
         self._began = None
 
     def trouble(self) -> str:
         began = self._began
         if began is not None and self._clock() - began > _SLOW_SECONDS:
-            return "the disk of the lease %s takes more than %d s for a write" % (
-                self._lease.path,
-                _SLOW_SECONDS,
-            )
-        if not (self._failure or self._lease.has_room()):
-            return "the file %s has no room for the next change: free space on its disk" % self._lease.path
+            return "%s: that takes more than %d s" % (self._text, _SLOW_SECONDS)
         return self._failure
 
 
 class Witness:
     """The rules of the lease.
 
-    `admit` changes the firewall to admit one appliance, or none (""). Like `save`, it raises `WitnessError` if
-    nothing has changed. Without a `record`, every request is refused.
+    `admit` changes the firewall to admit one appliance, or none (""). It raises `UncertainError` if it may have
+    changed something, and `WitnessError` if not; so does `save`. Without a `record`, every request is refused.
 
     """
 
@@ -358,7 +370,9 @@ class Witness:
         self._boot = boot
         self._clock = clock
         self._expires = clock() + EXPIRY
-        self.trouble = ""  # why the next change of the lease would not be saved
+        self.trouble = ""  # why the next takeover would fail
+        self.unknown_rules = ""  # why the rules cannot be listed
+        self.unsettled = False  # whether the disk may have another lease than `record`
         # Within one boot the rules of an earlier process stay, so that its end alone changes nothing.
         self.admitted = record.holder if record is not None and record.boot == boot else ""
         admit(self.admitted)
@@ -366,6 +380,12 @@ class Witness:
     def enforce_again(self) -> None:
         holder = self.record.holder if self.record is not None else ""
         self._enforce(holder if self.admitted == holder else "")
+
+    def settle(self) -> None:
+        """Save the lease again, so that the disk has this one."""
+        if self.record is not None:
+            self._save(self.record)
+        self.unsettled = False
 
     def left(self) -> float:
         return max(0.0, self._expires - self._clock())
@@ -398,6 +418,8 @@ class Witness:
             return "%s holds the lease for another %.1f s" % (before.holder or "no appliance", self.left())
         if name not in before.in_sync:
             return "%s is not in sync" % name
+        if self.unknown_rules:
+            return self.unknown_rules
         self._change(before._replace(epoch=before.epoch + 1, holder=name, boot=self._boot))
         try:
             self._enforce(name)
@@ -418,14 +440,21 @@ class Witness:
             self._change(record._replace(in_sync=tuple(sorted(wanted))))
 
     def _change(self, record: LeaseRecord) -> None:
-        self._save(record)
+        if self.unsettled:
+            self.settle()
+        try:
+            self._save(record)
+        except UncertainError:
+            self.unsettled = True
+            raise
         self.record = record
 
     def _enforce(self, name: str) -> None:
-        before, self.admitted = self.admitted, "?"  # after a failure, the next renewal tries again
+        before = self.admitted
         try:
             self._admit(name)
-        except WitnessError:
+        except UncertainError:
+            self.admitted = "?"  # after a second failure, the next renewal tries again
             self._admit(before if before != "?" else "")
             self.admitted = before
             raise
@@ -495,7 +524,9 @@ class WitnessGate:
             reason=reason[:200].encode("ascii", "replace").decode("ascii"),
             epoch=record.epoch if record is not None else 0,
             holder=record.holder if record is not None else "",
-            in_sync=list(record.in_sync) if record is not None else [],
+            in_sync=[]
+            if record is None
+            else sorted(self._appliances if self._witness.unsettled else record.in_sync),
             expired=not self._witness.left(),
             trouble=self._witness.trouble[:200].encode("ascii", "replace").decode("ascii"),
         )
@@ -751,18 +782,21 @@ def run_program(command: List[str], text: str) -> str:
     try:
         done = subprocess.run(
             command,
-            input=text,
+            input=text.encode("ascii"),
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
-            universal_newlines=True,
             timeout=_PROGRAM_SECONDS,
             check=False,
         )
-    except (OSError, subprocess.TimeoutExpired) as error:
+    except OSError as error:
         raise WitnessError("%s: %s" % (command[0], error)) from error
+    except subprocess.TimeoutExpired as error:
+        raise UncertainError("%s: %s" % (command[0], error)) from error
+    said, failed = (one.decode("utf-8", "replace") for one in (done.stdout, done.stderr))
     if done.returncode:
-        raise WitnessError("%s: %s" % (command[0], " ".join(done.stderr.split())[:150]))
-    return done.stdout
+        failure = WitnessError if done.returncode > 0 else UncertainError  # it was killed
+        raise failure("%s: %s" % (command[0], " ".join(failed.split())[:150] or done.returncode))
+    return said
 
 
 def chosen_backend(release: str, find: Callable[[str], Optional[str]]) -> str:
@@ -793,25 +827,27 @@ class LeaseFirewall:
         self._rules = 0
 
     def admit(self, name: str) -> None:
-        self._written = []
         if self._backend == "nft":
-            self._run(["nft", "-f", "-"], nft_rules(self._settings, name))
+            self._run(["nft", "-f", "-"], nft_rules(self._settings, name))  # changes all rules, or none
         else:
             text = iptables_rules(self._settings, name, self._chains())
-            self._run(["iptables-restore", "--noflush"], text)
+            try:
+                self._run(["iptables-restore", "--noflush"], text)
+            except WitnessError as error:
+                raise UncertainError(str(error)) from error  # each table is changed separately
             self._rules = text.count("-A %s-" % _CHAINS)
-        self._written = self._present()
+        self._written = []
+        with contextlib.suppress(
+            WitnessError
+        ):  # then they are not intact, and the next check writes them again
+            self._written = self.present()
 
-    def intact(self) -> bool:
+    def intact(self, present: List[str]) -> bool:
         """Return whether the rules are still those that were written.
 
         Another program may have changed them before they were first read. So the jumps, which must be first, and the
         number of rules are compared with the written text.
         """
-        try:
-            present = self._present()
-        except WitnessError:
-            return False
         jumps = ["-A %s -j %s-%s" % (chain, _CHAINS, name) for _, rows in _JUMPS for chain, name in rows]
         whole = present[: len(jumps)] == jumps and len(present) == len(jumps) + self._rules
         return present == self._written and (whole or self._backend == "nft")
@@ -824,9 +860,14 @@ class LeaseFirewall:
                 found.setdefault("%s %s" % (table, line.split()[1]), []).append(line)
         return found
 
-    def _present(self) -> List[str]:
+    def present(self) -> List[str]:
         if self._backend == "nft":
-            return [self._run(["nft", "list", "table", "ip", TABLE], "")]
+            try:
+                return [self._run(["nft", "list", "table", "ip", TABLE], "")]
+            except WitnessError:
+                if "table ip " + TABLE in self._run(["nft", "list", "tables"], "").splitlines():
+                    raise
+                return [""]  # the table is gone
         chains = self._chains()
         jumps = [chains.get("%s %s" % (table, chain), [""])[0] for table, rows in _JUMPS for chain, _ in rows]
         return jumps + [rule for name in sorted(chains) if _CHAINS in name for rule in chains[name]]
@@ -1059,8 +1100,16 @@ class LeaseEnforcement:
         self._idle = IdleConnections(settings)
         self._log = log
         self._checked = self._reset = time.monotonic()
+        self._changes = 0
+        self._listed = None  # type: Optional[Tuple[int, List[str]]]
+        self.listing = RegularCheck("the firewall rules cannot be listed", self._list, time.monotonic)
+
+    def _list(self) -> None:
+        changes = self._changes
+        self._listed = changes, self._firewall.present()
 
     def admit(self, name: str) -> None:
+        self._changes += 1
         connecting = self._idle.connecting()
         self._firewall.admit(name)
         self._idle.reset(name, connecting)
@@ -1071,17 +1120,18 @@ class LeaseEnforcement:
         if now - self._reset >= _RESET_SECONDS:
             self._reset = now
             self._idle.go_on()
-        if now - self._checked < _CHECK_SECONDS:
-            return False
-        self._checked = now
+        listed, self._listed = self._listed, None
         try:
-            if not self._firewall.intact():
+            if listed is not None and listed[0] == self._changes and not self._firewall.intact(listed[1]):
                 self._log.add(
                     "another program changed the firewall rules of the witness; they are written again"
                 )
                 enforce_again()
         except WitnessError as error:
             self._log.add(str(error))
+        if now - self._checked < _CHECK_SECONDS:
+            return False
+        self._checked = now
         return True
 
 
@@ -1108,8 +1158,11 @@ def serve(settings: WitnessSettings, backend: str, lease: LeaseFile) -> None:
         record=record, save=lease.write, admit=enforcement.admit, boot=boot, clock=time.monotonic
     )
     gate = WitnessGate(witness, settings.appliances, os.urandom(16).hex(), settings.followers)
-    disk = DiskCheck(lease, time.monotonic)
-    disk.start()
+    disk = RegularCheck(
+        "the disk of the lease %s cannot be written" % lease.path, lease.check_disk, time.monotonic
+    )
+    disk.start(_DISK_SECONDS)
+    enforcement.listing.start(_CHECK_SECONDS)
     with RequestSockets(settings.listen) as requests:
         log.add("the witness answers at %s:%d and uses %s" % (*settings.listen, backend))
         rejected = 0
@@ -1120,20 +1173,25 @@ def serve(settings: WitnessSettings, backend: str, lease: LeaseFile) -> None:
                         break
             if not enforcement.go_on(witness.enforce_again):
                 continue
+            witness.unknown_rules = enforcement.listing.trouble()
             _note_trouble(witness, lease, disk, log)
             if gate.rejected > rejected:
                 log.add("%d requests without a valid authentication code" % (gate.rejected - rejected))
                 rejected = gate.rejected
 
 
-def _note_trouble(witness: Witness, lease: LeaseFile, disk: DiskCheck, log: BoundedLog) -> None:
-    """Put into answers why the next change could not be saved. If the file lacks space, try to get it."""
-    if witness.record is not None and not lease.has_room():
-        with contextlib.suppress(WitnessError):  # reported as the trouble
-            lease.write(witness.record)
-    trouble = disk.trouble() if witness.record is not None else ""
+def _note_trouble(witness: Witness, lease: LeaseFile, disk: RegularCheck, log: BoundedLog) -> None:
+    """Put into answers why the next takeover would fail. If the file lacks space, try to get it."""
+    trouble = ""
+    if witness.record is not None:
+        trouble = witness.unknown_rules or disk.trouble()
+        if not disk.trouble() and (witness.unsettled or not lease.has_room()):
+            try:
+                witness.settle()
+            except WitnessError as error:
+                trouble = str(error)
     if trouble != witness.trouble:
-        log.add(trouble or "the lease can be saved again")
+        log.add(trouble or "nothing prevents a takeover now")
     witness.trouble = trouble
 
 
@@ -1193,15 +1251,16 @@ class RequestSockets:
 def _answer_one(one: socket.socket, gate: WitnessGate, requests: RequestSockets) -> bool:
     try:
         datagram, source = one.recvfrom(LONGEST + 1)
-        answer = gate.answer(datagram, source[0])
+    except BlockingIOError:
+        return False
+    except OSError:
+        return True  # an earlier answer was not delivered
+    answer = gate.answer(datagram, source[0])
+    with contextlib.suppress(OSError):  # no route to the appliance at present; it asks again
         if answer is not None:
             one.sendto(answer, source)
         if gate.fresh:
             requests.prefer(gate.fresh, source)
-    except BlockingIOError:
-        return False
-    except OSError:
-        pass  # no route to the appliance at present; it asks again
     return True
 
 
@@ -1227,6 +1286,7 @@ def follow(settings: WitnessSettings, backend: str, lease: LeaseFile) -> None:
         log.add(
             "%s follows the witness at %s:%d and uses %s" % (settings.follows_as, *settings.listen, backend)
         )
+        enforcement.listing.start(_CHECK_SECONDS)
         asked = time.monotonic() - _LOOK_SECONDS
         shown = ""
         while True:  # until the process is ended; each turn is bounded
@@ -1244,9 +1304,10 @@ def follow(settings: WitnessSettings, backend: str, lease: LeaseFile) -> None:
                 _send_look(asking, settings.listen, follower)
             silent = _boot_seconds() - follower.answered > EXPIRY
             state = "the witness at %s:%d does not answer" % settings.listen if silent else follower.refusal
+            state = state or enforcement.listing.trouble()
             if state != shown:
                 shown = state
-                log.add(state or "the witness answers again")
+                log.add(state or "the witness answers, and the rules can be listed")
             enforcement.go_on(follower.enforce_again)
 
 

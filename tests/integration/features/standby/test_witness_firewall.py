@@ -159,6 +159,30 @@ def test_rules_that_another_program_removes_are_written_again(site: Site) -> Non
     site.connect(site.robot, FIXED, MASTER).close()
 
 
+@pytest.mark.parametrize("script", ["echo no memory >&2; exit 1", "sleep 30"])
+def test_a_firewall_program_that_fails_or_hangs_stops_no_renewal(site: Site, script: str) -> None:
+    site.serve()
+    a, b = site.peer("a"), site.peer("b")
+    epoch = a.granted(1)
+    with site.firewall_program(script):
+
+        def reported() -> bool:
+            answer = a.ask("renew", epoch)
+            assert answer.ok, answer.reason
+            return "the firewall rules cannot be listed" in answer.trouble
+
+        eventually(reported, site.log)
+        site.connect(site.robot, FIXED, MASTER).close()
+        assert a.ask("release", epoch).ok
+        assert "the firewall rules cannot be listed" in b.ask("claim", epoch).reason
+        assert a.ask("renew", epoch).ok
+        assert site.lease.read().epoch == epoch
+    eventually(lambda: a.ask("renew", epoch).trouble == "", site.log)
+    assert "another program changed" not in site.log()
+    assert a.ask("release", epoch).ok
+    assert b.granted(epoch) == epoch + 1
+
+
 def test_an_attacker_on_the_network_gets_no_lease_and_delays_none(site: Site) -> None:
     site.serve()
     a, b = site.peer("a"), site.peer("b")

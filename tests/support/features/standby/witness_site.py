@@ -6,6 +6,7 @@ import socket
 import struct
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -84,6 +85,7 @@ class Site:
                 path = need_program(f"{backend}-{tool}", "iptables")
                 (programs / f"iptables-{tool}").symlink_to(path)
         self.environment = {"PATH": f"{programs}:{os.environ['PATH']}:/usr/sbin"}
+        self.programs = programs
         self.settings = folder / "witness.json"
         appliances = {
             name: {"address": address, "key": KEYS[name].hex()} for name, address in ADDRESSES.items()
@@ -116,6 +118,24 @@ class Site:
         with Process(self.robot, self.command(*words), env=self.environment, label=words[0]) as process:
             process.wait()
             assert process.popen.returncode == 0, process.errors
+
+    @contextlib.contextmanager
+    def firewall_program(self, script: str) -> Iterator[None]:
+        """Put a script into the place of the programs of the firewall."""
+        names = ["nft"] if self.backend == "nft" else ["iptables-save", "iptables-restore"]
+        for name in names:
+            with contextlib.suppress(FileNotFoundError):
+                (self.programs / name).rename(self.programs / f"{name}.real")
+            (self.programs / f"{name}.new").write_text(f"#!/bin/sh\n{script}\n")
+            (self.programs / f"{name}.new").chmod(0o755)
+            (self.programs / f"{name}.new").rename(self.programs / name)
+        try:
+            yield
+        finally:
+            for name in names:
+                (self.programs / name).unlink()
+                with contextlib.suppress(FileNotFoundError):
+                    (self.programs / f"{name}.real").rename(self.programs / name)
 
     def serve(self) -> Process:
         self.process = Process(self.robot, self.command("serve"), env=self.environment, label="witness")

@@ -263,6 +263,7 @@ class SimulatedRobot(Host):
         self.network_up = False
         self.disk_full = self.firewall_fails = False
         self.save_fault = ""
+        self.granted = self.disk.epoch
         self.gate: Any = None
         self.firewall = witness.LeaseFirewall(SETTINGS, "nft", self._nft)
 
@@ -302,22 +303,31 @@ class SimulatedRobot(Host):
         self.network_up = False
         self.rules = ""
 
+    def tick(self) -> None:
+        """Settle the lease as the program does."""
+        if self.keeper.unsettled:
+            try:
+                self.keeper.settle()
+            except self.history.product.witness.WitnessError:
+                return
+            except _PowerLost:
+                self._lose_power()
+
+    def _lose_power(self) -> None:
+        self.power_off()
+        self.history.at(self.history.random.uniform(0.5, 5), self.start)
+
     def received(self, sender: str, message: Any) -> None:
-        epoch_before = self.disk.epoch
         try:
             answer = self.gate.answer(message, SETTINGS.appliances[sender].address)
-        except OSError:
-            self.crash()
-            return
         except _PowerLost:
-            self.power_off()
-            self.history.at(self.history.random.uniform(0.5, 5), self.start)
+            self._lose_power()
             return
         if answer is not None:
-            self._trace(sender, message, answer, epoch_before)
+            self._trace(sender, message, answer)
             self.history.send("witness", sender, answer)
 
-    def _trace(self, sender: str, message: bytes, answer: bytes, epoch_before: int) -> None:
+    def _trace(self, sender: str, message: bytes, answer: bytes) -> None:
         request = witness.unseal(witness.REQUEST, KEYS[sender], message)
         said = witness.unseal(witness.ANSWER, KEYS[sender], answer)
         if request is None or said is None or "stale" in said or request["do"] == "look":
@@ -327,7 +337,8 @@ class SimulatedRobot(Host):
         if not said["ok"]:
             self.history.trace(f"refused {sender} {said['reason']}")
         elif request["do"] == "claim":
-            self.history.require(said["epoch"] > epoch_before, f"granted epoch {said['epoch']} twice")
+            self.history.require(said["epoch"] > self.granted, f"granted epoch {said['epoch']} twice")
+            self.granted = said["epoch"]
             self.history.require(self.admitted() == {sender}, f"granted {sender} without its firewall rules")
             self.history.trace(f"granted {sender} {said['epoch']}")
         elif request["do"] in ("renew", "release"):
@@ -347,21 +358,25 @@ class SimulatedRobot(Host):
         return set(re.findall(r"dnat to (\S+)", self.rules))
 
     def _save(self, record: Any) -> None:
-        fault, self.save_fault = self.save_fault, ""
+        fault, self.save_fault = self.save_fault, "broken" if self.save_fault == "broken" else ""
         if self.disk_full:
             raise self.history.product.witness.WitnessError("the disk is full")
-        if fault == "uncertain":
+        if fault in ("uncertain", "broken"):
             self.disk = self.history.random.choice([self.disk, record])
-            raise OSError("input/output error")
+            raise self.history.product.witness.UncertainError("input/output error")
         self.disk = record
         if fault == "power":
             raise _PowerLost
 
     def _nft(self, command: list[str], text: str) -> str:
         if command[1] == "-f":
-            if self.firewall_fails:
-                raise self.history.product.witness.WitnessError("nft: cannot allocate memory")
-            self.rules = text
+            fails, product = self.firewall_fails, self.history.product.witness
+            if fails and self.history.random.random() < 0.5:
+                raise product.WitnessError("nft: cannot allocate memory")
+            if not fails or self.history.random.random() < 0.5:
+                self.rules = text
+            if fails:
+                raise product.UncertainError("nft: timed out")
         return self.rules
 
 
@@ -602,8 +617,13 @@ class History:
         return self._short()
 
     def _broken_save(self) -> float:
-        self.robot.save_fault = self.random.choice(["uncertain", "power"])
+        self.robot.save_fault = self.random.choice(["uncertain", "power", "broken"])
+        if self.robot.save_fault == "broken":
+            self.at(self._short(), self._repair_disk)
         return self._short()
+
+    def _repair_disk(self) -> None:
+        self.robot.save_fault = ""
 
     def _switch_over(self) -> float:
         self._active().switch_over()

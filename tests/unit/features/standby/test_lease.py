@@ -14,9 +14,9 @@ from appliance.features.standby.lease import (
     WitnessAnswer,
     WitnessRequest,
 )
-from appliance.features.standby.witness import EXPIRY, HIGHEST
+from appliance.features.standby.witness import EXPIRY, HIGHEST, LeaseRecord
 from appliance.features.standby.witness_link import WitnessChannel
-from tests.unit.features.standby.test_witness import KEYS, Robot
+from tests.unit.features.standby.test_witness import FIRST, KEYS, PEERS, Robot
 
 BOTH, ALONE = frozenset("ab"), frozenset("a")
 
@@ -116,13 +116,13 @@ def test_a_holder_that_only_the_standby_could_replace_gives_up() -> None:
     assert isinstance(lease.later(0.3).tick()[0], TakeOver)  # the first may be lost
 
 
-def test_a_promise_makes_no_passive_appliance_active() -> None:
+def test_a_promise_ends_a_lapse_and_counts_from_its_request() -> None:
     lease = active_lease()
-    asked = asked_by(lease.later(0.9))
-    lease.later(0.1)
+    asked = asked_by(lease.later(CONFIDENCE + 0.1))
     assert not lease.active()
-    lease.lease.received(lease.now, ClaimPromise(asked.epoch, asked.session, asked.number))
-    assert not lease.active()
+    lease.lease.received(lease.later(0.5).now, ClaimPromise(asked.epoch, asked.session, asked.number))
+    assert lease.later(CONFIDENCE - 0.51).active()
+    assert not lease.later(0.02).active()
 
 
 def test_it_does_not_claim_while_its_promise_lasts() -> None:
@@ -202,7 +202,7 @@ def test_an_epoch_that_jumps_is_not_believed() -> None:
 def test_a_refused_renewal_of_a_replaced_holder_ends_its_epoch() -> None:
     lease = active_lease().later(0.3)
     lease.answered(lease.request("renew"), ok=False, reason="b holds epoch 3", epoch=3, holder="b")
-    assert not lease.active() and lease.lease.refusal == "b holds epoch 3"
+    assert not lease.active() and lease.lease.refusal == ""
     assert lease.later(0.3).operations() == ["claim"]
 
 
@@ -351,7 +351,7 @@ def test_an_impossible_switchover_is_refused_with_the_reason() -> None:
         (True, 0.3, "", ""),
         (False, 0.3, "", "b could not serve after a takeover"),
         (True, EXPIRY + 0.4, "", "the witness on the robot does not answer b"),
-        (True, 0.3, "the disk is full", "the witness could not save the takeover: the disk is full"),
+        (True, 0.3, "the disk is full", "could not grant the takeover: the disk is full"),
     ],
 )
 def test_a_lease_is_given_up_only_to_an_appliance_that_could_claim_it(
@@ -407,7 +407,7 @@ def test_a_witness_with_an_older_lease_makes_no_switchover_possible() -> None:
         (
             {"ok": False, "holder": "a", "trouble": "full"},
             0.3,
-            "the witness could not save the takeover: full",
+            "the witness on the robot could not grant the takeover: full",
         ),
         (
             {"ok": False, "holder": "a"},
@@ -434,6 +434,82 @@ def test_a_standby_that_the_witness_refuses_does_not_count_as_answered() -> None
         standby.answered(next(one for one in due if isinstance(one, WitnessRequest)), **OLDER)
     (promise,) = standby.lease.received(standby.now, PromiseRequest(2, "other", 1))
     assert isinstance(promise, ClaimPromise) and promise.unheard > EXPIRY
+
+
+# ---- Both appliances and the witness
+
+
+class Pair:
+    def __init__(self) -> None:
+        self.now = 50.0
+        self.robot = Robot()
+        self.leases = {
+            name: ApplianceLease(name, other, name, 1, self.now) for name, other in (("a", "b"), ("b", "a"))
+        }
+        self.channels = {name: WitnessChannel(name, KEYS[name], name) for name in self.leases}
+
+    def run(self, seconds: float) -> "Pair":
+        end = self.now + seconds
+        while self.now < end:
+            self.now += 0.1
+            self.robot.now += 0.1
+            for name, lease in self.leases.items():
+                self.deliver(name, lease.tick(self.now, waiting_since=None, caught_up=False))
+        return self
+
+    def deliver(self, name: str, due: Outgoing) -> None:
+        for message in due:
+            if isinstance(message, WitnessRequest):
+                datagram = self.robot.gate.answer(self.channels[name].write(message), PEERS[name].address)
+                found = self.channels[name].read(datagram) if datagram is not None else None
+                if found is not None:
+                    self.deliver(name, self.leases[name].answered(*found))
+            else:
+                other = "b" if name == "a" else "a"
+                self.deliver(other, self.leases[other].received(self.now, message))
+
+    def active(self) -> list[str]:
+        return [name for name, lease in self.leases.items() if lease.is_active(self.now)]
+
+    def refusals(self) -> list[str]:
+        return [lease.refusal for lease in self.leases.values()]
+
+
+@pytest.mark.parametrize(
+    ("record", "reason"),
+    [
+        (LeaseRecord(1, "a", ("a", "b"), "one"), "the witness knows only epoch 1: run witness.py begin"),
+        (LeaseRecord(1, "b", ("a", "b"), "one"), "the witness knows only epoch 1: run witness.py begin"),
+        (None, "the lease is damaged: run witness.py begin"),
+    ],
+)
+def test_a_witness_that_grants_nothing_is_reported_and_ends_no_service(
+    record: LeaseRecord | None, reason: str
+) -> None:
+    pair = Pair().run(5)
+    assert pair.active() == ["a"] and pair.refusals() == ["", ""]
+    pair.robot = Robot(record, boot="two")
+    pair.run(3)
+    assert pair.active() == ["a"], "hosts in tunnels are still served"
+    assert all(reason in refusal for refusal in pair.refusals())
+    with pytest.raises(LeaseError, match=reason):
+        pair.leases["a"].switch_over(pair.now)
+    pair.now += 10
+    assert pair.active() == []
+    pair.run(0.5)
+    assert pair.active() == ["a"], "it comes back after a lapse"
+    pair.robot = Robot(FIRST._replace(epoch=9))
+    pair.run(5)
+    assert len(pair.active()) == 1 and pair.refusals() == ["", ""]
+    assert pair.leases["a"].epoch == 10
+
+
+def test_after_a_failed_switchover_the_appliance_comes_back() -> None:
+    pair = Pair().run(5)
+    pair.robot = Robot(FIRST, boot="two")
+    pair.deliver("a", pair.leases["a"].switch_over(pair.now))
+    assert pair.run(1).active() == []
+    assert pair.run(2).active() == ["a"]
 
 
 # ---- The datagrams

@@ -87,7 +87,7 @@ def test_a_whole_pair_has_no_trouble(of: dict[str, Any]) -> None:
         ),
         (
             ACTIVE, {"witness": {"trouble": "Read-only file system"}},
-            "the witness on the robot (10.0.0.10) could not save a takeover: Read-only file system; correct that on"
+            "the witness on the robot (10.0.0.10) could not carry out a takeover: Read-only file system; correct that on"
             " the robot",
         ),
         (

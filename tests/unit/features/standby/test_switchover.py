@@ -130,7 +130,7 @@ async def test_a_silent_witness_refuses_the_order_before_anything_is_paused(acti
     [
         ({"in_sync": False}, "the standby b has been catching up for 0 s"),
         ({"heard": -10.0}, "the standby b (10.0.0.3) has been away"),
-        ({"trouble": "the disk is full"}, "could not save a takeover: the disk is full"),
+        ({"trouble": "the disk is full"}, "could not carry out a takeover: the disk is full"),
         ({"refusal": "the witness knows only epoch 3"}, "refuses this appliance"),
         ({"takeover_obstacle": "b could not serve after a takeover"}, "b could not serve after a takeover"),
     ],

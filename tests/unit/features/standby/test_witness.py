@@ -17,10 +17,11 @@ from appliance.features.standby.witness import (
     REQUEST,
     AppliancePeer,
     BoundedLog,
-    DiskCheck,
     LeaseFile,
     LeaseFirewall,
     LeaseRecord,
+    RegularCheck,
+    UncertainError,
     Witness,
     WitnessError,
     WitnessGate,
@@ -35,6 +36,7 @@ from appliance.features.standby.witness import (
 
 KEYS = {"a": b"a" * 32, "b": b"b" * 32}
 PEERS = {"a": AppliancePeer("10.0.0.2", KEYS["a"]), "b": AppliancePeer("10.0.0.3", KEYS["b"])}
+PAIR_SETTINGS = WitnessSettings(("10.0.0.1", 7411), "10.0.0.100", ("11311",), PEERS, "/lease", {}, "")
 BOTH = ("a", "b")
 FIRST = LeaseRecord(1, "", BOTH, "")
 
@@ -44,7 +46,7 @@ class Robot:
         self.now = 100.0
         self.disk = record
         self.admits: list[str] = []
-        self.disk_full = self.firewall_fails = False
+        self.disk_full = self.firewall_fails = self.uncertain = False
         self.witness = Witness(
             record=record, save=self.save, admit=self.admit, boot=boot, clock=lambda: self.now
         )
@@ -52,13 +54,17 @@ class Robot:
 
     def save(self, record: LeaseRecord) -> None:
         if self.disk_full:
-            raise WitnessError("the disk is full")
+            raise self.failure("the disk is full")
         self.disk = record
 
     def admit(self, name: str) -> None:
         if self.firewall_fails:
-            raise WitnessError("nft: no")
+            raise self.failure("nft: no")
         self.admits.append(name)
+
+    @property
+    def failure(self) -> type[WitnessError]:
+        return UncertainError if self.uncertain else WitnessError
 
     def asks(self, name: str, operation: str, epoch: int = 1) -> str:
         return self.witness.handle(name, operation, epoch, "b" if name == "a" else "a")
@@ -134,10 +140,62 @@ def test_a_failing_firewall_grants_nothing() -> None:
     robot.firewall_fails = True
     assert robot.asks("b", "claim", 2) == "nft: no"
     assert robot.disk == LeaseRecord(2, "a", BOTH, "one")
-    assert robot.asks("a", "renew", 2) == "nft: no", "the state of the rules is unknown"
+    assert robot.asks("a", "renew", 2) == "", "its rules have not changed"
+    assert robot.admits == ["", "a"]
+
+
+def test_uncertain_rules_are_written_again_before_the_next_renewal() -> None:
+    robot = granted().expired()
+    robot.firewall_fails = robot.uncertain = True
+    assert robot.asks("b", "claim", 2) == "nft: no"
+    assert robot.asks("a", "renew", 2) == "nft: no", "they may admit b"
     robot.firewall_fails = False
     assert robot.asks("a", "renew", 2) == ""
     assert robot.admits == ["", "a", "a"]
+
+
+def test_rules_that_cannot_be_listed_stop_takeovers_and_no_renewal() -> None:
+    robot = granted().expired()
+    robot.witness.unknown_rules = "nft: not found"
+    assert robot.asks("b", "claim", 2) == "nft: not found"
+    assert robot.disk == LeaseRecord(2, "a", BOTH, "one")
+    assert robot.asks("a", "renew", 2) == ""
+    robot.witness.unknown_rules = ""
+    assert robot.expired().asks("b", "claim", 2) == ""
+
+
+@pytest.mark.parametrize(("operation", "names"), [("remove", ("a",)), ("add", BOTH)])
+def test_until_an_uncertain_change_is_settled_the_holder_waits_for_the_standby(
+    operation: str, names: tuple[str, ...]
+) -> None:
+    before = BOTH if operation == "remove" else ("a",)
+    robot = Robot(LeaseRecord(2, "a", before, "one"))
+    robot.disk_full = robot.uncertain = True
+    assert robot.asks("a", operation, 2) == "the disk is full"
+    answer = answered(robot, request(do="renew", epoch=2))
+    assert answer is not None and (answer["ok"], answer["in_sync"]) == (True, ["a", "b"])
+    robot.expired()
+    assert "b is not in sync" in robot.asks("b", "claim", 2) or operation == "remove"
+    robot.disk_full, robot.disk = False, FIRST
+    robot.witness.settle()
+    assert robot.disk == LeaseRecord(2, "a", before, "one")
+    answer = answered(robot, request(do="renew", epoch=2, number=2))
+    assert answer is not None and answer["in_sync"] == list(before)
+    assert robot.asks("a", operation, 2) == "" and robot.disk.in_sync == names
+
+
+def test_a_slow_check_is_reported_while_it_runs() -> None:
+    now, seen = [0.0], []
+
+    def check() -> None:
+        for seconds in (4.9, 0.2):
+            now[0] += seconds
+            seen.append(checked.trouble())
+
+    checked = RegularCheck("the rules cannot be listed", check, lambda: now[0])
+    checked.run()
+    assert seen == ["", "the rules cannot be listed: that takes more than 5 s"]
+    assert checked.trouble() == ""
 
 
 def test_a_restart_of_the_witness_alone_changes_no_rule() -> None:
@@ -301,17 +359,14 @@ def test_the_lease_of_an_earlier_version_is_read_and_gets_room(tmp_path: Path) -
 def test_a_disk_that_cannot_be_written_is_reported_in_each_answer(tmp_path: Path) -> None:
     now = [0.0]
     file = LeaseFile(str(tmp_path / "lease"), BOTH)
-    disk = DiskCheck(file, lambda: now[0])
-    assert "has no room for the next change" in disk.trouble()
+    disk = RegularCheck("the disk cannot be written", file.check_disk, lambda: now[0])
     file.write(FIRST)
-    disk.check()
+    disk.run()
     assert disk.trouble() == ""
     (tmp_path / "lease.check").unlink()
     (tmp_path / "lease.check").symlink_to("/dev/full")
-    disk.check()
-    assert (
-        disk.trouble() == f"the disk of the lease {tmp_path}/lease cannot be written: No space left on device"
-    )
+    disk.run()
+    assert disk.trouble() == "the disk cannot be written: [Errno 28] No space left on device"
     robot = granted()
     robot.witness.trouble = disk.trouble()
     answer = answered(robot, request(do="look", epoch=2))
@@ -533,11 +588,32 @@ def test_it_imports_only_the_standard_library() -> None:
     assert imported <= sys.stdlib_module_names
 
 
-def test_rules_that_change_before_they_are_first_read_are_not_taken_for_ours() -> None:
-    settings = WitnessSettings(
-        ("10.0.0.1", 7411), "10.0.0.100", ("11311",),
-        {name: AppliancePeer(f"10.0.0.{number}", KEYS[name]) for number, name in enumerate("ab", 2)}, "/lease", {}, "",
-    )  # fmt: skip
-    firewall = LeaseFirewall(settings, "iptables", lambda _command, _text: "*filter\nCOMMIT\n")
+@pytest.mark.parametrize(
+    ("tables", "intact"), [("table inet other\n", False), ("table ip rosrv_witness\n", None), (None, None)]
+)
+def test_a_table_that_is_gone_differs_from_a_program_that_fails(
+    tables: str | None, intact: bool | None
+) -> None:
+    rules = ["table ip rosrv_witness { }"]
+
+    def run(command: list[str], _text: str) -> str:
+        found = {"-f": "", "table": rules[0], "tables": tables}[command[1 if command[1] == "-f" else 2]]
+        if not found and command[1] == "list":
+            raise WitnessError("nft: no")
+        return found or ""
+
+    firewall = LeaseFirewall(PAIR_SETTINGS, "nft", run)
     firewall.admit("a")
-    assert not firewall.intact()
+    assert firewall.intact(firewall.present())
+    rules[0] = ""
+    if intact is None:
+        with pytest.raises(WitnessError):
+            firewall.present()
+    else:
+        assert firewall.intact(firewall.present()) is intact
+
+
+def test_rules_that_change_before_they_are_first_read_are_not_taken_for_ours() -> None:
+    firewall = LeaseFirewall(PAIR_SETTINGS, "iptables", lambda _command, _text: "*filter\nCOMMIT\n")
+    firewall.admit("a")
+    assert not firewall.intact(firewall.present())
