@@ -161,8 +161,6 @@ def test_an_attacker_gains_nothing_from_a_followers_datagrams(site: Site) -> Non
             raw.sendto(forged(FOLLOWER, lies[number % len(lies)]), (ROBOT, 0))
         record = site.lease.read()
         assert (record.holder, record.epoch) == ("a", holder.epoch)
-        rejected = [line for line in site.log().splitlines() if "without a valid" in line]
-        assert sum(int(line.split()[0]) for line in rejected) < 1_000, "the firewall dropped the others"
         renewed = holder.renewed
         eventually(lambda: holder.renewed > renewed, site.log)
         eventually(lambda: reaches(site, "a"), lambda: f"the follower goes on: {following.errors}")
