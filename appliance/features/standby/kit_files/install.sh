@@ -10,8 +10,15 @@ PATH=$PATH:/usr/sbin:/sbin
 [ "$(id -u)" = 0 ] || die "run it as root: sudo ./install.sh"
 /usr/bin/python3 -c 'import sys; sys.exit(sys.version_info < (3, 5))' 2>/dev/null \
     || die "/usr/bin/python3 must be Python 3.5 or newer: sudo apt install python3"
-command -v nft >/dev/null || command -v iptables-restore >/dev/null \
-    || die "neither nft nor iptables is installed: sudo apt install nftables"
+# nft may be installed on a kernel without nf_tables. Then the units name the other program, also after an update.
+options=
+if command -v nft >/dev/null && ! said=$(nft list tables 2>&1); then
+    iptables-save >/dev/null 2>&1 || die "nft fails, and iptables does not work either: $said"
+    say "nft fails here, so the rules are those of iptables: $said"
+    options=" --backend iptables"
+elif ! command -v nft >/dev/null && ! command -v iptables-restore >/dev/null; then
+    die "neither nft nor iptables is installed: sudo apt install nftables"
+fi
 [ -d /run/systemd/system ] || die "this computer is not run by systemd; install the services of this folder by hand"
 
 unit=rosrv-witness
@@ -29,7 +36,8 @@ said=$(/usr/bin/python3 -I witness.py --help 2>&1) \
 
 # A file is complete before it gets its name: a boot after a power cut must find the boot rule.
 put() {
-    install -m "$1" "$2" "$3.new"
+    (umask 077; sed "${4:-}" "$2" > "$3.new")
+    chmod "$1" "$3.new"
     sync
     mv "$3.new" "$3"
 }
@@ -37,8 +45,9 @@ install -d -m 0755 /etc/rosrv
 put 0755 witness.py /etc/rosrv/witness.py
 put 0600 witness.json /etc/rosrv/witness.json
 put 0755 remove.sh /etc/rosrv/remove-witness.sh
-put 0644 rosrv-witness-shut.service /etc/systemd/system/rosrv-witness-shut.service
-put 0644 "$unit.service" "/etc/systemd/system/$unit.service"
+for name in rosrv-witness-shut "$unit"; do
+    put 0644 "$name.service" "/etc/systemd/system/$name.service" "s/^ExecStart=.*/&$options/"
+done
 if [ -e "/etc/systemd/system/$other.service" ]; then
     systemctl disable --quiet --now "$other.service"
     rm -f "/etc/systemd/system/$other.service"

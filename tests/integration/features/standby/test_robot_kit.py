@@ -78,6 +78,7 @@ class RobotSite:
         programs.mkdir()
         (programs / "systemctl").write_text(_SYSTEMCTL)
         (programs / "systemctl").chmod(0o755)
+        self._programs = programs
         self._path = f"{programs}:{os.environ['PATH']}:/usr/sbin"
         self.robot = self._host(lab.host("robot", f"{ROBOT}/24"), folder / "robot")
         self.follower = self._host(lab.host("follower", f"{FOLLOWER}/24"), folder / "follower")
@@ -106,6 +107,15 @@ class RobotSite:
 
     def _listening(self, host: Host, port: int) -> socket.socket:
         return self._stack.enter_context(host.run(lambda: socket.create_server((host.address, port))))
+
+    def breaks(self, *names: str) -> None:
+        for name in names:
+            (self._programs / name).write_text("#!/bin/sh\necho Operation not supported >&2; exit 1\n")
+            (self._programs / name).chmod(0o755)
+
+    def repair(self, *names: str) -> None:
+        for name in names:
+            (self._programs / name).unlink()
 
     def script(
         self, host: ScriptHost, path: str | Path, *, check: bool = True
@@ -218,6 +228,41 @@ def test_a_new_kit_begins_a_new_lease_with_the_first_appliance_alone_in_sync(sit
     assert b.ask("look", epoch).in_sync == frozenset({"a"})
     site.script(robot, site.kit.with_name("kit") / "witness" / "install.sh")
     assert not site.connects(site.hosts["b"], ROBOT, NODE), "the old kit's keys are not the appliances'"
+
+
+def test_a_kernel_without_nf_tables_gets_the_rules_of_iptables(site: RobotSite) -> None:
+    need_program("iptables-restore", "iptables")
+    robot, a, b = site.robot, site.peer("a"), site.peer("b")
+    site.breaks("nft")
+    said = site.script(robot, site.kit / "witness" / "install.sh").stdout
+    assert "nft fails here, so the rules are those of iptables: Operation not supported" in said
+    for unit in ("rosrv-witness", "rosrv-witness-shut"):
+        assert " --backend iptables\n" in robot.run("cat", f"/etc/systemd/system/{unit}.service").stdout
+    epoch = a.granted(0)
+    assert site.connects(robot.outer, FIXED, MASTER)
+    assert not site.connects(site.hosts["b"], ROBOT, NODE)
+    assert a.ask("add", epoch).ok and a.ask("release", epoch).ok
+    b.granted(epoch)
+    assert site.connects(site.hosts["b"], ROBOT, NODE)
+    assert not site.connects(site.hosts["a"], ROBOT, NODE)
+
+    site.breaks("iptables-save", "iptables-restore")
+    done = site.script(robot, "/etc/rosrv/remove-witness.sh", check=False)
+    assert done.returncode == 1 and "no program can remove the rules" in done.stderr
+    site.repair("iptables-save", "iptables-restore")
+    done = site.script(robot, "/etc/rosrv/remove-witness.sh")
+    assert "warning: nft fails" in done.stderr
+    assert "rosrv" not in robot.run("iptables-save").stdout
+    assert all(site.connects(host, ROBOT, NODE) for host in site.hosts.values())
+    for path in ("/etc/rosrv", "/var/lib/rosrv-witness", "/etc/systemd/system/rosrv-witness.service"):
+        assert robot.run("test", "-e", path, check=False).returncode
+
+
+def test_without_a_working_program_nothing_is_installed(site: RobotSite) -> None:
+    site.breaks("nft", "iptables-save")
+    done = site.script(site.robot, site.kit / "witness" / "install.sh", check=False)
+    assert done.returncode == 1 and "nft fails, and iptables does not work either" in done.stderr
+    assert site.robot.run("test", "-e", "/etc/rosrv", check=False).returncode
 
 
 def test_an_incomplete_kit_changes_nothing(site: RobotSite) -> None:
