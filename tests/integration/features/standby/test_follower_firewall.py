@@ -25,6 +25,7 @@ from tests.support.features.standby.witness_site import (
     WITNESS,
     Peer,
     Site,
+    broken_disk,
     forged,
     seconds_until_reset,
 )
@@ -123,6 +124,23 @@ def test_without_the_witness_a_follower_shuts_out_both(site: Site) -> None:
             eventually(lambda: reaches(site, "a"), lambda: f"admitted again: {following.errors}")
         finally:
             again.end()
+
+
+def test_a_follower_whose_disk_fails_shuts_out_both_until_it_works(site: Site) -> None:
+    following = site.follow()
+    with held(site, "a", 1) as first:
+        eventually(lambda: reaches(site, "a"), "the follower admits a")
+        with broken_disk(following):
+            assert reaches(site, "a")
+            first.end()
+            with held(site, "b", first.epoch):
+                eventually(
+                    lambda: "cannot be saved" in "\n".join(following.errors), lambda: str(following.errors)
+                )
+                assert not reaches(site, "b")
+        with held(site, "b", first.epoch + 1):
+            eventually(lambda: reaches(site, "b"), lambda: str(following.errors))
+    assert following.popen.poll() is None
 
 
 def test_a_restored_witness_is_not_followed(site: Site) -> None:

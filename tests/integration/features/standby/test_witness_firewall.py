@@ -25,6 +25,7 @@ from tests.support.features.standby.witness_site import (
     ROBOT,
     WITNESS,
     Site,
+    broken_disk,
     forged,
     seconds_until_reset,
 )
@@ -181,6 +182,20 @@ def test_a_firewall_program_that_fails_or_hangs_stops_no_renewal(site: Site, scr
     assert "another program changed" not in site.log()
     assert a.ask("release", epoch).ok
     assert b.granted(epoch) == epoch + 1
+
+
+def test_a_disk_that_fails_is_the_reason_of_a_refusal(site: Site) -> None:
+    process = site.serve()
+    a, b = site.peer("a"), site.peer("b")
+    epoch = a.granted(1)
+    with broken_disk(process):
+        assert "cannot be saved" in a.ask("remove", epoch).reason
+        assert a.ask("renew", epoch).in_sync == frozenset("ab")
+        assert a.ask("release", epoch).ok
+        assert "cannot be saved" in b.ask("claim", epoch).reason
+        assert a.ask("renew", epoch).ok
+    assert a.ask("remove", epoch).ok
+    assert site.lease.read().in_sync == ("a",)
 
 
 def test_an_attacker_on_the_network_gets_no_lease_and_delays_none(site: Site) -> None:

@@ -1,6 +1,7 @@
 import contextlib
 import json
 import os
+import resource
 import shutil
 import socket
 import struct
@@ -189,6 +190,19 @@ class Site:
         except TimeoutError:
             pass
         return False
+
+
+@contextlib.contextmanager
+def broken_disk(process: Process) -> Iterator[None]:
+    """Let each write of a process to a file fail."""
+    pid = process.popen.pid
+    before = resource.prlimit(pid, resource.RLIMIT_FSIZE)
+    resource.prlimit(pid, resource.RLIMIT_FSIZE, (0, before[1]))
+    try:
+        yield
+    finally:
+        if process.popen.poll() is None:
+            resource.prlimit(pid, resource.RLIMIT_FSIZE, before)
 
 
 def write_settings(path: Path, settings: dict[str, object]) -> None:

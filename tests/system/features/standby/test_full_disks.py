@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from appliance.features.standby.membership import load_membership, path_of, save_membership
+from appliance.features.standby.witness import LeaseRecord
 from examples.landshark.lab import Lab
 from tests.support.appliance import Appliance
 from tests.support.features.standby.standby_robot import StandbyRobot
@@ -56,6 +57,32 @@ def test_a_standby_that_the_witness_does_not_answer(site: StandbySite) -> None:
             done = one.rosrv("standby", "promote", check=False)
             assert (done.returncode, "does not answer" in done.stderr) == (1, True), done
     assert site.lease.read().epoch == 2
+
+
+def test_an_older_lease_on_a_restored_disk_of_the_robot(site: StandbySite, robot: StandbyRobot) -> None:
+    until_able(site)
+    epoch = site.lease.read().epoch
+    site.stop_witness()
+    site.lease.write(LeaseRecord(epoch - 1, site.holder(), ("a", "b"), ""))
+    site.boot_robot()
+    for one in site.appliances.values():
+        eventually(
+            lambda one=one: (
+                f"knows only epoch {epoch - 1}" in one.rosrv("standby", "status", check=False).stdout
+            ),  # type: ignore[misc]  # as above
+            site.story,
+        )
+        assert one.rosrv("standby", "status", check=False).returncode == 1
+        done = one.rosrv("standby", "promote", check=False)
+        assert (done.returncode, "could not grant the takeover" in done.stderr) == (1, True), done
+    site.stop_witness()
+    words = site.command("begin", "--in-sync", "a,b", "--epoch", str(epoch + 1))
+    with Process(site.robot, words, env=dict(os.environ), label="begin") as begun:
+        assert begun.wait() == 0, begun.story()
+    site.start_witness()
+    until_able(site)
+    assert site.lease.read().epoch == epoch + 2
+    robot.serves_newcomers()
 
 
 def test_a_full_disk_of_the_robot(site: StandbySite, robot: StandbyRobot) -> None:
