@@ -85,6 +85,30 @@ def test_an_older_lease_on_a_restored_disk_of_the_robot(site: StandbySite, robot
     robot.serves_newcomers()
 
 
+def test_an_epoch_that_was_never_granted_is_repaired(site: StandbySite, robot: StandbyRobot) -> None:
+    until_able(site)
+    epoch = site.lease.read().epoch
+    for one in site.appliances.values():
+        assert one.process is not None
+        one.process.stop()
+        (one.state / "lease" / "epoch").write_text(f"{epoch + 7}\n")
+    for name, one in site.appliances.items():
+        site.start(name)
+        eventually(
+            lambda one=one: f"knows only epoch {epoch}" in one.rosrv("standby", "status", check=False).stdout,  # type: ignore[misc]  # as above
+            site.story,
+        )
+    for one in site.appliances.values():
+        assert one.process is not None
+        one.process.stop()
+        assert f"Epoch {epoch + 7} is forgotten" in one.rosrv("standby", "repair").stdout
+    for name in site.appliances:
+        site.start(name)
+    until_able(site)
+    assert site.lease.read().epoch == epoch + 1
+    robot.serves_newcomers()
+
+
 def test_a_full_disk_of_the_robot(site: StandbySite, robot: StandbyRobot) -> None:
     until_able(site)
     with filled(site.home / "robot"):
