@@ -12,9 +12,7 @@ from appliance.base import clock
 from appliance.channel import messages
 from appliance.supervisor.service_gate import RoleChanges, ServiceGate
 
-LONGEST_LAPSE = (
-    300.0  # seconds: a boot of the robot; then the appliance stands by, and answers its operators again
-)
+LONGEST_LAPSE = 300.0  # seconds: a boot of the robot; then the appliance stands by, and answers operators
 PAUSED = (
     "the appliance is paused: its lease has lapsed, and it answers and relays nothing until the lease is renewed; after"
     f" {LONGEST_LAPSE / 60:g} minutes at most it becomes the standby. Check its load, and its network to the robot and"
