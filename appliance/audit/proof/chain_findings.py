@@ -57,7 +57,8 @@ class Verification(msgspec.Struct, frozen=True, kw_only=True):
     Signatures prove the chain up to `signed_through`; `unsealed` records come after it. `key` is the public key that
     was used. `elsewhere` is the comparison with checkpoints of another machine, if they were given. `removal` is ""
     (no records were removed), "signed", or "unsigned": nothing proves that the settings required the removal, for
-    example because a version that did not sign removals made it.
+    example because a version that did not sign removals made it. `remembered` is the number of the last checkpoint in
+    the signer's memory of this log, 0 without one; None if the log was not compared with that memory.
     """
 
     ok: bool
@@ -74,3 +75,4 @@ class Verification(msgspec.Struct, frozen=True, kw_only=True):
     findings: list[LogFinding]
     elsewhere: Elsewhere | None = None
     removal: str = ""
+    remembered: int | None = None

@@ -5,6 +5,7 @@ it. If the signer remembers a signature that the log lacks, it was removed, exce
 which may be under way.
 """
 
+import os
 import sqlite3
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -15,6 +16,7 @@ import msgspec
 from appliance.audit.log.retention import RemovedRange
 from appliance.audit.log.signatures import ASKED_AT_ONCE, signature_is_valid
 from appliance.audit.proof.chain_findings import FindingKind, LogFinding
+from appliance.base.owner_access import open_named
 from appliance.signing.log_proof import ProofFault, checkpoint_hash, parse_checkpoint, signature_fault
 
 _HASH = 32
@@ -38,13 +40,24 @@ class SignerMemory(msgspec.Struct, frozen=True):
         return self.hashes[at : at + _HASH].hex() if self.first <= number <= self.last else None
 
 
-def read_signer_memory(directory: Path, log: str) -> SignerMemory:
-    path, removed = (directory / f"{log}.{what}" for what in ("signed", "removed"))
-    if not path.exists():
-        return SignerMemory()
-    data = path.read_bytes()
-    approved = int.from_bytes(removed.read_bytes(), "big") if removed.exists() else None
-    return SignerMemory(int.from_bytes(data[:_HEADER], "big"), data[_HEADER:], approved)
+def read_signer_memory(directory: Path, log: str) -> SignerMemory | None:
+    """Return what the signer remembers of the log; None without the folder, or the right to read it."""
+    try:
+        signed, removed = (_remembered(directory / f"{log}.{what}") for what in ("signed", "removed"))
+    except PermissionError:
+        return None
+    if signed is None:
+        return SignerMemory() if directory.is_dir() else None
+    approved = None if removed is None else int.from_bytes(removed, "big")
+    return SignerMemory(int.from_bytes(signed[:_HEADER], "big"), signed[_HEADER:], approved)
+
+
+def _remembered(path: Path) -> bytes | None:
+    try:
+        with os.fdopen(open_named(path), "rb") as file:  # in a container, root reads it as the signer
+            return file.read()
+    except FileNotFoundError:
+        return None
 
 
 class StoredCheckpoint(NamedTuple):
@@ -67,10 +80,12 @@ def last_removal(connection: sqlite3.Connection) -> RemovedRange | None:
 class CheckpointVerifier:
     """Verifies checkpoints, in order, against the hashes of the chain."""
 
-    def __init__(self, log: str, key: bytes | None, remembered: SignerMemory) -> None:
+    def __init__(self, log: str, key: bytes | None, remembered: SignerMemory | None) -> None:
         self._log = log
         self._key = key
-        self._remembered = remembered
+        self.remembered = None if remembered is None else remembered.last
+        """The last checkpoint in the signer's memory; None if that was not read."""
+        self._remembered = remembered = remembered or SignerMemory()
         self.signed = 0
         self.signed_through = 0
         self.rows: list[StoredCheckpoint] = []

@@ -65,7 +65,7 @@ def verify(
         connection.text_factory = lambda text: text.decode("utf-8", "surrogateescape")
         log = _log_id(connection)
         # Read the memory before the log, so that a checkpoint signed in between is at most in the log.
-        remembered = SignerMemory() if signer is None else read_signer_memory(signer, log)
+        remembered = None if signer is None else read_signer_memory(signer, log)
         connection.execute("BEGIN").execute("SELECT count(*) FROM sqlite_schema")  # the log as it is now
         # A key is pinned before its first signature is stored: read it after that.
         if public_key is None and pinned_key_path(path).exists():
@@ -109,7 +109,7 @@ class _Verifier:
         connection: sqlite3.Connection,
         log: str,
         key: bytes | None,
-        remembered: SignerMemory,
+        remembered: SignerMemory | None,
         *,
         copies: Sequence[SignedCheckpoint] | None,
         progress: Callable[[int], None],
@@ -160,6 +160,7 @@ class _Verifier:
             signed_checkpoints=audit.signed, signed_through=audit.signed_through,
             unsealed=max(0, self.last - audit.signed_through), key=self._key.hex() if self._key else None,
             findings=self._findings, elsewhere=copies.result() if copies else None, removal=removal,
+            remembered=audit.remembered,
         )  # fmt: skip
 
     def _check_removal(self, removed: RemovedRange) -> str:

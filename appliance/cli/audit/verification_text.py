@@ -24,6 +24,7 @@ def print_verification(result: Verification) -> None:
     if result.elsewhere is not None:
         for text in _elsewhere(result.elsewhere):
             write(text)
+    write(_memory(result.remembered))
     write(f"key: {result.key or 'none (nothing was signed yet)'}")
     write(_verdict(result))
 
@@ -37,11 +38,21 @@ def _vouched(result: Verification) -> str:
 def _verdict(result: Verification) -> str:
     if result.ok and not result.signed_through:
         return "The log is consistent, but nothing is signed yet: its completeness is not proven. Verify again later."
+    if result.ok and not (result.remembered or result.elsewhere):
+        return "The log is consistent and its signatures are valid, but records may have been cut off at its end."
     if result.ok:
         return "The log is complete and unchanged."
     if all(finding.kind is FindingKind.PROVES_NOTHING for finding in result.findings):
         return "The log itself is consistent, but the checkpoints kept elsewhere do not confirm it."
     return "The log was tampered with or is damaged."
+
+
+def _memory(remembered: int | None) -> str:
+    if remembered is None:
+        return "not compared with the signer's memory: run this as root, with the appliance's --state"
+    if not remembered:
+        return "the signer's memory has no checkpoint of this log"
+    return f"compared with the signer's memory, up to checkpoint {remembered}"
 
 
 def _elsewhere(found: Elsewhere) -> Iterator[str]:

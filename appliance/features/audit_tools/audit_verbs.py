@@ -155,9 +155,10 @@ def verify(
 ) -> None:
     """Verify that the log is complete and unchanged. Exit status: 0 yes, 1 no, 2 cannot be read.
 
-    Signatures are checked with the key beside the log, or with --key. Checkpoints are also compared with the signer's
-    own records if they are readable, and with --checkpoints against copies on another machine, which even root on
-    this one cannot change. To prove records without the log, use `rosrv evidence export` and `rosrv evidence verify`.
+    Signatures are checked with the key beside the log, or with --key. Root also compares checkpoints with the signer's
+    memory, and the output says whether it did. With --checkpoints, they are compared with copies on another machine,
+    which even root on this one cannot change. To prove records without the log, use `rosrv evidence export` and
+    `rosrv evidence verify`.
 
     Example: rosrv audit verify --key /media/safe/audit.pub --checkpoints /media/safe/checkpoints.ndjson
     """

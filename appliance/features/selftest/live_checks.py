@@ -86,7 +86,8 @@ def _audit(appliance: Appliance) -> Iterator[SelftestFinding]:
         yield skip("audit log", str(error))
         return
     if result.ok:
-        yield ok("audit log", f"{counted(result.records, 'record is', 'records are')} complete and unchanged")
+        compared = "" if result.remembered else ", but not compared with the signer's memory"
+        yield ok("audit log", f"{counted(result.records, 'record is', 'records are')} unchanged{compared}")
     else:
         yield fail("audit log", result.findings[0].message, "rosrv audit verify")
 

@@ -68,7 +68,7 @@ def _verdict(pair: PairVerification) -> str:
     if pair.absent:
         return f"{pair.absent} has no log yet, because it was never active: there is no takeover to verify."
     if not pair.takeovers:
-        return "Both logs are complete and unchanged, but neither has a takeover: nothing links them."
+        return "Both logs are consistent, but neither has a takeover: nothing links them."
     count = len(pair.takeovers)
-    takeovers = "the takeover" if count == 1 else f"the {count} takeovers"
-    return f"Both logs are complete and unchanged, and so are {takeovers} between them."
+    takeovers, verb = ("the takeover", "is") if count == 1 else (f"the {count} takeovers", "are")
+    return f"Both logs are consistent, and so {verb} {takeovers} between them."

@@ -209,7 +209,9 @@ def test_log_and_signer_together(signer: SignerProcess, tmp_path: Path) -> None:
     result = verify(path, signer=tmp_path / "signer")
     assert result.ok, result.findings
     assert result.signed_checkpoints >= 5
-    assert read_signer_memory(tmp_path / "signer", result.log).hashes
+    memory = read_signer_memory(tmp_path / "signer", result.log)
+    assert memory is not None
+    assert memory.hashes
     assert not search(path, Filter(event="signature refused")).entries
 
 

@@ -1,6 +1,8 @@
 import base64
 import hashlib
+import os
 import sqlite3
+import tempfile
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -21,9 +23,11 @@ from appliance.audit.proof.chain_findings import FindingKind
 from appliance.audit.proof.checkpoints import SignerMemory, read_signer_memory
 from appliance.audit.proof.copies import signed_checkpoints
 from appliance.audit.proof.verification import verify
+from appliance.base.owner_access import acting_as
 from appliance.signing.log_proof import genesis, parse_checkpoint
 from tests.support.audit import decision, settle
 from tests.support.engines import ByHand
+from tests.support.requirements import need_root
 from tests.unit.audit.conftest import MakeLog
 from tests.unit.transcripts import transcripts
 
@@ -240,6 +244,35 @@ def test_the_signers_memory_finds_a_removed_end(
     assert kind in {one for one, _first, _last in found(log, signer=tmp_path / "signer")}
 
 
+def test_root_of_a_container_reads_the_signers_memory(log: Path) -> None:
+    need_root()
+    with tempfile.TemporaryDirectory() as name:
+        Path(name).chmod(0o711)
+        signer_memory(log, folder := Path(name, "signer"))
+        (signed,) = folder.iterdir()
+        folder.chmod(0o700)
+        os.chown(folder, 61015, 61015)
+        os.chown(signed, 61015, 61015)
+        with acting_as(61099):  # like root without CAP_DAC_OVERRIDE
+            with pytest.raises(PermissionError):
+                signed.read_bytes()
+            memory = read_signer_memory(folder, signed.stem)
+        assert memory is not None
+        assert memory.last > 1
+
+
+def test_the_result_says_whether_the_signers_memory_was_compared(log: Path, tmp_path: Path) -> None:
+    signer_memory(log, tmp_path / "signer")
+    (signed,) = (tmp_path / "signer").iterdir()
+    last = len(signed.read_bytes()) // 32
+    assert last > 1
+    assert verify(log, signer=tmp_path / "signer").remembered == last
+    signed.unlink()
+    assert verify(log, signer=tmp_path / "signer").remembered == 0
+    assert verify(log, signer=tmp_path / "none").remembered is None
+    assert verify(log).remembered is None
+
+
 @pytest.mark.parametrize("sequence", [3, 100, 190])
 def test_overwritten_page(log: Path, sequence: int) -> None:
     with closing(sqlite3.connect(log)) as connection:
@@ -425,7 +458,7 @@ def test_too_many_missing_signatures_are_found(make_log: MakeLog, path: Path, tm
 def test_a_checkpoint_made_during_verification_is_not_a_finding(
     log: Path, make_log: MakeLog, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def meanwhile(directory: Path, log_id: str) -> SignerMemory:
+    def meanwhile(directory: Path, log_id: str) -> SignerMemory | None:
         writing = make_log(checkpoint_every=10, checkpoint_seconds=3600)
         for number in range(40):
             writing.record(decision(writing, number))

@@ -27,12 +27,12 @@ export function Verify() {
 
 function Verdict(/** @type {{value: any}} */ { value }) {
   const unsigned = html`<${Notice} tone="warn" title="The log is consistent, but nothing is signed yet">Its completeness is not proven. Verify again in a minute.</${Notice}>`;
-  return html`${value.ok && !value.signed_through ? unsigned : value.ok ? html`<${Notice} tone="allow" title="The log is complete and unchanged">Each of the ${whole(value.records)} records is unchanged, and every signature is valid.</${Notice}>`
+  return html`${value.ok && !value.signed_through ? unsigned : value.ok ? html`<${Notice} tone="allow" title="The log is consistent">Each of the ${whole(value.records)} records is unchanged, and every signature is valid. Records may have been cut off at the end.</${Notice}>`
     : html`<${Notice} tone="deny" title="The log was changed or is damaged">Save a copy of it now, and check the findings below.</${Notice}>`}
     <dl class="facts"><dt>Log</dt><dd><${Given} value=${value.log} mono /></dd><dt>Records</dt><dd>${whole(value.first)} to ${whole(value.last)}${value.removed ? `, ${count(value.removed)} removed by retention` : ""}</dd>
       <dt>Checkpoints</dt><dd>${count(value.checkpoints)}, signed ${count(value.signed_checkpoints)}, the last one through record ${whole(value.signed_through)}</dd><dt>Not sealed yet</dt><dd>${whole(value.unsealed)}</dd><dt>Key</dt><dd><${Given} value=${value.key} mono /></dd></dl>
     ${value.findings.length > 0 && html`<ul class="stack-tight">${value.findings.map((/** @type {any} */ one, /** @type {number} */ index) => html`<li key=${index}><${Notice} tone="deny" title=${`${one.kind}: ${one.first}${one.last === one.first ? "" : ` to ${one.last}`}`}><${Given} value=${one.message} most=${500} /></${Notice}></li>`)}</ul>`}
-    <p class="muted small">To compare with the signer's own checkpoints, run <code>rosrv audit verify</code> on the appliance.</p>`;
+    <p class="muted small">To find a cut end, run <code>rosrv audit verify</code> as root on the appliance: it compares the log with the signer's own checkpoints.</p>`;
 }
 
 /** @param {{filter: Record<string, string>}} given */
