@@ -6,6 +6,8 @@ import msgspec
 
 from appliance.audit.log.log_database import TEXT_OF_RECORD
 from appliance.audit.log.record import Severity
+from appliance.audit.log.repetition import OTHERS
+from appliance.audit.search.equality import FOLDED
 
 IN_NETWORKS = "in_networks"
 """A function of SQL that `search` defines: whether a host is in one of the networks, which spaces separate."""
@@ -42,8 +44,11 @@ class Filter(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     hosts: tuple[str, ...] = ()
 
 
-# Records with a damaged detail have no author.
-_WHO = "CASE WHEN json_valid(CAST(detail AS TEXT)) THEN json_extract(CAST(detail AS TEXT), '$.who') END"
+# Records with a damaged detail have no author, and count no name.
+_DETAIL = "CASE WHEN json_valid(CAST(detail AS TEXT)) THEN CAST(detail AS TEXT) END"
+_WHO = f"json_extract({_DETAIL}, '$.who')"
+_TALLIES = {"host": "hosts", "caller_id": "callers", "resource": "resources"}
+"""The columns that a summary of several kinds lacks, and the names in its details."""
 # A record of a read has the method in its details, even if the read was only counted. The details escape quotes.
 _NO_LOOK = """NOT (
     category IS NOT NULL AND category = 'rest' AND decision IS NOT NULL AND decision = 'allow' AND (
@@ -68,7 +73,7 @@ def conditions(wanted: Filter) -> list[Condition]:
         if value is not None:
             found.append(_match(column, value))
     if wanted.hosts:
-        found.append(_within(wanted.hosts))
+        found.append(_within("host", wanted.hosts))
     if wanted.severity is not None:
         order = list(Severity)
         names = tuple(severity.value for severity in order[order.index(wanted.severity) :])
@@ -93,16 +98,42 @@ def conditions(wanted: Filter) -> list[Condition]:
     return found
 
 
+def counted_conditions(wanted: Filter) -> list[Condition]:
+    """Return the conditions of summaries that may count a wanted name; empty if the filter has no such name.
+
+    A summary of several hosts, callers or resources lacks that field, and counts the names in its details.
+    """
+    names = {"host": wanted.host, "caller_id": wanted.caller_id, "resource": wanted.resource}
+    found = [
+        _counts(column, _match(column, name), _match("key", name))
+        for column, name in names.items()
+        if name is not None
+    ]
+    if wanted.hosts:
+        found.append(_counts("host", _within("host", wanted.hosts), _within("key", wanted.hosts)))
+    if not found:
+        return []
+    others = msgspec.structs.replace(wanted, host=None, hosts=(), caller_id=None, resource=None)
+    return [*found, _one_of("event", tuple(sorted(FOLDED))), *conditions(others)]
+
+
+def _counts(column: str, named: Condition, counted: Condition) -> Condition:
+    """Return the condition that the record has the name, or counts it or further names."""
+    tally = f"json_each({_DETAIL}, '$.{_TALLIES[column]}') WHERE {counted.sql} OR key = '{OTHERS}'"
+    sql = f"({named.sql} OR {column} IS NULL AND EXISTS (SELECT 1 FROM {tally}))"  # noqa: S608  fixed names
+    return Condition(sql, named.values + counted.values)
+
+
 def _one_of(column: str, values: tuple[str, ...]) -> Condition:
     marks = ", ".join("?" * len(values))
     return Condition(f"({column} IN ({marks}) AND {column} IS NOT NULL)", values, f"record_{column}")
 
 
-def _within(networks: tuple[str, ...]) -> Condition:
+def _within(name: str, networks: tuple[str, ...]) -> Condition:
     """Return the condition that a host is in one of the networks; an index has only single addresses."""
     if all(network.endswith(("/32", "/128")) for network in networks):
-        return _one_of("host", tuple(network.rpartition("/")[0] for network in networks))
-    return Condition(f"(host IS NOT NULL AND {IN_NETWORKS}(host, ?))", (" ".join(networks),))
+        return _one_of(name, tuple(network.rpartition("/")[0] for network in networks))
+    return Condition(f"({name} IS NOT NULL AND {IN_NETWORKS}({name}, ?))", (" ".join(networks),))
 
 
 def _match(column: str, value: str) -> Condition:

@@ -22,6 +22,7 @@ from appliance.audit.search.query import (
     Filter,
     FilterError,
     conditions,
+    counted_conditions,
     text_condition,
     text_match,
 )
@@ -179,13 +180,17 @@ def _page(connection: sqlite3.Connection, wanted: Filter, walk: _Walk, limit: in
     if wanted.hosts:
         connection.create_function(IN_NETWORKS, 2, _in_networks, deterministic=True)
     index = _most_selective(connection, found)
-    if wanted.text:
-        found.append(text_condition(wanted.text))
+    texts = [text_condition(wanted.text)] if wanted.text else []
     words = text_match(wanted.text) if wanted.text and index is None else None
     if words is None:
-        entries = _select(connection, found + walk.condition("sequence"), index, walk, limit + 1)
+        entries = _select(connection, found + texts + walk.condition("sequence"), index, walk, limit + 1)
     else:
-        entries = _select_by_text(connection, found, words, walk, limit + 1)
+        entries = _select_by_text(connection, found + texts, words, walk, limit + 1)
+    if counted := counted_conditions(wanted):
+        index = _most_selective(connection, counted) or "record_event"
+        counts = _select(connection, counted + texts + walk.condition("sequence"), index, walk, limit + 1)
+        both = {entry.sequence: entry for entry in entries + counts}
+        entries = [both[sequence] for sequence in sorted(both, reverse=walk.newest_first)][: limit + 1]
     if len(entries) <= limit:
         return SearchPage(entries, None)
     return SearchPage(entries[:limit], str(entries[limit - 1].sequence))

@@ -6,7 +6,7 @@ import pytest
 
 from appliance.audit.log.log import AuditLog
 from appliance.audit.log.log_database import LogUnreadableError
-from appliance.audit.log.record import RuleReference, Severity
+from appliance.audit.log.record import AuditRecord, RuleReference, Severity
 from appliance.audit.search.query import Filter, FilterError
 from appliance.audit.search.search import Follower, export, search, show
 from tests.support.audit import decision, settle
@@ -83,6 +83,84 @@ def test_filters(log: AuditLog, path: Path, wanted: Filter, expected: list[int])
     assert sequences(path, wanted) == expected
     log.close()
     assert sequences(path, wanted) == expected
+
+
+def denial(log: AuditLog, host: str, caller: str, topic: str) -> AuditRecord:
+    return decision(
+        log, decision="deny", host=host, caller_id=caller, resource=topic, rule=None, reason="no rule names it",
+        unknown=True,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("newest_first", [True, False])
+@pytest.mark.parametrize(
+    ("wanted", "expected"),
+    [
+        (Filter(resource="/cmd_vel"), 1), (Filter(resource="/cmd_v*"), 1), (Filter(resource="/cmd"), 0),
+        (Filter(caller_id="/second"), 1), (Filter(caller_id="/third"), 0),
+        (Filter(resource="/cmd_vel", decision=("deny",), host="10.66.0.1"), 1),
+        (Filter(resource="/cmd_vel", hosts=("10.66.0.0/16",)), 1),
+        (Filter(resource="/cmd_vel", host="10.66.0.2"), 0), (Filter(resource="/cmd_vel", caller_id="/first"), 0),
+        (Filter(resource="/cmd_vel", decision=("allow",)), 0), (Filter(resource="/cmd_vel", event="decision"), 0),
+        (Filter(resource="/cmd_vel", text="second"), 1), (Filter(resource="/cmd_vel", text="absent"), 0),
+    ],
+    ids=str,
+)  # fmt: skip
+def test_a_name_that_was_only_counted_is_found(
+    make_log: MakeLog, path: Path, wanted: Filter, expected: int, *, newest_first: bool
+) -> None:
+    """The kinds of unknown hosts have neither resource nor caller: the second name is only in a summary."""
+    log = make_log(checkpoint_seconds=3600)
+    log.record(denial(log, "10.66.0.1", "/first", "/a"))
+    log.record(denial(log, "10.66.0.1", "/second", "/cmd_vel"))
+    assert settle(log) is None
+    log.close()
+    found = [entry.record for entry in search(path, wanted, newest_first=newest_first).entries]
+    assert [record.event for record in found] == ["denials folded"] * expected
+
+
+def test_names_beyond_the_first_ones_may_be_in_each_summary(make_log: MakeLog, path: Path) -> None:
+    log = make_log(checkpoint_seconds=3600)
+    for number in range(12):
+        log.record(denial(log, "10.66.0.1", "/evil", f"/topic{number}"))
+    assert settle(log) is None
+    log.close()
+    (found,) = search(path, Filter(resource="/topic11")).entries
+    assert found.record.detail["resources"]["(others)"] == 3
+    assert not search(path, Filter(resource="/topic11", caller_id="/good")).entries
+
+
+@pytest.mark.parametrize("wanted", [Filter(host="10.66.0.1"), Filter(hosts=("10.66.0.0/30",))], ids=str)
+def test_a_host_that_is_only_counted_with_others_is_found(
+    make_log: MakeLog, path: Path, wanted: Filter
+) -> None:
+    log = make_log(checkpoint_seconds=3600)
+    for number in range(1, 80):
+        log.record(denial(log, f"10.77.0.{number}", "/evil", "/a"))
+    log.record(denial(log, "10.66.0.1", "/evil", "/a"))
+    assert settle(log) is None
+    log.close()
+    (found,) = search(path, wanted).entries
+    assert found.record.detail["scope"] == "unknown hosts"
+    assert [entry.sequence for entry in search(path, Filter(host="10.77.0.79")).entries] == [found.sequence]
+
+
+@pytest.mark.parametrize("newest_first", [True, False])
+def test_pages_have_each_summary_once(make_log: MakeLog, path: Path, *, newest_first: bool) -> None:
+    log = make_log(checkpoint_seconds=3600)
+    for host in range(30):
+        for topic in ("/a", "/cmd_vel", "/cmd_vel", "/b"):
+            log.record(denial(log, f"10.66.0.{host}", "/evil", topic))
+        log.record(decision(log, host="10.66.1.1", resource="/cmd_vel"))
+    assert settle(log) is None
+    log.close()
+    page = search(path, Filter(resource="/cmd_vel"), None, 7, newest_first=newest_first)
+    found = [entry.sequence for entry in page.entries]
+    while page.cursor is not None:
+        page = search(path, Filter(resource="/cmd_vel"), page.cursor, 7, newest_first=newest_first)
+        found += [entry.sequence for entry in page.entries]
+    assert found == sorted(set(found), reverse=newest_first)
+    assert len(found) == 60
 
 
 def test_a_text_is_found_before_and_after_indexing(log: AuditLog, path: Path) -> None:
