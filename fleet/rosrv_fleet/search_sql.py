@@ -12,7 +12,7 @@ import msgspec
 
 from appliance.audit.log.columns import StoredColumns
 from appliance.audit.log.record import Severity
-from appliance.audit.search.query import Filter, FilterError, checked_pattern
+from appliance.audit.search.query import Filter, FilterError, checked_pattern, network_of
 
 _ORDER: LiteralString = " ORDER BY time DESC, robot DESC, id DESC LIMIT %s"
 _WORDS: LiteralString = (
@@ -110,7 +110,10 @@ def search_statement(
     if cursor is not None:
         found.add("(time, robot, id) < (%s, %s, %s)", cursor.time, cursor.robot, cursor.id)
     found.matching("robot", "robot = %s", "robot ~ %s", wanted.robot)
-    found.matching("host", "host = %s", "host ~ %s", record.host)
+    network = None if record.host is None else network_of(record.host)
+    single = network is not None and network.num_addresses == 1
+    host = str(network.network_address) if network is not None and single else record.host
+    found.matching("host", "host = %s", "host ~ %s", host)
     found.matching("caller", "caller_id = %s", "caller_id ~ %s", record.caller_id)
     found.matching("topic", "resource = %s", "resource ~ %s", record.resource)
     found.matching("category", "category = %s", "category ~ %s", record.category)

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import msgspec
 
-from appliance.audit.search.query import Filter, FilterError
+from appliance.audit.search.query import Filter, FilterError, network_of
 from appliance.channel.answers.policy_answers import PolicyInForce
 from appliance.policy.host_names import HostInWords, HostNames, UnknownHostNameError, in_words
 from appliance.policy.model import address_of
@@ -41,17 +41,15 @@ def host_in_words(known: PolicyInForce | None) -> HostInWords:
 
 
 def has_name(wanted: Filter) -> bool:
-    """Return whether the search needs the policy; addresses and globs do not."""
-    if wanted.host is None or not _GLOB.isdisjoint(wanted.host):
+    """Return whether the search needs the policy; addresses, networks and globs do not."""
+    host = wanted.host
+    if host is None or not _GLOB.isdisjoint(host) or network_of(host) is not None:
         return False
     try:
-        wanted.host.encode()
-        ipaddress.ip_address(wanted.host)
+        host.encode()
     except UnicodeEncodeError:
         return False  # the search rejects it
-    except ValueError:
-        return True
-    return False
+    return True
 
 
 def with_networks(wanted: Filter, known: PolicyInForce) -> Filter:

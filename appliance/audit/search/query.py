@@ -1,5 +1,6 @@
 """Translate filters to SQL. No I/O. Values are always bound as parameters, never part of the statement."""
 
+import ipaddress
 from typing import NamedTuple
 
 import msgspec
@@ -14,6 +15,7 @@ IN_NETWORKS = "in_networks"
 _LONGEST_PATTERN = 256
 _MOST_STARS = 8
 _TRIGRAM = 3
+_MAPPED_PREFIX = 96  # bits before the IPv4 address in ::ffff:10.0.0.1
 
 
 class FilterError(ValueError):
@@ -24,8 +26,8 @@ class Filter(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """The properties of the records to find; None or empty: any.
 
     `since` (inclusive) and `until` (exclusive) are nanoseconds since the epoch; `severity` is the minimum.
-    Names may be globs. `without_looks` omits allowed REST calls that only read. `hosts` are networks: the meaning
-    of a host's name.
+    Names may be globs. `without_looks` omits allowed REST calls that only read. `host` may also be an address in any
+    form, or a network; `hosts` are networks: the meaning of a host's name.
     """
 
     decision: tuple[str, ...] = ()
@@ -53,6 +55,24 @@ _TALLIES = {"host": "hosts", "caller_id": "callers", "resource": "resources"}
 _NO_LOOK = """NOT (
     category IS NOT NULL AND category = 'rest' AND decision IS NOT NULL AND decision = 'allow' AND (
         CAST(detail AS TEXT) LIKE '%"method":"GET"%' OR CAST(detail AS TEXT) LIKE '%"method":"HEAD"%'))"""
+
+
+def network_of(host: str) -> ipaddress.IPv4Network | ipaddress.IPv6Network | None:
+    """Return the network of an address or network in any form, or None for a name or glob."""
+    try:
+        found = ipaddress.ip_network(host)
+    except ValueError:
+        return None
+    mapped = found.network_address.ipv4_mapped if isinstance(found, ipaddress.IPv6Network) else None
+    if mapped is None or found.prefixlen < _MAPPED_PREFIX:
+        return found
+    return ipaddress.IPv4Network((mapped, found.prefixlen - _MAPPED_PREFIX))
+
+
+def with_network(wanted: Filter) -> Filter:
+    """Replace an address or network in `host`, whose text may differ from that of records."""
+    network = None if wanted.host is None else network_of(wanted.host)
+    return wanted if network is None else msgspec.structs.replace(wanted, host=None, hosts=(str(network),))
 
 
 class Condition(NamedTuple):

@@ -25,6 +25,7 @@ from appliance.audit.search.query import (
     counted_conditions,
     text_condition,
     text_match,
+    with_network,
 )
 
 LARGEST_PAGE = 10_000
@@ -176,6 +177,7 @@ def _last_sequence(connection: sqlite3.Connection) -> int:
 
 
 def _page(connection: sqlite3.Connection, wanted: Filter, walk: _Walk, limit: int) -> SearchPage:
+    wanted = with_network(wanted)
     found = conditions(wanted)
     if wanted.hosts:
         connection.create_function(IN_NETWORKS, 2, _in_networks, deterministic=True)

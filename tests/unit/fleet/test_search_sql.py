@@ -42,6 +42,11 @@ def test_input_is_never_part_of_a_statement(wanted: FleetFilter) -> None:
     assert statement.text.count("%s") == len(statement.values)
 
 
+@pytest.mark.parametrize("host", ["FD00:0::1", "fd00::1", "fd00::1/128"])
+def test_an_address_is_compared_as_records_have_it(host: str) -> None:
+    assert search_statement(FleetFilter(None, Filter(host=host)), None, 10, None).values == ("fd00::1", 10)
+
+
 @pytest.mark.parametrize("text", ["", "x", "!!!!", "W10=", "WzEsMiwzXQ==", "é"])
 def test_a_forged_cursor_is_refused(text: str) -> None:
     with pytest.raises(FilterError):

@@ -32,6 +32,7 @@ def log(make_log: MakeLog) -> AuditLog:
             "reason": "No answer from Żółw 100%",
         },
         {"detail": {"type": "std_msgs/Float64", "quote": 'say "hi"'}, "reason": "a_b and a%b", "revision": 9},
+        {"host": "fd66::1", "resource": "/six"},
     ]
     for number, fields in enumerate(odd):
         log.record(decision(log, time=_BEGIN + (1000 + number) * _SECOND, **fields))
@@ -53,6 +54,13 @@ def sequences(path: Path, wanted: Filter, **arguments: Any) -> list[int]:
         (Filter(hosts=("10.66.0.1/32", "fd00::1/128")), [100]),
         (Filter(hosts=("10.66.0.0/30", "fd00::/8"), decision=("deny",)), [100]),
         (Filter(hosts=("10.66.0.4/30",)), []),
+        (Filter(host="10.66.0.0/30"), [100]),
+        (Filter(host="::ffff:10.66.0.1"), [100]),
+        (Filter(host="::ffff:10.66.0.0/126"), [100]),
+        (Filter(host="FD66::1"), [104]),
+        (Filter(host="fd66:0::1", decision=("allow",)), [104]),
+        (Filter(host="fd66:0::/64"), [104]),
+        (Filter(host="10.66.0.1/16"), []),
         (Filter(caller_id="/evil"), [100]),
         (Filter(resource="/arm/*"), [101, 100]),
         (Filter(resource="/arm/joint_?"), [101, 100]),
