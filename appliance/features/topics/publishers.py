@@ -8,7 +8,7 @@ from appliance.audit.search.query import Filter
 
 _NODES = ("node lost", "node returned", "replaced", "takeover")
 _REGISTRATIONS = ("registered", "unregistered")
-_LOG = ("appliance started", "appliance stopped", "log begun")
+_RUNS = ("appliance started", "appliance stopped")
 _COUNTED = "repetitions folded"
 
 
@@ -37,8 +37,8 @@ def publishers_at(
 ) -> PastPublishers:
     """Return the publishers of a topic at a time (ns since the epoch). `first` is the first record of the log."""
     registrations = (Filter(event=event, category="publication", resource=topic) for event in _REGISTRATIONS)
-    others = (Filter(event=event, until=at + 1) for event in (*_NODES, *_LOG))
-    gaps = (Filter(event=event) for event in ("records lost", _COUNTED))
+    others = (Filter(event=event, until=at + 1) for event in _NODES)
+    gaps = (Filter(event=event) for event in (*_RUNS, "records lost", _COUNTED))
     entries = [entry for wanted in (*registrations, *others, *gaps) for entry in export(wanted)]
     entries.sort(key=lambda entry: entry.sequence)
     past = [entry for entry in entries if entry.record.time <= at]
@@ -49,7 +49,7 @@ def publishers_at(
     reaches = first is not None and first.record.time <= at
     ended = _ended_later((entry for entry in entries if entry.record.time > at), seen) if reaches else ()
     found = sorted([*known, *ended], key=lambda one: (one.node, one.host))
-    unknown = [*_unknown(past, first, at)]
+    unknown = [*_unknown(past, first, at), *_runs(entries, first, at)]
     if any(_counts(entry, topic, at) for entry in entries):
         unknown.append(
             "registrations before this time were only counted: rosrv audit search --event 'repetitions folded'"
@@ -116,8 +116,19 @@ def _unknown(past: list[LogEntry], first: LogEntry | None, at: int) -> Iterator[
         yield f"an earlier log is missing, with the registrations before {rfc3339(first.record.time)}"
     if any(entry.record.event == "records lost" for entry in past):
         yield "records were lost before this time: rosrv audit search --event 'records lost'"
-    runs = [
-        entry.record for entry in past if entry.record.event in ("appliance started", "appliance stopped")
-    ]
-    if runs and runs[-1].event == "appliance stopped":
-        yield f"the appliance was stopped at {rfc3339(runs[-1].time)}: these were registered then"
+
+
+def _runs(entries: list[LogEntry], first: LogEntry | None, at: int) -> Iterator[str]:
+    if first is None or at < first.record.time:
+        return
+    runs = [entry.record for entry in entries if entry.record.event in _RUNS]
+    before = [run for run in runs if run.time <= at]
+    after = [run for run in runs if run.time > at]
+    if before and before[-1].event == "appliance stopped":
+        yield f"the appliance was stopped at {rfc3339(before[-1].time)}: these were registered then"
+    elif after and after[0].event == "appliance started" and (before or first.record.event != "log begun"):
+        # Power that is cut leaves no record.
+        yield (
+            f"the appliance ended without a record before its start at {rfc3339(after[0].time)}: it may have been off"
+            " at this time"
+        )

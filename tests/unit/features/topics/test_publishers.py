@@ -37,6 +37,19 @@ def test_gaps_of_the_log_are_reported() -> None:
     assert empty.startswith("the log is empty")
 
 
+def test_a_time_without_the_appliance_is_reported() -> None:
+    log = [entry(1, "log begun"), entry(2, "appliance started")]
+    stopped, again = entry(4, "appliance stopped"), entry(8, "appliance started")
+    [orderly] = unknown([*log, stopped, again], 5)
+    assert orderly.startswith("the appliance was stopped at 1970-01-01T00:00:04")
+    assert unknown([*log, stopped, again], 3) == ()
+    assert unknown([*log, stopped, again], 9) == ()
+    [cut] = unknown([*log, again], 5)
+    assert cut.startswith("the appliance ended without a record before its start at 1970-01-01T00:00:08")
+    assert unknown([*log, again], 1) == (), "between the log's begin and the first start"
+    assert len(unknown([entry(4, "decision"), again], 5)) == 2, "retention has removed the earlier start"
+
+
 def counted(sequence: int, scope: str, event: str, **fields: Any) -> LogEntry:
     first = entry(sequence - 2, event, host="10.0.0.9", caller_id="/n", **fields).record
     state = new_state(structs.replace(first, folds=True), scope)
