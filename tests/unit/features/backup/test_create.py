@@ -10,7 +10,6 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
-from typing import Any
 
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
@@ -294,13 +293,13 @@ def test_a_signal_leaves_no_file(
 
 
 def test_nohup_protects_a_backup(state: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    copied = backup._copy_file
+    opened = backup.opened
 
-    def hung_up(*arguments: Any) -> None:
+    def hung_up(state: Path, name: str) -> int | None:
         signal.raise_signal(signal.SIGHUP)
-        copied(*arguments)
+        return opened(state, name)
 
-    monkeypatch.setattr(backup, "_copy_file", hung_up)
+    monkeypatch.setattr(backup, "opened", hung_up)
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
         assert back_up(state, tmp_path / "backup.tar.gz")
