@@ -262,8 +262,10 @@ class BundleGate:
             await self._try(trial, contents)
         except StoreError as error:  # says nothing about the bundle: it is offered again
             self._waits = str(error)
-            await self._undo(trial)
-            self._save(msgspec.structs.replace(self._record, trial=None))
+            # Before the rollback: after a crash in between, the next start rolls back.
+            self._save(msgspec.structs.replace(record, trial=trial))
+            await self._end(trial)
+            self._save(record)
 
     async def _try(self, trial: Trial, contents: BundleContents) -> None:
         before, self._earlier = self._health(), self._policies.current
@@ -274,8 +276,7 @@ class BundleGate:
         except _REFUSALS as error:
             reason = str(error)
         if reason:
-            self._earlier, self._held = None, frozenset()
-            await self._undo(trial)
+            await self._end(trial)
             self._refuse(trial.path, trial.sha256, reason)
             return
         policy, monitors = self._policies.revision, self._monitors.revision
@@ -353,6 +354,10 @@ class BundleGate:
         if interruptions >= _INTERRUPTIONS:
             reason = f"the appliance ended during each of {counted(interruptions, 'trial')}"
             self._refuse(trial.path, trial.sha256, reason)
+
+    async def _end(self, trial: Trial) -> None:
+        self._earlier, self._held = None, frozenset()
+        await self._undo(trial)
 
     async def _undo(self, trial: Trial) -> None:
         """Roll back to the state before the trial, except for parts that an operator has changed."""
