@@ -257,12 +257,18 @@ def reindex(config: Config = DEFAULT_CONFIG) -> None:
 def _index_all(collector: Collector) -> tuple[int, int]:
     robots = collector.robots.known().values()
     indexed, damaged = 0, len(collector.robots.unreadable)
+    oldest = collector.config.retention.oldest_day(collector.store.time_ns())
     for robot in robots:
         for log in collector.store.logs(robot.name):
             for place in collector.store.segments(robot.name, log):
                 try:
                     indexed += index(
-                        collector.database, collector.store, place, robot.public_keys, collector.config
+                        collector.database,
+                        collector.store,
+                        place,
+                        robot.public_keys,
+                        collector.config,
+                        oldest=oldest,
                     )
                 except NOT_INDEXABLE as error:
                     damaged += 1

@@ -4,14 +4,12 @@ Relative paths are relative to the folder of this file.
 """
 
 import os
-from datetime import date, timedelta
+from datetime import UTC, date, datetime, timedelta
 from pathlib import Path
 from typing import Annotated, Any
 
 import msgspec
 import yaml
-
-from appliance.base import clock
 
 _DATA = Path("/var/lib/rosrv-fleet")
 _Positive = Annotated[int, msgspec.Meta(gt=0)]
@@ -72,12 +70,10 @@ class RetentionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
         if self.segment_days is not None and not (self.index_days and self.index_days <= self.segment_days):
             raise ValueError(f"segment_days: {self.segment_days} needs index_days, which must not be larger")
 
-    def oldest_day(self) -> date | None:
-        return None if self.index_days is None else clock.utc_now().date() - timedelta(self.index_days)
-
-    def keeps(self, day: date) -> bool:
-        oldest = self.oldest_day()
-        return oldest is None or day >= oldest
+    def oldest_day(self, now_ns: int) -> date | None:
+        """Return the oldest day that the index keeps, at a time of the clock of ages."""
+        today = datetime.fromtimestamp(now_ns // 10**9, UTC).date()
+        return None if self.index_days is None else today - timedelta(self.index_days)
 
 
 class BundlesConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -139,7 +139,8 @@ class Indexer:
         if robot is None:
             self._set_aside(place, stamp, "its robot is not enrolled")
             return
-        work = self._workers.submit(_index_one, self._config, place, robot.public_keys)
+        oldest = self._config.retention.oldest_day(self._store.time_ns())
+        work = self._workers.submit(_index_one, self._config, place, robot.public_keys, oldest)
         try:
             work.result()
         except FileNotFoundError:
@@ -175,7 +176,9 @@ class Indexer:
 _database: IndexDatabase | None = None  # of this worker: a connection for all its segments
 
 
-def _index_one(config: FleetConfig, place: SegmentPlace, keys: Collection[bytes]) -> None:
+def _index_one(
+    config: FleetConfig, place: SegmentPlace, keys: Collection[bytes], oldest: date | None
+) -> None:
     global _database  # noqa: PLW0603  a worker has nothing else that lives as long
     if _database is None:
         _database = IndexDatabase(
@@ -183,7 +186,7 @@ def _index_one(config: FleetConfig, place: SegmentPlace, keys: Collection[bytes]
         )
         _database.open()
     store = SegmentStore(config.data, config.limits.reserve_bytes)
-    index(_database, store, place, keys, config)
+    index(_database, store, place, keys, config, oldest=oldest)
 
 
 def index(
@@ -192,14 +195,16 @@ def index(
     place: SegmentPlace,
     keys: Collection[bytes],
     config: FleetConfig,
+    *,
+    oldest: date | None,
 ) -> bool:
-    """Index one segment. Return False if it was already indexed, or of a day that the index no longer keeps.
+    """Index one segment. Return False if it was already indexed, or arrived before `oldest`, the index's first day.
 
     Raise `psycopg.Error`; for an unreadable segment `OSError`, `EOFError`, `zlib.error` or `SegmentError`.
     """
     received = store.received(place)
     day = datetime.fromtimestamp(received // _SECOND, UTC).date()
-    if not config.retention.keeps(day):
+    if oldest is not None and day < oldest:
         return False
     make_partition(database, day)
     try:
@@ -227,9 +232,9 @@ def index(
             )
             return True
     except psycopg.errors.CheckViolation:
-        if config.retention.keeps(day):
+        if day != oldest:
             raise
-        return False  # the day ended, and retention dropped its partition in between
+        return False  # the day has ended, and retention dropped its partition in between
 
 
 def make_partition(database: IndexDatabase, day: date) -> None:

@@ -11,7 +11,6 @@ from datetime import date
 import structlog
 from psycopg import sql
 
-from appliance.base import clock
 from rosrv_fleet.config import RetentionConfig
 from rosrv_fleet.database import IndexDatabase
 from rosrv_fleet.failures import failure_of
@@ -66,10 +65,10 @@ class Pruner:
 
     def step(self) -> None:
         """Remove the data that is old now. A damaged log stays and is reported."""
-        trouble = None
+        trouble, now = None, self._store.time_ns()
         if self._retention.segment_days is not None:
             by = f"retention.segment_days: {self._retention.segment_days}"
-            before = clock.wall_ns() - self._retention.segment_days * _DAY
+            before = now - self._retention.segment_days * _DAY
             for robot in self._robots.known():
                 for log in self._store.logs(robot):
                     if self._ending.is_set():
@@ -82,7 +81,7 @@ class Pruner:
                         continue
                     if removed:
                         _log.warning("old segments were removed", robot=robot, log=log, segments=removed)
-        oldest = self._retention.oldest_day()
+        oldest = self._retention.oldest_day(now)
         if oldest is not None:
             for day in drop_partitions(self._database, oldest):
                 _log.warning("an old day of the index was removed", day=day.isoformat())

@@ -13,7 +13,8 @@ A marker, an empty file KIND/ROBOT/LOG~NUMBER~NAME, states a fact about a segmen
    absent.
 3. The state that uploads need is in file names, not in a database, nor in memory that grows with the number of
    segments.
-4. Work for one robot does not grow with the data of others, and the number of names that a robot can choose is
+4. Times of arrival are those of a clock of ages, so a wrong system clock removes nothing.
+5. Work for one robot does not grow with the data of others, and the number of names that a robot can choose is
    limited. So a robot can neither slow down nor hide others.
 """
 
@@ -35,6 +36,7 @@ from typing import IO, NamedTuple
 import msgspec
 
 from appliance.base import clock
+from appliance.base.age_clock import AgeClock
 from appliance.base.atomic_files import write_whole
 from appliance.formats.segments import LONGEST_LINE, SegmentHeader, SegmentSummary
 from rosrv_fleet.robots import make_folder
@@ -106,11 +108,25 @@ class SegmentStore:
         self._folder = folder
         self._reserve = reserve
         self._locks: dict[str, threading.Lock] = {}
+        self._ages: AgeClock | None = None
+        self._aging = threading.Lock()
         for name in ("segments", "newest", "removed", "incoming", *_KINDS):
             make_folder(folder / name)
 
     def _lock(self, robot: str) -> threading.Lock:
         return self._locks.setdefault(robot, threading.Lock())
+
+    def time_ns(self) -> int:
+        """Return the time by the clock of ages, in nanoseconds since the epoch."""
+        with self._aging:
+            if self._ages is None:
+                self._ages = AgeClock(self._folder / "age", self._last_arrival)
+            return self._ages()
+
+    def _last_arrival(self) -> int | None:
+        """Return the newest arrival, as an earlier version kept no clock of ages."""
+        arrivals = (file.stat().st_mtime_ns for file in (self._folder / "newest").iterdir())
+        return min(max(arrivals, default=clock.wall_ns()), clock.wall_ns())
 
     def remove_unfinished(self) -> None:
         """Remove the uploads that a killed collector left. No other upload may be running."""
@@ -155,7 +171,8 @@ class SegmentStore:
         """Store an upload of `size` uncompressed bytes durably, or raise `NotStorableError`."""
         header = summary.header
         place = SegmentPlace(robot, header.end.log, header.end.number, summary.name)
-        path = self.path(place)
+        path, now = self.path(place), self.time_ns()
+        os.utime(upload, ns=(now, now))
         sync(upload)
         with self._lock(robot):
             if not self.has(place):
@@ -187,11 +204,13 @@ class SegmentStore:
     def _note_newest(self, place: SegmentPlace) -> None:
         newest = self.newest(place.robot)
         file = self._folder / "newest" / place.robot
+        now = self.time_ns()
         if newest is not None and newest[1].log == place.log and newest[1].number > place.number:
-            os.utime(file)
+            os.utime(file, ns=(now, now))
             return
         making = self._folder / "incoming" / f"{place.robot}.newest"
         making.write_text(place.mark, encoding="ascii")
+        os.utime(making, ns=(now, now))
         making.rename(file)
 
     def newest(self, robot: str) -> tuple[int, SegmentPlace] | None:
@@ -288,7 +307,7 @@ class SegmentStore:
             yield from _in_bucket(robot, log, bucket)
 
     def received(self, place: SegmentPlace) -> int:
-        """Return the time of arrival in nanoseconds since the epoch."""
+        """Return the time of arrival by the clock of ages, in nanoseconds since the epoch."""
         return self.path(place).stat().st_mtime_ns
 
     def marked(self, kind: str, robot: str, most: int) -> list[SegmentPlace]:

@@ -15,7 +15,7 @@ import psycopg
 import pytest
 from rosrv_fleet import indexer
 from rosrv_fleet.collector import make_collector
-from rosrv_fleet.config import RetentionConfig, load_config
+from rosrv_fleet.config import load_config
 from rosrv_fleet.database import IndexDatabase, migrate
 from rosrv_fleet.indexer import index, make_partition
 from rosrv_fleet.retention import drop_partitions
@@ -181,19 +181,22 @@ def test_a_day_that_is_dropped_while_its_segment_is_indexed(
 
     def midnight(database: IndexDatabase, day: date) -> None:
         make_partition(database, day)
-        if ended:
-            monkeypatch.setattr(RetentionConfig, "oldest_day", lambda _self: day + timedelta(1))
         assert drop_partitions(database, day + timedelta(1)) == [day]
 
     monkeypatch.setattr(indexer, "make_partition", midnight)
     (log,) = collector.store.logs("arm1")
     (place,) = collector.store.segments("arm1", log)
+    today = datetime.fromtimestamp(collector.store.received(place) // 10**9, UTC).date()
+
+    def indexed(database: IndexDatabase, oldest: date) -> bool:
+        return index(database, collector.store, place, (robot.public,), collector.config, oldest=oldest)
+
     with closing(_opened(site.database)) as database:
         if ended:
-            assert not index(database, collector.store, place, (robot.public,), collector.config)
+            assert not indexed(database, today)
         else:
             with pytest.raises(psycopg.errors.CheckViolation):
-                index(database, collector.store, place, (robot.public,), collector.config)
+                indexed(database, today - timedelta(1))
     assert _days(site.database) == 0
     with psycopg.connect(site.database) as connection:
         assert connection.execute("SELECT count(*) FROM segment").fetchone() == (0,)

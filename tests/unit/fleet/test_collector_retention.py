@@ -10,8 +10,12 @@ from rosrv_fleet.database import IndexDatabase
 from rosrv_fleet.retention import Pruner
 from rosrv_fleet.segment_store import SegmentPlace, SegmentStore
 
+from appliance.base.clock import utc_now, wall
 from tests.support.enrolled_robots import enrolled_robots
+from tests.support.virtual_clock import let_time_pass, set_wall
+from tests.unit.fleet.test_segment_store import Robot
 
+_DAY = 86_400
 _DAMAGED = "0" * 32, "1" * 32
 
 
@@ -43,3 +47,73 @@ def test_damaged_logs_do_not_stop_the_retention(
     assert pruner.trouble is not None
     assert f"arm1: log {_DAMAGED[-1]}" in pruner.trouble
     assert len(dropped) == 1
+
+
+class _Collector:
+    """A collector that keeps segments for 30 days, as after its start."""
+
+    def __init__(self, folder: Path) -> None:
+        self.robot = Robot(folder)
+        robots = enrolled_robots(folder) if (folder / "robots").exists() else enrolled_robots(folder, "arm7")
+        database = IndexDatabase("", connections=1, statement_seconds=1.0)
+        retention = RetentionConfig(index_days=30, segment_days=30)
+        self._pruner = Pruner(self.robot.store, robots, database, retention)
+
+    def push(self, number: int) -> None:
+        self.robot.store.indexed(self.robot.push(number))
+
+    def kept(self) -> list[int]:
+        """Return the numbers of the segments after a turn of the retention."""
+        self._pruner.step()
+        assert self._pruner.trouble is None
+        (log,) = self.robot.store.logs("arm7")
+        return [place.number for place in self.robot.store.segments("arm7", log)]
+
+
+@pytest.fixture
+def oldest_days(monkeypatch: pytest.MonkeyPatch) -> list[date]:
+    days: list[date] = []
+
+    def drop(_database: IndexDatabase, oldest: date) -> list[date]:
+        days.append(oldest)
+        return []
+
+    monkeypatch.setattr(retention, "drop_partitions", drop)
+    return days
+
+
+@pytest.mark.parametrize("years", [3, -3], ids=["ahead", "behind"])
+def test_a_wrong_clock_removes_nothing(years: int, tmp_path: Path, oldest_days: list[date]) -> None:
+    """Segments that arrive in that time also stay exactly as long as configured."""
+    collector, before = _Collector(tmp_path), utc_now().date()
+    collector.push(1)
+    let_time_pass(_DAY)
+    collector.push(2)
+    assert collector.kept() == [1, 2]
+    set_wall(wall() + years * 365 * _DAY)
+    collector = _Collector(tmp_path)
+    collector.push(3)
+    collector.push(4)
+    assert collector.kept() == [1, 2, 3, 4]
+    let_time_pass(_DAY / 2)
+    set_wall(wall() - years * 365 * _DAY)
+    assert collector.kept() == [1, 2, 3, 4]
+    assert {(before - day).days for day in oldest_days} <= {28, 29, 30}
+    let_time_pass(28 * _DAY)
+    assert collector.kept() == [1, 2, 3, 4]
+    let_time_pass(_DAY)
+    assert collector.kept() == [2, 3, 4]
+    let_time_pass(2 * _DAY)
+    assert collector.kept() == [4]
+
+
+def test_a_wrong_clock_at_the_first_start_of_this_version_removes_nothing(
+    tmp_path: Path, oldest_days: list[date]
+) -> None:
+    collector = _Collector(tmp_path)
+    collector.push(1)
+    collector.push(2)
+    (tmp_path / "age").unlink()
+    set_wall(wall() + 3 * 365 * _DAY)
+    assert _Collector(tmp_path).kept() == [1, 2]
+    assert len(oldest_days) == 1
