@@ -1,7 +1,8 @@
 """Prove from the stored segments that no record of a robot is missing.
 
 The segments of a complete log form one chain. It starts at the log's beginning, after records whose removal the
-signer signed, or after segments whose removal the collector's own retention noted.
+signer signed, or after segments whose removal the collector's own retention noted. The newest segment of a robot is
+also noted outside of the log, so its loss is found.
 """
 
 import gzip
@@ -43,7 +44,16 @@ class LogProof(msgspec.Struct, kw_only=True):
 
 
 def prove(store: SegmentStore, robot: Robot, segment_bytes: int) -> list[LogProof]:
-    return [_prove_log(store, robot, log, segment_bytes) for log in store.logs(robot.name)]
+    """Prove each log, and that the robot's newest segment, which the collector noted, is still stored."""
+    newest = store.newest(robot.name)  # first: a segment is noted after it is stored
+    proofs = {log: _prove_log(store, robot, log, segment_bytes) for log in store.logs(robot.name)}
+    if newest is not None:
+        _arrived, place = newest
+        head = store.head(robot.name, place.log)
+        if head is None or head.number < place.number:
+            proof = proofs.setdefault(place.log, LogProof(robot=robot.name, log=place.log))
+            proof.findings.append(f"segment {place.number}, the newest that arrived, is missing")
+    return list(proofs.values())
 
 
 def _prove_log(store: SegmentStore, robot: Robot, log: str, segment_bytes: int) -> LogProof:
