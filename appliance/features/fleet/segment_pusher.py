@@ -46,11 +46,15 @@ _log = structlog.get_logger()
 
 
 class PushPosition(msgspec.Struct, frozen=True):
-    """The last segment with a receipt."""
+    """The last segment with a receipt.
+
+    Before the first receipt (`number` is 0), `sequence` is the last record that was removed before the first step.
+    None: unknown.
+    """
 
     log: str
     number: int = 0
-    sequence: int = 0
+    sequence: int | None = None
 
 
 class StoredHead(msgspec.Struct, frozen=True):
@@ -97,7 +101,10 @@ class SegmentPusher:
     def _begin(self) -> PushPosition:
         log, upto = _newest_signed(self.log)
         lowest = next_segment(self.log, 0) or 1
-        position, step = PushPosition(log), 1
+        kept = self._kept()
+        if kept is None or kept.log != log:
+            self._store(PushPosition(log, 0, _removed(self.log)))
+        position, step = PushPosition(log, 0, self._kept_sequence(log, 0)), 1
         while upto > 0:
             head = msgspec.json.decode(self.collector.get(f"v1/logs/{log}?upto={upto}"), type=StoredHead)
             if head.number > upto:
@@ -119,12 +126,18 @@ class SegmentPusher:
         self._look(position)
         return position
 
-    def _kept_sequence(self, log: str, number: int) -> int:
+    def _kept(self) -> PushPosition | None:
         try:
-            kept = msgspec.json.decode((self.folder / "position.json").read_bytes(), type=PushPosition)
+            return msgspec.json.decode((self.folder / "position.json").read_bytes(), type=PushPosition)
         except (FileNotFoundError, ValueError):
-            return 0
-        return kept.sequence if (kept.log, kept.number) == (log, number) else 0
+            return None
+
+    def _kept_sequence(self, log: str, number: int) -> int | None:
+        kept = self._kept()
+        return kept.sequence if kept is not None and (kept.log, kept.number) == (log, number) else None
+
+    def _store(self, position: PushPosition) -> None:
+        write_whole(self.folder / "position.json", msgspec.json.encode(position), 0o600)
 
     def _has_log(self) -> bool:
         """Return whether there is a log. Only an appliance that was never active has none."""
@@ -231,24 +244,25 @@ class SegmentPusher:
             file.replace(file.with_name("receipts.1.ndjson"))
 
     def _advance(self, position: PushPosition, summary: SegmentSummary) -> None:
-        missed = max(0, summary.first - position.sequence - 1) if position.sequence else 0
+        missed = 0 if position.sequence is None else max(0, summary.first - position.sequence - 1)
         if missed:
             _log.error("retention removed records before the collector had them", count=missed)
         end = summary.header.end
         self._position = PushPosition(position.log, end.number, end.sequence)
-        write_whole(self.folder / "position.json", msgspec.json.encode(self._position), 0o600)
+        self._store(self._position)
         self.progress = msgspec.structs.replace(
             self.progress, sent=self.progress.sent + 1, missed=self.progress.missed + missed
         )
         self._look(self._position)
 
     def _look(self, position: PushPosition) -> None:
-        sealed, oldest = _waiting(self.log, position.sequence)
+        sequence = position.sequence or 0
+        sealed, oldest = _waiting(self.log, sequence)
         self.progress = msgspec.structs.replace(
             self.progress,
-            sequence=position.sequence,
+            sequence=sequence,
             checkpoint=position.number,
-            behind=max(0, sealed - position.sequence),
+            behind=max(0, sealed - sequence),
             seconds=max(0.0, (self.clock() - oldest) / 1e9) if oldest else 0.0,
             trouble="",
         )
@@ -274,6 +288,13 @@ def _newest_signed(log: Path) -> tuple[str, int]:
         query = "SELECT coalesce(max(number), 0) FROM checkpoint WHERE signature IS NOT NULL"
         (number,) = connection.execute(query).fetchone()
     return str(log_id), int(number)
+
+
+def _removed(log: Path) -> int:
+    """Return the sequence before the first record."""
+    with reading(log, advice="") as connection:
+        (first,) = connection.execute("SELECT coalesce(min(sequence), 1) FROM record").fetchone()
+    return int(first) - 1
 
 
 def _sequence_of(log: Path, number: int, hashes: list[str]) -> int | None:

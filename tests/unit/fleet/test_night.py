@@ -215,3 +215,25 @@ def test_each_fault_of_the_site_has_its_alarm(
         night.pass_time(60)
     assert night.fired.keys() == {Alert(alert)}
     assert night.fired[Alert(alert)] - begun <= 60 * minutes
+
+
+@pytest.mark.parametrize("joined", ["before", "after"])
+def test_removed_records_are_missed_even_before_the_first_receipt(joined: str, night: FleetNight) -> None:
+    """Records that were removed before the robot joined are not missed."""
+    robot = night.add_robot("arm7", kept_days=0.05)
+    if joined == "after":
+        robot.unplug()
+    robot.record(3)
+    for _quarter in range(8):
+        night.pass_time(15 * 60)
+        robot.record(3)
+    robot.start()
+    night.start_collector()
+    night.pass_time(60)
+    assert night.collector is not None
+    parts = night.collector.parts
+    (proof,) = prove(parts.store, parts.robots.known()["arm7"], _SEGMENT_BYTES)
+    assert proof.ok
+    assert proof.begins_after > 3
+    assert robot.pusher is not None
+    assert robot.pusher.progress.missed == (proof.begins_after if joined == "before" else 0)

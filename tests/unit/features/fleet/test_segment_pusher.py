@@ -11,6 +11,7 @@ import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from appliance.audit.proof.copies import signed_checkpoints
+from appliance.base.atomic_files import write_whole
 from appliance.base.clock import now, using
 from appliance.features.fleet import segment_pusher
 from appliance.features.fleet.connection import CollectorConnection, CollectorError
@@ -133,7 +134,7 @@ def test_a_receipt_for_another_segment_is_refused(
     pusher.step()
     assert "receipt is not for segment 1" in pusher.progress.trouble
     assert (pusher.progress.sent, pusher.progress.sequence) == (0, 0)
-    assert not list((tmp_path / "state").iterdir())
+    assert [file.name for file in (tmp_path / "state").iterdir()] == ["position.json"]
 
 
 def test_a_kill_between_receipt_and_position(
@@ -142,14 +143,17 @@ def test_a_kill_between_receipt_and_position(
     class KilledError(BaseException):
         pass
 
-    def killed(*_values: object) -> None:
-        raise KilledError
+    receipts = tmp_path / "state" / "receipts.ndjson"
+
+    def killed(*given: Any) -> None:
+        if receipts.exists():
+            raise KilledError
+        write_whole(*given)
 
     with monkeypatch.context() as patch:
         patch.setattr(segment_pusher, "write_whole", killed)
         with pytest.raises(KilledError):
             make().step()
-    receipts = tmp_path / "state" / "receipts.ndjson"
     receipts.write_bytes(receipts.read_bytes()[:-40])  # and the disk kept a part of the line
     pusher = make()
     while pusher.step() == 0:
