@@ -68,7 +68,7 @@ def make_collector(config: FleetConfig) -> Collector:
     if config.bundles is not None:
         bundles = BundleService(
             config.bundles.folder, config.bundles.timestamp_key, RolloutStore(database), robots.groups,
-            off=lambda: {name for name, robot in robots.known().items() if presence.off(robot)},
+            off=lambda: {name for name, robot in robots.known().items() if presence.is_off(robot)},
         )  # fmt: skip
     return Collector(
         config=config,

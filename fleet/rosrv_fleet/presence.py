@@ -49,6 +49,10 @@ class RobotPresence:
         signs = {name: self.last(robot.name, name) for name in robot.connecting}
         return {name for name, sign in signs.items() if sign is not None and sign.off}
 
+    def is_off(self, robot: Robot) -> bool:
+        """Return whether all appliances of a robot are off: a pair works with one of them."""
+        return self.off(robot) == set(robot.connecting) != set()
+
     def last(self, robot: str, appliance: str) -> LastSign | None:
         found = self._heard.get((robot, appliance))
         if found is not None:

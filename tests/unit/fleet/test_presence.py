@@ -3,10 +3,15 @@ from types import SimpleNamespace
 from typing import cast
 
 import pytest
-from rosrv_fleet.collector import Collector
+from rosrv_fleet import collector as collector_module
+from rosrv_fleet.collector import Collector, make_collector
+from rosrv_fleet.config import BundlesConfig, FleetConfig
+from rosrv_fleet.enrolment import RobotGroup
 from rosrv_fleet.health import RobotState, health_of
 from rosrv_fleet.presence import RobotPresence
 from rosrv_fleet.robots import Robots
+from rosrv_fleet.rollouts.conditions import ConditionKind
+from rosrv_fleet.rollouts.machine import RobotSeen
 from rosrv_fleet.segment_store import SegmentStore
 
 from appliance.base.clock import wall
@@ -94,6 +99,27 @@ def test_each_appliance_of_a_pair_is_heard(tmp_path: Path) -> None:
     assert (state.silent, state.off, state.heard_seconds) == (True, False, {"a": None, "b": 0})
     collector.presence.heard("arm7", "a")
     assert (collector.state().silent, collector.state().off) == (False, True)
+
+
+def test_a_pair_is_off_in_a_rollout_only_with_both_appliances(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Otherwise a switched off standby would hide that the active appliance is silent."""
+    monkeypatch.setattr(collector_module, "read_receipt_key", lambda _data: None)
+    group = RobotGroup("site-a", "arms")
+    bundles = BundlesConfig(folder=tmp_path, timestamp_key=tmp_path)
+    collector = make_collector(
+        FleetConfig(data=tmp_path, certificate=tmp_path, key=tmp_path, bundles=bundles)
+    )
+    for appliance in ("a", "b"):
+        JoiningAppliance().join(collector.robots, appliance)
+    assert collector.bundles is not None
+    collector.bundles.robots[group] = {"arm7": RobotSeen(1.0)}
+    kinds = []
+    for appliance in ("b", "a"):
+        collector.presence.heard("arm7", appliance, off=True)
+        kinds.append(collector.bundles.conditions(group)["arm7"].kind)
+    assert kinds == [ConditionKind.SILENT, ConditionKind.OFF]
 
 
 def test_a_full_disk_makes_no_robot_silent(tmp_path: Path) -> None:
