@@ -163,6 +163,13 @@ def resumed(rollout: BundleRollout, seconds: float) -> BundleRollout:
     return msgspec.structs.replace(rollout, opened=opened, healthy=None, why=why)
 
 
+def rewound(rollout: BundleRollout, now: float) -> BundleRollout:
+    """Begin the times of all gates at `now` at the latest: the clock was ahead, and has been corrected."""
+    healthy = None if rollout.healthy is None else min(rollout.healthy, now)
+    started, opened = min(rollout.started, now), min(rollout.opened, now)
+    return msgspec.structs.replace(rollout, started=started, opened=opened, healthy=healthy)
+
+
 def counts(rollout: BundleRollout, robots: Mapping[str, RobotSeen], now: float) -> list[dict[str, object]]:
     sick = unhealthy(rollout, robots, now)
     rows: list[dict[str, object]] = []

@@ -115,8 +115,10 @@ class BundleService:
             members = await asyncio.to_thread(self._members)
             self._arrived.clear()
             reports = await asyncio.to_thread(self.store.reports)
+            reports |= await self._rewind_reports(reports)
             self.robots = _by_group(members, reports | self._arrived)
             self.rollouts = await asyncio.to_thread(self.store.latest)
+            await self._rewind_rollouts()
             await self._resume(reports)
             await self._advance()
             self._wake()
@@ -242,6 +244,28 @@ class BundleService:
             robot: msgspec.structs.replace(seen, seen=seen.seen + seconds) if 0 < seen.seen <= since else seen
             for robot, seen in self.robots.get(group, {}).items()
         }
+
+    async def _rewind_reports(self, reports: Mapping[str, StoredReport]) -> dict[str, StoredReport]:
+        """Date reports from the future now, and return them: the clock was ahead, and has been corrected."""
+        now = self._clock()
+        if sum(self._deaf) > now + _CLOCK_SECONDS:
+            self._deaf = (0.0, 0.0)
+        rewound = {
+            robot: report._replace(seen=msgspec.structs.replace(report.seen, seen=now))
+            for robot, report in reports.items()
+            if report.seen.seen > now + _CLOCK_SECONDS
+        }
+        for robot, (group, seen) in rewound.items():
+            if robot not in self._arrived:
+                await asyncio.to_thread(self.store.save_report, robot, group, seen)
+        return rewound
+
+    async def _rewind_rollouts(self) -> None:
+        now = self._clock()
+        for group, stored in list(self.rollouts.items()):
+            rollout = stored.rollout
+            if max(rollout.started, rollout.opened, rollout.healthy or 0.0) > now + _CLOCK_SECONDS:
+                await self._save(group, stored, machine.rewound(rollout, now), now)
 
     async def _resume(self, reports: Mapping[str, StoredReport]) -> None:
         now = self._clock()

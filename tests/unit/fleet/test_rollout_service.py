@@ -167,6 +167,33 @@ def test_an_absence_is_health_for_no_tick(
     assert (store.stored.rollout.ring, store.stored.rollout.healthy) == (0, 4600.0)
 
 
+@pytest.mark.parametrize("restarted", [True, False])
+def test_a_clock_that_was_ahead_disables_no_gate_after_its_correction(
+    restarted: bool, store: _Memory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The robot's silence stops the rollout as soon as if the clock had never been ahead."""
+    now = [1000.0]
+
+    async def run() -> None:
+        service = _service(store, tmp_path, now)
+        await service.tick()
+        now[0] += 30 * 86_400.0
+        await service.tick()
+        await service.report("r-0", _GROUP, _TAKEN)
+        await service.tick()
+        now[0] -= 30 * 86_400.0
+        if restarted:
+            service = _service(store, tmp_path, now)
+        for _half_minute in range(6):
+            assert service.rollouts.get(_GROUP, store.stored).rollout.state == "running"
+            await service.tick()
+            now[0] += 30.0
+        assert service.rollouts[_GROUP].rollout.why.endswith("r-0: silent for 150 s")
+
+    _run(monkeypatch, _Calls(), run())
+    assert (store.stored.rollout.state, store.stored.rollout.opened) == ("stopped", 1000.0)
+
+
 def test_a_rollout_with_an_unknown_robot_does_not_start(
     store: _Memory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
