@@ -4,7 +4,8 @@
 2. The next ring opens only after enough robots of all open rings have had the bundle in force, and been healthy, for
    a time without interruption.
 3. If too many robots of an open ring are unhealthy, the rollout stops, and never continues.
-4. Every selection is the bundle of the rollout or the one before it.
+4. Every selection is the bundle of the rollout, the one before it, or one that the robot has from an earlier rollout,
+   which was stopped.
 5. A robot that has left the group does not count, but a ring that has lost all its robots stops the rollout.
 """
 
@@ -65,7 +66,8 @@ class BundleRollout(msgspec.Struct, frozen=True):
 
     The rings up to `ring` are open; it is -1 before the first one opens at `opened`. `healthy` is the time since
     which all open rings have had the bundle and been healthy. `baselines` has the robots that were not silent when
-    their ring opened; no other robots are counted.
+    their ring opened; no other robots are counted. `kept` has the bundles of earlier rollouts that were stopped: a
+    robot that has one keeps it until its ring opens. It is unset in rollouts that an earlier release stored.
     """
 
     path: str
@@ -80,6 +82,7 @@ class BundleRollout(msgspec.Struct, frozen=True):
     baselines: dict[str, Baseline] = {}
     why: str = ""
     acts: list[OperatorAct] = []
+    kept: list[str] | msgspec.UnsetType = msgspec.UNSET
 
     @property
     def bundle(self) -> BundlePath:
@@ -107,15 +110,28 @@ def fault_of_rings(rollout: BundleRollout, robots: Collection[str]) -> str:
 
 
 def selected(rollout: BundleRollout, robot: str, seen: RobotSeen | None) -> str:
-    """Return the bundle that a robot should have, or "". After a stop, robots with the new one in force keep it."""
+    """Return the bundle that a robot should have, or "". After a stop, robots with the new one in force keep it.
+
+    No robot moves back to `before` because the next rollout starts.
+    """
     if rollout.state == "reverted":
         return rollout.before
     if rollout.state == "done":
         return rollout.path
-    if ring_of(rollout, robot) > rollout.ring:
-        return rollout.before
-    stays = rollout.state == "running" or (seen is not None and seen.in_force == rollout.path)
-    return rollout.path if stays else rollout.before
+    in_force = "" if seen is None else seen.in_force
+    is_open = ring_of(rollout, robot) <= rollout.ring
+    if is_open and (rollout.state == "running" or in_force == rollout.path):
+        return rollout.path
+    return in_force if in_force in kept_by(rollout) else rollout.before
+
+
+def kept_by(rollout: BundleRollout) -> list[str]:
+    return [] if rollout.kept is msgspec.UNSET else rollout.kept
+
+
+def kept_after(rollout: BundleRollout) -> set[str]:
+    """Return the bundles that robots keep when the next rollout starts."""
+    return {*kept_by(rollout), rollout.path} if rollout.state == "stopped" else set()
 
 
 def advanced(rollout: BundleRollout, robots: Mapping[str, RobotSeen], now: float) -> BundleRollout:

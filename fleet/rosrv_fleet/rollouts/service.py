@@ -186,7 +186,16 @@ class BundleService:
                 f"{path} was signed {terms.signed - now:.0f} s in the future: correct the clock of the collector, or"
                 " that of the machine that signs, and add the bundle again"
             )
-        rollout = BundleRollout(str(path), before, terms, gates, now, acts=[OperatorAct(now, who, "start")])
+        kept = set() if last is None else machine.kept_after(last.rollout)
+        rollout = BundleRollout(
+            str(path),
+            before,
+            terms,
+            gates,
+            now,
+            acts=[OperatorAct(now, who, "start")],
+            kept=sorted(kept.intersection(self._signed())),
+        )
         members = await asyncio.to_thread(self._members)
         fault = machine.fault_of_rings(rollout, {one for one, own in members.items() if own == group})
         if fault:

@@ -1,5 +1,6 @@
 from collections.abc import Mapping
 
+import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -8,6 +9,7 @@ from rosrv_fleet.rollouts.machine import (
     BundleRollout,
     HealthGates,
     RobotSeen,
+    RolloutState,
     advanced,
     counts,
     fault_of_rings,
@@ -20,7 +22,7 @@ from rosrv_fleet.rollouts.machine import (
 
 from appliance.formats.terms import Ring, Terms
 
-OLD, NEW = "s/g/1.tar", "s/g/2.tar"
+OLD, KEPT, NEW = "s/g/1.tar", "s/g/2.tar", "s/g/3.tar"
 RINGS = [Ring("canary", ["r0", "r1"], 0, 0), Ring("some", [], 40, 100), Ring("rest", [], 100, 100)]
 GATES = HealthGates(healthy_seconds=50, ring_seconds=1000, silent_seconds=120)
 ROBOTS = [f"r{number}" for number in range(20)]
@@ -114,6 +116,20 @@ def test_a_bad_canary_stops(sick: RobotSeen, word: str) -> None:
     assert selected(rollout, "r0", RobotSeen(60, OLD)) == OLD
     assert selected(rollout, "r5", robots["r5"]) == OLD
     assert selected(reverted(rollout, ""), "r0", robots["r0"]) == OLD
+
+
+@pytest.mark.parametrize(
+    ("robot", "in_force", "expected"),
+    [("r0", NEW, NEW), ("r0", KEPT, KEPT), ("r5", KEPT, KEPT), ("r5", OLD, OLD), ("r5", "", OLD)],
+)
+@pytest.mark.parametrize("state", ["running", "stopped"])
+def test_a_robot_keeps_the_bundle_of_an_earlier_stopped_rollout_until_its_ring_opens(
+    robot: str, in_force: str, expected: str, state: RolloutState
+) -> None:
+    rollout = msgspec.structs.replace(begun(), kept=[KEPT], ring=0, state=state)
+    wanted = NEW if (robot, state) == ("r0", "running") else expected
+    assert selected(rollout, robot, RobotSeen(1, in_force)) == wanted
+    assert selected(reverted(rollout, ""), robot, RobotSeen(1, in_force)) == OLD
 
 
 def test_more_denials_of_the_old_bundle_do_not_stop() -> None:

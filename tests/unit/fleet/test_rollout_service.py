@@ -47,6 +47,12 @@ class _Memory(RolloutStore):
         self.stored = StoredRollout(1, rollout)
         return True
 
+    def begin(
+        self, _group: RobotGroup, _last: StoredRollout | None, rollout: BundleRollout, _now: float
+    ) -> int | None:
+        self.stored = StoredRollout(1, rollout)
+        return 1
+
     def reports(self) -> dict[str, StoredReport]:
         return dict(self.seen)
 
@@ -203,3 +209,39 @@ def test_a_rollout_with_an_unknown_robot_does_not_start(
     with pytest.raises(RolloutRefusedError, match="r-zero, not enrolled in site-a/arms"):
         _run(monkeypatch, _Calls(), service.start(BundlePath.parse(path), HealthGates(), "olga"))
     assert store.stored.rollout == _ROLLOUT
+
+
+@pytest.mark.parametrize(
+    ("end", "signed", "selected"),
+    [("stopped", "123", 2), ("stopped", "13", 1), ("reverted", "123", 1), ("done", "123", 2)],
+    ids=["stopped", "stopped and withdrawn", "reverted", "done"],
+)
+def test_the_next_rollout_moves_no_robot_of_a_later_ring_back(
+    end: str, signed: str, selected: int, *, store: _Memory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The fourth rollout also knows what the second one left, because the third one stopped."""
+    service, terms = (
+        _service(store, tmp_path, [1010.0]),
+        Terms(0, [Ring("canary", ["r-0"]), Ring("rest", [], 100)]),
+    )
+    service._members = lambda: {"r-0": _GROUP, "r-9": _GROUP}
+    paths = {f"site-a/arms/{version}.tar": terms for version in f"{signed}45"}
+    service.publication = cast(PublishedBundles, SimpleNamespace(bundles=paths))
+    store.seen["r-9"] = StoredReport(_GROUP, RobotSeen(1000.0, _PATH))
+    store.change(state=end)
+
+    async def run() -> None:
+        for version in (4, 5):
+            await service.start(BundlePath("site-a", "arms", version), HealthGates(), "olga")
+            assert service.selection("r-9", _GROUP) == f"site-a/arms/{selected}.tar"
+            await service.stop(_GROUP, "olga")
+            assert service.selection("r-9", _GROUP) == f"site-a/arms/{selected}.tar"
+
+    _run(monkeypatch, _Calls(), run())
+
+
+def test_a_rollout_of_an_earlier_release_keeps_its_form() -> None:
+    """The store changes a rollout only if its document is the one that was read."""
+    document = msgspec.json.encode(_ROLLOUT)
+    assert b"kept" not in document
+    assert msgspec.json.encode(msgspec.json.decode(document, type=BundleRollout)) == document
