@@ -41,7 +41,7 @@ from appliance.policy.model import Address
 from appliance.policy.policy import Policy
 from appliance.signing.fingerprints import fingerprint
 from appliance.specifications.specification_files import Sources, SpecificationsRefusedError
-from appliance.specifications.specification_manager import SpecificationManager
+from appliance.specifications.specification_manager import MonitorsChangedError, SpecificationManager
 from appliance.specifications.switches import Switches
 from appliance.store.state_file import StateStore
 from appliance.store.writer_thread import StoreError
@@ -56,10 +56,18 @@ _REFUSALS = (
     DeclaredHostsError,
     HostRefusedError,
     PolicyRefusedError,
-    RevisionChangedError,
     SpecificationsRefusedError,
 )
+_OUTDATED = (RevisionChangedError, MonitorsChangedError)
+_CHANGED_DURING_TRIAL = (
+    "an operator changed the policy or the specifications during commit-confirm; the bundle is rolled back, and tried"
+    " again at the next poll"
+)
 _UNCONFIRMED_CHANGE = "a local change waits for its confirmation; the bundle waits for it"
+
+
+class _OperatorChangeError(Exception):
+    """An operator changed a part of the bundle during its commit-confirm."""
 
 
 class Trial(msgspec.Struct, frozen=True):
@@ -139,7 +147,7 @@ class BundleGate:
         record, fleet = self._record, self._fleet
         if fleet.bundles.root is None and not record.in_force:
             return None
-        trouble = self._poll.trouble or self._waits
+        trouble = self._poll.trouble or self._waiting
         if fleet.bundles.root is not None and self.link.channel is None:
             trouble = trouble or "the process that polls for bundles is not running yet"
         return BundlesState(
@@ -193,10 +201,21 @@ class BundleGate:
             record.refused,
             self._changed,
             BundleHealth(health.denials, len(health.failing)),
+            self._waiting,
         )
         if (stated, self.link.channel) != (self._stated, self._stated_to):
             self._stated, self._stated_to = stated, self.link.channel
             self.link.send(stated)
+
+    @property
+    def _unconfirmed(self) -> bool:
+        return self._policies.confirm_by is not None or self._monitors.confirm_by is not None
+
+    @property
+    def _waiting(self) -> str:
+        """Return why the bundle that the last poll offered waits, or ""."""
+        ended = self._waits == _UNCONFIRMED_CHANGE and not self._unconfirmed
+        return "" if ended or not self._poll.offered else self._waits
 
     @property
     def _changed(self) -> bool:
@@ -236,7 +255,7 @@ class BundleGate:
         ):
             return
         self._waits = ""
-        if self._policies.confirm_by is not None or self._monitors.confirm_by is not None:
+        if self._unconfirmed:
             self._waits = _UNCONFIRMED_CHANGE
             return
         try:
@@ -260,8 +279,8 @@ class BundleGate:
         try:
             await self._keep(msgspec.structs.replace(record, trial=trial))
             await self._try(trial, contents)
-        except StoreError as error:  # says nothing about the bundle: it is offered again
-            self._waits = str(error)
+        except (*_OUTDATED, _OperatorChangeError, StoreError) as error:
+            self._waits = str(error)  # says nothing about the bundle: it is offered again
             # Before the rollback: after a crash in between, the next start rolls back.
             self._save(msgspec.structs.replace(record, trial=trial))
             await self._end(trial)
@@ -312,7 +331,7 @@ class BundleGate:
         there = (self._policies.revision, self._monitors.revision)
         while True:
             if there != (self._policies.revision, self._monitors.revision):
-                return "an operator changed the policy or the specifications during the trial"
+                raise _OperatorChangeError(_CHANGED_DURING_TRIAL)
             reason = self._health().worse_than(before)
             if reason or clock.now() >= deadline:
                 return reason
@@ -371,7 +390,7 @@ class BundleGate:
                     self._hosts.bundled != trial.hosts_back
                 ):
                     await self._hosts.take_bundle(trial.hosts_back, UNCONFIRMED)
-            except (*_REFUSALS, StoreError) as error:
+            except (*_REFUSALS, *_OUTDATED, StoreError) as error:
                 _log.error("a bundle cannot be rolled back yet", bundle=trial.path, error=str(error))
                 await asyncio.sleep(_AGAIN_SECONDS)
             else:

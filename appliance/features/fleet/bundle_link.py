@@ -22,6 +22,8 @@ class BundlePollReported(Message):
     trouble: str = ""
     rejected: bool = False
     """Whether the collector's files failed the verification."""
+    offered: bool = False
+    """Whether this check offered a bundle to control."""
 
 
 class RefusedBundle(msgspec.Struct, frozen=True):
@@ -49,6 +51,8 @@ class BundleStated(Message):
     changed: bool = False
     """Whether an operator has since changed the policy, the specifications or the hosts on the robot."""
     health: BundleHealth = BundleHealth()
+    waits: str = ""
+    """Why the offered bundle is not tried now, although it is not refused."""
 
 
 BundleLink = BundleOffered | BundlePollReported | BundleStated

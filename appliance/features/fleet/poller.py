@@ -46,6 +46,7 @@ class Poller:
     _failures: int = 0
     _reported: RobotReport | None = None
     report_due: float = 0.0
+    _early: str = ""
     _retry_at: float = 0.0
 
     def step(self) -> float:
@@ -62,12 +63,15 @@ class Poller:
             self._report(stated)
 
     def _checked(self, stated: BundleStated) -> float:
+        self._early, offers = "", False
         try:
             self.bundles.refresh()
             selected = self.bundles.selected()
-            if selected is not None and _is_news(selected, stated):
+            offers = selected is not None and _is_news(selected, stated)
+            if selected is not None and offers:
                 self.offer(_offered(self.bundles.get(selected)))
         except BundleTooEarlyError as error:
+            self._early = str(error)
             pause = max(1.0, error.at - self.clock())
         except (BundleRejectedError, BundleFolderError, CollectorError) as error:
             return self._failed(error)
@@ -76,7 +80,7 @@ class Poller:
         if self._failures:
             _log.warning("the collector's bundles are verified again")
         self._failures = 0
-        self.progress = BundlePollReported(self.clock())
+        self.progress = BundlePollReported(self.clock(), offered=offers)
         return _jittered(min(self.interval, pause))
 
     def _failed(self, error: Exception) -> float:
@@ -100,7 +104,7 @@ class Poller:
             stated.changed,
             stated.health.denials,
             stated.health.failing,
-            self.progress.trouble,
+            self.progress.trouble or stated.waits or self._early,
         )
         now = clock.now()
         pressing = self._reported is None or _fate_of(report) != _fate_of(self._reported)

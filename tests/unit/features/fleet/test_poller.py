@@ -2,6 +2,7 @@ from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import cast
 
+import msgspec
 import pytest
 
 from appliance.features.fleet.bundle_link import BundleOffered, BundleStated, RefusedBundle
@@ -13,6 +14,7 @@ from appliance.features.fleet.verified_bundles import (
     VerifiedBundle,
     VerifiedBundles,
 )
+from appliance.formats.bundle_api import RobotReport
 from appliance.formats.bundle_archive import BundleContents
 from appliance.formats.terms import BundlePath
 
@@ -28,6 +30,7 @@ class Site:
         self.errors: Iterator[Exception | None] = iter(())
         self.stated = BundleStated()
         self.offered: list[tuple[str, str]] = []
+        self.reported: list[RobotReport] = []
         bundles = SimpleNamespace(
             refresh=lambda: None,
             selected=lambda: SimpleNamespace(path=PATH, sha256=self.selected),
@@ -35,7 +38,7 @@ class Site:
         )
         self.poller = Poller(
             cast(VerifiedBundles, bundles),
-            cast(CollectorConnection, SimpleNamespace(put=lambda *_given: None)),
+            cast(CollectorConnection, SimpleNamespace(put=self._put)),
             (PATH.site, PATH.group),
             60.0,
             lambda: self.stated,
@@ -48,6 +51,9 @@ class Site:
         if error is not None:
             raise error
         return VerifiedBundle(selected.path, selected.sha256, BundleContents("[Nodes]\n", "hosts: []\n"))
+
+    def _put(self, _path: str, body: Iterator[bytes], *_given: object) -> None:
+        self.reported.append(msgspec.json.decode(b"".join(body), type=RobotReport))
 
     def _offer(self, bundle: BundleOffered) -> None:
         self.offered.append((bundle.path, bundle.sha256))
@@ -97,3 +103,32 @@ def test_a_bundle_that_is_too_early_ends_the_failures() -> None:
     assert site.offered == [(str(PATH), "new")]
     site.stated, site.errors = BundleStated(), iter([CollectorError("no answer")])
     assert site.poller.step() == pytest.approx(1.0, rel=0.2)  # the first failure again
+
+
+@pytest.mark.parametrize(
+    ("stated", "error", "reason"),
+    [
+        (BundleStated(waits="a local change waits"), None, "a local change waits"),
+        (BundleStated(), BundleTooEarlyError(PATH, TIME + 20), f"{PATH} is for this robot's ring in "),
+        (BundleStated(), CollectorError("no answer"), "no answer"),
+        (BundleStated(), None, ""),
+    ],
+    ids=["waits", "too early", "fails", "none"],
+)
+def test_the_collector_hears_why_the_robot_is_behind(
+    stated: BundleStated, error: Exception | None, reason: str
+) -> None:
+    site = Site()
+    site.stated, site.errors = stated, iter([error])
+    site.poller.step()
+    assert site.reported[-1].trouble.startswith(reason)
+    assert bool(site.reported[-1].trouble) == bool(reason)
+
+
+def test_control_hears_whether_a_check_offered_a_bundle() -> None:
+    site = Site()
+    site.poller.step()
+    assert site.poller.progress.offered
+    site.stated = BundleStated(str(PATH), "new")
+    site.poller.step()
+    assert not site.poller.progress.offered
