@@ -21,7 +21,7 @@ from appliance.formats.bundle_archive import (
 from appliance.formats.terms import BundlePath, Ring, Terms, TermsError, terms_of
 from rosrv_fleet.bundles.keys import KeyFileError, KeyFolder
 from rosrv_fleet.bundles.publication import PublicationError, read_publication
-from rosrv_fleet.bundles.repository import BundleRepository, RepositoryError
+from rosrv_fleet.bundles.repository import KEPT, BundleRepository, RepositoryError
 from rosrv_fleet.output import say
 
 bundle = typer.Typer(help="Make, sign and publish bundles on the operator's machine.", no_args_is_help=True)
@@ -79,7 +79,7 @@ def add(
     note: Annotated[str, typer.Option(help="A note that is signed with the bundle")] = "",
     keep: Annotated[
         int, typer.Option(min=1, max=20, help="Signed bundles of the group; older ones are withdrawn")
-    ] = 2,
+    ] = KEPT,
     repository: Repository = _HERE,
     keys: Keys = None,
     passphrase_file: Secret = None,
@@ -175,7 +175,8 @@ def publish(
 ) -> None:
     """Copy the signed files to the collector's folder; the snapshot comes last, so that no robot gets half of them.
 
-    To another machine, copy `metadata` and `targets` with any tool; the collector waits until they are complete.
+    To another machine, copy `metadata` and `targets` to a separate folder with any tool, and run the command there. An
+    interrupted copy is not published.
 
     Example: rosrv-fleet bundle publish /srv/bundles
     """
@@ -254,10 +255,11 @@ def _files_in(folder: Path) -> dict[str, bytes]:
 def _copy(source: Path, target: Path, pattern: str, leave: str = "") -> None:
     for path in sorted(source.glob(pattern)):
         copied = target / path.relative_to(source)
-        if copied.exists() or (leave and f".{leave}." in path.name):
+        content = path.read_bytes()
+        if (leave and f".{leave}." in path.name) or (copied.exists() and copied.read_bytes() == content):
             continue
         copied.parent.mkdir(parents=True, exist_ok=True)
-        write_whole(copied, path.read_bytes(), 0o644)
+        write_whole(copied, content, 0o644)
 
 
 def _say_expiries(repository: BundleRepository) -> None:

@@ -34,6 +34,7 @@ from appliance.formats.terms import BundlePath, Terms, custom_of, role_of
 from rosrv_fleet.bundles.keys import KeyFolder, make_online_key
 
 TIMESTAMP_KEY = "timestamp.pem"
+KEPT = 3  # signed bundles of a group: the last good one, a bad one, and its correction
 _TOP = ("root", "targets", "snapshot", "timestamp")
 _VERSIONED = re.compile(r"([1-9][0-9]*)\.(.+)\.json")
 S = TypeVar("S", Root, Targets, Snapshot)
@@ -110,7 +111,7 @@ class BundleRepository:
         self.snapshot()
 
     def add(
-        self, site: str, group: str, files: Mapping[str, bytes], terms: Terms, *, keep: int = 2
+        self, site: str, group: str, files: Mapping[str, bytes], terms: Terms, *, keep: int = KEPT
     ) -> BundlePath:
         """Sign a bundle of these files as the next version of a group, and withdraw all but the newest `keep`.
 

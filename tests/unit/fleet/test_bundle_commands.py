@@ -1,3 +1,4 @@
+import shutil
 from pathlib import Path
 
 import pytest
@@ -57,6 +58,43 @@ def test_a_bundle_from_the_folder_to_the_collector(desk: Desk) -> None:
     assert list(read_publication(served).bundles) == ["site-a/arms/2.tar"]
     assert "site-a/arms/2.tar" in desk.good("list")
     assert not list(served.rglob("*.pem"))
+
+
+def test_the_last_good_bundle_survives_a_bad_one_and_its_correction(desk: Desk) -> None:
+    for _bundle in ("good", "bad", "correction"):
+        desk.good("add", "site-a/arms", str(desk.robot))
+    assert "site-a/arms/1.tar" in desk.good("list")
+    desk.good("add", "site-a/arms", str(desk.robot))
+    assert "site-a/arms/1.tar" not in desk.good("list")
+
+
+def test_an_interrupted_copy_is_repeated_on_the_collectors_machine(desk: Desk) -> None:
+    """The copy has no keys. A file that the interruption cut is copied again, and not published before."""
+    served, incoming = desk.folder / "served", desk.folder / "incoming"
+    publish = [bundle, ["publish", str(served), "--repository", str(incoming)]]
+    desk.good("add", "site-a/arms", str(desk.robot))
+    for folder in ("metadata", "targets"):
+        shutil.copytree(desk.folder / "repository" / folder, incoming / folder)
+    (cut,) = incoming.rglob("*.1.tar")
+    whole = cut.read_bytes()
+    cut.write_bytes(whole[:100])
+    done = CliRunner().invoke(*publish)
+    assert (done.exit_code, "not a complete publication" in done.output) == (1, True)
+    assert not served.exists()
+    cut.write_bytes(whole)
+    assert CliRunner().invoke(*publish).exit_code == 0
+    assert list(read_publication(served).bundles) == ["site-a/arms/1.tar"]
+
+
+def test_publishing_again_repairs_a_damaged_file(desk: Desk) -> None:
+    served = desk.folder / "served"
+    desk.good("add", "site-a/arms", str(desk.robot))
+    desk.good("publish", str(served))
+    next(served.rglob("*.1.tar")).write_bytes(b"cut")
+    with pytest.raises(PublicationError, match="publish it again"):
+        read_publication(served)
+    desk.good("publish", str(served))
+    assert list(read_publication(served).bundles) == ["site-a/arms/1.tar"]
 
 
 def test_a_folder_that_may_not_be_read_is_not_signed(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
