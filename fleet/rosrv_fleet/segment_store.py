@@ -190,7 +190,8 @@ class SegmentStore:
         if note is not None and place.number <= note.number:
             raise NotStorableError(
                 f"the segments up to {note.number} of this log were removed ({note.by}); if the robot was restored from"
-                " an older copy, begin a new log"
+                " an older copy, begin a new log: stop its appliance, move control/audit.db* of its state directory"
+                " away, and start it"
             )
         if len(self.numbered(place.robot, place.log, place.number)) >= _MOST_FORKS:
             raise NotStorableError(f"{_MOST_FORKS} segments have the number {place.number}")
