@@ -71,18 +71,18 @@ def test_the_last_good_bundle_survives_a_bad_one_and_its_correction(desk: Desk) 
 def test_an_interrupted_copy_is_repeated_on_the_collectors_machine(desk: Desk) -> None:
     """The copy has no keys. A file that the interruption cut is copied again, and not published before."""
     served, incoming = desk.folder / "served", desk.folder / "incoming"
-    publish = [bundle, ["publish", str(served), "--repository", str(incoming)]]
+    publish = ["publish", str(served), "--repository", str(incoming)]
     desk.good("add", "site-a/arms", str(desk.robot))
     for folder in ("metadata", "targets"):
         shutil.copytree(desk.folder / "repository" / folder, incoming / folder)
     (cut,) = incoming.rglob("*.1.tar")
     whole = cut.read_bytes()
     cut.write_bytes(whole[:100])
-    done = CliRunner().invoke(*publish)
+    done = CliRunner().invoke(bundle, publish)
     assert (done.exit_code, "not a complete publication" in done.output) == (1, True)
     assert not served.exists()
     cut.write_bytes(whole)
-    assert CliRunner().invoke(*publish).exit_code == 0
+    assert CliRunner().invoke(bundle, publish).exit_code == 0
     assert list(read_publication(served).bundles) == ["site-a/arms/1.tar"]
 
 

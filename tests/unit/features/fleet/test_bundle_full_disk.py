@@ -9,7 +9,7 @@ import pytest
 from appliance.channel import admin
 from appliance.features.fleet.bundle_gate import BundleGate
 from appliance.features.fleet.bundle_health import RobotHealth
-from appliance.features.fleet.bundle_link import BundleLink, BundleOffered
+from appliance.features.fleet.bundle_link import BundleLink, BundleOffered, BundlePollReported
 from appliance.features.fleet.settings import Bundles, Fleet
 from appliance.formats.bundle_archive import BundleContents
 from appliance.policy.policy_compiler import compile_policy
@@ -110,12 +110,14 @@ def test_a_bundle_that_a_full_disk_rolled_back_is_not_in_force_and_is_tried_agai
         gate.link.attach(near)
         running = asyncio.create_task(gate.run())
         far.send(_OFFERED)
+        far.send(BundlePollReported(1.0, offered=True))
         await asyncio.sleep(60)
         assert state() == ("", "", "the state cannot be written: No space left on device")
         assert (policies.owners[-1], monitors.owners[-1], hosts.bundled) == ("olga", "olga", "")
         trials = [record.get("trial") is not None for record in disk.records]
         assert trials[-2:] == [True, False], "after a crash in between, the next start rolls back"
         far.send(_OFFERED)
+        far.send(BundlePollReported(1.0, offered=True))
         await asyncio.sleep(60)
         assert state() == (_OFFERED.path, "", "")
         assert said == ["bundle in force"]

@@ -87,8 +87,8 @@ def test_a_whole_pair_has_no_trouble(of: dict[str, Any]) -> None:
         ),
         (
             ACTIVE, {"witness": {"trouble": "Read-only file system"}},
-            "the witness on the robot (10.0.0.10) could not carry out a takeover: Read-only file system; correct that on"
-            " the robot",
+            "the witness on the robot (10.0.0.10) could not carry out a takeover: Read-only file system; correct that"
+            " on the robot",
         ),
         (
             ACTIVE, {"witness": {"holder": "b"}},
