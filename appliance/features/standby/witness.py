@@ -48,7 +48,7 @@ import subprocess
 import sys
 import threading
 import time
-from typing import Any, Callable, Dict, Iterable, List, NamedTuple, Optional, Set, Tuple
+from typing import Any, Callable, Dict, Iterable, Iterator, List, NamedTuple, Optional, Set, Tuple
 
 EXPIRY = 1.2  # seconds after a renewal until another appliance may have the lease
 LONGEST = 1024  # bytes of a datagram
@@ -254,59 +254,43 @@ class LeaseFile:
         }
         text = json.dumps(body, sort_keys=True).encode("ascii")
         copy = (hashlib.sha256(text).hexdigest().encode("ascii") + b"\n" + text).ljust(_COPY)
-        if self.has_room():
-            self._overwrite(copy)
-        else:
-            self._replace(2 * copy)
-
-    def _overwrite(self, copy: bytes) -> None:
         failure = WitnessError
         try:
-            descriptor = os.open(self.path, os.O_WRONLY)
-            try:
+            if self.has_room():
                 for offset in (0, _COPY):
-                    written = os.pwrite(descriptor, copy, offset)
-                    failure = UncertainError
-                    if written != _COPY:
-                        raise OSError("a part was written")
-                    os.fsync(descriptor)
-            finally:
-                os.close(descriptor)
-        except OSError as error:
-            raise failure(self._unsaved(error)) from error
-
-    def _replace(self, content: bytes) -> None:
-        folder, new = os.path.dirname(os.path.abspath(self.path)), self.path + ".new"
-        try:
+                    with synced(self.path, os.O_WRONLY) as descriptor:
+                        written = os.pwrite(descriptor, copy, offset)
+                        failure = UncertainError
+                        if written != _COPY:
+                            raise OSError("a part was written")
+                return
+            new = self.path + ".new"
             with contextlib.suppress(FileNotFoundError):
                 os.unlink(new)
-            write_synced(new, content)
+            write_synced(new, 2 * copy)
             os.rename(new, self.path)
+            failure = UncertainError
+            with synced(os.path.dirname(os.path.abspath(new)), os.O_RDONLY):
+                pass
         except OSError as error:
-            with contextlib.suppress(OSError):
-                os.unlink(new)
-            raise WitnessError(self._unsaved(error)) from error
-        try:
-            descriptor = os.open(folder, os.O_RDONLY)
-            try:
-                os.fsync(descriptor)
-            finally:
-                os.close(descriptor)
-        except OSError as error:
-            raise UncertainError(self._unsaved(error)) from error
-
-    def _unsaved(self, error: OSError) -> str:
-        return "the lease %s cannot be saved: %s" % (self.path, error)
+            raise failure("the lease %s cannot be saved: %s" % (self.path, error)) from error
 
 
-def write_synced(path: str, content: bytes) -> None:
-    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT, 0o600)
+@contextlib.contextmanager
+def synced(path: str, flags: int) -> Iterator[int]:
+    """Open a file or folder, and wait at the end until its changes are on the disk."""
+    descriptor = os.open(path, flags, 0o600)
     try:
-        if os.write(descriptor, content) != len(content):
-            raise OSError("the disk is full")
+        yield descriptor
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def write_synced(path: str, content: bytes) -> None:
+    with synced(path, os.O_WRONLY | os.O_CREAT) as descriptor:
+        if os.write(descriptor, content) != len(content):
+            raise OSError("the disk is full")
 
 
 class RegularCheck:
