@@ -766,7 +766,7 @@ def run_program(command: List[str], text: str) -> str:
     try:
         done = subprocess.run(
             command,
-            input=text.encode("ascii"),
+            input=text.encode("utf-8"),
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             timeout=_PROGRAM_SECONDS,
@@ -821,9 +821,7 @@ class LeaseFirewall:
                 raise UncertainError(str(error)) from error  # each table is changed separately
             self._rules = text.count("-A %s-" % _CHAINS)
         self._written = []
-        with contextlib.suppress(
-            WitnessError
-        ):  # then they are not intact, and the next check writes them again
+        with contextlib.suppress(WitnessError):  # unread rules are not intact: they are written again
             self._written = self.present()
 
     def intact(self, present: List[str]) -> bool:
