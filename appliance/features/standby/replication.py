@@ -301,7 +301,7 @@ class Replication:
             ) from None
 
     def _lease_changed(self, state: lease_link.LeaseState) -> None:
-        if state.answered is not None:
+        if state.answered is not None and not state.refusal:  # it may admit no appliance
             self.admission.note_answer(state.answered)
         if state.alone and state.permission > self._permission:
             self._permission = state.permission
