@@ -118,10 +118,8 @@ class StateCopies:
         try:
             async with asyncio.timeout(_LEAVE_SECONDS), self._copying:
                 copies = await self._rollout.copies(_LEAVE_SECONDS, full=True)
-                copied = all(
-                    copy.at for copy in copies
-                )  # otherwise a state cannot be copied while messages pass
-                if copied:
+                copied = all(copy.at for copy in copies)
+                if copied:  # otherwise a state cannot be copied while messages pass
                     contents = enumerate(copy.content or b"" for copy in copies)
                     _save_copies(self._store, self._epoch, contents, max(copy.at for copy in copies))
         except (TimeoutError, ConnectionError) as error:

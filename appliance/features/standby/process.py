@@ -193,10 +193,8 @@ class LeaseProcess:
     def _tell_control(self) -> None:
         lease, now = self._lease, clock.since_boot()
         active = lease.is_active(now)
-        seen, standby = (
-            lease.seen,
-            self._membership.other if lease.held is not None else self._membership.name,
-        )
+        seen = lease.seen
+        standby = self._membership.name if lease.held is None else self._membership.other
         state = lease_link.LeaseState(
             until=lease.valid_until if active else 0.0,
             epoch=lease.epoch,

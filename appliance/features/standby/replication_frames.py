@@ -134,9 +134,7 @@ class ReplicationLink(Generic[M]):
         self._encoder = msgspec.msgpack.Encoder()
         self._sending = asyncio.Lock()
         self._decoder: msgspec.msgpack.Decoder[M] = msgspec.msgpack.Decoder(received)
-        self._taken = (
-            -math.inf
-        )  # when the other appliance last took something, by the clock of the event loop
+        self._taken = -math.inf  # when the other appliance last took bytes, by the event loop
 
     async def send(self, message: Any) -> None:
         body = self._encoder.encode(message)

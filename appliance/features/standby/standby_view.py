@@ -34,9 +34,9 @@ class StandbyScreen:
         role = f"{state.role} since {moment(state.since)}, epoch {state.epoch}"
         grid.add_row("this appliance", f"{state.name} ({state.address}): {role}")
         seen = lag_in_words(other) if state.role == "active" else connection(other)
-        holder = f"{witness.holder} holds" if witness.holder else "no appliance holds"
+        holder = f", {witness.holder or 'no appliance'} holds the lease" if not witness.refusal else ""
         grid.add_row("other appliance", f"{other.name} ({other.address}): {seen}")
-        grid.add_row("witness", f"{witness.address}: {answer_in_words(witness)}, {holder} the lease")
+        grid.add_row("witness", f"{witness.address}: {answer_in_words(witness)}{holder}")
         grid.add_row("robot's address", f"{state.fixed}, for the active appliance")
         if state.role == "active":
             grid.add_row("answers", _answers(state))
