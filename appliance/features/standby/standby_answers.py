@@ -43,7 +43,9 @@ class WitnessSeen(msgspec.Struct, frozen=True):
         float | None, doc("seconds since its last answer, or null if it never answered")
     ]
     holder: Annotated[str, doc("the appliance that has the lease, or empty if none has it yet")]
-    refusal: Annotated[str, doc("why it refused the last request, or empty if it did not")]
+    refusal: Annotated[
+        str, doc("why it refuses this appliance, such as with an older lease, or empty if it does not")
+    ]
     trouble: Annotated[
         str, doc("why it could not carry out a takeover, such as a full disk, or empty if it could")
     ]

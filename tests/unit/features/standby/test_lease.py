@@ -427,6 +427,24 @@ def test_a_standby_knows_why_it_could_not_claim(
     assert found.startswith(obstacle) and bool(found) == bool(obstacle)
 
 
+@pytest.mark.parametrize(
+    ("answer", "reported"),
+    [
+        ({"reason": "a holds the lease for another 0.9 s"}, False),
+        ({"reason": "b is not in sync", "expired": True, "in_sync": ALONE}, False),
+        ({"reason": "nft: cannot allocate memory", "expired": True}, True),
+        (OLDER, True),
+    ],
+)
+def test_a_claim_that_came_too_early_is_not_a_refusal(answer: dict[str, Any], reported: bool) -> None:
+    """A standby claims again and again while it does not hear the active appliance."""
+    standby = Lease(epoch=2)
+    standby.lease = ApplianceLease("b", "a", "session", 2, standby.now)
+    claim = standby.later(EXPIRY).request("claim")
+    standby.answered(claim, **({"ok": False, "holder": "a"} | answer))
+    assert standby.lease.refusal == (answer["reason"] if reported else "")
+
+
 def test_a_standby_that_the_witness_refuses_does_not_count_as_answered() -> None:
     standby = Lease(epoch=2)
     for _ in range(6):
