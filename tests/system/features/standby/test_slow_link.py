@@ -1,5 +1,4 @@
 import json
-import time
 
 from tests.support.appliance import Appliance
 from tests.support.features.standby.standby_robot import StandbyRobot
@@ -14,7 +13,7 @@ def fails(one: Appliance) -> str:
     return " ".join(done.stdout.split()) if done.returncode == 1 else ""
 
 
-def test_a_standby_that_lacks_changes_is_reported_by_both_and_a_refused_order_pauses_nothing(
+def test_a_standby_that_lacks_changes_is_reported_by_both_and_refuses_the_order(
     site: StandbySite, robot: StandbyRobot
 ) -> None:
     site.until_both_in_sync()
@@ -24,14 +23,10 @@ def test_a_standby_that_lacks_changes_is_reported_by_both_and_a_refused_order_pa
         eventually(lambda: site.in_sync() == {active}, site.story)
         for one in site.appliances.values():
             eventually(lambda one=one: LACKS in fails(one), site.story)  # type: ignore[misc]  # mypy infers no type for a lambda's default
-        had, began = [len(one.seen(event="received")) for one in robot.listeners], time.monotonic()
         for one in site.appliances.values():
             done = one.rosrv("standby", "promote", check=False)
             assert (done.returncode, LACKS in done.stderr) == (1, True), done
-        seconds = time.monotonic() - began
         assert site.in_sync() == {active}
-    heard = [len(listener.seen(event="received")) for listener in robot.listeners]
-    assert min(now - before for now, before in zip(heard, had, strict=True)) > 0.7 * robot.rate * seconds
     site.until_both_in_sync()
     robot.lost_nothing()
 
