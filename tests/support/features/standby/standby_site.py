@@ -122,10 +122,13 @@ class StandbySite:
         assert self.witness is not None
         self.witness.stop(with_signal=signal.SIGKILL)
 
+    def run_witness(self, *words: str) -> None:
+        with Process(self.robot, self.command(*words), env=dict(os.environ), label=words[0]) as done:
+            assert done.wait() == 0, done.story()
+
     def boot_robot(self) -> None:
-        for words in (["remove"], ["shut"]):
-            with Process(self.robot, self.command(*words), env=dict(os.environ), label=words[0]) as done:
-                assert done.wait() == 0, done.story()
+        self.run_witness("remove")
+        self.run_witness("shut")
         (self.home / "boot").write_text(secrets.token_hex(8))
         self.start_witness()
 
