@@ -22,6 +22,7 @@ from appliance.control.assembly import assembly, foundation, listener_limits, op
 from appliance.control.links import supervisor_link
 from appliance.features.standby import passive, replica, replication, takeover_check
 from appliance.features.standby import process as lease_process
+from appliance.features.standby.replica_sync import StateComparison
 from appliance.features.standby.replication_frames import ReplicationError
 from appliance.features.standby.replication_receiver import ReplicationReceiver
 from appliance.features.standby.replication_sender import ReplicationSender
@@ -105,16 +106,18 @@ def _handle(descriptor: Any = None, *_given: Any, **named: Any) -> Any:
 
 
 class _Listener:
-    def __init__(self, streams: Streams, sender: ReplicationSender, _context: object) -> None:
+    def __init__(
+        self, streams: Streams, server: ReplicationSender | StateComparison, _context: object
+    ) -> None:
         self._streams = streams
-        self._sender = sender
+        self._server = server
 
     async def run(self, listening: Socket) -> None:
         await self._streams.serve(listening.address[1], self._serve)
 
     async def _serve(self, reader: Any, writer: Any) -> None:
         with contextlib.suppress(ReplicationError):
-            await self._sender.serve(reader, writer)
+            await self._server.serve(reader, writer)
 
 
 @contextlib.contextmanager
@@ -166,6 +169,8 @@ def joined(network: Network, streams: Streams, random: Random) -> Iterator[None]
         (replica, "sqlite3", databases),
         (passive, "follow_at", follow_at),
         (passive, "replication_context", _handle),
+        (passive, "ReplicationListener", partial(_Listener, streams)),
+        (passive, "socket", SimpleNamespace(create_server=_listening, socket=_handle)),
         (takeover_check, "replication_context", _handle),
         (replication, "replication_context", _handle),
         (replication, "ReplicationListener", partial(_Listener, streams)),

@@ -80,8 +80,13 @@ class Streams:
 
     async def serve(self, port: int, serve: Serve) -> None:
         process = present_process()
-        self._servers[process.machine.name, port] = process, serve
-        await asyncio.get_running_loop().create_future()
+        address, served = (process.machine.name, port), (process, serve)
+        self._servers[address] = served
+        try:
+            await asyncio.get_running_loop().create_future()
+        finally:
+            if self._servers.get(address) is served:
+                del self._servers[address]
 
     async def connect(self, address: str, port: int) -> StreamEnd:
         process = present_process()
