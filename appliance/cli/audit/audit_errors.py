@@ -19,7 +19,10 @@ CANNOT_READ = 2
 
 
 class Errors(ContextDecorator):
-    """Prints an error of the audit log and exits with its status."""
+    """Prints an error of the audit log and exits with its status; `unread` is the status if the reader ends."""
+
+    def __init__(self, unread: int = 0) -> None:
+        self._unread = unread
 
     def __enter__(self) -> None:
         pass
@@ -33,7 +36,7 @@ class Errors(ContextDecorator):
             case BrokenPipeError():
                 # The reader (head, less) has ended: discard the buffered output.
                 os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-                raise typer.Exit(0)
+                raise typer.Exit(self._unread)
             case KeyboardInterrupt():
                 raise typer.Exit(0)
             case PermissionError():

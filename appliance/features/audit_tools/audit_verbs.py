@@ -16,7 +16,7 @@ from appliance.api.routes.named_hosts import has_name, with_networks
 from appliance.audit.log.record_format import LogEntry, as_json, as_object, printable
 from appliance.audit.log.signatures import read_public_key
 from appliance.audit.proof.chain_findings import Verification
-from appliance.audit.proof.copies import read_copies
+from appliance.audit.proof.copies import SignedCheckpoint, read_copies
 from appliance.audit.search.filter_options import FILTER
 from appliance.audit.search.query import Filter, FilterError
 from appliance.audit.search.search import LARGEST_PAGE
@@ -26,7 +26,7 @@ from appliance.channel.answers.policy_answers import PolicyKnown
 from appliance.cli.audit.audit_errors import Errors, fail, note
 from appliance.cli.audit.record_argument import RecordArgument
 from appliance.cli.audit.verification_text import print_verification, write
-from appliance.cli.connection.admin_client import NotRunningError
+from appliance.cli.connection.admin_client import AccessDeniedError, NotRunningError
 from appliance.cli.connection.audit_file import FileLog
 from appliance.cli.connection.audit_over_rest import RestLog
 from appliance.cli.connection.target import Appliance, speaks_with
@@ -212,21 +212,45 @@ def checkpoints(
 ) -> None:
     """Write the signed checkpoints as NDJSON. Keep them on another machine for `verify --checkpoints`.
 
+    With --follow, an appliance that restarts is asked again until it answers. Exit status: 1 if the reader of the
+    output ends, 2 if the token is refused.
+
     Example: rosrv audit checkpoints --follow | ssh keeper 'cat >> checkpoints.ndjson'
     """
-    with Errors():
-        source = appliance.audit()
-        pause = threading.Event()
-        while True:
-            found = source.checkpoints(after)
+    with Errors(unread=1 if follow else 0):
+        for found in _checkpoints(appliance.audit(), after, follow=follow):
             for checkpoint in found:
                 write(checkpoint.as_json())
-                after = checkpoint.number
             sys.stdout.flush()
-            if not found:
-                if not follow:
-                    break
-                pause.wait(_CHECKPOINT_SECONDS)
+
+
+def _checkpoints(source: FileLog | RestLog, after: int, *, follow: bool) -> Iterator[list[SignedCheckpoint]]:
+    pause, away = threading.Event(), False
+    last: SignedCheckpoint | None = None
+    yield (found := source.checkpoints(after))
+    while found or follow:
+        if found:
+            last = found[-1]
+        else:
+            pause.wait(_CHECKPOINT_SECONDS)
+        try:
+            found = source.checkpoints(after) if last is None else _later(source, last)
+            away = False
+        except NotRunningError as error:
+            if not follow or isinstance(error, AccessDeniedError):
+                raise
+            if not away:  # it may be restarting
+                note(f"{printable(str(error))}; trying again")
+            found, away = [], True
+        yield found
+
+
+def _later(source: FileLog | RestLog, last: SignedCheckpoint) -> list[SignedCheckpoint]:
+    """Return the checkpoints after the last one, or all those of a log that has replaced its log."""
+    found = source.checkpoints(last.number - 1)
+    if found and (found[0].log, found[0].number) == (last.log, last.number):
+        return found[1:]
+    return source.checkpoints(0)
 
 
 @speaks_with(_ALWAYS_JSON_HELP, FILTER)

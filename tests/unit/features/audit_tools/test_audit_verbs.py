@@ -1,6 +1,7 @@
 """Exports and verifications that need real files. The transcripts `audit.txt` and `signed.txt` have the rest."""
 
 import contextlib
+import itertools
 import json
 import os
 import pty
@@ -9,12 +10,18 @@ import signal
 import stat
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+from typing import cast
 
 import pytest
 
 import appliance
-from appliance.features.audit_tools.audit_verbs import _new_file
+from appliance.audit.proof.copies import SignedCheckpoint
+from appliance.cli.connection.admin_client import AccessDeniedError, NotRunningError
+from appliance.cli.connection.audit_over_rest import RestLog
+from appliance.features.audit_tools import audit_verbs
+from appliance.features.audit_tools.audit_verbs import _checkpoints, _new_file
 from appliance.features.audit_tools.unrecorded import CATEGORIES
 from appliance.master.graph.registry import Kind
 from appliance.policy.model import Category
@@ -41,6 +48,71 @@ def state(tmp_path: Path) -> Path:
     )
     log.close()
     return tmp_path
+
+
+def checkpoint(number: int, log: str = "one") -> SignedCheckpoint:
+    return SignedCheckpoint(
+        log=log,
+        number=number,
+        sequence=number,
+        hash="",
+        time=0,
+        previous="",
+        signature="",
+        key="",
+        removed=None,
+    )
+
+
+class Checkpoints:
+    """A source whose answers are lists of checkpoints, of which it returns the later ones, or errors."""
+
+    def __init__(self, *answers: list[SignedCheckpoint] | NotRunningError) -> None:
+        self._answers = list(answers)
+
+    def checkpoints(self, after: int) -> list[SignedCheckpoint]:
+        answer = self._answers[0] if len(self._answers) == 1 else self._answers.pop(0)
+        if isinstance(answer, NotRunningError):
+            raise answer
+        return [one for one in answer if one.number > after]
+
+
+def followed(
+    monkeypatch: pytest.MonkeyPatch, *answers: list[SignedCheckpoint] | NotRunningError
+) -> Iterator[SignedCheckpoint]:
+    monkeypatch.setattr(audit_verbs, "_CHECKPOINT_SECONDS", 0.0)
+    found = _checkpoints(cast(RestLog, Checkpoints(*answers)), 0, follow=True)
+    return (one for several in found for one in several)
+
+
+def test_following_checkpoints_survives_a_restart_of_the_appliance(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    one, two, three = map(checkpoint, (1, 2, 3))
+    away = [NotRunningError("https://robot: the connection broke")] * 50
+    found = followed(monkeypatch, [], [one, two], *away, [one, two], [one, two, three])
+    assert list(itertools.islice(found, 3)) == [one, two, three]
+    assert capsys.readouterr().err == "rosrv: https://robot: the connection broke; trying again\n"
+
+
+def test_following_checkpoints_ends_without_access_and_without_a_first_answer(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    with pytest.raises(AccessDeniedError):
+        list(followed(monkeypatch, [checkpoint(1)], AccessDeniedError("the token has expired")))
+    with pytest.raises(NotRunningError):
+        list(followed(monkeypatch, NotRunningError("cannot be reached")))
+
+
+def test_following_checkpoints_continues_with_the_log_that_replaces_the_first(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    first, second = [checkpoint(number) for number in range(1, 4)], [checkpoint(1, "two")]
+    found = followed(monkeypatch, first, first, second)
+    assert list(itertools.islice(found, 4)) == [*first, *second]
+    full = [*first, checkpoint(4), checkpoint(5)]
+    found = followed(monkeypatch, first, full)
+    assert list(itertools.islice(found, 5)) == full
 
 
 def test_every_recorded_category_is_known() -> None:
