@@ -52,7 +52,7 @@ def purge(state: Path) -> tuple[int, int]:
     except OSError as error:
         if error.errno == errno.ENOTEMPTY:
             raise BackupError(f"{state}: it has new files; run this again") from error
-        # A mount point, or a folder in one that this user may not write: it stays, empty.
+        # A mount point, or this user may not write to the folder around it: it stays, empty.
     return counts
 
 
