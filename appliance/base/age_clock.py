@@ -80,6 +80,10 @@ class AgeClock:
                 write_whole(self._path, msgspec.json.encode(kept), 0o600)
         return kept.lived + kept.credited
 
+    def latest(self) -> int:
+        """Return the latest time that it may be: with the time off that does not count yet."""
+        return self() + max(0, self._kept.step)
+
     def _was_off(self, ahead: int) -> None:
         kept, counts = self._kept, 0
         if abs(ahead) <= _AT_ONCE:

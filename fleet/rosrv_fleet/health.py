@@ -66,7 +66,7 @@ def health_of(collector: Collector) -> FleetHealth:
 
 def _state(collector: Collector, robot: Robot, gaps: int, forks: int) -> RobotState:
     newest = collector.store.newest(robot.name)
-    now, monotonic, age = clock.wall(), clock.now(), collector.store.time_ns()
+    now, monotonic = clock.wall(), clock.now()
     heard = {name: collector.presence.last(robot.name, name) for name in robot.connecting}
     off = collector.presence.off(robot)
     silent = any(
@@ -80,7 +80,7 @@ def _state(collector: Collector, robot: Robot, gaps: int, forks: int) -> RobotSt
         name=robot.name,
         log=place and place.log,
         number=place and place.number,
-        age_seconds=None if arrived is None else max(0.0, (age - arrived) / _SECOND),
+        age_seconds=None if arrived is None else max(0.0, (collector.store.latest_ns() - arrived) / _SECOND),
         certificate_seconds=min(one.certificate_ends for one in robot.connecting.values()) - now,
         heard_seconds={name: max(0.0, now - sign.at) if sign else None for name, sign in heard.items()},
         silent=silent,

@@ -13,7 +13,8 @@ A marker, an empty file KIND/ROBOT/LOG~NUMBER~NAME, states a fact about a segmen
    absent.
 3. The state that uploads need is in file names, not in a database, nor in memory that grows with the number of
    segments.
-4. Times of arrival are those of a clock of ages, so a wrong system clock removes nothing.
+4. A wrong system clock removes nothing: while the time is uncertain, an arrival has the latest possible time, and
+   retention the earliest.
 5. Work for one robot does not grow with the data of others, and the number of names that a robot can choose is
    limited. So a robot can neither slow down nor hide others.
 """
@@ -30,6 +31,7 @@ import tempfile
 import threading
 import zlib
 from collections.abc import Iterator
+from functools import cached_property
 from pathlib import Path
 from typing import IO, NamedTuple
 
@@ -108,7 +110,6 @@ class SegmentStore:
         self._folder = folder
         self._reserve = reserve
         self._locks: dict[str, threading.Lock] = {}
-        self._ages: AgeClock | None = None
         self._aging = threading.Lock()
         for name in ("segments", "newest", "removed", "incoming", *_KINDS):
             make_folder(folder / name)
@@ -119,9 +120,16 @@ class SegmentStore:
     def time_ns(self) -> int:
         """Return the time by the clock of ages, in nanoseconds since the epoch."""
         with self._aging:
-            if self._ages is None:
-                self._ages = AgeClock(self._folder / "age", self._last_arrival)
             return self._ages()
+
+    def latest_ns(self) -> int:
+        """Return the latest time that it may be, which arrivals get."""
+        with self._aging:
+            return self._ages.latest()
+
+    @cached_property
+    def _ages(self) -> AgeClock:
+        return AgeClock(self._folder / "age", self._last_arrival)
 
     def _last_arrival(self) -> int | None:
         """Return the newest arrival, as an earlier version kept no clock of ages."""
@@ -171,7 +179,7 @@ class SegmentStore:
         """Store an upload of `size` uncompressed bytes durably, or raise `NotStorableError`."""
         header = summary.header
         place = SegmentPlace(robot, header.end.log, header.end.number, summary.name)
-        path, now = self.path(place), self.time_ns()
+        path, now = self.path(place), self.latest_ns()
         os.utime(upload, ns=(now, now))
         sync(upload)
         with self._lock(robot):
@@ -205,7 +213,7 @@ class SegmentStore:
     def _note_newest(self, place: SegmentPlace) -> None:
         newest = self.newest(place.robot)
         file = self._folder / "newest" / place.robot
-        now = self.time_ns()
+        now = self.latest_ns()
         if newest is not None and newest[1].log == place.log and newest[1].number > place.number:
             os.utime(file, ns=(now, now))
             return
@@ -308,7 +316,7 @@ class SegmentStore:
             yield from _in_bucket(robot, log, bucket)
 
     def received(self, place: SegmentPlace) -> int:
-        """Return the time of arrival by the clock of ages, in nanoseconds since the epoch."""
+        """Return the time of arrival in nanoseconds since the epoch."""
         return self.path(place).stat().st_mtime_ns
 
     def marked(self, kind: str, robot: str, most: int) -> list[SegmentPlace]:
@@ -379,8 +387,9 @@ class SegmentStore:
     def prune(self, robot: str, log: str, before: int, by: str) -> int:
         """Remove the segments at the beginning of a log that arrived before a time (ns), and return their number.
 
-        A segment that is not in the index yet stays with all later ones, and so does the last segment of a log. Also
-        raise `EOFError`, `zlib.error` and `ValueError`.
+        Segments dated in the future are removed with those after them. A segment that is not in the index yet stays
+        with all later ones, and so does the last segment of a log. Also raise `EOFError`, `zlib.error` and
+        `ValueError`.
         """
         with self._lock(robot):
             note = self.removal(robot, log)
@@ -407,14 +416,19 @@ class SegmentStore:
             return len(old)
 
     def _old(self, robot: str, log: str, before: int) -> list[SegmentPlace]:
-        head = self.head(robot, log)
+        head, now = self.head(robot, log), self.time_ns()
         found: list[SegmentPlace] = []
+        last = 0
         for place in self.segments(robot, log):
             waits = any((self._folder / kind / robot / place.mark).exists() for kind in ("pending", "large"))
-            if head is None or place.number >= head.number or waits or self.received(place) >= before:
-                return [one for one in found if one.number < place.number]
+            arrived = self.received(place)
+            if head is None or place.number >= head.number or waits or before <= arrived <= now:
+                last = min(last, place.number - 1)
+                break
             found.append(place)
-        return found
+            if arrived < before:
+                last = place.number
+        return [one for one in found if one.number <= last]
 
     def _up_to(self, robot: str, log: str, number: int) -> list[SegmentPlace]:
         return list(itertools.takewhile(lambda one: one.number <= number, self.segments(robot, log)))

@@ -109,6 +109,15 @@ def test_a_long_time_off_counts_after_a_day(machine: Machine) -> None:
     assert abs(machine.run(6 * HOUR) - machine.true) < DAY
 
 
+def test_the_latest_time_has_the_time_off_at_once(machine: Machine) -> None:
+    machine.off(90 * DAY)
+    machine.run(HOUR)
+    assert abs(machine.age.latest() - machine.true) < DAY
+    machine.wrong = -YEAR
+    machine.off(HOUR)
+    assert machine.age.latest() == machine.age()
+
+
 def test_the_smallest_of_varying_steps_counts(machine: Machine) -> None:
     machine.wrong = YEAR
     machine.off(10 * DAY)

@@ -10,9 +10,9 @@ from rosrv_fleet.database import IndexDatabase
 from rosrv_fleet.retention import Pruner
 from rosrv_fleet.segment_store import SegmentPlace, SegmentStore
 
-from appliance.base.clock import utc_now, wall
+from appliance.base.clock import using, utc_now, wall
 from tests.support.enrolled_robots import enrolled_robots
-from tests.support.virtual_clock import let_time_pass, set_wall
+from tests.support.virtual_clock import VirtualClock, let_time_pass, set_wall
 from tests.unit.fleet.test_segment_store import Robot
 
 _DAY = 86_400
@@ -84,7 +84,7 @@ def oldest_days(monkeypatch: pytest.MonkeyPatch) -> list[date]:
 
 @pytest.mark.parametrize("years", [3, -3], ids=["ahead", "behind"])
 def test_a_wrong_clock_removes_nothing(years: int, tmp_path: Path, oldest_days: list[date]) -> None:
-    """Segments that arrive in that time also stay exactly as long as configured."""
+    """Segments that arrive in that time are removed neither earlier nor later than those after them."""
     collector, before = _Collector(tmp_path), utc_now().date()
     collector.push(1)
     let_time_pass(_DAY)
@@ -97,14 +97,40 @@ def test_a_wrong_clock_removes_nothing(years: int, tmp_path: Path, oldest_days: 
     assert collector.kept() == [1, 2, 3, 4]
     let_time_pass(_DAY / 2)
     set_wall(wall() - years * 365 * _DAY)
-    assert collector.kept() == [1, 2, 3, 4]
+    collector.push(5)
+    collector.push(6)
+    assert collector.kept() == [1, 2, 3, 4, 5, 6]
     assert {(before - day).days for day in oldest_days} <= {28, 29, 30}
     let_time_pass(28 * _DAY)
-    assert collector.kept() == [1, 2, 3, 4]
+    assert collector.kept() == [1, 2, 3, 4, 5, 6]
     let_time_pass(_DAY)
-    assert collector.kept() == [2, 3, 4]
+    assert collector.kept() == [2, 3, 4, 5, 6]
     let_time_pass(2 * _DAY)
-    assert collector.kept() == [4]
+    assert collector.kept() == [6]
+
+
+def test_segments_that_arrive_after_a_long_time_off_stay_as_long_as_others(
+    tmp_path: Path, oldest_days: list[date]
+) -> None:
+    """The time off counts after a day of running, but only for older segments."""
+    collector = _Collector(tmp_path)
+    collector.push(1)
+    collector.push(2)
+    assert collector.kept() == [1, 2]
+    let_time_pass(60 * _DAY)
+    clock = VirtualClock(wall=wall())  # of the machine after its boot
+    with using(clock):
+        collector = _Collector(tmp_path)
+        collector.push(3)
+        collector.push(4)
+        assert collector.kept() == [1, 2, 3, 4]
+        clock.advance(1.1 * _DAY)
+        assert collector.kept() == [3, 4]
+        clock.advance(28 * _DAY)
+        assert collector.kept() == [3, 4]
+        clock.advance(2 * _DAY)
+        assert collector.kept() == [4]
+    assert len(oldest_days) == 5
 
 
 def test_a_wrong_clock_at_the_first_start_of_this_version_removes_nothing(
