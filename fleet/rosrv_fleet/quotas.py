@@ -73,12 +73,15 @@ class RobotQuotas:
             received=used.received + max(received, _LEAST_BYTES),
             unpacked=used.unpacked + max(unpacked, _LEAST_BYTES),
         )
-        making = self._folder / f"{robot}.new"
-        making.write_bytes(msgspec.json.encode(added))
-        making.rename(self._folder / f"{robot}.json")
+        self._save(robot, added)
 
     def refused(self, robot: str, seconds: float) -> None:
         self._pauses[robot] = clock.now() + max(_LEAST_PAUSE, _REST * seconds)
+
+    def _save(self, robot: str, used: UsedBytes) -> None:
+        making = self._folder / f"{robot}.new"
+        making.write_bytes(msgspec.json.encode(used))
+        making.rename(self._folder / f"{robot}.json")
 
     def _used(self, robot: str) -> UsedBytes:
         now = self._clock()
@@ -89,7 +92,10 @@ class RobotQuotas:
         except ValueError as error:
             _log.error("a robot's quota begins again: its file is damaged", robot=robot, reason=str(error))
             return UsedBytes(now)
-        days, limits = max(0.0, now - used.time) / _DAY_SECONDS, self._limits
+        if used.time > now:  # the clock was ahead, and has been corrected
+            used = msgspec.structs.replace(used, time=now)
+            self._save(robot, used)
+        days, limits = (now - used.time) / _DAY_SECONDS, self._limits
         return UsedBytes(
             now,
             _after(used.received, days, limits.robot_bytes_per_day),

@@ -46,6 +46,19 @@ def test_used_bytes_survive_a_restart_and_return_evenly(
     found.check("arm1")
 
 
+def test_used_bytes_return_evenly_after_a_corrected_clock(clock: _Clock, tmp_path: Path) -> None:
+    clock.now += 365 * _DAY
+    quotas(tmp_path, clock).charge("arm1", 2_000_000, 0)
+    clock.now -= 365 * _DAY
+    found = quotas(tmp_path, clock)
+    for _ in range(2):
+        with pytest.raises(OverQuotaError) as error:
+            found.check("arm1")
+        assert error.value.seconds > 0
+        clock.now += _DAY / 2 + 1
+    found.check("arm1")
+
+
 def test_a_robot_that_was_off_sends_its_backlog_faster(clock: _Clock, tmp_path: Path) -> None:
     found = quotas(tmp_path, clock)
     found.charge("arm1", 65_536, 65_536)
