@@ -84,7 +84,9 @@ def next_timestamp(
         if before.snapshot_meta.version > publication.snapshot:
             there = f"snapshot {publication.snapshot} is older than {before.snapshot_meta.version}"
             raise PublicationError(f"{there}, which robots know: publish the newest repository")
-        good = before.expires - now > LIFETIME - _RENEW or before.expires >= expires
+        fresh = before.expires - now > LIFETIME - _RENEW or before.expires >= expires
+        # A clock that was ahead may have signed a longer life, in which robots would not notice a freeze.
+        good = fresh and before.expires <= now + LIFETIME
         if before.snapshot_meta.version == publication.snapshot and good:
             return None
     least = 1 if before is None else before.version + 1
