@@ -19,7 +19,7 @@ from appliance.base.counted import counted
 from appliance.base.timestamps import TimestampError
 from rosrv_fleet.bundles.commands import bundle
 from rosrv_fleet.collector import Collector, make_collector
-from rosrv_fleet.config import FleetConfigError, load_config
+from rosrv_fleet.config import LEAST_SILENT_SECONDS, FleetConfigError, load_config
 from rosrv_fleet.database import migrate
 from rosrv_fleet.enrolment import EnrolmentError
 from rosrv_fleet.evidence.commands import evidence
@@ -106,7 +106,13 @@ def serve_collector(config: Config = DEFAULT_CONFIG) -> None:
 
     Example: rosrv-fleet serve --config fleet.yaml
     """
-    serve(make_collector(load_config(config)))
+    found = load_config(config)
+    if found.silent_seconds < LEAST_SILENT_SECONDS:
+        _note(
+            f"silent_seconds: {found.silent_seconds:g} is too short, so parked robots appear as silent:"
+            f" set at least {LEAST_SILENT_SECONDS:g} in {config}"
+        )
+    serve(make_collector(found))
 
 
 @token_app.command("add")

@@ -12,6 +12,9 @@ import msgspec
 import yaml
 
 _DATA = Path("/var/lib/rosrv-fleet")
+LEAST_SILENT_SECONDS = 120.0
+"""Robots without records report every 48 to 72 s."""
+
 _Positive = Annotated[int, msgspec.Meta(gt=0)]
 _Seconds = Annotated[float, msgspec.Meta(gt=0, le=86_400)]
 

@@ -3,7 +3,9 @@ import os
 from pathlib import Path
 
 import pytest
+from rosrv_fleet import cli
 from rosrv_fleet.config import FleetConfigError, load_config
+from typer.testing import CliRunner
 
 from tests.support.sources import ROOT
 
@@ -42,6 +44,19 @@ def test_a_wrong_configuration_is_refused(text: str, why: str, tmp_path: Path) -
     with pytest.raises(FleetConfigError, match=why) as error:
         load_config(file)
     assert str(file) in str(error.value)
+
+
+@pytest.mark.parametrize(("seconds", "warned"), [(60, True), (120, False)])
+def test_a_silence_shorter_than_two_reports_is_warned_about(
+    seconds: int, warned: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    served = []
+    monkeypatch.setattr(cli, "make_collector", lambda config: config)
+    monkeypatch.setattr(cli, "serve", lambda config: served.append(config.silent_seconds))
+    file = tmp_path / "fleet.yaml"
+    file.write_text(f"data: here\nsilent_seconds: {seconds}\n")
+    done = CliRunner().invoke(cli.app, ["serve", "--config", str(file)])
+    assert (served, "set at least 120" in done.output) == ([seconds], warned)
 
 
 def test_an_unreadable_file_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
