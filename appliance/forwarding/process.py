@@ -15,7 +15,7 @@ from appliance.channel.channel import Channel
 from appliance.channel.child_process import Child
 
 _REPORT_SECONDS = 1.0
-_LAST_SECONDS = 1.0
+_LAST_SECONDS = 2.5  # of the 3 s that the supervisor gives: a robot that is switched off reports this
 
 
 class Forwarder(Protocol):

@@ -1,3 +1,6 @@
+import asyncio
+import socket
+import threading
 from collections.abc import Callable
 from typing import Any, cast
 
@@ -6,7 +9,7 @@ import pytest
 from appliance.channel import messages
 from appliance.channel.channel import Channel
 from appliance.control.links.forwarder_link import ForwarderLink
-from appliance.forwarding.process import ProgressReports
+from appliance.forwarding.process import ForwardingProcess, ProgressReports
 from appliance.telemetry.audit_trail import AuditTrail
 
 pytestmark = pytest.mark.anyio
@@ -55,6 +58,35 @@ def begin(
     controls.append(control)
     reports.anew(progress)
     return control
+
+
+class SlowForwarder:
+    """A forwarder whose receiver answers the last report late."""
+
+    progress = messages.ForwardingReported()
+
+    def __init__(self, seconds: float) -> None:
+        self._seconds = seconds
+        self.answered: list[bool] = []
+
+    def step(self) -> float:
+        return 60.0
+
+    def close(self, *, stopped: bool = False) -> None:
+        threading.Event().wait(self._seconds)
+        self.answered.append(stopped)
+
+
+@pytest.mark.nightly
+async def test_the_last_report_has_the_time_that_the_supervisor_gives() -> None:
+    far, near = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    supervisor = Channel(far, messages.Lifeline)
+    supervisor.attach(asyncio.get_running_loop(), lambda _message, _descriptors: None, lambda: None)
+    forwarder = SlowForwarder(1.5)
+    supervisor.send(messages.Stop())
+    await ForwardingProcess(forwarder, near.detach()).run()
+    assert forwarder.answered == [True]
+    supervisor.close()
 
 
 async def test_records_missed_before_the_first_link_are_reported(
