@@ -67,9 +67,9 @@ class Poller:
         try:
             self.bundles.refresh()
             selected = self.bundles.selected()
-            offers = selected is not None and _is_news(selected, stated)
-            if selected is not None and offers:
+            if selected is not None and _is_news(selected, stated):
                 self.offer(_offered(self.bundles.get(selected)))
+                offers = True
         except BundleTooEarlyError as error:
             self._early = str(error)
             pause = max(1.0, error.at - self.clock())
