@@ -9,12 +9,13 @@ ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "dev" / "architecture.md").read_text()
 SECTION = PAGE.split("\n## The kernel", 1)[1].split("\n## ", 1)[0]
 SIZES = {path: int(lines) for path, lines in re.findall(r"`([\w/]+\.pyx?)` (\d+)", SECTION)}
-BUDGET = 11_234  # lines of code: lower this number with the kernel, and never raise it
+BUDGET = 11_216  # lines of code: lower this number with the kernel, and never raise it
 
 # The modules outside the kernel that the kernel may import.
 OUTSIDE = frozenset(
     """
     audit.log.disk_space audit.log.events audit.log.ids audit.log.lock_holders audit.proof.copies
+    audit.proof.signer_memory
     base.atomic_files base.clock base.counted base.engine_thread base.input_files base.validation_messages
     channel.channel channel.link channel.messages channel.messages.relay_link channel.rosout_address
     configuration.settings master.calls.monitor_calls

@@ -5,10 +5,8 @@ it. If the signer remembers a signature that the log lacks, it was removed, exce
 which may be under way.
 """
 
-import os
 import sqlite3
 from collections.abc import Iterable, Iterator
-from pathlib import Path
 from typing import NamedTuple
 
 import msgspec
@@ -16,48 +14,10 @@ import msgspec
 from appliance.audit.log.retention import RemovedRange
 from appliance.audit.log.signatures import ASKED_AT_ONCE, signature_is_valid
 from appliance.audit.proof.chain_findings import FindingKind, LogFinding
-from appliance.base.owner_access import open_named
+from appliance.audit.proof.signer_memory import SignerMemory
 from appliance.signing.log_proof import ProofFault, checkpoint_hash, parse_checkpoint, signature_fault
 
-_HASH = 32
-_HEADER = 8
 _TYPES = (int, int, bytes, bytes | None, bytes | None)
-
-
-class SignerMemory(msgspec.Struct, frozen=True):
-    """The hashes of the checkpoints that the signer signed, from number `first` on, and the last approved removal."""
-
-    first: int = 1
-    hashes: bytes = b""
-    removed: int | None = None
-
-    @property
-    def last(self) -> int:
-        return self.first + len(self.hashes) // _HASH - 1
-
-    def hash(self, number: int) -> str | None:
-        at = (number - self.first) * _HASH
-        return self.hashes[at : at + _HASH].hex() if self.first <= number <= self.last else None
-
-
-def read_signer_memory(directory: Path, log: str) -> SignerMemory | None:
-    """Return what the signer remembers of the log; None without the folder, or the right to read it."""
-    try:
-        signed, removed = (_remembered(directory / f"{log}.{what}") for what in ("signed", "removed"))
-    except PermissionError:
-        return None
-    if signed is None:
-        return SignerMemory() if directory.is_dir() else None
-    approved = None if removed is None else int.from_bytes(removed, "big")
-    return SignerMemory(int.from_bytes(signed[:_HEADER], "big"), signed[_HEADER:], approved)
-
-
-def _remembered(path: Path) -> bytes | None:
-    try:
-        with os.fdopen(open_named(path), "rb") as file:  # in a container, root reads it as the signer
-            return file.read()
-    except FileNotFoundError:
-        return None
 
 
 class StoredCheckpoint(NamedTuple):

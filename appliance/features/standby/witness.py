@@ -914,7 +914,7 @@ class IdleConnections:
     """Resets local connections with an appliance that is no longer admitted, even idle ones.
 
     For ten seconds after a reset, the connection tracker would lead a new connection from the same port to the earlier
-    appliance, so it is told to forget it.
+    appliance, so reset connections are deleted from it.
     """
 
     def __init__(self, settings: WitnessSettings) -> None:

@@ -533,7 +533,7 @@ def test_connections_are_found_in_the_tables_of_the_kernel() -> None:
     ]
 
 
-def test_the_connection_tracker_is_told_to_forget_a_connection() -> None:
+def test_a_message_deletes_a_connection_from_the_tracker() -> None:
     """The attributes of nfnetlink_conntrack.h are nested, and each is padded to four bytes."""
     message = forgetting(("10.0.0.1", 0xD431, "10.0.0.2", 11311))
     assert struct.unpack("=IHHII", message[:16]) == (len(message), 0x102, 1, 0, 0)

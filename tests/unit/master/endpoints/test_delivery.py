@@ -167,7 +167,7 @@ async def test_a_list_that_did_not_arrive_told_no_removal() -> None:
     assert [publishers for _topic, publishers in post.node.lists] == [["a", "b"], ["b"], ["a", "b"]]
 
 
-async def test_a_removal_comes_first_also_if_the_node_has_an_unknown_list() -> None:
+async def test_a_removal_comes_first_even_if_the_list_of_the_node_is_unknown() -> None:
     """After a takeover, `Delivery` knows no list, and roscpp would ignore an unchanged one."""
     post = Post()
     post.node.answers.set()
