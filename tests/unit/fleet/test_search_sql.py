@@ -15,11 +15,12 @@ _HOSTILE = "'; DROP TABLE record; -- %s"
 @given(glob=st.text("ab]^[*?-\\.$", max_size=8), text=st.text("ab]^[-\\.$\n", max_size=6))
 def test_a_glob_matches_what_sqlite_matches(glob: str, text: str) -> None:
     try:
-        pattern = re.compile(regex_of(glob), re.DOTALL)
+        regex = regex_of(glob)
+        if "-" in glob:
+            return  # ranges that run backwards differ; PostgreSQL refuses them, and Python warns of some
+        pattern = re.compile(regex, re.DOTALL)
     except (FilterError, re.error):
         return
-    if "-" in glob:
-        return  # ranges that run backwards differ; PostgreSQL refuses them
     found = bool(pattern.fullmatch(text))
     connection = sqlite3.connect(":memory:")
     (expected,) = connection.execute("SELECT ? GLOB ?", (text, glob)).fetchone()
