@@ -257,8 +257,6 @@ class ApplianceLease:
             self.refusal = answer.reason
         else:
             self._witnessed_at = max(self._witnessed_at, request.sent)
-            if request.operation == "claim" and not (answer.expired and self._name in answer.in_sync):
-                self.refusal = ""  # the claim came too early, as it may, or `seen` has the reason
         if answer.epoch < self.epoch:
             return ()
         self._witnessed, self.seen = answer.epoch, answer

@@ -1,5 +1,5 @@
 import asyncio
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Collection, Coroutine
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, TypeVar, cast
@@ -99,8 +99,11 @@ def store() -> _Memory:
     return _Memory()
 
 
-def _service(store: _Memory, folder: Path, now: list[float]) -> BundleService:
-    return BundleService(folder / "absent", folder / "key", store, lambda: {"r-0": _GROUP}, lambda: now[0])
+def _service(
+    store: _Memory, folder: Path, now: list[float], robots: Collection[str] = ("r-0",)
+) -> BundleService:
+    members = dict.fromkeys(robots, _GROUP)
+    return BundleService(folder / "absent", folder / "key", store, lambda: members, lambda: now[0])
 
 
 def _run(monkeypatch: pytest.MonkeyPatch, calls: _Calls, work: Coroutine[Any, Any, T]) -> T:
@@ -220,11 +223,8 @@ def test_the_next_rollout_moves_no_robot_of_a_later_ring_back(
     end: str, signed: str, selected: int, *, store: _Memory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The fourth rollout also knows what the second one left, because the third one stopped."""
-    service, terms = (
-        _service(store, tmp_path, [1010.0]),
-        Terms(0, [Ring("canary", ["r-0"]), Ring("rest", [], 100)]),
-    )
-    service._members = lambda: {"r-0": _GROUP, "r-9": _GROUP}
+    service = _service(store, tmp_path, [1010.0], ("r-0", "r-9"))
+    terms = Terms(0, [Ring("canary", ["r-0"]), Ring("rest", [], 100)])
     paths = {f"site-a/arms/{version}.tar": terms for version in f"{signed}45"}
     service.publication = cast(PublishedBundles, SimpleNamespace(bundles=paths))
     store.seen["r-9"] = StoredReport(_GROUP, RobotSeen(1000.0, _PATH))

@@ -13,11 +13,13 @@ import pytest
 from appliance.control.assembly.policies import RevisionChangedError
 from appliance.features.fleet.bundle_gate import BundleGate
 from appliance.features.fleet.bundle_health import RobotHealth
-from appliance.features.fleet.bundle_link import BundleOffered, BundlePollReported, BundleStated
+from appliance.features.fleet.bundle_link import BundleLink, BundleOffered, BundlePollReported, BundleStated
 from appliance.features.fleet.settings import Bundles, Fleet
+from appliance.features.fleet.view import BundlesState
 from appliance.formats.bundle_archive import BundleContents
 from appliance.policy.policy import Policy
 from appliance.policy.policy_compiler import compile_policy
+from tests.support.memory_channel import memory_link
 
 pytestmark = pytest.mark.anyio
 _HEALTHY = RobotHealth(0, frozenset(), frozenset())
@@ -89,17 +91,15 @@ class _Robot:
         async def settled() -> None:
             """All is on the disk."""
 
-        self.gate = BundleGate(
-            _FLEET,
-            policies=self.policies,  # type: ignore[arg-type]  # only what the gate uses
-            monitors=self.monitors,  # type: ignore[arg-type]
-            hosts=self.hosts,  # type: ignore[arg-type]
-            store=SimpleNamespace(settings=dict, save_setting=lambda *_given: None, settled=settled),  # type: ignore[arg-type]
-            trail=SimpleNamespace(happened=lambda event, *_given, **_fields: self.events.append(event)),  # type: ignore[arg-type]
-            health=lambda _deprived: _HEALTHY,
-        )  # fmt: skip
-        channel = SimpleNamespace(send=lambda message, *_given, **_options: self.stated.append(message))
-        self.gate.link.channel = channel  # type: ignore[assignment]
+        parts: Any = {
+            "policies": self.policies, "monitors": self.monitors, "hosts": self.hosts,
+            "store": SimpleNamespace(settings=dict, save_setting=lambda *_given: None, settled=settled),
+            "trail": SimpleNamespace(happened=lambda event, *_given, **_fields: self.events.append(event)),
+            "health": lambda _deprived: _HEALTHY,
+        }  # fmt: skip
+        self.gate = BundleGate(_FLEET, **parts)
+        near, self.poller = memory_link(BundleLink)
+        self.gate.link.attach(near)
 
     async def _take_hosts(self, text: str, _who: str) -> None:
         self.hosts.bundled = text
@@ -107,17 +107,24 @@ class _Robot:
     def poll(self, *, offered: bool) -> None:
         """Send what a poll sends."""
         if offered:
-            self.gate._heard(_OFFER)
-        self.gate._heard(BundlePollReported(1.0, offered=offered))
+            self.poller.send(_OFFER)
+        self.poller.send(BundlePollReported(1.0, offered=offered))
 
     @property
     def trouble(self) -> str:
+        return self.state.trouble
+
+    @property
+    def state(self) -> BundlesState:
         state = self.gate.status()
         assert state is not None
-        return state.trouble
+        return state
 
     @asynccontextmanager
     async def running(self) -> AsyncIterator[None]:
+        self.poller.attach(
+            asyncio.get_running_loop(), lambda stated, _given: self.stated.append(stated), lambda: None
+        )
         running = asyncio.create_task(self.gate.run())
         yield
         running.cancel()
@@ -126,7 +133,7 @@ class _Robot:
 
 
 @pytest.fixture
-def robot() -> _Robot:
+async def robot() -> _Robot:
     return _Robot()
 
 
@@ -134,7 +141,7 @@ async def test_a_change_by_an_operator_during_commit_confirm_only_delays_the_bun
     async with robot.running():
         robot.poll(offered=True)
         await asyncio.sleep(5)
-        assert robot.gate.status().trying == _OFFER.path  # type: ignore[union-attr]
+        assert robot.state.trying == _OFFER.path
         robot.policies.change("olga")
         await asyncio.sleep(5)
         assert robot.policies.texts[-1] == ("olga", _OF_OPERATOR)

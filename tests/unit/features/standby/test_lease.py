@@ -432,7 +432,6 @@ def test_a_standby_knows_why_it_could_not_claim(
     [
         ({"reason": "a holds the lease for another 0.9 s"}, False),
         ({"reason": "b is not in sync", "expired": True, "in_sync": ALONE}, False),
-        ({"reason": "nft: cannot allocate memory", "expired": True}, True),
         (OLDER, True),
     ],
 )
