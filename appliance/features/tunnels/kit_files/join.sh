@@ -69,7 +69,8 @@ mv /etc/rosrv/protect.nft.new /etc/rosrv/protect.nft
 install -m 0755 keep.sh renew.sh leave.sh /etc/rosrv/
 # The kit was made elsewhere, for the usual range of ports.
 closed=$(sed -n 's/^ *tcp dport \([0-9-]*\) .* reject with tcp reset$/\1/p' protect.nft)
-read -r first last < /proc/sys/net/ipv4/ip_local_port_range
+range=$(cat /proc/sys/net/ipv4/ip_local_port_range)
+first=${range%%[!0-9]*} last=${range##*[!0-9]}
 if [ "$first" -lt "${closed%-*}" ] || [ "$last" -gt "${closed#*-}" ]; then
     say "warning: ROS nodes of this machine listen on $first-$last, and the kit closes only $closed:" \
         "on the appliance, rosrv host kit @name@ --ports $first-$last"
