@@ -902,6 +902,14 @@ def forgetting(connection: Ends) -> bytes:
     return struct.pack("=IHHII", 16 + len(body), _CT_DELETE, _NLM_REQUEST, 0, 0) + body
 
 
+def forget(connections: List[Ends]) -> None:
+    """Delete connections from the connection tracker, if this kernel has its interface."""
+    kernel = (socket.AF_NETLINK, socket.SOCK_RAW, _NETFILTER)
+    with contextlib.suppress(OSError), socket.socket(*kernel) as tracker:
+        for connection in connections:
+            tracker.send(forgetting(connection))
+
+
 def _attribute(kind: int, value: bytes) -> bytes:
     return struct.pack("=HH", 4 + len(value), kind) + value + b"\0" * (-len(value) % 4)
 
@@ -919,7 +927,6 @@ class IdleConnections:
 
     def __init__(self, settings: WitnessSettings) -> None:
         self._settings = settings
-        self._tracker = socket.socket(socket.AF_NETLINK, socket.SOCK_RAW, _NETFILTER)
         self._raw = socket.socket(socket.AF_INET, socket.SOCK_RAW, socket.IPPROTO_RAW)
         self._raw.setsockopt(socket.SOL_SOCKET, _SO_MARK, MARK)
         self._raw.setblocking(False)
@@ -947,10 +954,7 @@ class IdleConnections:
         peers, tables = {peer for _, _, peer, _ in self._left}, _socket_tables()
         present = dict.fromkeys(sockets_with(peers, tables), _ACK)
         present.update((ends, _SYN) for ends in sockets_with(peers, tables, _CONNECTING))
-        for ends in self._left:
-            if ends not in present:
-                with contextlib.suppress(OSError):  # a kernel without a tracker's interface
-                    self._tracker.send(forgetting(ends))
+        forget([ends for ends in self._left if ends not in present])
         self._left = [ends for ends in self._left if ends in present]
         self._rounds -= 1
         for ends in self._left:

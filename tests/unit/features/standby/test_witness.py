@@ -1,6 +1,8 @@
 import ast
+import errno
 import json
 import re
+import socket
 import struct
 import subprocess
 import sys
@@ -541,6 +543,14 @@ def test_a_message_deletes_a_connection_from_the_tracker() -> None:
         "3400018014000180080001000a000001080002000a0000021c000280050001000600000006000200d431000006000300"
     )
     assert message[16:].hex() == "02000000" + tuple_of + "2c2f0000"
+
+
+def test_a_kernel_without_the_trackers_interface_stops_no_witness(monkeypatch: pytest.MonkeyPatch) -> None:
+    def missing(*_given: object) -> None:
+        raise OSError(errno.EPROTONOSUPPORT, "Protocol not supported")
+
+    monkeypatch.setattr(socket, "socket", missing)
+    program.forget([("10.0.0.1", 0xD431, "10.0.0.2", 11311)])
 
 
 # ---- The file runs on the robot as it is
