@@ -6,7 +6,7 @@ from typing import TypeVar
 from rosmop.check.assignables import Value, Variable
 from rosmop.check.conversion import convert
 from rosmop.check.event_facts import first_facts
-from rosmop.check.library_functions import ELEMENTARY, FREE
+from rosmop.check.function_library import ELEMENTARY, FREE
 from rosmop.check.loops import charge
 from rosmop.check.scope import CompilationContext, FunctionScope, HelperFunction, SpecificationNames
 from rosmop.check.slicing import check_own

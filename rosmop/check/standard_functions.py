@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 
-from rosmop.check import library_functions
+from rosmop.check import function_library
 from rosmop.check.assignables import Value
 from rosmop.check.assignments import require_original, store
 from rosmop.check.conversion import convert, number, require_number
@@ -83,7 +83,7 @@ def _elementary(name: str) -> Function:
         value = function(call)
         if value.type == value_types.FLOAT:
             return value
-        return call.result(library_functions.invoke(call.scope, name, call.values))
+        return call.result(function_library.invoke(call.scope, name, call.values))
 
     return of_doubles
 
@@ -159,7 +159,7 @@ def _question(name: str) -> Function:
 def _finite(call: Arguments) -> Value:
     call.count(1)
     if isinstance(call.values[0].type, value_types.RecordType | value_types.VectorType):
-        return call.result(library_functions.all_finite(call.scope, call.values[0]))
+        return call.result(function_library.all_finite(call.scope, call.values[0]))
     return _question("isfinite")(call)
 
 
@@ -172,8 +172,8 @@ def _of_library(name: str, *wanted: str) -> Function:
                     value.position, f"`{call.name}` needs {kind} here; this is {value.type}"
                 )
             if kind == _POLYGON:
-                library_functions.check_polygon(value)
-        return call.result(library_functions.invoke(call.scope, name, call.values))
+                function_library.check_polygon(value)
+        return call.result(function_library.invoke(call.scope, name, call.values))
 
     return function
 
@@ -183,9 +183,9 @@ _QUATERNION, _TEXT = "a geometry_msgs/Quaternion", "a string"
 _FITS: Mapping[str, Callable[[value_types.Type], bool]] = MappingProxyType(
     {
         _NUMBER: value_types.is_number,
-        _POLYGON: library_functions.is_polygon,
-        _NAMES: library_functions.is_names,
-        _QUATERNION: library_functions.is_quaternion,
+        _POLYGON: function_library.is_polygon,
+        _NAMES: function_library.is_names,
+        _QUATERNION: function_library.is_quaternion,
         _TEXT: lambda kind: isinstance(kind, value_types.StringType),
     }
 )
@@ -193,7 +193,7 @@ _FITS: Mapping[str, Callable[[value_types.Type], bool]] = MappingProxyType(
 
 def _nearest(call: Arguments) -> Value:
     call.count(3)
-    if not library_functions.is_polygon(call.values[0].type):
+    if not function_library.is_polygon(call.values[0].type):
         raise SpecificationError.at(
             call.values[0].position, f"`nearest` needs a list of numbers here; this is {call.values[0].type}"
         )
@@ -311,7 +311,7 @@ def _printed(
 LIBRARY: Mapping[str, Function] = MappingProxyType(
     {
         **{name: _math(name, count) for name, (count, _) in numbers.MATH.items()},
-        **{name: _elementary(name) for name in library_functions.ELEMENTARY},
+        **{name: _elementary(name) for name in function_library.ELEMENTARY},
         "abs": _absolute,
         "labs": _absolute_of_long,
         "llabs": _absolute_of_long,

@@ -88,7 +88,7 @@ class NextDue(Protocol):
     """Returns the time of the next tick or deadline (ns), or None."""
 
     def __call__(self, *, anew: bool) -> int | None:
-        """With `anew`, compute the time again: a deadline may be earlier now."""
+        """If `anew`, compute the time again, since a deadline may now be earlier."""
 
 
 class FastLane(Protocol):

@@ -1,7 +1,7 @@
 """`sin`, `cos`, `atan2` and `hypot` from IEEE operations only, so that every machine gives the same bits.
 
 The algorithms are those of fdlibm (Sun Microsystems, 1993) and, for `hypot`, of musl; the error is below one
-unit in the last place. `check/library_functions.py` has the same operations in the same order.
+unit in the last place. `check/function_library.py` has the same operations in the same order.
 """
 
 import math

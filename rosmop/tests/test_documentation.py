@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from rosmop.check.library_functions import FREE, TEXT, functions
+from rosmop.check.function_library import FREE, TEXT, functions
 from rosmop.check.loops import MAX_NESTED
 from rosmop.check.members import TIME_METHODS
 from rosmop.check.sources import compiled_from
@@ -31,7 +31,7 @@ def test_the_example_of_a_property_loads() -> None:
     assert load(f"s() {{ {events} {PROPERTY} }}").monitors[0].properties
 
 
-def test_the_code_of_library_functions_is_on_the_page() -> None:
+def test_the_code_of_the_functions_in_rv_is_on_the_page() -> None:
     code = re.sub(r" +// .*", "", FUNCTIONS).strip().split("\n")
     text = "\n".join(code)
     named = set(re.findall(r"^\w+ (\w+)\(", text, re.MULTILINE))
