@@ -241,7 +241,7 @@ def test_the_next_rollout_moves_no_robot_of_a_later_ring_back(
 
 
 def test_a_rollout_of_an_earlier_release_keeps_its_form() -> None:
-    """The store changes a rollout only if its document is the one that was read."""
+    """The store does not change a rollout whose document has changed since it was read."""
     document = msgspec.json.encode(_ROLLOUT)
     assert b"kept" not in document
     assert msgspec.json.encode(msgspec.json.decode(document, type=BundleRollout)) == document

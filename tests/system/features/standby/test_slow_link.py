@@ -38,6 +38,6 @@ def test_a_cut_between_the_appliances_is_not_reported_as_a_refusal(site: Standby
     with site.without_link((ADDRESSES["a"], ADDRESSES["b"])):
         eventually(lambda: site.in_sync() == {active}, site.story)
         for name in (passive, active):
-            eventually(lambda name=name: fails(site.appliances[name]), site.story)  # type: ignore[misc]  # as above
+            eventually(lambda name=name: fails(site.appliances[name]), site.story)  # type: ignore[misc]  # mypy infers no type for a lambda's default
             assert "refuses" not in fails(site.appliances[name])
     site.until_both_in_sync()

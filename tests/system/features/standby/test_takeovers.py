@@ -95,7 +95,7 @@ def test_the_death_of_one_process(site: StandbySite, robot: StandbyRobot) -> Non
             os.kill(pid, signal.SIGKILL)
         eventually(lambda name=active, title=role: site.pids(name, title), site.story)  # type: ignore[misc]  # mypy infers no type for a lambda's default
         if role == "lease":  # the appliance stays active until its time is over, then one of the two claims
-            eventually(lambda before=epoch: site.lease.read().epoch > before, site.story)  # type: ignore[misc]  # as above
+            eventually(lambda before=epoch: site.lease.read().epoch > before, site.story)  # type: ignore[misc]  # mypy infers no type for a lambda's default
         robot.lost_nothing()
         site.until_both_in_sync()
         assert role == "lease" or site.holder() == active, role

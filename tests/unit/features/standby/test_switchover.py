@@ -48,7 +48,7 @@ class Active:
         parts: Any = client
         parts.send = self._ordered
         parts = self.replication = Replication(
-            MEMBERSHIP, client, database, 4, taken_over=False, folder=Path()  # type: ignore[arg-type]  # a double
+            MEMBERSHIP, client, database, 4, taken_over=False, folder=Path()  # type: ignore[arg-type]  # a stand-in with the methods that the replication calls
         )  # fmt: skip
         parts.sender.lag = self._lag
         self.database = database

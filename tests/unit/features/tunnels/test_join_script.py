@@ -79,22 +79,25 @@ def test_any_other_certificate_is_replaced(tmp_path: Path, openssl: str, name: s
 
 
 @pytest.mark.parametrize(
-    ("own", "warned"),
-    [("32768\t60999", False), ("40000\t50000", False), ("1024\t60999", True), ("32768\t65535", True)],
+    ("closed", "warned"),
+    [((0, 0), False), ((-100, 100), False), ((1, 0), True), ((0, -1), True)],
+    ids=["the same", "more", "from a later port", "to an earlier port"],
 )
-def test_a_machine_with_other_ports_than_the_kit_is_warned(tmp_path: Path, own: str, warned: bool) -> None:
+def test_a_machine_with_other_ports_than_the_kit_is_warned(
+    tmp_path: Path, closed: tuple[int, int], warned: bool
+) -> None:
+    """The kernel's own file is read: a shell that reads it byte by byte gets only the first one."""
+    first, last = map(int, RANGE_FILE.read_text().split())
     text = filled("join.sh", defaultdict(str, name="laptop"))
     begin, end = text.index("closed=$("), text.index("\nfi\n", text.index("closed=$(")) + 4
     say = "".join(line for line in text.splitlines(True) if line.startswith("say()"))
-    rules = protection(["10.113.11.1"], PortRange(32768, 60999), (), tunnelled=True)
-    (tmp_path / "protect.nft").write_text(rules)
-    (tmp_path / "range").write_text(own + "\n")
-    script = say + text[begin:end].replace(str(RANGE_FILE), "range")
+    ports = PortRange(first + closed[0], last + closed[1])
+    (tmp_path / "protect.nft").write_text(protection(["10.113.11.1"], ports, (), tunnelled=True))
     done = subprocess.run(
-        ["dash", "-eu", "-c", script], cwd=tmp_path, capture_output=True, text=True, check=True
+        ["dash", "-eu", "-c", say + text[begin:end]], cwd=tmp_path, capture_output=True, text=True, check=True
     )
     assert done.stderr == ""
-    assert (f"--ports {own.replace('	', '-')}" in done.stdout) == ("warning" in done.stdout) == warned
+    assert (f"--ports {first}-{last}" in done.stdout) == ("warning" in done.stdout) == warned
 
 
 @pytest.mark.parametrize(("sas", "status"), [("ros{1}: INSTALLED", 0), ("", 1)])
