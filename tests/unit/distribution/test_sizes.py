@@ -1,0 +1,16 @@
+from pathlib import Path
+
+from distribution.sizes import LIMITS, lines_of_code, too_large
+
+
+def test_a_limit_has_five_percent_of_play() -> None:
+    limit = LIMITS["core"]
+    assert too_large({"core": limit + limit // 20}) == []
+    [line] = too_large({"core": limit + limit // 20 + 1})
+    assert line.startswith(f"core has {limit + limit // 20 + 1:,} lines, and a limit of {limit:,}")
+
+
+def test_lines_of_code_leave_out_blanks_comments_and_docstrings(tmp_path: Path) -> None:
+    module = tmp_path / "module.py"
+    module.write_text('"""A docstring\nof two lines."""\n\n# a comment\nx = (\n    1,\n)\n')
+    assert lines_of_code(module) == 3
