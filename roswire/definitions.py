@@ -7,7 +7,7 @@ bounded work.
 import difflib
 import hashlib
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Self, TypeVar
 
 from roswire.errors import DefinitionError
@@ -86,6 +86,15 @@ class Definitions:
     def extended(self, other: "Definitions") -> "Definitions":
         """Return the definitions of both. A type of `other` replaces one of the same name."""
         return Definitions(self._messages | other._messages, self._services | other._services)
+
+    @property
+    def message_names(self) -> Collection[str]:
+        """The names of all messages, in no order."""
+        return self._messages.keys()
+
+    @property
+    def service_names(self) -> Collection[str]:
+        return self._services.keys()
 
     @property
     def message_types(self) -> list[str]:

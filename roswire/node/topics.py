@@ -96,11 +96,15 @@ class NodeSubscription:
         for uri in wanted:
             if uri not in self._followed:
                 self._followed[uri] = self._tasks.start(self._follow(uri))
+        self._connection.set()
 
-    async def headers(self) -> list[Mapping[str, str]]:
-        """Wait until a publisher is connected, and return the headers of all that are."""
-        while not self.connected:
-            await self._connection.wait()
+    async def headers(self, seconds: float) -> list[Mapping[str, str]]:
+        """Return the headers of the publishers, once all are connected or after some seconds."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(seconds):
+                while len(self.connected) < len(self._followed):
+                    self._connection.clear()
+                    await self._connection.wait()
         return [*self.connected.values()]
 
     def hear_own(self, body: Body, header: Mapping[str, str]) -> None:
@@ -122,8 +126,6 @@ class NodeSubscription:
                 self.problems[uri] = str(error) or f"{uri} did not answer in time"
             finally:
                 self.connected.pop(uri, None)
-                if not self.connected:
-                    self._connection.clear()
                 self._latest.pop(uri, None)
             if asyncio.get_running_loop().time() - before > _LONGEST_PAUSE:  # it was connected for a while
                 pause = _FIRST_PAUSE

@@ -57,6 +57,7 @@ async def inherit(base: Foundation, parts: Any) -> FeaturePart:
         tickets=lambda door: [row.id for row in (*tickets.valid(door), *visits.present(door))],
         left=visits.left,
         definitions=lambda: parts.monitors.sources.definitions,
+        host_of=lambda node: None if (held := parts.core.registry.holder(node)) is None else held.host,
     )
     orders = kept.orders = DoorOrders(base, parts, table, tickets=tickets, visits=visits, processes=processes)
     return FeaturePart(

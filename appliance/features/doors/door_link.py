@@ -90,6 +90,24 @@ class SocketRefused(Message, frozen=True):
     reason: str
 
 
+MOST_NODES = 200
+"""The most names in one `HostsWanted`."""
+
+
+class HostsWanted(Message, frozen=True):
+    """The door asks which of these nodes are on the same host."""
+
+    number: int
+    nodes: list[str]
+
+
+class HostsGiven(Message, frozen=True):
+    """A number for the host of each node of request `number`; -1 for a node that is gone."""
+
+    number: int
+    hosts: list[int]
+
+
 class ConnectionsChanged(Message, frozen=True):
     """Connections of one peer began or ended in the last second."""
 
@@ -139,7 +157,8 @@ class ClientsShown(Message, frozen=True):
 
 DoorLink = (
     DoorStarted | DoorGiven | TypesGiven | PolicyChanged | DoorEnded | AgentListener | ViewerGiven | TicketEnded
-    | SocketWanted | SocketGiven | SocketRefused | ConnectionsChanged | DoorCounted | ClientsShown
+    | SocketWanted | SocketGiven | SocketRefused | HostsWanted | HostsGiven | ConnectionsChanged
+    | DoorCounted | ClientsShown
 )  # fmt: skip
 
 

@@ -18,8 +18,9 @@ from appliance.base import clock
 from appliance.base.counted import counted
 from appliance.features.doors.door_memory import ClientMemory
 from appliance.features.doors.door_parameters import TOO_MANY_CALLS, DoorParameters, ParameterClient
+from appliance.features.doors.heard_topic import HeardTopic, one_type
 from appliance.features.doors.host_shares import check_share, of_hosts
-from appliance.features.doors.known_types import DoorMessage, KnownTypes, SharedFrames
+from appliance.features.doors.known_types import DoorMessage, KnownType, KnownTypes, SharedFrames, TypeKey
 from appliance.features.doors.lingering import Lingering
 from appliance.features.doors.message_writer import MessageWriter, Now
 from appliance.features.doors.quotas import DOOR_CALLS, DOOR_SERVICES, DOOR_TOPICS
@@ -39,7 +40,6 @@ from appliance.features.doors.requests import (
     WithdrawService,
     WriteParameter,
 )
-from appliance.features.doors.values import MessageCodec
 from roswire.errors import DefinitionError, LimitExceededError, PeerError, ProtocolError, RosError
 from roswire.node import (
     MasterDenialError,
@@ -75,14 +75,18 @@ class _Subscriber(Protocol):
 
     def failed(self, request: DoorRequest, reason: str) -> None: ...
 
+    def warned(self, reason: str) -> None: ...
 
-@dataclass(frozen=True, slots=True)
+
+@dataclass(frozen=True, slots=True, eq=False)
 class _Learner:
     memory: ClientMemory
 
     def heard(self, message: DoorMessage, now: float) -> None: ...
 
     def failed(self, request: DoorRequest, reason: str) -> None: ...
+
+    def warned(self, reason: str) -> None: ...
 
 
 class DoorClient(_Subscriber, ParameterClient, Protocol):
@@ -99,7 +103,7 @@ class DoorClient(_Subscriber, ParameterClient, Protocol):
 @dataclass(slots=True)
 class _Publication:
     publication: NodePublication
-    codec: MessageCodec
+    type: KnownType
     asked: float
     """The time when the master was last asked whether it grants the publication."""
     doubtful: bool = False
@@ -110,13 +114,13 @@ class _Publication:
 
     def publish(self, values: Raw | bytes, memory: ClientMemory) -> None:
         raw = isinstance(values, Raw)
-        self.publication.publish(_written(self.codec.writer, values, memory) if raw else values)
+        self.publication.publish(_written(self.type.codec.writer, values, memory) if raw else values)
 
 
 @dataclass(slots=True)
 class _Offer:
     client: DoorClient
-    response: MessageCodec
+    response: KnownType
     calls: dict[str, asyncio.Future[bytes]] = field(default_factory=dict)
 
 
@@ -139,7 +143,7 @@ class DoorNode:
         self._types = types
         self._built_in = built_in
         self._publications: dict[str, _Publication] = {}
-        self._heard: dict[str, dict[_Subscriber, SubscribeTopic]] = {}
+        self._heard: dict[str, HeardTopic[_Subscriber]] = {}
         self._offers: dict[str, _Offer] = {}
         self._parameters = DoorParameters(node, calls)
         self._frames = SharedFrames()
@@ -195,7 +199,7 @@ class DoorNode:
                 with contextlib.suppress(LimitExceededError):  # its subscribers would not get it either
                     known.publish(known.wills[client], client.memory)
             self._unadvertise(topic, client)
-        for topic in [topic for topic, clients in self._heard.items() if client in clients]:
+        for topic in [topic for topic, heard in self._heard.items() if client in heard.clients]:
             self._unsubscribe(topic, client)
         for service in [service for service, offer in self._offers.items() if offer.client is client]:
             await self._withdraw(service)
@@ -206,31 +210,42 @@ class DoorNode:
     async def _advertise(self, request: AdvertiseTopic, client: DoorClient) -> None:
         async with self._lock(f"publisher {request.topic}"):
             known = self._publications.get(request.topic)
+            if known is not None and not known.clients and not known.type.defined:
+                # The publisher that defined the type may be gone.
+                del self._publications[request.topic]
+                await self.node.unadvertise(request.topic)
+                known = None
             if known is None:
                 users = [one.clients for one in self._publications.values()]
                 await self._make_room(
                     self._publications, users, client, self._published, self._end_publication
                 )
-                name = request.type or await self._type_of(request.topic)
-                codec, definitions = self._types.message(name)
+                kind = await self._published_type(request)
                 publication = await self.node.advertise(
                     request.topic,
-                    MessageType.defined(definitions, name),
+                    MessageType.defined(kind.definitions, kind.name),
                     latched=request.latched,
                     queue=request.queue,
                     replay=_REPLAY_SECONDS,
                 )
-                known = self._publications[request.topic] = _Publication(publication, codec, clock.now())
+                known = self._publications[request.topic] = _Publication(publication, kind, clock.now())
                 self._published.left(request.topic)  # until the client is added
             elif request.type not in (None, known.publication.type.name):
                 raise ProtocolError(
                     f"{request.topic} is advertised as {known.publication.type.name}, not {request.type}"
                 )
             if request.will is not None:
-                _written(known.codec.writer, request.will, client.memory)  # raises if it does not fit
+                _written(known.type.codec.writer, request.will, client.memory)  # raises if it does not fit
                 known.wills[client] = request.will
             known.clients.add(client)
             self._published.used(request.topic)
+
+    async def _published_type(self, request: AdvertiseTopic) -> KnownType:
+        """Return the type as ROS or the operator define it, or else as the publishers of this topic do."""
+        name = request.type or await self._type_of(request.topic)
+        if self._types.has_message(name):
+            return self._types.message(name)
+        return one_type(request.topic, await self._headers(request.topic), self._types, name)
 
     async def _type_of(self, topic: str) -> str:
         try:
@@ -293,14 +308,13 @@ class DoorNode:
         topic = request.topic
         async with self._lock(f"subscriber {topic}"):
             if topic in self._heard:
-                self._heard[topic][client] = request
+                self._heard[topic].clients[client] = request
                 self._subscribed.used(topic)
                 self.node.repeat(topic, lambda body, header: self._hear(topic, body, header, [client]))
                 return
-            await self._make_room(
-                self._heard, self._heard.values(), client, self._subscribed, self._end_subscription
-            )
-            self._heard[topic] = {client: request}
+            users = [one.clients for one in self._heard.values()]
+            await self._make_room(self._heard, users, client, self._subscribed, self._end_subscription)
+            self._heard[topic] = HeardTopic(topic, self._types, {client: request})
             try:
                 await self.node.subscribe(
                     topic,
@@ -318,9 +332,17 @@ class DoorNode:
         header: Mapping[str, str],
         receivers: Iterable[_Subscriber] | None = None,
     ) -> None:
-        clients, kind = self._heard.get(topic, {}), header.get("type", ANY)
+        heard = self._heard.get(topic)
+        if heard is None:
+            return
+        if heard.header is not header and (reason := heard.refusal(header, self._present(topic))):
+            if heard.tells(header):
+                for client in heard.clients:
+                    client.warned(reason)
+            return
+        clients, kind = heard.clients, header.get("type", ANY)
         shared = self._frames if receivers is None and len(clients) > 1 else None
-        message = DoorMessage(topic, body, header, clock.wall_ns(), self._types.learn, shared)
+        message = DoorMessage(topic, body, header, clock.wall_ns(), heard.codec, shared)
         now = asyncio.get_running_loop().time()
         wrong = []
         for client in clients if receivers is None else receivers:
@@ -333,14 +355,31 @@ class DoorNode:
             self._unsubscribe(topic, client)
             client.failed(request, f"{topic} has the type {kind[:200]}, not {request.type}")
 
+    def _present(self, topic: str) -> list[TypeKey]:
+        """Return the types of the present publishers of a topic, also of this node."""
+        subscription, own = self.node.subscribers.get(topic), self.node.publishers.get(topic)
+        headers = [] if subscription is None else subscription.connected.values()
+        present = [TypeKey.of(header) for header in headers]
+        return present if own is None else [*present, TypeKey(own.type.name, own.type.md5sum)]
+
+    def heard_type(self, topic: str) -> KnownType | None:
+        """Return the type that counts on a topic to which the door subscribes, or None if there is none."""
+        heard = self._heard.get(topic)
+        if heard is None or heard.header is None or TypeKey.of(heard.header) not in self._present(topic):
+            return None
+        try:
+            return heard.known(heard.header)
+        except DefinitionError:
+            return None
+
     def _unsubscribe(self, topic: str, client: _Subscriber) -> None:
-        clients = self._heard.get(topic)
-        if clients is not None and clients.pop(client, None) is not None and not clients:
+        heard = self._heard.get(topic)
+        if heard is not None and heard.clients.pop(client, None) is not None and not heard.clients:
             self._subscribed.left(topic)
 
     async def _end_subscription(self, topic: str) -> None:
         async with self._lock(f"subscriber {topic}"):
-            if topic in self._heard and not self._heard[topic]:
+            if topic in self._heard and not self._heard[topic].clients:
                 del self._heard[topic]
                 await self.node.unsubscribe(topic)
 
@@ -369,15 +408,17 @@ class DoorNode:
     async def _call_node(self, request: CallOfService) -> Raw | bytes:
         header = await self.node.probe_service(request.service)
         seconds = request.seconds or _ANSWER_SECONDS
-        md5sum = header.get("md5sum", "*")
-        if not isinstance(request.values, Raw):
-            return await self.node.call_service(request.service, md5sum, request.values, seconds)
-        name = header.get("type", "")
+        name, md5sum = header.get("type", ""), header.get("md5sum", "*")
+        if request.type not in (None, name):
+            raise ProtocolError(f"{request.service} has the type {name[:200]}, not {request.type}")
         sent, received, definitions = self._types.service(name)
         if definitions.service_md5sum(name) != md5sum:
             raise DefinitionError(f"{request.service} has another version of this type", name[:200])
-        body = _written(sent.writer, _named(request.values, sent.writer.fields), self._calls)
-        return received.json(await self.node.call_service(request.service, md5sum, body, seconds))
+        if not isinstance(request.values, Raw):
+            return await self.node.call_service(request.service, md5sum, request.values, seconds)
+        writer = sent.codec.writer
+        body = _written(writer, _named(request.values, writer.fields), self._calls)
+        return received.codec.json(await self.node.call_service(request.service, md5sum, body, seconds))
 
     async def _offer(self, request: OfferService, client: DoorClient) -> None:
         known = self._offers.get(request.service)
@@ -390,7 +431,7 @@ class DoorNode:
         offer = self._offers[request.service] = _Offer(client, response)
 
         async def answer(body: bytes) -> bytes:
-            call = client.ask(request.service, given.json(body))
+            call = client.ask(request.service, given.codec.json(body))
             future: asyncio.Future[bytes] = asyncio.get_running_loop().create_future()
             offer.calls[call] = future
             try:
@@ -423,22 +464,28 @@ class DoorNode:
             raise ProtocolError(f"no call of {request.service} waits for this answer")
         try:
             # As in rosbridge, values that fit are the answer, whatever `result` is: some clients send false.
-            future.set_result(_written(offer.response.writer, request.values, client.memory))
+            future.set_result(_written(offer.response.codec.writer, request.values, client.memory))
         except PeerError as error:
             reason = str(error) if request.ok else bytes(request.values)[:1000].decode("utf-8", "replace")
             future.set_exception(ServiceFailedError(reason))
             if request.ok:
                 raise
 
-    async def learn(self, topic: str) -> None:
+    async def learn(self, topic: str) -> KnownType:
+        """Return the type that counts on a topic. Raise `RosError` if no publisher answers, or none can be used."""
+        headers = await self._headers(topic)
+        if not headers:
+            raise PeerUnreachableError(f"no publisher of {topic} answers")
+        keys = [TypeKey.of(header) for header in headers]
+        defined = [header for key, header in zip(keys, headers, strict=True) if self._types.defines(key)]
+        return self._types.learn((defined or headers)[0])
+
+    async def _headers(self, topic: str) -> list[Mapping[str, str]]:
+        """Return the connection headers of the publishers of a topic, after at most a second."""
         learner = _Learner(self._calls)
         await self._subscribe(SubscribeTopic(topic), learner)
         try:
-            async with asyncio.timeout(_LEARN_SECONDS):
-                for header in await self.node.subscribers[topic].headers():
-                    self._types.learn(header)
-        except TimeoutError:
-            raise PeerUnreachableError(f"no publisher of {topic} answers") from None
+            return await self.node.subscribers[topic].headers(_LEARN_SECONDS)
         finally:
             self._unsubscribe(topic, learner)
 

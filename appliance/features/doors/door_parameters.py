@@ -14,6 +14,7 @@ from weakref import WeakValueDictionary
 
 import msgspec
 
+from appliance.base.counted import counted
 from appliance.features.doors.door_memory import ClientMemory
 from appliance.features.doors.host_shares import check_share
 from appliance.features.doors.quotas import DOOR_PARAMETERS
@@ -24,7 +25,7 @@ from appliance.features.doors.requests import (
     WriteParameter,
 )
 from roswire.errors import LimitExceededError, ProtocolError, RosError, quoted
-from roswire.node import RosNode
+from roswire.node import MasterDenialError, RosNode
 from roswire.node.network import OwnedTasks
 from roswire.xmlrpc import Value
 
@@ -85,7 +86,11 @@ class DoorParameters:
             self._turns[client.memory.host] = turn
             async with turn, self._reading:  # so the others wait for one read of this host
                 if client in self._reads:  # else it left
-                    client.parameters(await self._read(request.names), request.reply_to)
+                    values, denials = await self._read(request.names)
+                    if values or not denials:
+                        client.parameters(values, request.reply_to)
+                    if denials:
+                        raise ProtocolError(_in_words(denials))
         except RosError as error:
             client.failed(request, str(error))
         finally:
@@ -93,16 +98,21 @@ class DoorParameters:
             if client in self._reads:
                 self._reads[client] -= 1
 
-    async def _read(self, names: Sequence[str]) -> dict[str, Any]:
+    async def _read(self, names: Sequence[str]) -> tuple[dict[str, Any], dict[str, str]]:
+        """Return the values, and the reason for each parameter that the door may not read."""
         if not names:
             listed = await self._node.master("getParamNames")
             names = [name for name in listed if isinstance(name, str)] if isinstance(listed, list) else []
             _check_number(names)
-        return {
-            name: await self._node.master("getParam", name)
-            for name in names
-            if await self._node.master("hasParam", name)
-        }
+        values: dict[str, Any] = {}
+        denials: dict[str, str] = {}
+        for name in names:
+            try:
+                if await self._node.master("hasParam", name):
+                    values[name] = await self._node.master("getParam", name)
+            except MasterDenialError as denial:
+                denials[name] = str(denial)
+        return values, denials
 
     async def write(self, request: WriteParameter) -> None:
         if request.value is None:
@@ -156,6 +166,11 @@ class DoorParameters:
                 if name in self._clients and not self._clients[name]:
                     del self._clients[name]
                     await self._node.unsubscribe_parameter(name)
+
+
+def _in_words(denials: Mapping[str, str]) -> str:
+    first, more = next(iter(denials.values())), len(denials) - 1
+    return first if not more else f"{first}; and {counted(more, 'other parameter')}"
 
 
 def _check_number(names: Sequence[str]) -> None:

@@ -27,6 +27,7 @@ from appliance.features.doors import door_link
 from appliance.features.doors.door_table import DoorTable
 from appliance.features.doors.settings import MOST_DOORS, Doors
 from appliance.features.doors.view import LATELY_SECONDS, DoorHealth
+from appliance.policy.model import Address
 from appliance.rpc.server import listen
 from appliance.store.door_tables import DoorRow
 
@@ -36,6 +37,7 @@ _END_SECONDS = 5.0
 _MOST_PENDING = 64
 _BACKLOG = 128
 _MOST_DEATHS = 16
+_MOST_HOSTS = 4096  # with a number; then they get new ones
 _EVERYWHERE = ("0.0.0.0", "::")  # noqa: S104  compared only
 
 
@@ -72,12 +74,15 @@ class DoorProcesses:
         tickets: Callable[[str], list[str]],
         left: Callable[[str, str], None],  # called after connections of a door with a ticket ended
         definitions: Callable[[], Mapping[str, str]],
+        host_of: Callable[[str], Address | None],  # of a node
     ) -> None:
         self._base = base
         self._table = table
         self._tickets = tickets
         self._left = left
         self._definitions = definitions
+        self._host_of = host_of
+        self._host_numbers: dict[Address, int] = {}
         self._settings = base.settings.of(Doors)
         self._tasks: set[asyncio.Task[None]] = set()
         self._revision = base.policies.revision
@@ -178,6 +183,8 @@ class DoorProcesses:
                 self._begin(slot, row, message)
             case door_link.SocketWanted(request, port):
                 self._make(slot, row, request, port)
+            case door_link.HostsWanted(request, nodes):
+                self._send(slot, door_link.HostsGiven(request, [*map(self._host_number, nodes)]))
             case door_link.DoorCounted():
                 slot.counts = message
                 full = message.connections >= self._settings.connections
@@ -188,6 +195,14 @@ class DoorProcesses:
                 self._record(row, message)
             case _:
                 slot.link.close()
+
+    def _host_number(self, node: str) -> int:
+        host = self._host_of(node)
+        if host is None:
+            return -1
+        if len(self._host_numbers) >= _MOST_HOSTS:
+            self._host_numbers.clear()
+        return self._host_numbers.setdefault(host, len(self._host_numbers))
 
     def _lost(self, number: int, _reason: str) -> None:
         slot, row = self._slots[number], self._table.in_slot(number)

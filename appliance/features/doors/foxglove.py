@@ -98,6 +98,7 @@ class Foxglove:
         self._parameters: dict[str, None] = {}  # subscribed, by canonical name
         self._graph: dict[str, dict[str, Sequence[str]]] | None = None  # as last sent to the client
         self._seen: DoorSurroundings | None = None
+        self._changed: set[SeenTopic] = set()  # announced topics whose messages have another type
         self._carry_out: dict[type[Any], Callable[[Any], list[DoorRequest]]] = {
             FoxgloveSubscribe: self._subscribe,
             FoxgloveUnsubscribe: self._unsubscribe,
@@ -232,7 +233,7 @@ class Foxglove:
             return []
         self._number += 1
         self._calls[self._number] = service, call
-        return [CallOfService(seen.service, self._number, frame[start:])]
+        return [CallOfService(seen.service, self._number, frame[start:], type=seen.type)]
 
     def _get_parameters(self, operation: FoxgloveGetParameters) -> list[DoorRequest]:
         return [ReadParameters(tuple(operation.parameterNames), operation.id)]
@@ -362,6 +363,7 @@ class Foxglove:
             for request in self._end_subscription(number)
         ]
         self._topics, self._services = topics, services
+        self._changed &= {*seen.topics}
         if self._graph is not None:
             self._send_graph(seen)
         return ended
@@ -395,8 +397,19 @@ class Foxglove:
             self._tell("connectionGraphUpdate", **changed, removedTopics=removed, removedServices=services)
 
     def message(self, message: DoorMessage, now: float) -> None:
+        md5sum = message.header.get("md5sum", "")
         for number in self._by_topic.get(message.topic, ()):
-            self.queue.put(number, message, len(message.body), now)
+            seen = self._topics[self._subscriptions[number]]
+            if seen.md5sum == md5sum:
+                self.queue.put(number, message, len(message.body), now)
+            elif seen not in self._changed:  # the next look announces the topic with its definition
+                self._changed.add(seen)
+                self._refuse(
+                    f"{seen.topic} has the md5sum {md5sum[:32]}, not {seen.md5sum}: subscribe to it again"
+                )
+
+    def warned(self, reason: str) -> None:
+        self._refuse(reason)
 
     def next_frame(self, now: float) -> DoorFrame | None:
         taken = self.queue.take(now)

@@ -1,13 +1,17 @@
 """The message and service types that a door knows.
 
-A type is known if ROS's own packages define it, if a publisher sent its definition in a connection header, or if
-the operator gave the file of a service.
+1. A name has the definition of ROS's own packages or of the operator's files. A header never replaces it.
+2. A definition in a connection header counts for messages with this header only, so it is found by its md5sum.
+3. A header is parsed once: a definition that cannot be used is remembered like one that can.
+4. A type that is in use is never forgotten, so no publisher can make the door parse others' headers again.
 """
 
+import hashlib
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, field
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
+from weakref import WeakValueDictionary
 
 from appliance.features.doors.client_frames import frame_size
 from appliance.features.doors.png_frames import DoorFrame, PngFrame
@@ -19,8 +23,37 @@ from roswire.tcpros import Body
 Form = TypeVar("Form", bound=Hashable)
 _FRAME_OVERHEAD = 500  # bytes that a shared frame takes besides its own and those of its message
 
-_MOST_CHARACTERS = 500_000
-"""The most characters of all kept definitions and layouts. A codec takes up to 140 bytes for each of its own."""
+MOST_CHARACTERS = 500_000
+"""The most characters of all definitions and layouts. A codec takes up to 140 bytes for each of its own."""
+_MOST_DEFINED_CHARACTERS = 100_000  # of them: of types that are found by their name
+_MOST_FAILURES = 1000
+
+
+class TypeKey(NamedTuple):
+    """A type as a connection header names it."""
+
+    name: str
+    md5sum: str
+
+    @classmethod
+    def of(cls, header: Mapping[str, str]) -> "TypeKey":
+        return cls(header.get("type", ""), header.get("md5sum", ""))
+
+
+@dataclass(frozen=True, slots=True, weakref_slot=True, eq=False)
+class KnownType:
+    """A type that can be used; `defined` if ROS's packages or the operator define it."""
+
+    name: str
+    md5sum: str
+    codec: MessageCodec
+    definitions: Definitions
+    defined: bool
+    characters: int
+
+    @property
+    def full_text(self) -> str:
+        return self.definitions.full_text(self.name)
 
 
 @dataclass(eq=False, slots=True)  # a frozen one takes twice as long to make, for each message
@@ -78,75 +111,129 @@ def _kept_bytes(message: DoorMessage, frame: DoorFrame) -> int:
     return len(message.body) + size + _FRAME_OVERHEAD
 
 
-class KnownTypes:
-    """The most recently used types of one door. Methods raise `DefinitionError` for types that cannot be used."""
+class _Cache:
+    """The most recently used types. Those that are in use elsewhere count even after they are dropped here."""
 
-    def __init__(self, standard: Definitions, limits: ValueLimits) -> None:
-        self._standard = self._defined = standard
-        self._limits = limits
-        self._codecs: OrderedDict[tuple[str, str], tuple[MessageCodec, Definitions]] = OrderedDict()
-        self._sizes: dict[tuple[str, str], int] = {}
-        self._latest: dict[str, str] = {}  # the md5sum of each type that a header defined
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._kept: OrderedDict[TypeKey, KnownType] = OrderedDict()  # oldest first
+        self._alive: WeakValueDictionary[TypeKey, KnownType] = WeakValueDictionary()
 
-    def define(self, given: Definitions) -> None:
-        earlier, self._defined = self._defined, self._standard.extended(given)
-        names = {*earlier.message_types, *self._defined.message_types}
-        for name, md5sum in [key for key in self._codecs if key[0] in names]:
-            del self._codecs[name, md5sum], self._sizes[name, md5sum]
-            self._latest.pop(name, None)
-
-    def learn(self, header: Mapping[str, str]) -> MessageCodec:
-        name, md5sum = header.get("type", ""), header.get("md5sum", "")
-        known = self._codecs.get((name, md5sum))
+    def find(self, key: TypeKey) -> KnownType | None:
+        known = self._alive.get(key)
         if known is not None:
-            self._codecs.move_to_end((name, md5sum))
-            return known[0]
-        definitions = Definitions.from_full_text(name, header.get("message_definition", ""))
-        if definitions.md5sum(name) != md5sum:
-            raise DefinitionError(
-                f"the publisher's definition does not have its md5sum {md5sum[:32]}", name[:200]
-            )
-        return self._keep(name, md5sum, definitions)
-
-    def message(self, name: str) -> tuple[MessageCodec, Definitions]:
-        md5sum = self._latest.get(name, "")
-        known = self._codecs.get((name, md5sum))
-        if known is None:
-            if name not in self._defined.message_types:
-                raise DefinitionError(
-                    "the door does not know this message type: no publisher of it has been heard, and it is not one "
-                    "of ROS's own packages; put its .msg file in msg/PACKAGE of the folder of specifications "
-                    "(rosrv monitor reload)",
-                    name[:200],
-                )
-            self._keep(name, self._defined.md5sum(name), self._defined)
-            known = self._codecs[name, self._latest[name]]
-        self._codecs.move_to_end((name, self._latest[name]))
+            self._kept[key] = known
+            self._kept.move_to_end(key)
         return known
 
-    def service(self, name: str) -> tuple[MessageCodec, MessageCodec, Definitions]:
-        if name not in self._defined.service_types:
+    def keep(self, known: KnownType, *, beyond: bool) -> None:
+        """Keep a type, and drop others. If those in use take too much, raise `DefinitionError`, unless `beyond`."""
+        while self._used() + known.characters > self._most and self._kept:
+            self._kept.popitem(last=False)
+        used = self._used()
+        if used and used + known.characters > self._most and not beyond:
+            raise DefinitionError(
+                f"the types of topics in use take {used} characters at this door, and this one {known.characters}; "
+                f"at most {self._most}",
+                known.name[:200],
+            )
+        self._kept[TypeKey(known.name, known.md5sum)] = known
+        self._alive[TypeKey(known.name, known.md5sum)] = known
+
+    def forget(self) -> None:
+        self._kept.clear()
+        self._alive.clear()
+
+    def _used(self) -> int:
+        return sum(one.characters for one in self._alive.values())
+
+
+class KnownTypes:
+    """The types of one door. Methods raise `DefinitionError` for types that cannot be used."""
+
+    def __init__(
+        self, standard: Definitions, limits: ValueLimits, *, most_characters: int = MOST_CHARACTERS
+    ) -> None:
+        self._standard = self._definitions = standard
+        self._limits = limits
+        self._defined = _Cache(_MOST_DEFINED_CHARACTERS)
+        self._heard = _Cache(most_characters - _MOST_DEFINED_CHARACTERS)
+        self._failed: OrderedDict[tuple[TypeKey, bytes], DefinitionError] = OrderedDict()  # oldest first
+
+    def define(self, given: Definitions) -> None:
+        self._definitions = self._standard.extended(given)
+        self._defined.forget()
+        self._failed.clear()
+
+    def has_message(self, name: str) -> bool:
+        """Return whether ROS's packages or the operator define a type of this name."""
+        return name in self._definitions.message_names
+
+    def defines(self, key: TypeKey) -> bool:
+        """Return whether ROS's packages or the operator define this type, in this version."""
+        if not self.has_message(key.name):
+            return False
+        try:
+            return self._definitions.md5sum(key.name) == key.md5sum
+        except DefinitionError:
+            return False
+
+    def learn(self, header: Mapping[str, str]) -> KnownType:
+        """Return the type of the messages of a connection."""
+        key = TypeKey.of(header)
+        if self.defines(key):
+            return self.message(key.name)
+        if (known := self._heard.find(key)) is not None:
+            return known
+        text = header.get("message_definition", "")
+        failure = key, hashlib.sha256(text.encode("utf-8", "surrogateescape")).digest()
+        if (earlier := self._failed.get(failure)) is not None:
+            raise DefinitionError(earlier.text, earlier.source, earlier.line)
+        try:
+            known = self._parsed(key, text)
+        except DefinitionError as error:
+            self._failed[failure] = error.with_traceback(None)
+            while len(self._failed) > _MOST_FAILURES:
+                self._failed.popitem(last=False)
+            raise
+        self._heard.keep(known, beyond=False)
+        return known
+
+    def _parsed(self, key: TypeKey, text: str) -> KnownType:
+        definitions = Definitions.from_full_text(key.name, text)
+        if definitions.md5sum(key.name) != key.md5sum:
+            raise DefinitionError(
+                f"the publisher's definition does not have its md5sum {key.md5sum[:32]}", key.name[:200]
+            )
+        return self._made(key, definitions, defined=False)
+
+    def message(self, name: str) -> KnownType:
+        """Return the type that ROS's packages or the operator define."""
+        if not self.has_message(name):
+            raise DefinitionError(
+                "the door does not know this message type: it is not one of ROS's own packages; put its .msg file in"
+                " msg/PACKAGE of the folder of specifications (rosrv monitor reload)",
+                name[:200],
+            )
+        key = TypeKey(name, self._definitions.md5sum(name))
+        known = self._defined.find(key)
+        if known is None:
+            known = self._made(key, self._definitions, defined=True)
+            self._defined.keep(known, beyond=True)
+        return known
+
+    def service(self, name: str) -> tuple[KnownType, KnownType, Definitions]:
+        if name not in self._definitions.service_names:
             raise DefinitionError(
                 "the door does not know this service type, which is not one of ROS's own packages: put its .srv file "
                 "in msg/PACKAGE of the folder of specifications (rosrv monitor reload)",
                 name[:200],
             )
-        service = self._defined.service(name)
-        return (
-            self.message(service.request.name)[0],
-            self.message(service.response.name)[0],
-            self._defined,
-        )
+        service = self._definitions.service(name)
+        return self.message(service.request.name), self.message(service.response.name), self._definitions
 
-    def _keep(self, name: str, md5sum: str, definitions: Definitions) -> MessageCodec:
-        codec = MessageCodec(definitions, name, self._limits)
-        self._codecs[name, md5sum] = codec, definitions
+    def _made(self, key: TypeKey, definitions: Definitions, *, defined: bool) -> KnownType:
+        codec = MessageCodec(definitions, key.name, self._limits)
         # A short definition can have a large layout.
-        self._sizes[name, md5sum] = len(definitions.full_text(name)) + definitions.layout(name).characters
-        self._latest[name] = md5sum
-        while sum(self._sizes.values()) > _MOST_CHARACTERS and len(self._codecs) > 1:
-            (oldest, oldest_md5sum), _ = self._codecs.popitem(last=False)
-            del self._sizes[oldest, oldest_md5sum]
-            if self._latest.get(oldest) == oldest_md5sum:
-                del self._latest[oldest]
-        return codec
+        size = len(definitions.full_text(key.name)) + definitions.layout(key.name).characters
+        return KnownType(key.name, key.md5sum, codec, definitions, defined, size)

@@ -1,15 +1,20 @@
 """Find the topics and services that a door's identity may see, with definitions and types.
 
-Viewers need a definition before they subscribe. If it is unknown, the door itself subscribes briefly. A result is
-kept until the nodes of the topic or service change, and a denial at most until the policy changes.
+Viewers need a definition before they subscribe. If it is unknown, the door itself subscribes briefly.
+
+1. A result belongs to one topic or service, and is kept until its nodes change. A denial is kept at most until the
+   policy changes.
+2. A look asks about at most `_MOST_PROBES` things, in turn for each host, and first about those that wait longest. So
+   names that never answer delay only the names of their own host.
 """
 
 import asyncio
 import math
-from collections.abc import Awaitable, Callable
-from typing import Literal, NamedTuple
+from collections import Counter, defaultdict, deque
+from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping
+from typing import Literal, NamedTuple, Protocol
 
-from appliance.features.doors.known_types import KnownTypes
+from appliance.features.doors.known_types import KnownType, KnownTypes
 from appliance.features.doors.rosapi import Sight
 from appliance.features.doors.surroundings import DoorSurroundings, SeenService, SeenTopic, VisibleGraph
 from roswire.errors import DefinitionError, LimitExceededError, RosError
@@ -18,30 +23,47 @@ from roswire.node.network import PeerUnreachableError
 
 _FRESH_SECONDS = 1.0
 _MOST_PROBES = 50  # topics and services that one look asks about
+_PROBE_SECONDS = 1.0
 _AGAIN_SECONDS = (
     10.0  # after which a node is asked again that did not answer, or for which the door had no slot
 )
+_MOST_ROUNDS = 20  # of looks for one answer about all services
 
 _Thing = tuple[Literal["topic", "service"], str]
+HostsOf = Callable[[Collection[str]], Awaitable[Mapping[str, str]]]
+"""Returns the host of each node, as a text that differs for each host."""
+
+
+class TopicSource(Protocol):
+    """The node of the door."""
+
+    async def learn(self, topic: str) -> KnownType:
+        """Subscribe to a topic until its type is known. Raise `RosError`."""
+
+    def heard_type(self, topic: str) -> KnownType | None:
+        """Return the type that counts on a topic to which the door subscribes."""
 
 
 class _Asked(NamedTuple):
-    """The nodes that were queried about a topic or service, and the time of the next query."""
+    """The nodes that were queried about a topic or service, the answer, and the time of the next query."""
 
     nodes: tuple[str, ...]
+    at: float
+    known: KnownType | str | None = None
+    """The type of a topic, or the name of the type of a service."""
     again: float = math.inf
     denied: int | None = None  # the policy that denied it
 
 
 class Lookout:
-    """Finds the surroundings; `learn` subscribes to a topic until its definition is known."""
+    """Finds the surroundings."""
 
-    def __init__(self, sight: Sight, types: KnownTypes, learn: Callable[[str], Awaitable[None]]) -> None:
+    def __init__(self, sight: Sight, types: KnownTypes, door: TopicSource, hosts: HostsOf) -> None:
         self._sight = sight
         self._types = types
-        self._learn = learn
+        self._door = door
+        self._hosts = hosts
         self._asked: dict[_Thing, _Asked] = {}
-        self._service_types: dict[str, str] = {}
         self._policy = 0  # its number
         self._lock = asyncio.Lock()
         self._last: tuple[float, DoorSurroundings] | None = None
@@ -53,6 +75,18 @@ class Lookout:
                 self._last = now, await self._look()
             return self._last[1]
 
+    async def service_types(self) -> Mapping[str, str]:
+        """Return the type of each service that answers the door. Raise `RosError` if the graph is denied."""
+        async with self._lock:
+            for _round in range(_MOST_ROUNDS):
+                graph = await self._sight.graph()
+                if not await self._ask(
+                    graph, {("service", name): nodes for name, nodes in graph.services.items()}
+                ):
+                    break
+        found = {name: self._asked.get(("service", name)) for name in graph.services}
+        return {name: asked.known for name, asked in found.items() if asked and isinstance(asked.known, str)}
+
     def policy_changed(self) -> None:
         self._policy += 1
 
@@ -61,65 +95,103 @@ class Lookout:
             graph = await self._sight.graph()
         except RosError as error:
             return DoorSurroundings(VisibleGraph({}, {}, {}, {}), (), (), str(error))
-        await self._ask(graph)
+        things: dict[_Thing, Collection[str]] = {
+            ("topic", topic): nodes
+            for topic, nodes in graph.publishers.items()
+            if not self._types.has_message(graph.types.get(topic, ""))
+        }
+        await self._ask(graph, things | {("service", name): nodes for name, nodes in graph.services.items()})
         topics = [
-            SeenTopic(topic, kind, text)
+            SeenTopic(topic, kind.name, kind.full_text, kind.md5sum)
             for topic in graph.topics
-            if (kind := graph.types.get(topic, "")) and (text := self._text(kind)) is not None
+            if (kind := self._type(topic, graph)) is not None
         ]
         services = [
             seen for service in sorted(graph.services) if (seen := self._service(service)) is not None
         ]
         return DoorSurroundings(graph, topics, services)
 
-    async def _ask(self, graph: VisibleGraph) -> None:
-        now = asyncio.get_running_loop().time()
+    async def _ask(self, graph: VisibleGraph, things: Mapping[_Thing, Collection[str]]) -> int:
+        """Ask about things that are due. Return how many others are due."""
         nodes: dict[_Thing, tuple[str, ...]] = {
-            ("topic", topic): tuple(graph.publishers[topic])
-            for topic in sorted(graph.publishers)
-            if self._text(graph.types.get(topic, "")) is None
+            ("topic", topic): tuple(names) for topic, names in graph.publishers.items()
         }
-        nodes |= {("service", service): tuple(graph.services[service]) for service in sorted(graph.services)}
+        nodes |= {("service", service): tuple(names) for service, names in graph.services.items()}
         self._asked = {
             thing: asked
             for thing, asked in self._asked.items()
             if nodes.get(thing) == asked.nodes and asked.denied in (None, self._policy)
         }
-        self._service_types = {
-            name: kind for name, kind in self._service_types.items() if name in graph.services
-        }
-        due = [one for one in nodes if one not in self._asked or self._asked[one].again <= now]
-        await asyncio.gather(*(self._ask_one(thing, nodes[thing]) for thing in due[:_MOST_PROBES]))
+        now = asyncio.get_running_loop().time()
+        due = [one for one in things if one not in self._asked or self._asked[one].again <= now]
+        due.sort(key=lambda one: (self._asked[one].at if one in self._asked else -math.inf, one))
+        chosen = due
+        if len(due) > _MOST_PROBES:
+            hosts = await self._hosts({name for one in due for name in nodes[one]})
+            chosen = in_turn([(one, [hosts.get(name, name) for name in nodes[one]]) for one in due])[
+                :_MOST_PROBES
+            ]
+        await asyncio.gather(*(self._ask_one(thing, nodes[thing]) for thing in chosen))
+        return len(due) - len(chosen)
 
     async def _ask_one(self, thing: _Thing, nodes: tuple[str, ...]) -> None:
         kind, name = thing
-        policy = self._policy
+        policy, now = self._policy, asyncio.get_running_loop().time
         try:
-            await (self._learn if kind == "topic" else self._probe)(name)
-            self._asked[thing] = _Asked(nodes)
+            known = await (self._door.learn(name) if kind == "topic" else self._probe(name))
+            self._asked[thing] = _Asked(nodes, now(), known)
         except (PeerUnreachableError, LimitExceededError):
-            self._asked[thing] = _Asked(nodes, again=asyncio.get_running_loop().time() + _AGAIN_SECONDS)
+            self._asked[thing] = _Asked(nodes, now(), again=now() + _AGAIN_SECONDS)
         except RosError as error:
-            self._asked[thing] = _Asked(
-                nodes, denied=policy if isinstance(error, MasterDenialError) else None
-            )
+            denied = policy if isinstance(error, MasterDenialError) else None
+            self._asked[thing] = _Asked(nodes, now(), denied=denied)
 
-    async def _probe(self, service: str) -> None:
-        self._service_types.pop(service, None)
-        self._service_types[service] = (await self._sight.service_header(service)).get("type", "")
-
-    def _text(self, kind: str) -> str | None:
+    async def _probe(self, service: str) -> str:
         try:
-            return self._types.message(kind)[1].full_text(kind)
+            async with asyncio.timeout(_PROBE_SECONDS):
+                header = await self._sight.service_header(service)
+        except TimeoutError:
+            raise PeerUnreachableError(f"{service} does not answer") from None
+        return header.get("type", "")
+
+    def _type(self, topic: str, graph: VisibleGraph) -> KnownType | None:
+        """Return the type of this topic, and not just one of the same name."""
+        name = graph.types.get(topic, "")
+        asked = self._asked.get(("topic", topic))
+        known: KnownType | str | None = self._door.heard_type(topic)
+        if known is None and asked is not None:
+            known = asked.known
+        elif isinstance(known, KnownType) and topic in graph.publishers:
+            now = asyncio.get_running_loop().time()
+            self._asked["topic", topic] = _Asked(tuple(graph.publishers[topic]), now, known)
+        if isinstance(known, KnownType) and known.name == name:
+            return known
+        try:
+            return self._types.message(name) if self._types.has_message(name) else None
         except DefinitionError:
             return None
 
     def _service(self, service: str) -> SeenService | None:
+        asked = self._asked.get(("service", service))
+        kind = asked.known if asked is not None and isinstance(asked.known, str) else ""
         try:
-            kind = self._service_types.get(service, "")
-            definitions = self._types.service(kind)[2]
+            request, response, _definitions = self._types.service(kind)
         except DefinitionError:
             return None
-        found = definitions.service(kind)
-        texts = [definitions.full_text(one.name) for one in (found.request, found.response)]
-        return SeenService(service, kind, *texts)
+        return SeenService(service, kind, request.full_text, response.full_text)
+
+
+def in_turn(things: Iterable[tuple[_Thing, Collection[str]]]) -> list[_Thing]:
+    """Order things so that hosts alternate. A thing of several hosts counts for the one with the fewest things."""
+    rows = [(thing, [*hosts] or [""]) for thing, hosts in things]
+    counts = Counter(host for _thing, hosts in rows for host in hosts)
+    queues: defaultdict[str, deque[_Thing]] = defaultdict(deque)
+    for thing, hosts in rows:
+        queues[min(hosts, key=lambda host: (counts[host], host))].append(thing)
+    found: list[_Thing] = []
+    while queues:
+        for host in [*queues]:
+            found.append(queues[host].popleft())
+            if not queues[host]:
+                del queues[host]
+    return found

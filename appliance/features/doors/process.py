@@ -20,17 +20,18 @@ from appliance.channel import messages
 from appliance.channel.channel import Channel
 from appliance.channel.child_process import Child
 from appliance.features.doors import door_link
+from appliance.features.doors.assembled_door import assembled_door
 from appliance.features.doors.client_counts import SAMPLE_SECONDS, CountedClient, shown
 from appliance.features.doors.connections import ClientWriter, ConnectionLimits, DoorConnections
 from appliance.features.doors.door_link import node_name
 from appliance.features.doors.door_memory import ClientMemory, DoorMemory
-from appliance.features.doors.door_node import DoorNode, present_time
+from appliance.features.doors.door_node import DoorNode
 from appliance.features.doors.foxglove import SUBPROTOCOLS, Foxglove, FoxgloveLimits
 from appliance.features.doors.given_network import GivenNetwork
 from appliance.features.doors.known_types import KnownTypes
 from appliance.features.doors.lookout import Lookout
+from appliance.features.doors.node_hosts import NodeHosts
 from appliance.features.doors.quotas import DOOR_TOPICS
-from appliance.features.doors.rosapi import MasterSight, Rosapi
 from appliance.features.doors.rosbridge import Rosbridge, RosbridgeLimits
 from appliance.features.doors.session import ClientProtocol, DoorSession, SessionOptions
 from appliance.features.doors.values import ValueLimits
@@ -98,6 +99,7 @@ class DoorProcess:
         )
         self._given: door_link.DoorGiven | None = None
         self._network: GivenNetwork | None = None
+        self._hosts = NodeHosts(self._child.tell)
         self._types = KnownTypes(standard_definitions(), ValueLimits())
         self._door: _Door | None = None
         self._connections: DoorConnections | None = None  # also before the node has started
@@ -159,6 +161,8 @@ class DoorProcess:
                 self._over.set()
             case door_link.TicketEnded(ticket):
                 self._end_tickets(lambda one: one == ticket)
+            case door_link.HostsGiven(number, hosts):
+                self._hosts.given(number, hosts)
             case door_link.SocketRefused(number, reason):
                 if self._network is not None:
                     self._network.refused(number, reason)
@@ -208,11 +212,10 @@ class DoorProcess:
                 await asyncio.sleep(_AGAIN_SECONDS)
                 continue
             types = self._types
-            sight = MasterSight(node, present_time)
-            door = DoorNode(
-                node, types, Rosapi(sight, types).answer, most_topics=DOOR_TOPICS.bounds.whole, calls=calls
+            door, lookout = assembled_door(
+                node, types, most_topics=DOOR_TOPICS.bounds.whole, calls=calls, hosts=self._hosts.of
             )
-            self._door = _Door(door, Lookout(sight, types, door.learn), memory)
+            self._door = _Door(door, lookout, memory)
         self._started.set()
 
     def _skip(self) -> None:

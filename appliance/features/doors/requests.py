@@ -69,6 +69,8 @@ class CallOfService:
     values: msgspec.Raw | bytes
     seconds: float | None = None
     reply_to: ClientId = None
+    type: str | None = None
+    """The type for which the client wrote `values`; None for values by name."""
 
 
 @dataclass(frozen=True, slots=True)

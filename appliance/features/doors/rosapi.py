@@ -14,9 +14,9 @@ from msgspec import Raw, Struct
 from appliance.features.doors.known_types import KnownTypes
 from appliance.features.doors.message_writer import Now
 from appliance.features.doors.requests import CallOfService
-from appliance.features.doors.surroundings import VisibleGraph
+from appliance.features.doors.surroundings import DoorSurroundings, VisibleGraph
 from roswire.definitions import Definitions
-from roswire.errors import DefinitionError, ProtocolError, quoted
+from roswire.errors import ProtocolError, quoted
 from roswire.message_text import PRIMITIVES, MessageDefinition
 from roswire.node import RosNode
 from roswire.xmlrpc import Value
@@ -42,6 +42,14 @@ class Sight(Protocol):
     async def set_parameter(self, name: str, value: Value) -> None: ...
 
     def time(self) -> Now: ...
+
+
+class Outlook(Protocol):
+    """The topics and services that the identity may see, with their types."""
+
+    async def look(self) -> DoorSurroundings: ...
+
+    async def service_types(self) -> Mapping[str, str]: ...
 
 
 class MasterSight:
@@ -106,9 +114,10 @@ _Answer = Callable[[_Arguments], Awaitable[dict[str, Any]]]
 class Rosapi:
     """The services of one door."""
 
-    def __init__(self, sight: Sight, types: KnownTypes) -> None:
+    def __init__(self, sight: Sight, types: KnownTypes, outlook: Outlook) -> None:
         self._sight = sight
         self._types = types
+        self._outlook = outlook
         self._answers: dict[str, tuple[tuple[str, ...], _Answer]] = {
             "topics": ((), self._topics),
             "topics_and_raw_types": ((), self._topics_and_raw_types),
@@ -165,13 +174,9 @@ class Rosapi:
 
     async def _topics_and_raw_types(self, given: _Arguments) -> dict[str, Any]:
         found = await self._topics(given)
-        return found | {"typedefs_full_text": [self._full_text(name) for name in found["types"]]}
-
-    def _full_text(self, name: str) -> str:
-        try:
-            return self._types.message(name)[1].full_text(name)
-        except DefinitionError:
-            return ""  # as rosapi does for a package that is not installed
+        texts = {seen.topic: seen.definition for seen in (await self._outlook.look()).topics}
+        # As in rosapi, a type that is not known has no text.
+        return found | {"typedefs_full_text": [texts.get(topic, "") for topic in found["topics"]]}
 
     async def _topics_for_type(self, given: _Arguments) -> dict[str, Any]:
         graph = await self._sight.graph()
@@ -192,14 +197,11 @@ class Rosapi:
         return {"services": sorted((await self._sight.graph()).services)}
 
     async def _services_for_type(self, given: _Arguments) -> dict[str, Any]:
-        services = sorted((await self._sight.graph()).services)
-        return {"services": [one for one in services if await self._type_of(one) == given.type]}
-
-    async def _type_of(self, service: str) -> str:
-        return (await self._sight.service_header(service)).get("type", "")
+        types = await self._outlook.service_types()  # of services that the door may not use, there is none
+        return {"services": sorted(service for service, kind in types.items() if kind == given.type)}
 
     async def _service_type(self, given: _Arguments) -> dict[str, Any]:
-        return {"type": await self._type_of(given.service)}
+        return {"type": (await self._sight.service_header(given.service)).get("type", "")}
 
     async def _service_node(self, given: _Arguments) -> dict[str, Any]:
         nodes = (await self._sight.graph()).services.get(given.service, [])
@@ -240,7 +242,16 @@ class Rosapi:
     # --- types ---
 
     async def _message_details(self, given: _Arguments) -> dict[str, Any]:
-        return {"typedefs": typedefs(self._types.message(given.type)[1], given.type)}
+        if self._types.has_message(given.type):
+            return {"typedefs": typedefs(self._types.message(given.type).definitions, given.type)}
+        seen = [one for one in (await self._outlook.look()).topics if one.type == given.type]
+        versions = {one.md5sum: one for one in seen}
+        if len(versions) > 1:
+            words = " and ".join(f"{one.topic} ({md5sum})" for md5sum, one in versions.items())
+            raise ProtocolError(f"{quoted(given.type)} has several definitions: {words}")
+        for one in seen:
+            return {"typedefs": typedefs(Definitions.from_full_text(one.type, one.definition), one.type)}
+        return {"typedefs": typedefs(self._types.message(given.type).definitions, given.type)}  # raises
 
     async def _request_details(self, given: _Arguments) -> dict[str, Any]:
         definitions = self._types.service(given.type)[2]

@@ -316,6 +316,9 @@ class Rosbridge:
             fields = {"op": "service_response", "service": call.service, "values": values, "result": True}
             self.queue.reply(json_frame(fields, call.reply_to))
 
+    def warned(self, reason: str) -> None:
+        self.status("error", reason)
+
     def parameters(self, _values: Mapping[str, Any], _reply_to: str | None) -> None: ...
 
     def parameter_changed(self, _subscribed: str, _name: str, _value: Value, _now: float) -> None: ...

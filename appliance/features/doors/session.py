@@ -20,6 +20,7 @@ import contextlib
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from http import HTTPStatus
 from typing import Any, Protocol
 
@@ -92,6 +93,9 @@ class ClientProtocol(Protocol):
         """Return the requests of a frame, whose text is UTF-8."""
 
     def failed(self, request: DoorRequest, reason: str) -> None: ...
+
+    def warned(self, reason: str) -> None:
+        """Tell the client about something that it did not request."""
 
     def answered(self, number: int, values: Raw | bytes) -> None: ...
 
@@ -495,8 +499,7 @@ class DoorSession:
     # --- the door's side: a `DoorClient` ---
 
     def heard(self, message: DoorMessage, now: float) -> None:
-        self._protocol.message(message, now)
-        self._wake.set()
+        self._tell(partial(self._protocol.message, message, now))
 
     def answered(self, call: int, values: Raw | bytes) -> None:
         self._tell(lambda: self._protocol.answered(call, values))
@@ -511,6 +514,9 @@ class DoorSession:
     def failed(self, request: DoorRequest, reason: str) -> None:
         self.refusals += 1
         self._tell(lambda: self._protocol.failed(request, reason))
+
+    def warned(self, reason: str) -> None:
+        self._tell(lambda: self._protocol.warned(reason))
 
     def ask(self, service: str, values: Raw) -> str:
         try:

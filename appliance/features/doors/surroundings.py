@@ -20,11 +20,12 @@ class VisibleGraph:
 
 @dataclass(frozen=True, slots=True)
 class SeenTopic:
-    """A topic, its type, and the full text of the type."""
+    """A topic, its type, and the full text and md5sum of the type."""
 
     topic: str
     type: str
     definition: str
+    md5sum: str
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,6 +1,6 @@
 import asyncio
 import json
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncIterator, Collection, Mapping, Sequence
 from contextlib import asynccontextmanager
 from typing import Any
 
@@ -13,13 +13,13 @@ from websockets.protocol import State
 from websockets.typing import Origin, Subprotocol
 from websockets.uri import parse_uri
 
+from appliance.features.doors.assembled_door import assembled_door
 from appliance.features.doors.connections import ConnectionLimits, DoorConnections
 from appliance.features.doors.door_memory import DoorMemory
 from appliance.features.doors.door_node import DoorNode
 from appliance.features.doors.foxglove import SUBPROTOCOLS, Foxglove, FoxgloveLimits
 from appliance.features.doors.known_types import KnownTypes
 from appliance.features.doors.lookout import Lookout
-from appliance.features.doors.rosapi import MasterSight, Rosapi
 from appliance.features.doors.rosbridge import Rosbridge, RosbridgeLimits
 from appliance.features.doors.session import DoorSession, SessionOptions
 from appliance.features.doors.values import ValueLimits
@@ -100,16 +100,21 @@ class DoorWorld:
         self.options = SessionOptions(origins=("https://robot.example",))
         self.types = KnownTypes(standard_definitions(), ValueLimits())
         self.nodes: list[RosNode] = []
+        self.hosts: dict[str, str] = {}  # of nodes
         self.node: RosNode
         self.door: DoorNode
         self.lookout: Lookout
 
     async def start(self) -> None:
         self.node = await self.robot("10.0.0.2", "/door_alice", self.waiting)
-        sight = MasterSight(self.node, lambda: (7, 8))
-        built_in = Rosapi(sight, self.types).answer
-        self.door = DoorNode(self.node, self.types, built_in, most_topics=50, calls=self.calls)
-        self.lookout = Lookout(sight, self.types, self.door.learn)
+        self.door, self.lookout = assembled_door(
+            self.node,
+            self.types,
+            most_topics=50,
+            calls=self.calls,
+            hosts=self._hosts_of,
+            now=lambda: (7, 8),
+        )
         connections = DoorConnections(self.limits)
 
         async def arrive(reader: asyncio.StreamReader, writer: Any) -> None:
@@ -118,6 +123,9 @@ class DoorWorld:
             )
 
         self.network.listen(DOOR[0], arrive, DOOR[1])
+
+    async def _hosts_of(self, nodes: Collection[str]) -> Mapping[str, str]:
+        return {node: self.hosts[node] for node in nodes if node in self.hosts}
 
     async def robot(self, address: str, name: str, memory: NodeMemory | None = None) -> RosNode:
         node = RosNode(

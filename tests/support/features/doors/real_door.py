@@ -7,18 +7,16 @@ import asyncio
 import os
 import socket
 import sys
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Collection, Mapping
 from contextlib import asynccontextmanager
 from functools import partial
 from pathlib import Path
 
+from appliance.features.doors.assembled_door import assembled_door
 from appliance.features.doors.connections import ClientWriter, ConnectionLimits, DoorConnections, ServeClient
 from appliance.features.doors.door_memory import ClientMemory, DoorMemory
-from appliance.features.doors.door_node import DoorNode, present_time
 from appliance.features.doors.foxglove import SUBPROTOCOLS, Foxglove, FoxgloveLimits
 from appliance.features.doors.known_types import KnownTypes
-from appliance.features.doors.lookout import Lookout
-from appliance.features.doors.rosapi import MasterSight, Rosapi
 from appliance.features.doors.rosbridge import Rosbridge, RosbridgeLimits
 from appliance.features.doors.session import ClientProtocol, DoorSession, SessionOptions
 from appliance.features.doors.values import ValueLimits
@@ -46,9 +44,9 @@ async def real_door(
     await node.start()
     defined = standard_definitions()
     types = KnownTypes(defined.extended(definitions) if definitions else defined, ValueLimits())
-    sight = MasterSight(node, present_time)
-    door = DoorNode(node, types, Rosapi(sight, types).answer, most_topics=2000, calls=DoorMemory().client())
-    lookout = Lookout(sight, types, door.learn)
+    door, lookout = assembled_door(
+        node, types, most_topics=2000, calls=DoorMemory().client(), hosts=_no_hosts
+    )
 
     async def serve(reader: asyncio.StreamReader, writer: ClientWriter) -> None:
         memory = DoorMemory().client()
@@ -73,6 +71,10 @@ async def real_door(
             accepting.cancel()
             await connections.close()
             await door.close()
+
+
+async def _no_hosts(_nodes: Collection[str]) -> Mapping[str, str]:
+    return {}
 
 
 async def _accept(listener: socket.socket, connections: DoorConnections, serve: ServeClient) -> None:

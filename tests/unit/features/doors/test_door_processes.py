@@ -55,6 +55,7 @@ class Bench:
             tickets=lambda _door: ["3f9a0c5d17e2"],
             left=lambda *left: self.left.append(left),
             definitions=lambda: self.definitions,
+            host_of=lambda _node: None,
         )
         self.link = cast(Any, self.processes.links()["door"][0])
         monkeypatch.setattr(self.processes, "_given", self._given)

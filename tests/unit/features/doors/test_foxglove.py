@@ -21,7 +21,7 @@ from roswire.definitions import Definitions
 from roswire.node import MessageType, RosNode, ServiceFailedError, ServiceType
 from roswire.standard import standard_definitions
 from roswire.tcpros import Body
-from roswire.xmlrpc import MethodCall
+from roswire.xmlrpc import MethodCall, Value
 from tests.support.features.doors.door_world import DoorWorld, WebSocketClient, door_world
 
 pytestmark = pytest.mark.anyio
@@ -322,7 +322,7 @@ def viewer(**limits: int) -> tuple[Foxglove, ViewerQueue[int | str]]:
     queue: ViewerQueue[int | str] = ViewerQueue()
     foxglove = Foxglove("/door_alice", FoxgloveLimits(**limits), queue)
     graph = VisibleGraph({"/t": ["/n"]}, {}, {}, {"/t": "a/B"})
-    foxglove.surroundings(DoorSurroundings(graph, [SeenTopic("/t", "a/B", "int8 x")], []))
+    foxglove.surroundings(DoorSurroundings(graph, [SeenTopic("/t", "a/B", "int8 x", "md5")], []))
     while foxglove.next_frame(0.0) is not None:
         pass
     return foxglove, queue
@@ -384,7 +384,7 @@ def test_a_subscription_ends_with_its_channel() -> None:
     foxglove, _queue = viewer()
     subscribe = '{"op":"subscribe","subscriptions":[{"id":5,"channelId":%d}]}'
     assert received(foxglove, subscribe % 1) == [SubscribeTopic("/t", "a/B")]
-    gone = DoorSurroundings(VisibleGraph({}, {}, {}, {}), [SeenTopic("/t", "a/C", "int8 y")], [])
+    gone = DoorSurroundings(VisibleGraph({}, {}, {}, {}), [SeenTopic("/t", "a/C", "int8 y", "md5")], [])
     assert foxglove.surroundings(gone) == [UnsubscribeTopic("/t")]
     assert received(foxglove, '{"op":"unsubscribe","subscriptionIds":[5]}') == []
     assert received(foxglove, subscribe % 2) == [SubscribeTopic("/t", "a/C")]
@@ -394,7 +394,7 @@ def test_a_channel_that_comes_back_has_a_new_number() -> None:
     foxglove, _queue = viewer()
     announced = []
     for number in range(100):
-        seen = [SeenTopic(f"/t{number % 2}", "a/B", "int8 x")]
+        seen = [SeenTopic(f"/t{number % 2}", "a/B", "int8 x", "md5")]
         foxglove.surroundings(DoorSurroundings(VisibleGraph({}, {}, {}, {}), seen, []))
         while (frame := text_frame(foxglove)) is not None:
             announced += [one["id"] for one in json.loads(frame).get("channels", ())]
@@ -414,3 +414,27 @@ def test_subscriptions_and_channels_are_bounded() -> None:
     foxglove.failed(SubscribeTopic("/t", "a/B"), "denied by [Subscribers] /t (site.ini:7)")
     assert len(received(foxglove, json.dumps({"op": "subscribe", "subscriptions": many[:3]}))) == 3
     assert queue.dropped == 0
+
+
+async def test_a_read_of_many_parameters_gives_those_that_the_door_may_read() -> None:
+    async with door_world() as world:
+        sees(world, topics={})
+        client = await world.client(subprotocols=SUBPROTOCOLS)
+        world.master.answers |= {"hasParam": True}
+        answer = world.master.answer
+
+        async def denies(call: MethodCall) -> Value:
+            if call.method == "getParam" and str(call.params[1]).startswith("/secret"):
+                return [-1, f"denied by [Parameters] (site.ini:9): {call.params[1]}", 0]
+            return [1, "", 5] if call.method == "getParam" else await answer(call)
+
+        world.master.answer = denies  # type: ignore[method-assign]
+        names = ["/secret/a", "/speed", "/secret/b"]
+        client.send({"op": "getParameters", "parameterNames": names, "id": "x"})
+        assert (await next_op(client, "parameterValues"))["parameters"] == [{"name": "/speed", "value": 5}]
+        words = (await next_op(client, "status"))["message"]
+        assert words == "denied by [Parameters] (site.ini:9): /secret/a; and 1 other parameter"
+        client.send({"op": "getParameters", "parameterNames": ["/secret/a"], "id": "y"})
+        assert "site.ini:9" in (await next_op(client, "status"))["message"]
+        await asyncio.sleep(1)
+        assert all("parameterValues" not in str(frame) for frame in [*client.frames._queue])  # type: ignore[attr-defined]

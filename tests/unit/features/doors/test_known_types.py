@@ -1,4 +1,5 @@
 import struct
+import weakref
 from collections.abc import Mapping
 
 import pytest
@@ -22,14 +23,36 @@ def types() -> KnownTypes:
     return KnownTypes(standard_definitions(), ValueLimits())
 
 
-def test_a_type_is_known_once_a_publisher_sent_its_definition(types: KnownTypes) -> None:
-    with pytest.raises(DefinitionError, match="no publisher of it has been heard"):
-        types.message("own/Load")
+def test_a_definition_counts_for_its_header_only(types: KnownTypes) -> None:
     first = types.learn(header("own/Load", "int8 x"))
     second = types.learn(header("own/Load", "int16 x"))
-    assert types.learn(header("own/Load", "int8 x")) is first
-    assert types.message("own/Load")[0] is second
-    assert types.message("std_msgs/String")[0].name == "std_msgs/String"
+    assert types.learn(header("own/Load", "int8 x")) is first is not second
+    with pytest.raises(DefinitionError, match="not one of ROS's own packages"):
+        types.message("own/Load")
+    assert types.message("std_msgs/String").codec.name == "std_msgs/String"
+
+
+@pytest.mark.parametrize("name", [*standard_definitions().message_types[::7], "std_srvs/SetBoolRequest"])
+def test_no_header_replaces_a_type_of_ros(types: KnownTypes, name: str) -> None:
+    before = types.message(name).full_text
+    given = header(name, "int8 forged")
+    assert types.learn(given).definitions.message(name).text == "int8 forged"
+    assert types.message(name).full_text == before and types.message(name).defined
+
+
+def test_no_header_replaces_a_type_of_the_operator(types: KnownTypes) -> None:
+    types.define(
+        Definitions.from_files({"my/State.msg": "int8 level", "my/Set.srv": "bool on\n---\nbool done"})
+    )
+    for name in ("my/State", "my/SetRequest", "my/SetResponse"):
+        types.learn(header(name, "int64 forged"))
+    assert types.message("my/State").full_text.strip() == "int8 level"
+    assert [one.codec.writer.fields for one in types.service("my/Set")[:2]] == [["on"], ["done"]]
+
+
+def test_the_text_of_ros_counts_even_if_a_header_has_its_md5sum(types: KnownTypes) -> None:
+    given = header("std_msgs/String", "string data  # the robot is safe to touch")
+    assert types.learn(given) is types.message("std_msgs/String")
 
 
 @pytest.mark.parametrize(
@@ -54,36 +77,65 @@ def test_a_type_with_too_large_messages_is_an_error(types: KnownTypes) -> None:
 
 
 def test_many_large_definitions_are_forgotten_in_order(types: KnownTypes) -> None:
-    types.message("std_msgs/String")
     large = "\n".join(f"int8 f{number}" for number in range(4000))
-    for number in range(15):
+    first = weakref.ref(types.learn(header("own/Large0", large)))
+    for number in range(1, 15):
         types.learn(header(f"own/Large{number}", large))
-        types.message("std_msgs/String")  # in use
-    assert types.message("own/Large14")
-    assert types.message("std_msgs/String")
-    with pytest.raises(DefinitionError):
-        types.message("own/Large0")
-    assert types.learn(header("own/Large0", large)) is types.message("own/Large0")[0]
+    assert first() is None
+    assert types.learn(header("own/Large14", large)) is types.learn(header("own/Large14", large))
 
 
-def test_short_definitions_with_large_layouts_are_forgotten_in_order(types: KnownTypes) -> None:
+def test_types_in_use_are_never_parsed_again_and_bound_all_others(types: KnownTypes) -> None:
+    large = "\n".join(f"int8 f{number}" for number in range(4000))
+    used = []
+    with pytest.raises(DefinitionError, match="the types of topics in use take"):
+        for number in range(100):
+            used.append(types.learn(header(f"own/Large{number}", large)))
+    assert 5 < len(used) < 20
+    assert types.learn(header("own/Large0", large)) is used[0]
+    used.clear()
+    assert types.learn(header("own/Large99", large))
+
+
+def test_a_short_definition_with_a_large_layout_counts_by_its_layout(types: KnownTypes) -> None:
     parts = [f"Part{level} a\nPart{level} b" for level in range(1, 12)] + ["int8 x"]
     text = "".join(f"\n{'=' * 80}\nMSG: own/Part{level}\n{part}" for level, part in enumerate(parts))
-    for number in range(3):
-        types.learn(header(f"own/Large{number}", f"Part0 a{text}"))
-    assert len(text) < 2_000 and types.message("own/Large2")
+    known = types.learn(header("own/Large", f"Part0 a{text}"))
+    assert len(text) < 2_000 and known.characters > 100_000
+
+
+def test_a_definition_that_cannot_be_used_is_parsed_once(
+    types: KnownTypes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    parsed: list[str] = []
+    parse = Definitions.from_full_text
+
+    def counted(name: str, text: str) -> Definitions:
+        parsed.append(name)
+        return parse(name, text)
+
+    monkeypatch.setattr(Definitions, "from_full_text", counted)
+    bad = header("own/Load", "int8 x") | {"md5sum": "0" * 32}
+    for _message in range(100):
+        with pytest.raises(DefinitionError, match="does not have its md5sum"):
+            types.learn(bad)
+    assert len(parsed) == 1 + 1
+    other = bad | {"message_definition": "int8 y"}  # a failure belongs to the whole header
     with pytest.raises(DefinitionError):
-        types.message("own/Large0")
+        types.learn(other)
+    assert len(parsed) == 3
+    types.define(Definitions.from_files({"own/Part.msg": "int8 x"}))
+    with pytest.raises(DefinitionError):
+        types.learn(bad)
+    assert len(parsed) == 4
 
 
 def test_the_operators_files_define_types_until_they_change(types: KnownTypes) -> None:
-    types.learn(header("own/Heard", "int8 x"))
     with pytest.raises(DefinitionError, match="rosrv monitor reload"):
         types.service("own/Add")
     for field in ("a", "b"):
         types.define(Definitions.from_files({"own/Add.srv": f"int8 {field}\n---\nint8 sum\n"}))
-        assert types.service("own/Add")[0].writer.fields == [field]
-    assert types.message("own/Heard")[0].name == "own/Heard"
+        assert types.service("own/Add")[0].codec.writer.fields == [field]
     types.define(Definitions.from_files({}))
     with pytest.raises(DefinitionError, match="does not know this service type"):
         types.service("own/Add")
@@ -96,7 +148,7 @@ def test_a_message_is_encoded_once_for_all_clients_within_bounds(types: KnownTyp
 
     def learn(fields: Mapping[str, str]) -> MessageCodec:
         learned.append(fields["type"])
-        return types.learn(fields)
+        return types.learn(fields).codec
 
     def message(size: int) -> DoorMessage:
         return DoorMessage("/x", struct.pack("<I", size) + bytes(size), given, 0, learn, shared)

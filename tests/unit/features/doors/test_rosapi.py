@@ -1,18 +1,20 @@
 import asyncio
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import pytest
 from msgspec import Raw
 
-from appliance.features.doors.known_types import KnownTypes
+from appliance.features.doors.known_types import KnownType, KnownTypes
+from appliance.features.doors.lookout import Lookout
 from appliance.features.doors.requests import CallOfService
 from appliance.features.doors.rosapi import Rosapi
 from appliance.features.doors.surroundings import VisibleGraph
 from appliance.features.doors.values import ValueLimits
 from roswire.errors import PeerError
 from roswire.node import MasterDenialError
+from roswire.node.network import PeerUnreachableError
 from roswire.standard import standard_definitions
 from roswire.xmlrpc import Value
 from tests.support.features.doors.door_world import door_world
@@ -56,9 +58,22 @@ class StatedSight:
         return 7, 8
 
 
+class Silent:
+    async def learn(self, topic: str) -> KnownType:
+        raise PeerUnreachableError(f"no publisher of {topic} answers")
+
+    def heard_type(self, _topic: str) -> KnownType | None:
+        return None
+
+
+async def no_hosts(_nodes: Collection[str]) -> Mapping[str, str]:
+    return {}
+
+
 @pytest.fixture
 def rosapi() -> Rosapi:
-    return Rosapi(StatedSight(), KnownTypes(standard_definitions(), ValueLimits()))
+    types, sight = KnownTypes(standard_definitions(), ValueLimits()), StatedSight()
+    return Rosapi(sight, types, Lookout(sight, types, Silent(), no_hosts))
 
 
 async def ask(rosapi: Rosapi, service: str, values: str = "{}") -> Any:

@@ -1,0 +1,150 @@
+import asyncio
+from collections.abc import Collection, Mapping
+
+import pytest
+
+from appliance.features.doors.known_types import KnownType, KnownTypes
+from appliance.features.doors.lookout import Lookout, in_turn
+from appliance.features.doors.rosapi import Rosapi
+from appliance.features.doors.surroundings import VisibleGraph
+from appliance.features.doors.values import ValueLimits
+from roswire.definitions import Definitions
+from roswire.node import MasterDenialError
+from roswire.node.network import PeerUnreachableError
+from roswire.standard import standard_definitions
+from roswire.xmlrpc import Value
+from tests.unit.features.doors.test_rosapi import ask
+
+pytestmark = pytest.mark.anyio
+OWN = Definitions.from_files({"own/Load.msg": "int8 x"})
+
+
+class Robot:
+    """A robot whose nodes answer, and a guest with 400 names that never do."""
+
+    def __init__(self, kind: str, hosts: int) -> None:
+        self.types = KnownTypes(standard_definitions(), ValueLimits())
+        self.asked: list[str] = []
+        self.denied = {"/robot/denied"}
+        guests = {f"/a_guest/{number:03}": [f"/guest_{number % hosts}"] for number in range(400)}
+        own = {f"/robot/{number:02}": ["/base"] for number in range(60)} | {"/robot/denied": ["/base"]}
+        names = guests | own
+        self.graph_now = VisibleGraph(
+            publishers=names if kind == "topic" else {},
+            subscribers={},
+            services=names if kind == "service" else {},
+            types=dict.fromkeys(names, "own/Load") if kind == "topic" else {},
+        )
+        self.lookout = Lookout(self, self.types, self, self.hosts)
+
+    async def hosts(self, nodes: Collection[str]) -> Mapping[str, str]:
+        return {node: "guest" if node.startswith("/guest") else "robot" for node in nodes}
+
+    async def graph(self) -> VisibleGraph:
+        return self.graph_now
+
+    async def _answer(self, name: str) -> None:
+        self.asked.append(name)
+        if name in self.denied:
+            raise MasterDenialError(f"{name} is denied (site.ini:4)")
+        if name.startswith("/a_guest"):
+            await asyncio.sleep(30)
+            raise PeerUnreachableError(f"no publisher of {name} answers")
+
+    async def learn(self, topic: str) -> KnownType:
+        async with asyncio.timeout(1):
+            try:
+                await self._answer(topic)
+            except asyncio.CancelledError:
+                raise PeerUnreachableError(f"no publisher of {topic} answers") from None
+        text = OWN.full_text("own/Load")
+        header = {"type": "own/Load", "md5sum": OWN.md5sum("own/Load"), "message_definition": text}
+        return self.types.learn(header)
+
+    def heard_type(self, _topic: str) -> KnownType | None:
+        return None
+
+    async def service_header(self, service: str) -> Mapping[str, str]:
+        await self._answer(service)
+        return {"type": "std_srvs/Trigger"}
+
+    async def service_uri(self, _service: str) -> str:
+        return ""
+
+    async def parameter(self, _call: str, *_arguments: Value) -> Value:
+        return 0
+
+    async def set_parameter(self, name: str, value: Value) -> None: ...
+
+    def time(self) -> tuple[int, int]:
+        return 0, 0
+
+
+@pytest.mark.parametrize("hosts", [1, 400])
+@pytest.mark.parametrize("kind", ["topic", "service"])
+async def test_names_that_never_answer_delay_only_those_of_their_host(kind: str, hosts: int) -> None:
+    robot = Robot(kind, hosts)
+    for _look in range(3):
+        seen = await robot.lookout.look()
+        await asyncio.sleep(2)
+    found = [one.topic for one in seen.topics] + [one.service for one in seen.services]
+    assert sum(name.startswith("/robot") for name in found) == 60
+    before = len(robot.asked)
+    for _look in range(30):
+        await robot.lookout.look()
+        await asyncio.sleep(2)
+    later = [name for name in robot.asked[before:] if name.startswith("/robot")]
+    assert later == []  # the robot's own answers are kept
+    assert {*robot.asked} >= {*robot.graph_now.publishers, *robot.graph_now.services}  # and all were asked
+
+
+async def test_a_new_name_of_the_robot_is_asked_about_in_the_next_look() -> None:
+    robot = Robot("topic", 1)
+    for _look in range(20):
+        await robot.lookout.look()
+        await asyncio.sleep(2)
+    before = len(robot.asked)
+    assert isinstance(robot.graph_now.publishers, dict)
+    robot.graph_now.publishers["/robot/new"] = ["/base"]
+    robot.graph_now.types["/robot/new"] = "own/Load"  # type: ignore[index]
+    await robot.lookout.look()
+    assert "/robot/new" in robot.asked[before : before + 2]
+
+
+async def test_services_are_found_by_their_type_although_some_are_denied_or_silent() -> None:
+    """As in every answer that is put together from many, one of them does not make it fail."""
+    robot = Robot("service", 1)
+    rosapi = Rosapi(robot, robot.types, robot.lookout)
+    answer = await ask(rosapi, "/rosapi/services_for_type", '{"type":"std_srvs/Trigger"}')
+    assert answer["services"] == [f"/robot/{number:02}" for number in range(60)]
+    assert await ask(rosapi, "/rosapi/services_for_type", '{"type":"own/None"}') == {"services": []}
+
+
+@pytest.mark.parametrize(
+    "service", ["topics_and_raw_types", "topics", "services", "nodes", "services_for_type"]
+)
+async def test_an_answer_about_many_does_not_fail_for_one(service: str) -> None:
+    robot = Robot("topic", 1)
+    robot.denied = {*robot.graph_now.publishers} - {"/robot/00"}
+    answer = await ask(Rosapi(robot, robot.types, robot.lookout), f"/rosapi/{service}")
+    if service == "topics_and_raw_types":
+        texts = dict(zip(answer["topics"], answer["typedefs_full_text"], strict=True))
+        assert [topic for topic, text in texts.items() if text] == ["/robot/00"]
+
+
+async def test_a_denial_of_the_whole_list_is_words() -> None:
+    robot = Robot("service", 1)
+
+    async def denied() -> VisibleGraph:
+        raise MasterDenialError("getSystemState is denied (site.ini:2)")
+
+    robot.graph = denied  # type: ignore[method-assign]
+    with pytest.raises(MasterDenialError, match=r"site\.ini:2"):
+        await robot.lookout.service_types()
+    assert (await robot.lookout.look()).denial == "getSystemState is denied (site.ini:2)"
+
+
+def test_a_thing_of_several_hosts_counts_for_the_one_with_the_fewest() -> None:
+    shared = ("topic", "/shared")
+    rows = [(("topic", f"/g{number}"), ["guest"]) for number in range(9)] + [(shared, ["guest", "robot"])]
+    assert in_turn(rows).index(shared) == 1  # type: ignore[arg-type]
