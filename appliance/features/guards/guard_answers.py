@@ -104,12 +104,23 @@ class Suggestion(msgspec.Struct, frozen=True):
     measured: Annotated[dict[str, str], doc("values from the present rates of topics, by parameter")]
     values: Annotated[dict[str, str], doc("other values that fit the topics, by parameter")]
     command: Annotated[str, doc("the command line that makes it")]
+    others: Annotated[dict[str, list[str]], doc("alternatives, by the names of its topics")] = {}
+
+
+class LoadedSuggestion(msgspec.Struct, frozen=True):
+    """A guard that would be proposed if it were not loaded."""
+
+    name: Annotated[str, doc("the guard")]
+    preset: Annotated[str, doc("its preset")]
+    topics: Annotated[dict[str, str], doc("its topics, by the names that the preset has for them")]
 
 
 class Suggestions(msgspec.Struct, frozen=True):
-    """Guards for each topic that commands a base or an arm, in the order in which they act."""
+    """Guards for each topic that commands a base or an arm."""
 
     suggestions: Annotated[list[Suggestion], doc("the proposed guards")]
+    loaded: Annotated[list[LoadedSuggestion], doc("guards that are loaded, so not proposed")] = []
+    left_out: Annotated[list[str], doc("what is ambiguous or cannot be guarded, as sentences")] = []
 
 
 class DriverCheck(msgspec.Struct, frozen=True):

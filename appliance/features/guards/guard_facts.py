@@ -3,7 +3,7 @@
 from appliance.channel.answers.graph_answers import Graph
 from appliance.features.guards.guard_answers import PresetParameter, PresetRow
 from appliance.features.guards.presets import Preset
-from appliance.features.guards.suggestions import TopicFacts
+from appliance.features.guards.robot_graph import TopicFacts
 
 
 def facts_of(graph: Graph) -> list[TopicFacts]:

@@ -16,6 +16,7 @@ from appliance.features.guards.guard_answers import (
     GuardList,
     GuardPlan,
     GuardRow,
+    LoadedSuggestion,
     Suggestion,
     Suggestions,
 )
@@ -35,7 +36,7 @@ from appliance.features.guards.presets import (
     types_in,
     with_values,
 )
-from appliance.features.guards.suggestions import proposals
+from appliance.features.guards.suggestions import LoadedGuard, advice
 from appliance.features.guards.view import ActingGuard, GuardsState
 from appliance.specifications.specification_files import SpecificationsRefusedError
 from appliance.specifications.specification_manager import SpecificationManager
@@ -55,14 +56,6 @@ def _same(one: str, other: str) -> bool:
         return float(one) == float(other)
     except ValueError:
         return one == other
-
-
-def _suggestions_of(graph: Graph) -> list[Suggestion]:
-    return [
-        Suggestion(one.preset, one.name, PRESETS[one.preset].what, dict(one.topics), dict(one.measured),
-                   dict(one.values), one.command)
-        for one in proposals(facts_of(graph))
-    ]  # fmt: skip
 
 
 class GuardOrders:
@@ -113,7 +106,18 @@ class GuardOrders:
         )  # fmt: skip
 
     async def suggestions(self, _request: guard_requests.GuardSuggestionsWanted) -> Suggestions:
-        return Suggestions(_suggestions_of(self._graph()))
+        loaded = [
+            LoadedGuard(name, preset.name, self._row(name, preset).topics)
+            for name, preset in self._guards().items()
+        ]
+        found = advice(facts_of(self._graph()), loaded, self._monitors.checked.monitors)
+        return Suggestions(
+            [Suggestion(one.preset, one.name, PRESETS[one.preset].what, dict(one.topics), dict(one.measured),
+                        dict(one.values), one.command, {name: [*topics] for name, topics in one.others.items()})
+             for one in found.proposals],
+            [LoadedSuggestion(guard.name, guard.preset, dict(guard.topics)) for guard in found.loaded],
+            found.left_out,
+        )  # fmt: skip
 
     async def new(self, request: guard_requests.GuardNew, who: str) -> Replacement:
         file, text = self._made(request)

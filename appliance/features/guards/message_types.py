@@ -22,7 +22,9 @@ class TypeRow:
     cancelled.
     """
     parameters: str = ""
-    """The event's parameters if a value is made of several fields. `local` then makes the value."""
+    """The event's parameters if a value is made of several fields. `local` then makes the value, or makes one where the
+    message gives none.
+    """
     local: str = ""
     element: str = ""
     """The type of the elements of `values`, in variables that keep them, or empty for the type in the text."""
@@ -93,6 +95,12 @@ MOTIONS = {
         ("geometry_msgs/TwistWithCovarianceStamped", "twist.twist."),
     )
 }
+_ARRIVAL = TypeRow(
+    local="std::vector<double> values = {ros::Time::now().toSec()};       // only its silence is judged",
+    element="double",
+)
+ANY_TYPE = "*"
+"""The key of the row for every type that has none of its own."""
 SENSORS = {
     "sensor_msgs/LaserScan": TypeRow({"values": "ranges"}),
     "sensor_msgs/Range": _listed("range"),
@@ -105,6 +113,8 @@ SENSORS = {
         *(f"pose.pose.orientation.{axis}" for axis in "xyzw"),
     ),
     "sensor_msgs/JointState": TypeRow({"values": "position"}, parameters="double[] values", element="double"),
+    "sensor_msgs/Joy": _ARRIVAL,
+    ANY_TYPE: _ARRIVAL,
 }
 _SCAN = {
     "start": "angle_min", "step": "angle_increment", "low": "range_min", "high": "range_max", "ranges": "ranges",
@@ -149,13 +159,26 @@ def text_for(text: str, topic: str, kind: str, row: TypeRow) -> str:
     return _SAFE.sub(f"safe {kind} {{ }} on command every 100ms;", text) if row.stops else _cancelling(text)
 
 
+def row_of(rows: Mapping[str, TypeRow], kind: str) -> TypeRow | None:
+    """Return the row of a type, or of every type, or nothing if none fits."""
+    return rows.get(kind) or rows.get(ANY_TYPE)
+
+
+def works_with(rows: Mapping[str, TypeRow]) -> str:
+    return ", ".join("any other type by its silence alone" if kind == ANY_TYPE else kind for kind in rows)
+
+
+def judges_arrival(row: TypeRow) -> bool:
+    return row is _ARRIVAL
+
+
 def _header(found: "re.Match[str]", kind: str, row: TypeRow) -> str:
     wanted = [one.rsplit(" ", 1) for one in found["parameters"].split(", ") if one]
     bound = {name: row.paths[name] for _type, name in wanted if name in row.paths}
     parameters = ", ".join(f"{of} {name}" for of, name in wanted if name in bound)
     lacking = [name for _type, name in wanted if name not in bound]
     local = f"double {', '.join(f'{name} = 0' for name in lacking)};" if lacking else ""
-    if row.parameters and wanted:
+    if (row.parameters or row.local) and wanted:
         parameters, bound, local = row.parameters, dict(row.paths), row.local
     pattern = ", ".join(f"{path}:{name}" for name, path in bound.items())
     head = f"event {found['name']}({parameters}) {found['topic']} {kind}"

@@ -218,13 +218,14 @@ def text_of(guard: Guard) -> str:
     for name, topic in guard.topics.items():
         text = _with_topic(preset, text, name, topic)
     for name, kind in guard.types.items():
-        rows = preset.topics.get(name, {})
-        if name in preset.topics and kind not in rows:
+        row = types.row_of(preset.topics.get(name, {}), kind)
+        if row is not None:
+            text = text_for(text, name, kind, row)
+        elif name in preset.topics:
             raise GuardError(
-                f"{guard.topics.get(name, name)} has the type {kind}; {preset.name} works with {', '.join(rows)}"
+                f"{guard.topics.get(name, name)} has the type {kind}; {preset.name} works with"
+                f" {types.works_with(preset.topics[name])}"
             )
-        if name in rows or kind in rows:
-            text = text_for(text, name, kind, rows[kind])
     for name, value in guard.values.items():
         parameter = preset.parameter(name)
         text = _with_value(text, parameter, parameter.checked(value))

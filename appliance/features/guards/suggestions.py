@@ -1,28 +1,64 @@
-"""Propose guards for the topics of a running robot."""
+"""Propose guards for the topics of a running robot.
+
+`robot_graph.py` decides which sources belong to a command. A source that is ambiguous is not chosen: the proposal is
+left out, and a sentence names the alternatives.
+"""
 
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 from appliance.features.guards import message_types as types
-from appliance.features.guards.message_types import TypeRow
+from appliance.features.guards.robot_graph import COMMAND, MOST_COMMANDS, RobotGraph, TopicFacts, near
 
-_COMMAND = re.compile(r"cmd|command|setpoint|drive|ackermann", re.IGNORECASE)
-_STOP = re.compile(r"e_?stop|emergency|protective_stop", re.IGNORECASE)
-_POSITION_FIRST = re.compile(r"odom|local_position/pose|amcl_pose", re.IGNORECASE)
+_WORD = re.compile(r"[a-z]+")
+_STOP = re.compile(r"e_?stop|emergency(?:_stop)?|protective_stop|run_?stop(?:ped)?", re.IGNORECASE)
+_WORDS_OF_A_STOP = {
+    "pressed", "active", "activated", "triggered", "engaged", "hit", "on", "is", "button", "soft", "software",
+    "hardware", "hw", "sw", "front", "rear", "back", "left", "right", "base", "robot", "platform", "wireless", "remote",
+    "operator", "user", "topic", "stop",
+}  # fmt: skip
+_KNOWN_STOPS = re.compile(r"/(?:software_runstop_enabled|enable_software_runstop|is_runstopped)$")
+"""True stops, by the drivers of Fetch and Stretch."""
+_RESET = re.compile(r"reset|clear", re.IGNORECASE)
+_FILTERED = re.compile(r"filtered|fused|ekf|local_position", re.IGNORECASE)
+_WHEELS = re.compile(r"wheel|encoder|(?:^|[/_])(?:enc|raw)(?=[/_]|$)", re.IGNORECASE)
+_SIDE = re.compile(r"(?:^|[/_])(?:f|b|r|l|front|back|rear|left|right)(?=[/_]|$)", re.IGNORECASE)
+_RAW = re.compile(r"(?:^|[/_])raw(?=[/_]|$)", re.IGNORECASE)
+_AMCL = re.compile(r"amcl", re.IGNORECASE)
+_NO_POSITION = re.compile(r"initialpose|goal|target|setpoint|ground_truth", re.IGNORECASE)
 _WORLD_FRAME = re.compile(r"/mavros/setpoint_velocity/")  # MAVROS takes them in the local frame by default
-_SCAN_OF_A_CAMERA = re.compile(r"camera|depth", re.IGNORECASE)
+_SCAN_OF_A_CAMERA = re.compile(r"camera|depth|rgbd", re.IGNORECASE)
+_JOY = "sensor_msgs/Joy"
+_BOOL = "std_msgs/Bool"
+_SLOWEST_HZ = 2.0
+"""A base drives blind between two messages of a slower sensor."""
+_STEADY_HZ = 5.0
+"""A joystick that repeats its state at least this often."""
+
+_MOST_TOPICS = 500
+_READ = {
+    *types.COMMANDS, *types.GOALS, *types.RESULTS, *types.POSES, *types.SCANS, *types.BATTERIES, _BOOL, _JOY,
+    "sensor_msgs/JointState", "sensor_msgs/Imu", "geometry_msgs/PoseArray",
+}  # fmt: skip
+"""The types from which the advice follows."""
+
+NOT_SUGGESTED = {
+    "agree": "no name says which two velocities should be equal",
+    "rate": "a rate follows from the driver, which the graph does not show",
+    "sane": "the other guards of a base stop it at values that are not finite",
+    "withhold": "no name says which picture is private, and from whom",
+}
+"""The presets that are never proposed, and why."""
 
 
-class TopicFacts(NamedTuple):
-    """A topic with its type, the nodes at both ends, and its messages per second."""
+@dataclass(frozen=True)
+class LoadedGuard:
+    """A guard in use, with its topics by the preset's names for them."""
 
     name: str
-    type: str
-    publishers: tuple[str, ...]
-    subscribers: tuple[str, ...]
-    rate: float = 0.0
+    preset: str
+    topics: Mapping[str, str]
 
 
 @dataclass(frozen=True)
@@ -35,6 +71,8 @@ class Proposal:
     measured: Mapping[str, str] = field(default_factory=dict)
     """The values that come from present rates; `values` has the others that fit the topics."""
     values: Mapping[str, str] = field(default_factory=dict)
+    others: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    """Alternatives, by the preset's names for its topics."""
 
     @property
     def command(self) -> str:
@@ -50,95 +88,318 @@ class Proposal:
         return " ".join(words)
 
 
-def proposals(graph: Iterable[TopicFacts]) -> list[Proposal]:
-    """Return guards for all topics that command a base or an arm, in the order in which they act."""
-    topics = list(graph)
-    bases = [one for one in topics if one.type in types.VELOCITIES and _commands_a_base(one, topics)]
-    arms = [one for one in topics if one.type in types.TRAJECTORIES and one.subscribers]
-    alone = len(bases) + len(arms) == 1
-    found = [one for base in bases for one in _for_a_base(base, topics, alone=alone)]
-    return found + [one for arm in arms for one in _for_an_arm(arm, topics, alone=alone)]
+@dataclass(frozen=True)
+class Advice:
+    """Proposals, the guards in use that make further ones unnecessary, and what is left out, as sentences."""
+
+    proposals: list[Proposal]
+    loaded: list[LoadedGuard]
+    left_out: list[str]
 
 
-def _commands_a_base(topic: TopicFacts, topics: Iterable[TopicFacts]) -> bool:
-    passing = {
-        node
-        for one in topics
-        if one.type in types.VELOCITIES and one.name != topic.name and _COMMAND.search(one.name)
-        for node in one.publishers
-    }
-    return bool(_COMMAND.search(topic.name)) and not passing.issuperset(topic.subscribers)
+def advice(
+    topics: Iterable[TopicFacts], loaded: Sequence[LoadedGuard] = (), names: Collection[str] = ()
+) -> Advice:
+    """Return guards for all topics that command a base or an arm. `names` are those of all monitors in use."""
+    read = [
+        topic
+        for topic in sorted(topics)
+        if topic.type in _READ
+        or topic.type.endswith("Goal")
+        or COMMAND.search(topic.name)
+        or _STOP.search(topic.name)
+    ]
+    graph = RobotGraph(tuple(read[:_MOST_TOPICS]))
+    writer = _Writer(graph, loaded, {*names, *(guard.name for guard in loaded)})
+    for base in graph.bases:
+        writer.add_base(base)
+    for arm in graph.arm_velocities:
+        writer.add_arm_velocity(arm)
+    for arm in graph.arms:
+        writer.add_arm(arm)
+    for goal in graph.topics:
+        if goal.type in types.GOALS:
+            writer.add_goal(goal)
+    for command in graph.velocities:
+        writer.add_joystick(command)
+    unguarded = graph.unguarded(types.COMMANDS | types.GOALS)
+    if unguarded and graph.robots:
+        named = ", ".join(f"{topic.name} ({topic.type})" for topic in unguarded[:5])
+        writer.left_out.append(f"no preset works with these commands, which may also move the robot: {named}")
+    if len(read) > _MOST_TOPICS or MOST_COMMANDS in (len(graph.velocity_commands), len(graph.arms)):
+        writer.left_out.append(
+            f"only the first {MOST_COMMANDS} commands of each kind among {_MOST_TOPICS} topics were read: others may"
+            " need a guard"
+        )
+    return Advice(writer.found, writer.in_use, writer.left_out)
 
 
-def _for_a_base(base: TopicFacts, topics: list[TopicFacts], *, alone: bool) -> Iterator[Proposal]:
-    def proposal(preset: str, measured: Mapping[str, str] | None = None, **further: str) -> Proposal:
-        values = {"worldFrame": "true"} if preset == "fence" and _WORLD_FRAME.search(base.name) else {}
-        return Proposal(
-            preset, _name(preset, base, alone), {"command": base.name, **further}, measured or {}, values
+class _Writer:
+    """Collects the advice."""
+
+    def __init__(self, graph: RobotGraph, loaded: Sequence[LoadedGuard], names: set[str]) -> None:
+        self.graph, self._loaded, self._names = graph, loaded, names
+        self._alone = len([*graph.bases, *graph.arms, *graph.arm_velocities]) == 1
+        self.found: list[Proposal] = []
+        self.in_use: list[LoadedGuard] = []
+        self.left_out: list[str] = []
+
+    def add_base(self, base: TopicFacts) -> None:
+        self._add("deadman", base, _silence(base, 5, 0.2, 2))
+        self._add_stops(base)
+        self._add_fence(base)
+        self._add_scanners(base)
+        self._add("speed", base)
+        batteries = self.graph.sources(base, types.BATTERIES)
+        if len(batteries) == 1:
+            self._add("arm", base, _silence(batteries[0], 5, 5, 600), topics={"by": batteries[0].name})
+        elif batteries:
+            self._leave("arm", base, "several batteries fit", batteries)
+
+    def add_arm_velocity(self, arm: TopicFacts) -> None:
+        self._add("deadman", arm, _silence(arm, 5, 0.2, 2))
+        self._add_stops(arm)
+        self._say(
+            f"{arm.name} moves joints, not a base: it gets no fence, and no speed, whose defaults are those of a base;"
+            f" if its values are metres and radians a second: rosrv guard new speed {arm.name} vMax=… wMax=…"
         )
 
-    yield proposal("deadman", _silence(base, 0.2, 2))
-    for stop in (
-        one for one in topics if one.type == "std_msgs/Bool" and _STOP.search(one.name) and one.publishers
-    ):
-        yield proposal("estop", stop=stop.name)
-        break
-    scans = _sources(base, topics, types.SCANS, avoid=_SCAN_OF_A_CAMERA)
-    position = next(iter(_sources(base, topics, types.POSES, prefer=_POSITION_FIRST)), None)
-    if position is not None:
-        yield proposal("fence", _silence(position, 0.2, 5), by=position.name)
-    if scans:
-        yield proposal("sensor", _silence(scans[0], 0.1, 5), by=scans[0].name)
-        yield proposal("separation", _silence(scans[0], 0.1, 5), by=scans[0].name)
-    yield proposal("speed")
-    for battery in _sources(base, topics, types.BATTERIES)[:1]:
-        yield proposal("arm", _silence(battery, 5, 600), by=battery.name)
-
-
-def _for_an_arm(arm: TopicFacts, topics: list[TopicFacts], *, alone: bool) -> Iterator[Proposal]:
-    yield Proposal("joints", _name("joints", arm, alone), {"command": arm.name})
-    states = _sources(arm, topics, {"sensor_msgs/JointState": TypeRow()})
-    if states:
-        by = {"command": arm.name, "by": states[0].name}
+    def add_arm(self, arm: TopicFacts) -> None:
+        self._add("joints", arm)
+        self._add_stops(arm)
+        states = self.graph.sources(arm, {"sensor_msgs/JointState"})
+        drivers = self.graph.robot_of(arm).drivers
+        best = [state for state in states if not drivers.isdisjoint(state.publishers)] or states
         # A resting arm repeats its positions.
-        yield Proposal(
-            "sensor", _name("sensor", arm, alone), by, _silence(states[0], 0.1, 5), {"frozen": "0"}
+        if len(best) == 1:
+            self._add("sensor", arm, _silence(best[0], 3, 0.1, 1), {"frozen": "0"}, topics={"by": best[0].name},
+                      others=states)  # fmt: skip
+        elif best:
+            self._leave("sensor", arm, "several topics have its joints", best)
+
+    def add_goal(self, goal: TopicFacts) -> None:
+        before = goal.name.removesuffix("/goal")
+        wanted = f"{before}/result", goal.type.replace("ActionGoal", "ActionResult")
+        if goal.subscribers and before != goal.name and wanted in {
+            (topic.name, topic.type) for topic in self.graph.topics if topic.publishers
+        }:  # fmt: skip
+            self._add("answer", goal)
+
+    def add_joystick(self, command: TopicFacts) -> None:
+        """Propose to stop a command whose joystick is silent: some teleoperations repeat its last value."""
+        if not command.publishers or not command.subscribers:
+            return
+        sticks = [
+            topic for topic in self.graph.topics
+            if topic.type == _JOY and topic.publishers and {*command.publishers} <= {*topic.subscribers}
+        ]  # fmt: skip
+        for stick in sticks[:1]:
+            if stick.rate >= _STEADY_HZ:
+                self._add(
+                    "sensor", command, _silence(stick, 5, 0.2, 1), {"frozen": "0"}, topics={"by": stick.name}
+                )
+            else:
+                self._say(
+                    f"{command.name} comes from the joystick {stick.name}, which is silent while it is not moved: to"
+                    " guard its link, set autorepeat_rate of joy_node, and run rosrv guard suggest again"
+                )
+
+    def _add_stops(self, command: TopicFacts) -> None:
+        switches = self.graph.sources(command, {_BOOL})
+        resets = [topic for topic in switches if _STOP.search(topic.name) and _RESET.search(topic.name)]
+        stops = [topic for topic in switches if _stops(topic.name)]
+        stops = [
+            topic for topic in stops if not any(self.graph.derived_from(other, [topic]) for other in stops)
+        ]
+        for stop in stops:
+            topics = {"stop": stop.name}
+            if len(resets) == 1:
+                topics["reset"] = resets[0].name
+            elif space := self.graph.robot_of(command).namespace:
+                topics["reset"] = f"/{'/'.join(space)}/emergency_stop_reset"
+            self._add("estop", command, _silence(stop, 5, 0.5, 5), several=len(stops) > 1, topics=topics)
+            if not stop.rate:
+                self._say(
+                    f"{stop.name} sends nothing now: if it sends only changes, add silent=0, and its failure is not"
+                    " noticed"
+                )
+        for topic in switches:
+            if topic not in resets and _STOP.search(topic.name) and not _stops(topic.name):
+                self._say(
+                    f"{topic.name}: its name does not say whether true stops; {_by_hand('if it does', topic)}"
+                )
+        for topic in self.graph.topics:
+            if (
+                topic.type != _BOOL
+                and topic.publishers
+                and _stops(topic.name)
+                and self.graph.belongs(topic, command)
+            ):
+                self._say(f"{topic.name} has the type {topic.type}: an estop works with {_BOOL} only")
+        for topic in self.graph.shared({_BOOL}):
+            if _stops(topic.name):
+                self._say(
+                    f"{topic.name} belongs to no robot alone; {_by_hand('for each that it should stop', topic)}"
+                )
+
+    def _add_fence(self, base: TopicFacts) -> None:
+        places = self.graph.sources(base, types.POSES)
+        sleeping = [topic for topic in places if self._comes_after_motion(topic)]
+        places = [topic for topic in places if topic not in sleeping and not _NO_POSITION.search(topic.name)]
+        if not places:
+            title = self.graph.robot_of(base).title
+            why = "".join(f"; {topic.name} is published only after a motion" for topic in sleeping)
+            self._say(
+                f"no odometry of {title} found{why}: give --by: rosrv guard new fence {base.name} --by TOPIC --shadow"
+            )
+            return
+        ranked = sorted(places, key=lambda topic: self._rank(topic, places, base))
+        best = [
+            topic
+            for topic in ranked
+            if self._rank(topic, places, base) == self._rank(ranked[0], places, base)
+        ]
+        if len(best) > 1:
+            self._leave("fence", base, "several odometries fit", best)
+        elif 0 < best[0].rate < _SLOWEST_HZ:
+            self._leave(
+                "fence",
+                base,
+                _slow(best[0]),
+                ranked[1:] or best,
+            )
+        else:
+            frame = {"worldFrame": "true"} if _WORLD_FRAME.search(base.name) else {}
+            self._add(
+                "fence", base, _silence(best[0], 3, 0.2, 1), frame, topics={"by": best[0].name}, others=ranked
+            )
+
+    def _add_scanners(self, base: TopicFacts) -> None:
+        scans = self.graph.sources(base, types.SCANS)
+        for avoided in (_SCAN_OF_A_CAMERA, _RAW):
+            scans = [topic for topic in scans if not avoided.search(topic.name)] or scans
+        merged = [topic for topic in scans if self.graph.derived_from(topic, scans)]
+        sides = [topic for topic in scans if _SIDE.search(topic.name)]
+        raw = sides if len(sides) > 1 else [topic for topic in scans if topic not in merged] or scans
+        for preset, chosen in (("sensor", raw), ("separation", merged or raw)):
+            several = len(chosen) > 1
+            for scan in chosen:
+                if 0 < scan.rate < _SLOWEST_HZ:
+                    self._leave(preset, base, _slow(scan), [scan])
+                else:
+                    others = [topic for topic in scans if topic not in chosen]
+                    self._add(
+                        preset,
+                        base,
+                        _silence(scan, 3, 0.1, 1),
+                        several=several,
+                        topics={"by": scan.name},
+                        others=others,
+                    )
+            if several and preset == "separation":
+                self._say(
+                    f"each separation counts angles from the front of its scanner: set sector of one that does not look"
+                    f" ahead ({', '.join(scan.name for scan in chosen)})"
+                )
+
+    def _comes_after_motion(self, topic: TopicFacts) -> bool:
+        """Whether a particle filter publishes it, which waits for the robot to move."""
+        return topic.type != "nav_msgs/Odometry" and (
+            bool(_AMCL.search(topic.name))
+            or any(
+                _AMCL.search(node) or self.graph.publishes(node, {"geometry_msgs/PoseArray"})
+                for node in topic.publishers
+            )
         )
-    if arm.type == types.GOAL and arm.name.endswith("/goal"):
-        before = arm.name.removesuffix("/goal")
-        if any(one.name == f"{before}/result" for one in topics):
-            yield Proposal("answer", _name("answer", arm, alone), {"command": arm.name})
+
+    def _rank(
+        self, topic: TopicFacts, places: Sequence[TopicFacts], base: TopicFacts
+    ) -> tuple[int, int, int]:
+        odometry = topic.type == "nav_msgs/Odometry"
+        if odometry and (_FILTERED.search(topic.name) or self.graph.derived_from(topic, places)):
+            level = 0
+        elif odometry and not self.graph.robot_of(base).drivers.isdisjoint(topic.publishers):
+            level = 1
+        else:
+            level = 2 if odometry else 3 + (topic.type != "geometry_msgs/PoseStamped")
+        return level, int(bool(_WHEELS.search(topic.name))), -near(topic, base)
+
+    def _add(
+        self,
+        preset: str,
+        command: TopicFacts,
+        measured: Mapping[str, str] | None = None,
+        values: Mapping[str, str] | None = None,
+        *,
+        several: bool = False,
+        others: Iterable[TopicFacts] = (),
+        topics: Mapping[str, str] | None = None,
+    ) -> None:
+        topics = {"command": command.name, **(topics or {})}
+        for guard in self._loaded:
+            told_apart = ("command", *_OWN_GUARD.get(preset, ()))
+            if guard.preset == preset and all(guard.topics.get(name) == topics[name] for name in told_apart):
+                if guard not in self.in_use:
+                    self.in_use.append(guard)
+                return
+        source = topics.get("by") or topics.get("stop") or ""
+        parts = [preset, *([] if self._alone else [command.name]), *([source] if several else [])]
+        name = next(name for name in _names(parts, command.name) if name not in self._names)
+        self._names.add(name)
+        alternatives = [topic.name for topic in others if topic.name != topics.get("by")]
+        self.found.append(
+            Proposal(preset, name, topics, measured or {}, values or {},
+                     {"by": alternatives} if alternatives else {})
+        )  # fmt: skip
+
+    def _leave(self, preset: str, command: TopicFacts, why: str, topics: Sequence[TopicFacts]) -> None:
+        choice = "" if len(topics) == 1 else f"; choose one of {', '.join(topic.name for topic in topics)}"
+        by = topics[0].name if len(topics) == 1 else "TOPIC"
+        self._say(
+            f"{preset} of {command.name} is left out: {why}{choice}:"
+            f" rosrv guard new {preset} {command.name} --by {by} --shadow"
+        )
+
+    def _say(self, sentence: str) -> None:
+        if sentence not in self.left_out:
+            self.left_out.append(sentence)
 
 
-def _sources(
-    command: TopicFacts,
-    topics: Iterable[TopicFacts],
-    rows: Mapping[str, TypeRow],
-    prefer: "re.Pattern[str] | None" = None,
-    avoid: "re.Pattern[str] | None" = None,
-) -> list[TopicFacts]:
-    """Return the topics with publishers and such a type. Topics near the command's namespace come first."""
-    found = [one for one in topics if one.type in rows and one.publishers and not _COMMAND.search(one.name)]
-
-    def order(one: TopicFacts) -> tuple[bool, bool, int, str]:
-        preferred = prefer is None or bool(prefer.search(one.name))
-        avoided = avoid is not None and bool(avoid.search(one.name))
-        return (avoided, not preferred, -_shared(one.name, command.name), one.name)
-
-    return sorted(found, key=order)
+_OWN_GUARD = {"sensor": ("by",), "separation": ("by",), "estop": ("stop",)}
+"""The topics that have a guard of their own each."""
 
 
-def _shared(one: str, other: str) -> int:
-    pairs = zip(one.split("/")[:-1], other.split("/")[:-1], strict=False)
-    return next(
-        (place for place, (a, b) in enumerate(pairs) if a != b), min(one.count("/"), other.count("/"))
-    )
+def _stops(topic: str) -> bool:
+    """Whether true on the topic means stop: no word of its name says the opposite, or something else."""
+    if _KNOWN_STOPS.search(topic):
+        return True
+    leaf = topic.rsplit("/", 1)[1].lower()
+    rest = _STOP.sub(" ", leaf)
+    return rest != leaf and {*_WORD.findall(rest)} <= _WORDS_OF_A_STOP
 
 
-def _silence(topic: TopicFacts, least: float, most: float) -> dict[str, str]:
-    """Allow five periods of the present rate."""
-    return {"silent": f"{min(max(5 / topic.rate, least), most):.3g}"} if topic.rate > 0 else {}
+def _slow(topic: TopicFacts) -> str:
+    return f"{topic.name} has a rate of only {topic.rate:.3g} Hz"
 
 
-def _name(preset: str, topic: TopicFacts, alone: bool) -> str:
-    return preset if alone else f"{preset}_{re.sub(r'[^a-z0-9]+', '_', topic.name.lower()).strip('_')[-50:]}"
+def _by_hand(when: str, stop: TopicFacts) -> str:
+    return f"{when}: rosrv guard new estop TOPIC --topic stop={stop.name} --shadow"
+
+
+def _names(parts: list[str], command: str) -> Iterator[str]:
+    tail = "_".join(_slug(part) for part in parts[1:])
+    yield f"{parts[0]}_{tail[-50:]}".rstrip("_")
+    yield f"{parts[0]}_{_slug(command)[-50:]}"
+    number = 2
+    while True:
+        yield f"{parts[0]}_{tail[-46:]}_{number}".replace("__", "_")
+        number += 1
+
+
+def _slug(topic: str) -> str:
+    return re.sub(r"[^a-z0-9]+", "_", topic.lower()).strip("_")
+
+
+def _silence(topic: TopicFacts, periods: int, least: float, most: float) -> dict[str, str]:
+    """Allow some periods of the present rate."""
+    return {"silent": f"{min(max(periods / topic.rate, least), most):.3g}"} if topic.rate > 0 else {}

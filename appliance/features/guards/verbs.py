@@ -16,9 +16,9 @@ from appliance.cli.commit_confirm import ConfirmWithin, seconds_within
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.monitor_changes import say_replaced, say_shadow_deadline
 from appliance.cli.output import moment, say_json
-from appliance.features.guards.guard_answers import GuardRow
-from appliance.features.guards.guard_facts import facts_of, preset_row
-from appliance.features.guards.guard_requests import GuardNew, GuardsWanted, GuardTry
+from appliance.features.guards.guard_answers import GuardRow, Suggestion
+from appliance.features.guards.guard_facts import preset_row
+from appliance.features.guards.guard_requests import GuardNew, GuardSuggestionsWanted, GuardsWanted, GuardTry
 from appliance.features.guards.presets import (
     PRESETS,
     GuardError,
@@ -28,7 +28,6 @@ from appliance.features.guards.presets import (
     preset_of,
     with_values,
 )
-from appliance.features.guards.suggestions import proposals
 from appliance.features.table import verb_function
 from rosmop.tool.tables import say_table, table_of
 from rosmop.tool.terminal import say
@@ -94,21 +93,23 @@ def suggest(appliance: Appliance) -> None:
 
     Example: rosrv guard suggest
     """
-    found = proposals(facts_of(appliance.ask_or_exit(admin.GraphWanted())))
-    for one in found:
-        if appliance.as_json:
-            say_json({"preset": one.preset, "name": one.name, "topics": dict(one.topics),
-                      "measured": dict(one.measured), "values": dict(one.values), "command": one.command})  # fmt: skip
-            continue
-        set_by = {**one.measured, **one.values}
-        rest = ", ".join(f"{each.name}={each.default}" for each in PRESETS[one.preset].parameters
-                         if each.name not in set_by and each.name != "limits")  # fmt: skip
-        say(one.command)
-        say(f"    {PRESETS[one.preset].what}", "dim")
-        say("    " + "; ".join(filter(None, (
-            f"from the present rate: {', '.join(one.measured)}" if one.measured else "",
-            f"defaults, which you should check: {rest}" if rest else ""))), "dim")  # fmt: skip
-    if not found and not appliance.as_json:
+    found = appliance.ask_or_exit(GuardSuggestionsWanted())
+    if appliance.as_json:
+        for guard in found.loaded:
+            say_json({"loaded": guard.name, "preset": guard.preset, "topics": guard.topics})
+        for one in found.suggestions:
+            say_json({"preset": one.preset, "name": one.name, "topics": one.topics, "measured": one.measured,
+                      "values": one.values, "command": one.command, "others": one.others})  # fmt: skip
+        for sentence in found.left_out:
+            say_json({"left_out": sentence})
+        return
+    for guard in found.loaded:
+        say(f"loaded: {guard.name} ({guard.preset} on {guard.topics['command']})", "green")
+    for one in found.suggestions:
+        _say_suggestion(one)
+    for sentence in found.left_out:
+        say(sentence, "yellow")
+    if not (found.suggestions or found.loaded):
         say(
             "no topic now commands a base or an arm: start the robot's nodes, or name a topic: rosrv guard new --help"
         )
@@ -401,6 +402,20 @@ def _replay(appliance: Appliance, row: MonitorState, text: str, since: str) -> N
                 end.exit_code != 1
             ):  # nothing is recorded, or the recorder is off, and this was said: the plan holds
                 raise
+
+
+def _say_suggestion(one: Suggestion) -> None:
+    set_by = {**one.measured, **one.values}
+    rest = ", ".join(f"{each.name}={each.default}" for each in PRESETS[one.preset].parameters
+                     if each.name not in set_by and each.name != "limits")  # fmt: skip
+    notes = [
+        f"from the present rate: {', '.join(one.measured)}" if one.measured else "",
+        f"defaults, which you should check: {rest}" if rest else "",
+        *(f"instead of {one.topics[name]}: {', '.join(topics)}" for name, topics in one.others.items()),
+    ]
+    say(one.command)
+    say(f"    {one.what}", "dim")
+    say(f"    {'; '.join(filter(None, notes))}", "dim")
 
 
 def _say_preset(preset: Preset) -> None:

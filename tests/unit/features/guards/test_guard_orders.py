@@ -6,7 +6,7 @@ import pytest
 
 from appliance.base import clock
 from appliance.channel import admin
-from appliance.channel.answers.graph_answers import Graph
+from appliance.channel.answers.graph_answers import Graph, Publisher, Topic
 from appliance.control.errors import SenselessError, UnknownThingError
 from appliance.features.guards import guard_requests
 from appliance.features.guards.guard_orders import GuardOrders
@@ -222,3 +222,30 @@ async def test_a_new_guard_is_in_shadow_mode_or_in_force(
     assert manager.enabling == [not shadow]
     assert "double vMax = 0.3 m/s" in load.files["speed.rv"]
     assert (load.shadow, load.confirm_within, load.note[:14]) == (shadow, 300.0, "preset speed 1")
+
+
+async def test_suggestions_name_the_guards_that_are_loaded(manager: Manager) -> None:
+    flow = {
+        "messages": 0,
+        "bytes": 0,
+        "dropped": 0,
+        "messages_per_second": 10.0,
+        "bytes_per_second": 0.0,
+        "delay_seconds": 0.0,
+    }
+    topics = [
+        Topic(name, kind, True, [Publisher(node="/a", **flow)], ["/base"], [])  # type: ignore[arg-type]  # of floats
+        for name, kind in (
+            ("/cmd_vel", TYPES["command"]),
+            ("/odom", TYPES["by"]),
+            ("/estop_enabled", "std_msgs/Bool"),
+        )
+    ]
+    given = [SimpleNamespace(name=name, kind="topic", value=topic) for name, topic in
+             (("command", "/cmd_vel"), ("by", "/odom"))]  # fmt: skip
+    manager.givens = SimpleNamespace(states=lambda _checked, _name: given)
+    orders = GuardOrders(manager, lambda: Graph([], topics, []))  # type: ignore[arg-type]  # as much as guards need
+    found = await orders.suggestions(guard_requests.GuardSuggestionsWanted())
+    assert [one.name for one in found.loaded] == ["fence"]
+    assert [one.preset for one in found.suggestions] == ["deadman", "speed"]
+    assert found.left_out[0].startswith("/estop_enabled: its name does not say")

@@ -1,3 +1,4 @@
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -6,9 +7,10 @@ import yaml
 
 from appliance.features.guards.plans import planned
 from appliance.features.guards.presets import PRESETS, GuardError, text_of
-from appliance.features.guards.suggestions import Proposal, TopicFacts, proposals
+from appliance.features.guards.robot_graph import MOST_COMMANDS, TopicFacts
+from appliance.features.guards.suggestions import NOT_SUGGESTED, Advice, LoadedGuard, Proposal, advice
 from rosmop.check.sources import compiled_from
-from tests.unit.features.guards.guarding import DEFINITIONS
+from tests.unit.features.guards.guarding import DEFINITIONS, seeded
 
 ROBOTS: dict[str, Any] = yaml.safe_load(Path(__file__).with_name("robots.yaml").read_text(encoding="utf-8"))
 
@@ -29,27 +31,136 @@ def text(proposal: Proposal, graph: list[TopicFacts]) -> str:
     return text_of(planned(PRESETS[proposal.preset], proposal.name, proposal.topics, graph, values, {}))
 
 
+def printed(found: Advice) -> Iterator[str]:
+    for one in found.proposals:
+        yield one.command.removeprefix("rosrv guard new ")
+        yield from (f"  instead: {', '.join(topics)}" for topics in one.others.values())
+    yield from (f"! {sentence}" for sentence in found.left_out)
+
+
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_a_robot_is_guarded_without_editing_a_file(robot: str) -> None:
     graph = graph_of(robot)
-    found = proposals(graph)
-    by_command: dict[str, list[str]] = {}
-    for one in found:
-        by_command.setdefault(one.topics["command"], []).append(one.preset)
-        assert one.command.startswith(f"rosrv guard new {one.preset} {one.topics['command']}")
-    assert by_command == ROBOTS[robot]["commands"]
-    sources = {f"{one.name}.rv": text(one, graph) for one in found}
-    assert len(sources) == len(found)
-    assert len(compiled_from(sources, DEFINITIONS).specifications) == len(found)
+    found = advice(graph)
+    assert [*printed(found)] == ROBOTS[robot]["proposal"].splitlines()
+    sources = {f"{one.name}.rv": text(one, graph) for one in found.proposals}
+    assert len(sources) == len(found.proposals)
+    assert len(compiled_from(sources, DEFINITIONS).specifications) == len(found.proposals)
 
 
-def test_values_follow_the_present_rates_and_the_frame_of_the_commands() -> None:
-    base = {one.preset: one for one in proposals(graph_of("turtlebot3"))}
-    assert base["deadman"].command == "rosrv guard new deadman /cmd_vel --shadow silent=0.5"
-    assert base["fence"].topics["by"] == "/odom"
-    copter = {one.preset: one for one in proposals(graph_of("copter"))}
-    assert copter["fence"].values == {"worldFrame": "true"}
-    assert copter["arm"].command.endswith("--by /mavros/battery --shadow silent=5")
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_the_order_of_topics_and_further_observers_change_nothing(robot: str) -> None:
+    """A graph has no order, and a plot or a recording is not a base."""
+    graph = graph_of(robot)
+    found = advice(graph)
+    for seed in range(5):
+        mixed = [one._replace(subscribers=(*one.subscribers, "/record_1", "/rqt_plot")) for one in graph]
+        seeded(seed).shuffle(mixed)
+        again = advice(mixed)
+        assert {one.command for one in again.proposals} == {one.command for one in found.proposals}
+        assert {*again.left_out} == {*found.left_out}
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_nothing_is_proposed_that_is_loaded(robot: str) -> None:
+    graph = graph_of(robot)
+    found = advice(graph).proposals
+    loaded = [LoadedGuard(f"mine_{place}", one.preset, one.topics) for place, one in enumerate(found)]
+    again = advice(graph, loaded)
+    assert (again.proposals, {guard.name for guard in again.loaded}) == ([], {guard.name for guard in loaded})
+    one_less = advice(graph, loaded[1:], ["deadman", "deadman_2"])
+    assert [one.topics for one in one_less.proposals] == [found[0].topics]
+    assert one_less.proposals[0].name not in {"deadman", "deadman_2"}
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_a_second_robot_changes_nothing_for_the_first(robot: str) -> None:
+    """Each has its nodes and topics below its namespace: no proposal mixes the two."""
+    alone, both = (
+        advice(moved(graph_of(robot), "a")),
+        advice([*moved(graph_of(robot), "b"), *moved(graph_of(robot), "a")]),
+    )
+
+    def essence(one: Proposal) -> tuple[str, dict[str, str]]:
+        return one.preset, {name: topic for name, topic in one.topics.items() if name != "reset"}
+
+    assert [essence(one) for one in alone.proposals] == [
+        essence(one) for one in both.proposals if one.topics["command"].startswith("/a/")
+    ]
+    for one in both.proposals:
+        assert len({topic.split("/")[1] for topic in one.topics.values()}) == 1
+
+
+def moved(graph: list[TopicFacts], space: str) -> list[TopicFacts]:
+    return [
+        one._replace(
+            name=f"/{space}{one.name}",
+            publishers=tuple(f"/{space}{node}" for node in one.publishers),
+            subscribers=tuple(f"/{space}{node}" for node in one.subscribers),
+        )
+        for one in graph
+    ]
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_without_its_source_a_guard_is_left_out(robot: str) -> None:
+    """No neighbour's source takes its place."""
+    graph = moved(graph_of(robot), "a")
+    for one in advice(graph).proposals:
+        sources = {topic for name, topic in one.topics.items() if name not in {"command", "reset"}}
+        less = [topic for topic in graph if topic.name not in sources]
+        again = advice([*moved(graph_of(robot), "b"), *less]).proposals
+        assert all(topic.startswith("/a/") for each in again if each.topics["command"].startswith("/a/")
+                   for topic in each.topics.values())  # fmt: skip
+
+
+STOPS = {
+    "/e_stop": True, "/estop": True, "/emergency_stop": True, "/robot1/estop_pressed": True, "/hw_estop": True,
+    "/protective_stop": True, "/is_runstopped": True, "/software_runstop_enabled": True, "/front/e_stop_button": True,
+    "/runstop": True, "/emergency_stop_reset": False, "/estop_released": False, "/estop_enabled": False,
+    "/estop_ok": False, "/estop_not_pressed": False, "/estop_clear": False, "/estop_disabled": False,
+    "/runstop_motion_enabled": False, "/estop_heartbeat": False, "/safe/scan": False, "/stop_sign": False,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("topic", "stops"), STOPS.items())
+def test_a_stop_is_proposed_only_if_its_name_says_what_true_means(topic: str, stops: bool) -> None:
+    graph = [
+        TopicFacts("/cmd_vel", "geometry_msgs/Twist", ("/teleop",), ("/base",)),
+        TopicFacts(topic, "std_msgs/Bool", ("/plc",), (), 10),
+    ]
+    found = {one.topics["stop"] for one in advice(graph).proposals if one.preset == "estop"}
+    assert found == ({topic} if stops else set())
+
+
+def test_a_flood_of_topics_is_cut_and_said() -> None:
+    graph = [
+        TopicFacts(f"/r{number}/cmd_vel", "geometry_msgs/Twist", ("/operator",), (f"/r{number}",), 10)
+        for number in range(700)
+    ]
+    found = advice(graph)
+    assert len({one.topics["command"] for one in found.proposals}) == MOST_COMMANDS
+    assert "only the first" in found.left_out[-1]
+
+
+def test_each_preset_is_proposed_for_some_robot_or_has_a_reason() -> None:
+    found = {one.preset for robot in ROBOTS for one in advice(graph_of(robot)).proposals}
+    assert found | NOT_SUGGESTED.keys() == PRESETS.keys() and not found & NOT_SUGGESTED.keys()
+
+
+def test_a_topic_of_any_type_is_watched_by_its_silence_alone() -> None:
+    types = {"by": "sensor_msgs/Joy"}
+    for kind, silent in (("sensor_msgs/Joy", True), ("std_msgs/String", True), ("sensor_msgs/Imu", False)):
+        graph = [*graph_of("turtlebot3"), TopicFacts("/link", kind, ("/joy",), ())]
+        guard = planned(
+            PRESETS["sensor"], "link", {"command": "/cmd_vel", "by": "/link"}, graph, {"silent": "0.3"}, {}
+        )
+        assert (guard.values.get("frozen") == "0") == silent
+        compiled_from({"link.rv": text_of(guard)}, DEFINITIONS)
+    with pytest.raises(GuardError, match="only the silence is judged"):
+        planned(
+            PRESETS["sensor"], "link", {"command": "/cmd_vel", "by": "/joy"}, graph, {"frozen": "5"}, types
+        )
 
 
 PLANS = [

@@ -12,10 +12,15 @@ from appliance.channel import admin
 from appliance.channel.answers.monitor_answers import GivenSet, Replacement, Switched
 from appliance.cli.output import say_json
 from appliance.features.guards import verbs
-from appliance.features.guards.guard_answers import GuardPlan, GuardRow
-from appliance.features.guards.guard_requests import GuardNew, GuardsWanted, GuardTry
+from appliance.features.guards.guard_answers import (
+    GuardPlan,
+    GuardRow,
+    LoadedSuggestion,
+    Suggestion,
+    Suggestions,
+)
+from appliance.features.guards.guard_requests import GuardNew, GuardSuggestionsWanted, GuardsWanted, GuardTry
 from appliance.features.guards.presets import PRESETS, Guard, GuardError, text_of
-from tests.unit.features.guards.test_suggestions import graph_of
 
 
 class Robot:
@@ -37,12 +42,13 @@ class Robot:
 
     def ask_or_exit(self, request: Any) -> Any:
         match request:
-            case admin.GraphWanted():
-                flows = {one.name: [SimpleNamespace(node=node, messages_per_second=one.rate) for node in one.publishers]
-                         for one in graph_of("turtlebot3")}  # fmt: skip
-                topics = [SimpleNamespace(name=one.name, type=one.type, publishers=flows[one.name],
-                                          subscribers=one.subscribers) for one in graph_of("turtlebot3")]  # fmt: skip
-                return SimpleNamespace(topics=topics)
+            case GuardSuggestionsWanted():
+                return Suggestions(
+                    [Suggestion("fence", "fence", "Keeps the base inside.", {"command": "/cmd_vel", "by": "/odom"},
+                                {"silent": "0.2"}, {}, "rosrv guard new fence", {"by": ["/wheels"]})],
+                    [LoadedSuggestion("mine", "deadman", {"command": "/cmd_vel"})],
+                    ["/estop_enabled: its name does not say whether true stops"],
+                )  # fmt: skip
             case GuardsWanted():
                 rows = [
                     GuardRow(one, one, "", "stopping", {"command": "/cmd_vel"}, {}, [], {}, 3)
@@ -241,6 +247,19 @@ def test_lists_and_proposals_are_printed(tmp_path: Path, capsys: pytest.CaptureF
     assert all(f"{name}: {preset.what}" in shown for name, preset in PRESETS.items())
     assert "guard fence: fence on /cmd_vel, in force, stopping, 3 stops\nfence acts before rate\n" in shown
     run(verbs.suggest, Robot(None))
-    shown = capsys.readouterr().out
-    assert "rosrv guard new fence /cmd_vel --by /odom --shadow silent=0.2\n" in shown
-    assert "defaults, which you should check: margin=0.2" in shown
+    assert capsys.readouterr().out == (
+        "loaded: mine (deadman on /cmd_vel)\n"
+        "rosrv guard new fence\n"
+        "    Keeps the base inside.\n"
+        "    from the present rate: silent; defaults, which you should check: "
+        "margin=0.2, ahead=0.5, worldFrame=false, lat0=0, lon0=0, polygon=-2,-2 2,-2 2,2 -2,2; "
+        "instead of /odom: /wheels\n"
+        "/estop_enabled: its name does not say whether true stops\n"
+    )
+    robot = Robot(None)
+    robot.as_json = True
+    run(verbs.suggest, robot)
+    lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert lines[0] == {"loaded": "mine", "preset": "deadman", "topics": {"command": "/cmd_vel"}}
+    assert (lines[1]["command"], lines[1]["others"]) == ("rosrv guard new fence", {"by": ["/wheels"]})
+    assert lines[2]["left_out"].startswith("/estop_enabled")

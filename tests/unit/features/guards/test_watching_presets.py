@@ -4,7 +4,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from appliance.features.guards.message_types import GOAL
+from appliance.features.guards.message_types import ANY_TYPE, GOAL
 from appliance.features.guards.presets import PRESETS, loaded_values
 from rosmop.tests.acting import STORE, fields, message
 from rosmop.tests.examples import examples
@@ -165,7 +165,11 @@ SENSED: dict[str, dict[str, Any]] = {
 
 @pytest.mark.parametrize("kind", SENSED)
 def test_other_sensors_are_watched_likewise(kind: str) -> None:
-    assert set(SENSED) == {*PRESETS["sensor"].topics["by"]} - {"sensor_msgs/LaserScan"}
+    assert set(SENSED) == {*PRESETS["sensor"].topics["by"]} - {
+        "sensor_msgs/LaserScan",
+        "sensor_msgs/Joy",
+        ANY_TYPE,
+    }
     guard = Guarded("sensor", {"by": kind}, frozen=2)
     for at, moves in ((1, True), (2, True), (3, False)):
         guard.tell("by", message(kind, **SENSED[kind]), at)
@@ -173,6 +177,17 @@ def test_other_sensors_are_watched_likewise(kind: str) -> None:
     name, value = next(iter(SENSED[kind].items()))
     guard.tell("by", message(kind, **{name: [math.nan] if isinstance(value, list) else math.nan}), 4)
     assert not runs(guard, 4) or kind in {"sensor_msgs/NavSatFix", "sensor_msgs/Imu", "nav_msgs/Odometry"}
+
+
+@pytest.mark.parametrize("kind", ["sensor_msgs/Joy", "std_msgs/Header"])
+def test_only_the_silence_of_any_other_type_is_judged(kind: str) -> None:
+    """A joystick at rest repeats its values; a broken link is silent."""
+    guard = Guarded("sensor", {"by": kind}, frozen=2)
+    for at in range(0, 1000, 100):
+        guard.tell("by", message(kind), at)
+        assert runs(guard, at + 1)
+    guard.advance(3000)
+    assert stops(guard) == [1420]
 
 
 def speed(v: float) -> bytes:
