@@ -355,24 +355,34 @@ AUDIT_READ_KINDS = QuotaRow(
     alarm="none",
     shown_by=("unit/audit/log/test_folding.py::test_reads_beyond_the_quota_are_recorded_in_full",),
 )
+AUDIT_RATE = 64 << 10
+"""Bytes a second by which a host's debt of audit records falls."""
+AUDIT_ROBOT_PART, AUDIT_NAMED_PART, AUDIT_NAMED_MOST = 4, 64, 256 << 20
+"""The robot's part of the disk's free space is one of 4, that of an address or network of the policy one of 64, at most
+256 MiB.
+"""
 AUDIT_BYTES = QuotaRow(
     thing="bytes of audit records that a host owes; its debt falls by 64 KiB a second",
     bounds=Bounds(whole=1 << 40, host=16 << 20, unknown=16 << 20, kept=1 << 39),
-    at_limit="the host's calls wait; a multicall's excess parts are rejected with the reason",
-    between="records of unknown hosts whose calls are denied are folded; in audit-only mode, where their calls pass,"
-    " all unknown hosts owe as one",
+    at_limit="the host's calls wait once its group has also used up its part of the free disk space; a multicall's"
+    " excess parts are rejected with the reason",
+    between="the robot may owe a quarter of the free disk space; an address or network that the policy names a 64th,"
+    " at most 256 MiB (with `audit.retention_bytes`, a 64th of that if it is less); while a quarter of the log's queue"
+    " waits for the disk (for the robot three quarters), no host has a part. Records of unknown hosts whose calls are"
+    " denied are folded; in audit-only mode, where their calls pass, all unknown hosts owe as one",
     alarm="`limit exceeded`",
     shown_by=(
         "unit/audit/log/test_budget.py::test_two_hundred_hosts_leave_the_robot_its_quota",
         "unit/audit/log/test_budget.py::test_a_host_in_debt_waits_until_it_is_paid",
+        "unit/audit/log/test_starts.py::test_a_robot_that_is_started_again_and_again_never_waits",
         "integration/master/test_audit_quotas.py::test_reads_with_long_keys_do_not_fill_the_disk",
     ),
 )
 AUDIT_RESERVE = QuotaRow(
     thing="bytes of free disk space reserved for the audit log",
     bounds=Bounds(whole=64 << 20, host=1 << 20, unknown=0, kept=16 << 20),
-    at_limit="a host's debt falls by 8 KiB a second and its calls wait; on a full disk every call is denied until"
-    " there is room",
+    at_limit="a host's debt falls by 8 KiB a second and its calls wait (the robot's once it owes a quarter of what is"
+    " left); on a full disk every call is denied until there is room",
     between="the last quarter is for the robot and the hosts that the policy names by address or group (for hosts with"
     " a registration if it names none); calls of others are rejected with the reason",
     alarm="`disk nearly full`; `rosrv status`",
