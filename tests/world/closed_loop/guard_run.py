@@ -25,6 +25,11 @@ def unchanged(text: str) -> str:
     return text
 
 
+@functools.cache
+def parameters_of(preset: str) -> frozenset[str]:
+    return frozenset(one.name for one in preset_named(preset).parameters)
+
+
 @functools.lru_cache(maxsize=256)
 def _part(text: str) -> SetPart:
     [part] = parts_of(certified(compiled_from({"guard.rv": text}, DEFINITIONS)).data, [(("guard",), ())])

@@ -1,6 +1,7 @@
 """Worlds with a base that moves: among obstacles and persons (`separation`), and inside a fence (`fence`)."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -25,7 +26,7 @@ from tests.world.closed_loop.messages import (
     scan,
     travels,
 )
-from tests.world.closed_loop.world import SLACK, World
+from tests.world.closed_loop.world import SLACK, World, void
 
 PERSON_RADIUS = 0.2
 KINDS = {
@@ -39,13 +40,15 @@ class DrivenWorld(World):
     """A base, and a node that drives it somewhere at any rate, with pauses."""
 
     base: Base
-    sensor_fails = False
-    dead = False
-    """Whether the sensor sends nothing any more."""
+    fault = ""
+    foreign = False
+    """Whether another node publishes good measurements of something else."""
     heard = -1
     """When the last valid measurement arrived, or -1."""
     blind_from: int | None = None
     """When the first measurement without any evidence arrived that no valid one has followed."""
+    tick = 20
+    """Milliseconds between two looks of the guard."""
 
     def built(self, kinds: "tuple[str, ...]", lag: int, braking: float, top: float) -> None:
         r = self.random
@@ -96,9 +99,19 @@ class DrivenWorld(World):
     def move(self, until: int) -> None:
         self.base.move(until)
 
-    def measured(self, *, valid: bool) -> None:
-        """Note the arrival of a measurement: valid, or without any evidence."""
-        if valid:
+    def law(self, otherwise: str = "L2") -> str:
+        return "L4" if self.foreign else "L2" if self.fault else otherwise
+
+    def another(self, say: Callable[[], object]) -> None:
+        """Plan, in a part of the worlds, another node that publishes on the topic of the sensor."""
+        if self.random.random() < 0.15:
+            self.foreign = True
+            period = self.random.choice((50, 200))
+            self.every(lambda: period, lambda: void(say()), first=2000)
+
+    def measured(self, *, valid: "bool | None") -> None:
+        """Note the arrival of a measurement: valid, valid in parts (None), or without any evidence."""
+        if valid or valid is None:
             self.heard, self.blind_from = self.now, None
         elif self.blind_from is None:
             self.blind_from = self.now
@@ -108,13 +121,15 @@ class DrivenWorld(World):
         if not travels(self.force[1]) or self.switched_off:
             return
         if self.heard < 0:
-            self.broken("L2", "a motion is in force before the first measurement")
-        if self.blind_from is not None and self.now > self.blind_from + SLACK:
+            self.broken(self.law(), "a motion is in force before the first measurement")
+        if self.blind_from is not None and self.now > self.blind_from + self.tick + SLACK:
             self.broken(
                 "L2", f"a motion is in force, though all measurements since {self.blind_from} ms are invalid"
             )
-        if self.now > self.heard + silent * 1000 + 50 + SLACK:
-            self.broken("L2", f"a motion is in force, though the last measurement came at {self.heard} ms")
+        if self.now > self.heard + silent * 1000 + self.tick + SLACK:
+            self.broken(
+                self.law(), f"a motion is in force, though the last measurement came at {self.heard} ms"
+            )
 
 
 @dataclass
@@ -123,6 +138,11 @@ class Person:
     y: float
     speed: float
     begins: int
+    before: Point = (0.0, 0.0)
+    """The place a step ago."""
+    in_way: bool = False
+    stepped_in: bool = False
+    """Whether the person came from beside the base's way, nearer than the separation distance."""
 
 
 WHOLE, HALF = 3.2, 1.6
@@ -154,11 +174,13 @@ class SeparationWorld(DrivenWorld):
             (DIFFERENTIAL,) if self.sector == HALF else (DIFFERENTIAL, OMNIDIRECTIONAL, OMNIDIRECTIONAL, STEERED),
             lag, braking, r.choice((0.5, 1.0, 2.0, 3.0)),
         )  # fmt: skip
+        self.reaction, self.braking, self.margin = reaction, braking, margin
         self.radius = margin - r.uniform(0.06, 0.15)
         self._surroundings()
         self.guarded({
             "sector": self.sector, "reaction": reaction, "braking": braking, "person": self.speed, "margin": margin,
-            "silent": self.silent,
+            "silent": self.silent, "width": round(self.radius + r.uniform(0.06, 0.2), 2),
+            "wheelbase": self.base.wheelbase,
         }, {"by": SCAN})  # fmt: skip
         self._scanner(r.uniform(25, self.silent * 850), r.uniform(0, reaction * 1000 - lag))
         self.driven(
@@ -167,7 +189,11 @@ class SeparationWorld(DrivenWorld):
         )  # fmt: skip
         if r.random() < 0.5:
             self.after(r.uniform(300, 6000), self._fail)
+        self.another(lambda: self.say("by", self._elsewhere(), 4))
         self.interrupt("hold restart", 0.2)
+
+    def _elsewhere(self) -> bytes:
+        return scan(self.now, -math.pi, math.pi / 50, self.near, self.far, np.full(101, self.far * 0.9))
 
     def _surroundings(self) -> None:
         r = self.random
@@ -235,8 +261,7 @@ class SeparationWorld(DrivenWorld):
 
     def _arrive(self, data: bytes, valid: "bool | None") -> None:
         self.say("by", data, 5)
-        if valid is not None:
-            self.measured(valid=valid)
+        self.measured(valid=valid)
 
     def _fail(self) -> None:
         self.fault = self.random.choice(SCAN_FAULTS)
@@ -295,9 +320,11 @@ class SeparationWorld(DrivenWorld):
         self.only_fresh()
 
     def _touch(self) -> None:
-        vx, vy = self.base.velocity
+        for person in self.persons:
+            self._follow(person)
         places = [(*geometry.nearest_on(wall, self.base.x, self.base.y), 0.0) for wall in self.walls]
-        places += [(one.x, one.y, PERSON_RADIUS) for one in self.persons]
+        places += [(one.x, one.y, PERSON_RADIUS) for one in self.persons if not one.stepped_in]
+        vx, vy = self.base.velocity
         for x, y, radius in places:
             dx, dy = x - self.base.x, y - self.base.y
             away = math.hypot(dx, dy)
@@ -308,10 +335,36 @@ class SeparationWorld(DrivenWorld):
             self.report.clearance = min(self.report.clearance, left)
             if left <= 1e-9:
                 what = "a person" if radius else "a wall"
-                law = "L2" if self.fault else "L3"
-                if self.base.kind == OMNIDIRECTIONAL and self.force[1][1] and law == "L3":
-                    law = "L1"
+                law = self.law("L1" if self.base.kind == OMNIDIRECTIONAL and self.force[1][1] else "L3")
                 self.broken(law, f"the base touches {what} at {towards:.2f} m/s")
+
+    def _follow(self, person: Person) -> None:
+        """Note whether a person steps into the base's way from beside it, so near that no moving base can stop."""
+        before, person.before = person.before, (person.x, person.y)
+        is_in = self._in_way(person.x, person.y)
+        if not is_in:
+            person.stepped_in = False
+        elif not person.in_way and not self._in_way(*before):
+            speed = math.hypot(*self.base.velocity)
+            delay = self.reaction + self.silent
+            needed = (
+                (self.speed + speed) * delay
+                + self.speed * speed / self.braking
+                + speed**2 / (2 * self.braking)
+            )
+            away = math.dist((person.x, person.y), (self.base.x, self.base.y)) - PERSON_RADIUS
+            person.stepped_in = away < needed + self.margin
+        person.in_way = is_in
+
+    def _in_way(self, x: float, y: float) -> bool:
+        vx, vy = self.base.velocity
+        speed = math.hypot(vx, vy)
+        dx, dy = x - self.base.x, y - self.base.y
+        return (
+            speed > 0.01
+            and vx * dx + vy * dy > 0
+            and abs(vx * dy - vy * dx) / speed < self.radius + PERSON_RADIUS
+        )
 
     def ended(self) -> None:
         if self.live and self.base.driven < 0.6 * self.honest[1]:
@@ -335,6 +388,7 @@ class FenceWorld(DrivenWorld):
     """A base inside a polygon, or at first outside: not a centimetre is left outside."""
 
     preset: ClassVar[str] = "fence"
+    tick = 50
 
     def plan(self) -> None:
         r = self.random
@@ -369,6 +423,7 @@ class FenceWorld(DrivenWorld):
         self.driven(self.field, turns=not self.outside)
         if r.random() < 0.4:
             self.after(r.uniform(300, 6000), self._fail)
+        self.another(lambda: self.say("by", position(self.by, self.now, -1.0, 0.0, 0.0), 4))
         self.interrupt("hold restart", 0.2)
 
     def _place(self) -> None:
@@ -448,14 +503,10 @@ class FenceWorld(DrivenWorld):
             where = (
                 f"{-left:.3f} m outside" if self.least == 0 else f"{self.least - left:.3f} m further outside"
             )
-            self.broken("L2" if self.fault else "L3", f"the base is {where}, at {speed:.2f} m/s")
+            self.broken(self.law("L3"), f"the base is {where}, at {speed:.2f} m/s")
         self.evidence(self.silent)
         self.only_fresh()
 
     def ended(self) -> None:
         if self.live and self.base.driven < 0.6 * self.honest:
             self.broken("live", f"the base drives {self.base.driven:.2f} m, not {self.honest:.2f} m")
-
-
-def void(_result: object) -> None:
-    """Take the result of a call whose result does not matter."""

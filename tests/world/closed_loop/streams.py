@@ -4,6 +4,7 @@ A base executes the last command that it got. So each oracle asks which motion i
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -27,7 +28,7 @@ from tests.world.closed_loop.messages import (
     steering,
     values,
 )
-from tests.world.closed_loop.world import SLACK, World
+from tests.world.closed_loop.world import SLACK, World, void
 
 NEVER = -(10**9)
 VELOCITIES = (TWIST, TWIST, TWIST, TWIST_STAMPED, ACKERMANN, ACKERMANN_STAMPED)
@@ -276,23 +277,26 @@ class RateWorld(World):
     def passed(self, node: int, wanted: Legs, got: "Legs | None") -> None:
         if got is None and not self.moves(wanted):
             self.broken("L3", "a stop is dropped")
-        if got is not None and self.moves(got) and abs(got[0]) > abs(self.before):
+        slower = self._slower(wanted, self.before)
+        if got is not None and self.moves(got) and not slower:
             self.motions.append(self.now)
-            for count in range(self.burst + 1, len(self.motions) + 1):
+            for count in range(self.burst + 1, min(30, len(self.motions)) + 1):
                 seconds = (self.motions[-1] - self.motions[-count]) / 1000
                 if count > self.burst + 1 + seconds / self.interval + 1e-6:
                     self.broken(
-                        "L3", f"{count} motions that are faster than the one before pass in {seconds:.3f} s"
+                        "L3", f"{count} motions, none slower than the one before, pass in {seconds:.3f} s"
                     )
-                if count > 30:
-                    break
-        if got is None and abs(wanted[0]) < abs(self.force[1][0]) and not self.guard.holds:
-            self.broken("L3", f"{wanted[0]} m/s is dropped while {self.force[1][0]} m/s is in force")
+        if got is None and slower and not self.guard.holds:
+            self.broken("L3", f"{wanted[0]} m/s is dropped while {self.before[0]} m/s is in force")
 
-    before = 0.0
+    def _slower(self, one: Legs, other: Legs) -> bool:
+        turns = (0.0, 0.0) if self.kind.startswith("ackermann") else (abs(one[5]), abs(other[5]))
+        return abs(one[0]) < abs(other[0]) and turns[0] <= turns[1]
+
+    before: Legs = STILL
 
     def publish(self, data: bytes, node: int = 1) -> "Legs | None":
-        self.before = self.force[1][0]
+        self.before = self.force[1]
         return super().publish(data, node)
 
     def watch(self) -> None:
@@ -305,6 +309,8 @@ class EvidenceWorld(World):
     span = 6000
     steady = 1.0
     sent = got = 0
+    tick = 20
+    """Milliseconds between two looks of the guard."""
     fit_since = NEVER
     """Since when an honest node's commands must pass; `NEVER`: they need not."""
 
@@ -321,22 +327,33 @@ class EvidenceWorld(World):
 
     def passed(self, node: int, wanted: Legs, got: "Legs | None") -> None:
         if got is not None and self.moves(got) and (why := self.fit()):
-            self.broken(self.law(why), f"a motion passes: {why}")
+            self.broken(self.law(), f"a motion passes: {why}")
         if self.fit_since != NEVER and self.now > self.fit_since and self.moves(wanted):
             self.sent += 1
             self.got += got == wanted
 
-    def law(self, why: str) -> str:
-        return "L4" if why.startswith("of one node") else "L2"
+    foreign = False
+    """Whether another node publishes good values on the sensor's topic."""
+
+    def law(self) -> str:
+        return "L4" if self.foreign else "L2"
+
+    def another(self, act: Callable[[], object]) -> None:
+        """Plan, in a part of the worlds, another node that publishes good values."""
+        r = self.random
+        if r.random() < 0.25:
+            self.foreign = True
+            period = r.choice((50, 200))
+            self.every(lambda: period, lambda: void(act()), first=2000)
 
     def watch(self) -> None:
         self.only_fresh()
         why = self.fit()
         self.unfit_from = (self.unfit_from if self.unfit_from != NEVER else self.now) if why else NEVER
-        if self.switched_off or not why or self.now <= self.unfit_from + SLACK:
+        if self.switched_off or not why or self.now <= self.unfit_from + self.tick + SLACK:
             return
         if self.fresh_from <= self.force[0] < self.now and self.moves(self.force[1]):
-            self.broken(self.law(why), f"a motion stays in force: {why}")
+            self.broken(self.law(), f"a motion stays in force: {why}")
 
     unfit_from = NEVER
 
@@ -367,6 +384,7 @@ class SensorWorld(EvidenceWorld):
         if not live:
             self.interrupt("hold restart switch")
             self.after(r.uniform(500, 4000), self._fail)
+            self.another(lambda: self.say("by", self._good(), 5))
         period = r.uniform(15, min(200, self.silent * 800))
         self.every(
             lambda: -1 if self.fault == "dead" else period * r.uniform(0.7, 1),
@@ -379,6 +397,11 @@ class SensorWorld(EvidenceWorld):
         self.trace(f"the sensor fails: {self.fault}")
         if self.fault != "dead" and self.random.random() < 0.5:
             self.after(self.now + self.random.uniform(300, 2000), lambda: setattr(self, "fault", ""))
+
+    def _good(self) -> bytes:
+        return values(
+            self.by, self.now, [self.random.uniform(1, 5) for _value in range(SENSOR_VALUES[self.by])]
+        )
 
     def _sense(self) -> None:
         r = self.random
@@ -423,6 +446,7 @@ class ArmWorld(EvidenceWorld):
 
     preset: ClassVar[str] = "arm"
     span = 8000
+    tick = 100
 
     def plan(self) -> None:
         r = self.random
@@ -447,6 +471,7 @@ class ArmWorld(EvidenceWorld):
         self.every(lambda: r.uniform(100, 900), self._check, first=r.uniform(0, 500))
         if not live:
             self.interrupt("hold restart switch")
+            self.another(lambda: (self.say("by", battery(0.9), 5), self.say("check", boolean(True), 5)))
             for _fault in range(2):
                 self.after(r.uniform(500, 6000), self._fail)
 
@@ -524,6 +549,8 @@ class AgreeWorld(EvidenceWorld):
         if not live:
             self.interrupt("hold restart switch")
             self.after(r.uniform(1000, 4000), self._fail)
+            good = (1.0, 0.2, 0.0, 0.0, 0.0, 0.5)
+            self.another(lambda: self.say("other", odometry(self.now, (0, 0, 0, 0, 0, 0, 1), good), 5))
         for given, period in (("by", r.uniform(15, 80)), ("other", r.uniform(15, 80))):
             self._source(given, period)
 
@@ -593,6 +620,7 @@ class EstopWorld(World):
         self.edges: dict[int, int] = {}
         self.needs_reset = False
         self.latched_at = NEVER
+        self.latched_by = "L6"
         self.reset_at = NEVER
         self.waiting: set[int] = set()
         """Nodes whose next command must stand still."""
@@ -612,11 +640,14 @@ class EstopWorld(World):
     def _drives(self, node: int) -> None:
         r = self.random
         period = r.choice((20, 50, 100))
-        stubborn = not self.live and r.random() < 0.5
+        stubborn = not self.live and r.random() < 0.3
 
         def send() -> None:
-            pause = self.live and 4500 < self.now < 5500
-            self.drive(STILL if pause or (not stubborn and r.random() < 0.05) else straight(0.5), node)
+            pause = self.now < 300 or (self.live and 4500 < self.now < 5500)
+            self.drive(
+                STILL if pause or (not stubborn and not self.live and r.random() < 0.05) else straight(0.5),
+                node,
+            )
 
         self.every(lambda: period * r.uniform(0.8, 1.2), send, first=r.uniform(0, 100))
 
@@ -629,21 +660,24 @@ class EstopWorld(World):
         if on and not self.switched_off and self.moves(self.force[1]):
             self.broken("L3", "a press does not stop the base at once")
 
-    def _latch(self) -> None:
+    def _latch(self, law: str = "") -> None:
+        """Note a stop that only a reset ends; without one, this law is broken."""
         self.needs_reset, self.latched_at = True, self.now
+        self.latched_by = law or ("L4" if self.hands or len(self.resets) > 1 else "L6")
         self.edges.clear()
 
     def _button(self, node: int) -> None:
         r = self.random
         changes = (
-            [] if self.live else sorted(r.uniform(300, 7000) for _change in range(r.choice((0, 2, 2, 3, 4))))
+            [] if self.live else sorted(r.uniform(1600, 7000) for _change in range(r.choice((0, 2, 2, 3, 4))))
         )
         on = False
         for at in changes:
             on = not on
             self.after(at, lambda on=on: self._press(node, on))  # type: ignore[misc]  # bound now
         dies = self.span + 1 if self.live or r.random() < 0.7 else r.uniform(500, 7000)
-        self.after(1, lambda: self._press(node, False))
+        begins = 1 if self.live or r.random() < 0.7 else r.uniform(100, 1500)
+        self.after(begins, lambda: self._press(node, False))
         if self.silent or r.random() < 0.5:
             period = (self.silent or 0.5) * 400
 
@@ -684,8 +718,8 @@ class EstopWorld(World):
             match habit:
                 case "edges":
                     self._reset(node, False)
-                    self.after(self.now + r.uniform(5, 200), lambda: self._reset(node, True))
-                    self.after(self.now + r.uniform(201, 400), lambda: self._reset(node, False))
+                    self.after(self.now + r.uniform(5, 250), lambda: self._reset(node, True))
+                    self.after(self.now + r.uniform(251, 400), lambda: self._reset(node, False))
                 case "stuck":
                     self._reset(node, True)
                 case "tied":
@@ -706,15 +740,15 @@ class EstopWorld(World):
     def lost(self) -> None:
         self.trace("the process is replaced, and its state is lost")
         self.guard.restart(self.now, lost=True)
-        self._doubt()
+        self._doubt("L5")
 
     def cut(self) -> None:
         self.trace("a button sends bytes that are no message")
         self.say("stop", b"", 3)
-        self._doubt()
+        self._doubt("L2")
 
-    def _doubt(self) -> None:
-        self._latch()
+    def _doubt(self, law: str) -> None:
+        self._latch(law)
         self.fresh_from = self.now
         self.after(self.now + self.random.choice((50, 300, 1000)), self._resume)
 
@@ -732,8 +766,9 @@ class EstopWorld(World):
                 f"a motion passes while node {pressed[0]} presses the stop",
             )
         if self.needs_reset:
-            law = "L4" if self.hands or len(self.resets) > 1 else "L6"
-            self.broken(law, f"a motion passes without a reset after the stop at {self.latched_at} ms")
+            self.broken(
+                self.latched_by, f"a motion passes without a reset after the stop at {self.latched_at} ms"
+            )
         if node in self.waiting:
             self.broken(
                 "L6",
@@ -742,7 +777,7 @@ class EstopWorld(World):
         if self.silent and not self.stops:
             self.broken("L2", "a motion passes before the first word of a button")
         for one, button in self.stops.items():
-            if self.silent and self.now > button.heard + self.silent * 1000 + SLACK:
+            if self.silent and self.now > button.heard + self.silent * 1000 + 100 + SLACK:
                 self.broken(
                     "L4", f"a motion passes while the button of node {one} is silent since {button.heard} ms"
                 )
