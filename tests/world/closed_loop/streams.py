@@ -685,7 +685,7 @@ class EstopWorld(World):
                 self._press(node, self.stops[node].on)
 
             self.every(
-                lambda: -1 if self.now > dies else period * r.uniform(0.5, 1), repeat, first=r.uniform(2, 50)
+                lambda: -1 if self.now > dies else period * r.uniform(0.5, 1), repeat, first=begins + 2
             )
 
     def _reset(self, node: int, on: bool) -> None:
