@@ -38,7 +38,7 @@ def test_every_preset_has_a_world_or_a_reason() -> None:
 
 LAWS_OF = {
     "deadman": {"L3", "L4", "L6"}, "speed": {"L1", "L2"}, "separation": {"L1", "L2", "L3"}, "fence": {"L2", "L3"},
-    "sensor": {"L2"}, "estop": {"L2", "L3", "L4", "L6"}, "arm": {"L2"}, "rate": {"L3"}, "agree": {"L2"},
+    "sensor": {"L2"}, "estop": {"L2", "L3", "L4"}, "arm": {"L2"}, "rate": {"L3"}, "agree": {"L2"},
     "sane": {"L1", "L2"},
 }  # fmt: skip
 
