@@ -163,7 +163,15 @@ REFUSED: dict[str, dict[str, Any]] = {
     "end_sessions": {"name": "alice"}, "sign_out": {"session": "0" * 12},
 }  # fmt: skip
 
-ELSEWHERE = {"begin_sign_on", "complete_sign_on", "new_guard", "set_guard", "check_driver", "add_door"}
+ELSEWHERE = {
+    "begin_sign_on",
+    "complete_sign_on",
+    "new_guard",
+    "set_guard",
+    "upgrade_guard",
+    "check_driver",
+    "add_door",
+}
 """Operations that need a provider, a guard's topics or a door. The tests of these features call them."""
 
 FOR_INVESTIGATORS = {"recording_of_memory", "recording_messages", "recording_bag", "recording_evidence"}

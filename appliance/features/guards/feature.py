@@ -44,6 +44,7 @@ GUARDS = Feature(
                 "new": Verb(f"{_VERBS}:new"),
                 "set": Verb(f"{_VERBS}:set_values"),
                 "enforce": Verb(f"{_VERBS}:enforce"),
+                "upgrade": Verb(f"{_VERBS}:upgrade"),
                 "remove": Verb(f"{_VERBS}:remove"),
                 "check-driver": Verb("appliance.features.guards.driver_verb:check_driver"),
             },

@@ -60,6 +60,14 @@ class GuardRow(msgspec.Struct, frozen=True):
     off_until: Annotated[Moment | None, doc("when it is enabled again automatically, or null if never")] = (
         None
     )
+    version: Annotated[int, doc("the version of the preset in its text")] = 0
+    origin: Annotated[
+        str,
+        doc(
+            "`current`: the text of the preset, with its topics and values; `older`: that of a released version, which"
+            " `rosrv guard upgrade` replaces; `changed`: any other text"
+        ),
+    ] = "current"
 
 
 class GuardList(msgspec.Struct, frozen=True):

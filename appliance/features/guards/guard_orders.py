@@ -36,7 +36,9 @@ from appliance.features.guards.presets import (
     types_in,
     with_values,
 )
+from appliance.features.guards.released import origin_of
 from appliance.features.guards.suggestions import LoadedGuard, advice
+from appliance.features.guards.upgrades import Upgrade, same, upgraded
 from appliance.features.guards.view import ActingGuard, GuardsState
 from appliance.specifications.specification_files import SpecificationsRefusedError
 from appliance.specifications.specification_manager import SpecificationManager
@@ -49,13 +51,6 @@ _ACTS = ("drop", "change", "publish", "call")
 
 def _written(value: bool | int | float | str) -> str:
     return str(value).lower() if isinstance(value, bool) else str(value)
-
-
-def _same(one: str, other: str) -> bool:
-    try:
-        return float(one) == float(other)
-    except ValueError:
-        return one == other
 
 
 class GuardOrders:
@@ -73,6 +68,7 @@ class GuardOrders:
             RequestMethod(guard_requests.GuardSuggestionsWanted, self.suggestions, order=False),
             RequestMethod(guard_requests.GuardNew, self.new, who=True),
             RequestMethod(guard_requests.GuardSet, self.set, who=True),
+            RequestMethod(guard_requests.GuardUpgrade, self.upgrade, who=True),
             RequestMethod(guard_requests.GuardTry, self.plan, order=False, who=True),
         )
 
@@ -141,9 +137,19 @@ class GuardOrders:
             await monitors.give(admin.MonitorGive(name, dict(constants), request.expected), who)
         return await self.guards(guard_requests.GuardsWanted())
 
+    async def upgrade(self, request: guard_requests.GuardUpgrade, who: str) -> Replacement:
+        monitors, name = self._monitors, request.name
+        new = self._upgraded(name)
+        order = admin.MonitorLoad(
+            {monitors.checked.monitors[name]: new.text}, note=described(new.text), expected=request.expected,
+            confirm_within=request.confirm_within, shadow=monitors.switches.in_shadow(name), hold=request.hold,
+        )  # fmt: skip
+        return await monitors.load(order, who)
+
     async def plan(self, request: guard_requests.GuardTry, who: str) -> GuardPlan:
         monitors, name = self._monitors, request.name or request.preset
         changed: dict[str, list[str]] = {}
+        kept: list[str] = []
         if request.preset:
             file, text = self._made(request)
             shadow = request.shadow or monitors.switches.starts_in_shadow
@@ -151,6 +157,9 @@ class GuardOrders:
             changed = {each: ["", value] for each, value in request.values.items()}
         else:
             present, text, _constants = self._changed(name, request.values)
+            if request.upgrade:
+                new = self._upgraded(name)
+                text, kept = new.text, new.warnings
             file = "" if text == present else monitors.checked.monitors[name]
             row = self._row(name, self._guards()[name])
             shadow = monitors.switches.in_shadow(name) and not request.enforce
@@ -160,11 +169,13 @@ class GuardOrders:
             after = {
                 each: self._guards()[name].parameter(each).checked(to) for each, to in request.values.items()
             }
-            changed = {each: [before[each], to] for each, to in after.items() if not _same(before[each], to)}
+            changed = {each: [before[each], to] for each, to in after.items() if not same(before[each], to)}
+            if request.upgrade:
+                changed = {**new.changed}
         warnings, refused = await self._judged(request, file, text, who, shadow=shadow)
         return GuardPlan(
             monitors.revision, monitors.tag, name, file, text if file else "", bool(file), shadow, changed, topics,
-            stops, warnings, refused, off,
+            stops, kept + warnings, refused, off,
         )  # fmt: skip
 
     async def _judged(
@@ -198,6 +209,16 @@ class GuardOrders:
             raise SenselessError(str(error)) from error
         placed = Placed(name, preset.name, request.topics["command"], file)
         return file, text + statements(placed, self._placed())
+
+    def _upgraded(self, name: str) -> Upgrade:
+        preset, text = self._guard(name)
+        try:
+            in_force = {
+                one.name: _written(one.value) for one in self._row(name, preset).given if one.kind != "topic"
+            }
+            return upgraded(text, in_force, facts_of(self._graph()))
+        except GuardError as error:
+            raise SenselessError(str(error)) from error
 
     def _changed(self, name: str, values: Mapping[str, str]) -> tuple[str, str, dict[str, str]]:
         preset, text = self._guard(name)
@@ -266,4 +287,6 @@ class GuardOrders:
             why_held=monitors.rollout.why_held.get(name, ""),
             confirm_by=monitors.returns.confirm_by(name),
             off_until=monitors.returns.until(name),
+            version=preset.version,
+            origin=origin_of(text),
         )

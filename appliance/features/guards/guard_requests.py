@@ -46,6 +46,7 @@ class GuardDraft(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     values: Annotated[_Values, doc("by parameter, as text")] = {}
     shadow: Annotated[bool, doc("a new guard only records what it would have done")] = False
     enforce: Annotated[bool, doc("bring the guard from shadow mode into force")] = False
+    upgrade: Annotated[bool, doc("make the guard again from the present version of its preset")] = False
 
 
 class NewDriverCheck(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -102,10 +103,26 @@ class GuardSet(AdminRequest[GuardList], frozen=True, tag="guard set"):
 
 
 @rest(
+    "admin", "POST", "/v1/guards/{name}/upgrade", ("confirm_within", "hold"), name="upgrade_guard", of=MONITORS,
+    problems=_NO_GUARD,
+)  # fmt: skip
+class GuardUpgrade(AdminRequest[Replacement], frozen=True, tag="guard upgrade"):
+    """Make a guard of an older version again from the present preset, with its topics and values.
+
+    Refused with the name of a value that the present version does not have, or does not allow. The guard begins again.
+    """
+
+    name: OneMonitor
+    expected: str | None = None
+    confirm_within: Confirm = None
+    hold: Hold = False
+
+
+@rest(
     "operator", "POST", "/v1/guards/plan", ("hold",), name="plan_guard", body=GuardDraft, problems=_NO_GUARD,
 )  # fmt: skip
 class GuardTry(WaitingRequest[GuardPlan], frozen=True, tag="guard try"):
-    """Report what a new guard, new values or `enforce` would load, change and hold; nothing changes."""
+    """Report what a new guard, new values, `enforce` or `upgrade` would load, change and hold; nothing changes."""
 
     preset: str = ""
     topics: dict[str, str] = msgspec.field(default_factory=dict)
@@ -115,6 +132,7 @@ class GuardTry(WaitingRequest[GuardPlan], frozen=True, tag="guard try"):
     shadow: bool = False
     enforce: bool = False
     hold: Hold = False
+    upgrade: bool = False
 
 
 @rest(
@@ -139,5 +157,6 @@ class DriverCheckWanted(WaitingRequest[DriverCheck], frozen=True, tag="driver ch
 
 
 REQUESTS = (
-    GuardsWanted, GuardSuggestionsWanted, GuardNew, GuardSet, GuardTry, DriverCheckBegin, DriverCheckWanted,
+    GuardsWanted, GuardSuggestionsWanted, GuardNew, GuardSet, GuardUpgrade, GuardTry, DriverCheckBegin,
+    DriverCheckWanted,
 )  # fmt: skip

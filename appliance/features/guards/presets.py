@@ -6,7 +6,7 @@ The first line of a guard names the preset, its version, the topics and their ty
 import functools
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from ipaddress import ip_network
 from pathlib import Path
 
@@ -125,10 +125,12 @@ class Preset:
     """The rows of each topic with several types."""
     further: tuple[Parameter, ...] = ()
     """The parameters that are part of the text."""
+    source: str = field(default="", repr=False)
+    """A text of another version, or that of a guard, instead of the present one."""
 
     @functools.cached_property
     def text(self) -> str:
-        return (FOLDER / f"{self.name}.rv").read_text(encoding="utf-8")
+        return self.source or (FOLDER / f"{self.name}.rv").read_text(encoding="utf-8")
 
     @property
     def version(self) -> int:
@@ -152,7 +154,7 @@ class Preset:
                       one["most"] or "", one["remark"] or "")
             for one in self._given if one["kind"] != "topic"
         )  # fmt: skip
-        return (*given, *self.further)
+        return (*given, *(one for one in self.further if _in_text(self.text, one) is not None))
 
     @property
     def given_topics(self) -> dict[str, str]:
@@ -234,8 +236,10 @@ def text_of(guard: Guard) -> str:
 
 
 def preset_of(text: str) -> Preset | None:
+    """Return the preset of a guard, with the parameters of the guard's own text."""
     found = _FIRST_LINE.match(text)
-    return PRESETS.get(found["preset"]) if found else None
+    preset = PRESETS.get(found["preset"]) if found else None
+    return None if preset is None else replace(preset, source=text)
 
 
 def described(text: str) -> str:
@@ -260,25 +264,70 @@ def _made_for(text: str) -> Iterator[tuple[str, str, str]]:
 def loaded_values(text: str) -> dict[str, str]:
     """Return the values of the parameters that are part of the text."""
     preset = preset_of(text)
-    return {one.name: _in_text(text, one) for one in (preset.parameters if preset else ()) if one.loads}
+    return {one.name: _in_text(text, one) or "" for one in (preset.parameters if preset else ()) if one.loads}
 
 
-def _in_text(text: str, parameter: Parameter) -> str:
+def values_in(text: str) -> dict[str, str]:
+    """Return all values of a guard's text, except limits of joints that it does not have."""
+    preset = preset_of(text)
+    given = {one.name: one.default for one in (preset.parameters if preset else ()) if not one.loads}
+    return given | {name: value for name, value in loaded_values(text).items() if value}
+
+
+def name_in(text: str) -> str:
+    found = _HEAD.search(text)
+    return found[2] if found else ""
+
+
+def _in_text(text: str, parameter: Parameter) -> str | None:
+    """Return the value of a parameter that is part of the text, or null if the text does not have it."""
     tables = {found[2]: found[0].partition("{")[2].split(", ") for found in _TABLE.finditer(text)}
     match parameter.kind:
         case "corners":
-            cells = tables["POLYGON"]
-            return " ".join(f"{x},{y}" for x, y in zip(cells[::2], cells[1::2], strict=True))
+            cells = tables.get("POLYGON")
+            if cells is None:
+                return None
+            return " ".join(f"{x},{y}" for x, y in zip(cells[::2], cells[1::2], strict=False))
         case "joints":
-            rows = zip(tables["NAMES"], tables["LOW"], tables["HIGH"], strict=True)
+            if not tables.keys() >= {"NAMES", "LOW", "HIGH"}:
+                return None
+            rows = zip(tables["NAMES"], tables["LOW"], tables["HIGH"], strict=False)
             return " ".join(
                 f"{joint.strip(chr(34))}:{low}..{high}" for joint, low, high in rows if joint != '""'
             )
         case "hosts":
             hosts = _HOSTS.search(text)
-            return hosts[2].replace('"', "").replace(",", "") if hosts else parameter.default
+            return hosts and hosts[2].replace('"', "").replace(",", "")
     found = _TIMEOUT.search(text)
-    return found[2] if found else parameter.default
+    return found and found[2]
+
+
+def plain(text: str, base: Preset) -> str:
+    """Return a guard's text with the name, topics and values of a version of its preset, and without its first line.
+
+    Raises `GuardError` for a value or topic that the version does not allow, or that is not the same everywhere.
+    """
+    topics, values = topics_in(text), values_in(text)
+    given = (preset_of(text) or base).given_topics
+    if any(given.get(name) != topic or not _TOPIC.fullmatch(topic) for name, topic in topics.items()):
+        raise GuardError("the first line names other topics than the text")
+    known = (
+        base.given_topics | {"cancel": f"{topics.get('command', '').removesuffix('/goal')}/cancel"} | topics
+    )
+    if any(known.get(name) != topic for name, topic in given.items()):
+        raise GuardError("the text has further topics")
+    checked = {name: base.parameter(name).checked(value) for name, value in values.items()}
+    if with_values(text, checked) != text:
+        raise GuardError("a value is not the same everywhere")
+    for name, topic in base.given_topics.items():
+        text = _given(text, "topic", name, topic)
+    text = _given(text, "topic", "cancel", "/cancel")
+    for name, value in (
+        {one.name: one.default for one in base.parameters} | loaded_values(base.text)
+    ).items():
+        text = _with_value(text, base.parameter(name), value)
+    text = _HEAD.sub(rf"\g<1>{base.name}(", text, count=1)
+    return text.partition("\n")[2]
 
 
 def with_values(text: str, values: Mapping[str, str]) -> str:

@@ -1,4 +1,4 @@
-"""The commands `rosrv guard list|suggest|new|set|enforce|remove`."""
+"""The commands `rosrv guard list|suggest|new|set|enforce|upgrade|remove`."""
 
 import tempfile
 from pathlib import Path
@@ -18,7 +18,13 @@ from appliance.cli.monitor_changes import say_replaced, say_shadow_deadline
 from appliance.cli.output import moment, say_json
 from appliance.features.guards.guard_answers import GuardRow, Suggestion
 from appliance.features.guards.guard_facts import preset_row
-from appliance.features.guards.guard_requests import GuardNew, GuardSuggestionsWanted, GuardsWanted, GuardTry
+from appliance.features.guards.guard_requests import (
+    GuardNew,
+    GuardSuggestionsWanted,
+    GuardsWanted,
+    GuardTry,
+    GuardUpgrade,
+)
 from appliance.features.guards.presets import (
     PRESETS,
     GuardError,
@@ -75,9 +81,10 @@ def list_guards(appliance: Appliance) -> None:
             held, shadow, on = (row.state == state for state in ("holding", "shadow", "off"))
             say_json({"guard": row.name, "preset": row.preset, "state": row.state, "shadow": shadow,
                       "enabled": not shadow and not on, "held": held, "topics": [*row.topics.values()],
-                      "stops": row.stops, "confirm_by": row.confirm_by})  # fmt: skip
+                      "stops": row.stops, "confirm_by": row.confirm_by, "version": row.version,
+                      "origin": row.origin})  # fmt: skip
         else:
-            say(f"guard {row.name}: {row.preset} on {', '.join(row.topics.values())}, {_state(row)}")
+            say(f"guard {row.name}: {_origin(row)} on {', '.join(row.topics.values())}, {_state(row)}")
     for warning in body.warnings:
         if appliance.as_json:
             say_json({"warning": warning})
@@ -260,6 +267,50 @@ def enforce(
 
 
 @speaks
+def upgrade(
+    appliance: Appliance,
+    name: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="GUARD",
+            help="Name as in `rosrv guard list` (default: all guards of an older version)",
+            autocompletion=completion.monitors,
+            show_default=False,
+        ),
+    ] = None,
+    *,
+    confirm_within: ConfirmWithin = None,
+    hold: _Hold = False,
+    dry_run: _DryRun = False,
+) -> None:
+    """Make guards of an older version again from the present presets, with their topics and values.
+
+    Each guard begins again: the base is stopped until the next command. A value that the present version does not
+    have or allow is refused with its name.
+
+    Example: rosrv guard upgrade --dry-run
+    """
+    if name is None:
+        if confirm_within is not None:
+            raise GuardError("--confirm-within is for one guard: name it; see rosrv guard list")
+        names = [row.name for row in appliance.ask_or_exit(GuardsWanted()).guards if row.origin == "older"]
+        if not names and not appliance.as_json:
+            say("no guard has an older version")
+    else:
+        names = [name]
+    within = seconds_within(confirm_within, "guard")
+    for each in names:
+        if dry_run:
+            _plan(appliance, GuardTry(name=each, upgrade=True, hold=hold))
+            continue
+        body = appliance.ask_or_exit(GuardUpgrade(each, confirm_within=within, hold=hold))
+        _say_changed(appliance, body)
+        loaded = appliance.ask_or_exit(admin.MonitorsWanted(texts=True))
+        file = next(row.file for row in loaded.monitors if row.name == each)
+        _write(appliance, loaded, file, (loaded.files or {})[file], temporary=body.confirm_by is not None)
+
+
+@speaks
 def remove(appliance: Appliance, name: _Name, confirm_within: ConfirmWithin = None) -> None:
     """Remove a guard, and its file from the folder of specifications.
 
@@ -428,6 +479,15 @@ def _say_preset(preset: Preset) -> None:
             span = f"{one.least}..{one.most}" if one.least else ""
             table.add_row(f"    {one.name}", f"{one.default} {one.unit}".strip(), span, one.what)
         say_table(table)
+
+
+def _origin(row: GuardRow) -> str:
+    match row.origin:
+        case "older":
+            return f"{row.preset} {row.version}, older: rosrv guard upgrade {row.name};"
+        case "changed":
+            return f"{row.preset} {row.version}, changed: not the text of the preset;"
+    return row.preset
 
 
 def _state(row: GuardRow) -> str:

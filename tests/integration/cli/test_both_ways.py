@@ -84,7 +84,8 @@ LOOKING = [
     ("drive", "take", "base", "--host", "robot"), ("drive", "give", "base"),
     ("drive", "ask", "base", "--host", "robot"), ("approve",),
     ("approve", "48213"), ("sso", "list"), ("sso", "end", "nobody"),
-    ("guard", "set", "nobody", "vMax=1"), ("guard", "enforce", "nobody"), ("guard", "remove", "nobody"),
+    ("guard", "set", "nobody", "vMax=1"), ("guard", "enforce", "nobody"), ("guard", "upgrade", "nobody"),
+    ("guard", "remove", "nobody"),
     ("guard", "check-driver", "/nothing", "--by", "/odom", "--yes"),
 ]  # fmt: skip
 

@@ -55,7 +55,8 @@ function Guard(/** @type {{guard: any, guards: ReturnType<typeof useGuards>, see
   const turn = (/** @type {string} */ said, /** @type {string} */ more, /** @type {any} */ json) => guards.order(`${guard.name} ${said}`, more, "PATCH", path, { json });
   const found = margins(guard, seen);
   return html`<tr data-guard=${guard.name}>
-    <td class="first"><${Link} to=${`/console/monitors/${encodeURIComponent(guard.name)}`}><strong><${Given} value=${guard.name} most=${60} /></strong></${Link}><div class="muted small">${guard.preset === guard.name ? "" : `${guard.preset}: `}${preset?.what}</div></td>
+    <td class="first"><${Link} to=${`/console/monitors/${encodeURIComponent(guard.name)}`}><strong><${Given} value=${guard.name} most=${60} /></strong></${Link}><div class="muted small">${guard.preset === guard.name ? "" : `${guard.preset}: `}${preset?.what}</div>
+      ${guard.origin !== "current" && html`<div class="small"><${Badge} word=${guard.origin} tone="warn" /> ${guard.origin === "older" ? `the text of ${guard.preset} ${guard.version}; the present version is ${preset?.version}` : "not the text of the preset"}</div>`}</td>
     <td data-label="State"><span><${Badge} word=${guard.state} tone=${TONES[/** @type {keyof typeof TONES} */ (guard.state)]} />${guard.why_held && html`<div class="small muted"><${Given} value=${guard.why_held} most=${200} /></div>`}
       ${guard.off_until && html`<div class="small muted">until <${Moment} at=${guard.off_until} /></div>`}${guard.confirm_by && html`<div class="small muted">returns to shadow mode at <${Moment} at=${guard.confirm_by} />, unless confirmed</div>`}</span></td>
     <td data-label="Guards"><span><${Given} value=${guard.topics.command} mono most=${60} />${guard.topics.by && html`<div class="small muted">by <${Given} value=${guard.topics.by} mono most=${60} /></div>`}</span></td>
@@ -67,12 +68,15 @@ function Guard(/** @type {{guard: any, guards: ReturnType<typeof useGuards>, see
       ${guard.confirm_by && html`<${Button} small role="operator" tone="primary" onClick=${() => guards.order(`${guard.name} stays in force`, "It is confirmed.", "POST", "/v1/monitors/confirm")}>Confirm</${Button}>`}
       ${guard.state === "off" && html`<${Button} small role="operator" tone="primary" onClick=${() => turn("is in force", "It acts from now on.", { enabled: true })}>Turn on</${Button}>`}
       <${Button} small role="operator" onClick=${() => setOpen("set")}>Set…</${Button}>
+      ${guard.origin === "older" && html`<${Button} small role="admin" onClick=${() => setOpen("upgrade")}>Upgrade</${Button}>`}
       ${guard.state !== "shadow" && guard.state !== "holding" && html`<${Button} small role="operator" onClick=${() => setOpen("shadow")}>Shadow</${Button}>`}
       <${Button} small role="admin" tone="danger" onClick=${() => setOpen("remove")}>Remove</${Button}></div>
       ${open === "set" && html`<${SetValues} guard=${guard} preset=${preset} seen=${seen} guards=${guards} close=${close} />`}
       ${open === "enforce" && html`<${Enforce} guard=${guard} guards=${guards} path=${path} close=${close} />`}
       ${open === "shadow" && html`<${Confirm} title=${`Put ${guard.name} into shadow mode?`} verb="Shadow mode" role="operator" tone="danger" close=${close} act=${() => turn("is in shadow mode", "It only records what it would have done.", { shadow: true })}>
         <p>It stops the robot no longer: it only records what it would have done.</p></${Confirm}>`}
+      ${open === "upgrade" && html`<${Confirm} title=${`Upgrade ${guard.name}?`} verb="Upgrade" role="admin" close=${close} act=${() => guards.order(`${guard.name} is upgraded`, "It begins in its initial state.", "POST", `/v1/guards/${encodeURIComponent(guard.name)}/upgrade`)}>
+        <p>It is made again from ${guard.preset} ${preset?.version}, with its topics and values, and begins again: the base is stopped until the next command. <code>rosrv guard upgrade ${guard.name} --dry-run</code> reports the differences.</p></${Confirm}>`}
       ${open === "remove" && html`<${Confirm} title=${`Remove ${guard.name}?`} verb="Remove" role="admin" tone="danger" close=${close} act=${() => guards.order(`${guard.name} is removed`, "", "DELETE", path)}>
         <p>It stops the robot no longer. The file <code><${Given} value=${guard.file} /></code> on disk is kept: remove it there also, or the next reload loads it again.</p></${Confirm}>`}</td></tr>`;
 }

@@ -72,6 +72,8 @@ REQUESTS: list[tuple[str, str, Any]] = [
                                                     "values": {"margin": "1"}, "name": "yard", "shadow": True}),
     ("POST", "/v1/guards/driver-check", {"command": "/cmd_vel", "by": "/odom"}),
     ("PATCH", "/v1/guards/fence?hold=1", {"values": {"margin": "0.5"}}),
+    ("POST", "/v1/guards/yard/upgrade", None),
+    ("POST", "/v1/guards/yard/upgrade?confirm_within=300&hold=1", None),
     ("POST", "/v1/guards/plan?hold=1", {"name": "fence", "values": {"margin": "0.5"}}),
     ("POST", "/v1/drive/base/take", {"host": "robot"}),
     ("POST", "/v1/drive/base/give", {}),
@@ -148,7 +150,8 @@ LEAST = {
         (
             "load_policy", "load_monitors", "replace_monitor", "remove_monitors", "remove_monitor",
             "roll_back_monitors", "remove_recording", "tokens", "revoke_token", "enrol_host", "host_token",
-            "new_host_kit", "revoke_host", "promote_standby", "new_guard", "set_guard", "check_driver", "add_door",
+            "new_host_kit", "revoke_host", "promote_standby", "new_guard", "set_guard", "upgrade_guard", "check_driver",
+            "add_door",
             "remove_door", "sso_sessions", "end_sessions",
         ),
         "admin",

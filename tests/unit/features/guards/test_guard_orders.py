@@ -8,9 +8,10 @@ from appliance.base import clock
 from appliance.channel import admin
 from appliance.channel.answers.graph_answers import Graph, Publisher, Topic
 from appliance.control.errors import SenselessError, UnknownThingError
-from appliance.features.guards import guard_requests
+from appliance.features.guards import guard_orders, guard_requests
 from appliance.features.guards.guard_orders import GuardOrders
 from appliance.features.guards.presets import PRESETS, Guard, text_of
+from appliance.features.guards.upgrades import Upgrade
 from appliance.features.guards.view import ActingGuard, GuardsState
 from appliance.specifications.specification_files import SpecificationsRefusedError
 from tests.support.virtual_clock import let_time_pass
@@ -249,3 +250,29 @@ async def test_suggestions_name_the_guards_that_are_loaded(manager: Manager) -> 
     assert [one.name for one in found.loaded] == ["fence"]
     assert [one.preset for one in found.suggestions] == ["deadman", "speed"]
     assert found.left_out[0].startswith("/estop_enabled: its name does not say")
+
+
+async def test_a_guard_shows_its_version_and_is_upgraded_once(
+    manager: Manager, orders: GuardOrders, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown = await row(orders)
+    assert (shown.version, shown.origin) == (PRESETS["fence"].version, "current")
+    manager.sources.files["fence.rv"] = text_of(FENCE).replace("<= silent", "<= 1e9", 1)
+    assert (await row(orders)).origin == "changed"
+    for request in (
+        guard_requests.GuardUpgrade("fence"),
+        guard_requests.GuardTry(name="fence", upgrade=True),
+    ):
+        act: Any = orders.plan if isinstance(request, guard_requests.GuardTry) else orders.upgrade
+        with pytest.raises(SenselessError, match="was changed after it was made"):
+            await act(request, "eve")
+    assert not manager.orders
+    new = Upgrade("// preset fence 9: by=/odom\nnew text", {"margin": ["0.2", "0.3"]}, ["ahead=1 is kept"])
+    monkeypatch.setattr(guard_orders, "upgraded", lambda *_given: new)
+    manager.shadow = True
+    plan = await orders.plan(guard_requests.GuardTry(name="fence", upgrade=True), "eve")
+    assert (plan.file, plan.text, plan.changed, plan.shadow) == ("fence.rv", new.text, new.changed, True)
+    assert plan.warnings == new.warnings
+    await orders.upgrade(guard_requests.GuardUpgrade("fence", confirm_within=60.0), "eve")
+    [load] = manager.orders
+    assert (load.files, load.shadow, load.confirm_within) == ({"fence.rv": new.text}, True, 60.0)

@@ -73,7 +73,12 @@ def test_a_guard_is_an_ordinary_text_with_its_topics_types_and_values() -> None:
         "'{pose.position.x:px",
     ):
         assert part in text
-    assert preset_of(text) is PRESETS["fence"]
+    made = preset_of(text)
+    assert made is not None and (made.name, made.text, made.version) == (
+        "fence",
+        text,
+        PRESETS["fence"].version,
+    )
     assert "{1, 1, 2, 1, 2, 2}" in with_values(text, {"polygon": "1,1 2,1 2,2"})
     [code] = compiled(text).specifications
     assert {one.topic for one in code.events if one.topic} == {"/base/cmd", "/pose"}

@@ -19,7 +19,13 @@ from appliance.features.guards.guard_answers import (
     Suggestion,
     Suggestions,
 )
-from appliance.features.guards.guard_requests import GuardNew, GuardSuggestionsWanted, GuardsWanted, GuardTry
+from appliance.features.guards.guard_requests import (
+    GuardNew,
+    GuardSuggestionsWanted,
+    GuardsWanted,
+    GuardTry,
+    GuardUpgrade,
+)
 from appliance.features.guards.presets import PRESETS, Guard, GuardError, text_of
 
 
@@ -51,12 +57,14 @@ class Robot:
                 )  # fmt: skip
             case GuardsWanted():
                 rows = [
-                    GuardRow(one, one, "", "stopping", {"command": "/cmd_vel"}, {}, [], {}, 3)
-                    for one in ("fence",)
-                ]
+                    GuardRow(name, "fence", "", "stopping", {"command": "/cmd_vel"}, {}, [], {}, 3, version=1,
+                             origin=origin)
+                    for name, origin in (("fence", "current"), ("old", "older"), ("mine", "changed"))
+                ]  # fmt: skip
                 return SimpleNamespace(guards=rows, warnings=["fence acts before rate"])
             case GuardTry():
-                assert request.values == {"margin": "0.5"} and not request.enforce
+                assert request.upgrade or request.values == {"margin": "0.5"}
+                assert not request.enforce
                 return GuardPlan(2, "2", "fence", "", "", False, False, {"margin": ["0.2", "0.5"]},
                                  {"command": "/c"}, 3, [], self.refused, self.off)  # fmt: skip
             case admin.MonitorsWanted():
@@ -245,7 +253,12 @@ def test_lists_and_proposals_are_printed(tmp_path: Path, capsys: pytest.CaptureF
     run(verbs.list_guards, Robot(tmp_path, FENCE))
     shown = capsys.readouterr().out
     assert all(f"{name}: {preset.what}" in shown for name, preset in PRESETS.items())
-    assert "guard fence: fence on /cmd_vel, in force, stopping, 3 stops\nfence acts before rate\n" in shown
+    assert shown.endswith(
+        "guard fence: fence on /cmd_vel, in force, stopping, 3 stops\n"
+        "guard old: fence 1, older: rosrv guard upgrade old; on /cmd_vel, in force, stopping, 3 stops\n"
+        "guard mine: fence 1, changed: not the text of the preset; on /cmd_vel, in force, stopping, 3 stops\n"
+        "fence acts before rate\n"
+    )
     run(verbs.suggest, Robot(None))
     assert capsys.readouterr().out == (
         "loaded: mine (deadman on /cmd_vel)\n"
@@ -263,3 +276,20 @@ def test_lists_and_proposals_are_printed(tmp_path: Path, capsys: pytest.CaptureF
     assert lines[0] == {"loaded": "mine", "preset": "deadman", "topics": {"command": "/cmd_vel"}}
     assert (lines[1]["command"], lines[1]["others"]) == ("rosrv guard new fence", {"by": ["/wheels"]})
     assert lines[2]["left_out"].startswith("/estop_enabled")
+
+
+def test_all_guards_of_an_older_version_are_upgraded_and_written(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    robot = Robot(tmp_path, Guard("old", PRESETS["fence"], types=FENCE.types))
+    assert run(verbs.upgrade, robot) == GuardUpgrade("old")
+    assert (tmp_path / "old.rv").read_text() == robot.files["old.rv"]
+    robot.orders.clear()
+    run(verbs.upgrade, robot, "old", confirm_within="5m")
+    assert robot.orders == [GuardUpgrade("old", confirm_within=300.0)]
+    capsys.readouterr()
+    with pytest.raises(typer.Exit):
+        run(verbs.upgrade, robot, dry_run=True)
+    assert "would be refused: it would hold /c" in capsys.readouterr().out
+    with pytest.raises(GuardError, match="for one guard"):
+        run(verbs.upgrade, robot, confirm_within="5m")
