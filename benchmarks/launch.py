@@ -1,4 +1,5 @@
 """Launch a robot beside plain `rosmaster`: python -m benchmarks.launch [--nodes 40] [--rounds 8] [--rospy] [--busy]
+[--again 20]
 
 `roslaunch` starts nodes. Each reads 20 private parameters, publishes five topics, subscribes to five of the next
 node, and is up when all five bring messages. Both masters are new in each round and take turns: `rosmaster` with
@@ -17,11 +18,16 @@ robot in `benchmarks/RESULTS.md`, in every round and always on the same side. If
 round is beyond a limit with a probability of at most one half. So chance makes a row a finding in at most one of 128
 measurements of eight rounds.
 
+With `--again 20`, both masters stay, and the robot is started that many times in a row on each of them, by turns: a
+start begins when the nodes of the one before have ended. The table has the seconds of each start. The exit status is 1
+if a start fails, if the median of the ratios is above 1.4, or if one of them is above 2.
+
 Needs root. The benchmark runs in its own process namespace, so that the kernel ends everything with it.
 """
 
 import argparse
 import contextlib
+import math
 import os
 import shutil
 import signal
@@ -62,6 +68,7 @@ while True:
     while time.monotonic() < end: pass
     time.sleep(0.05)
 """
+MEDIAN, GREATEST = 1.4, 2.0  # the ratios of repeated starts that are still good
 TOOLS = (("rostopic", "list"), ("rosnode", "info", "/node_0"), ("rosparam", "dump"))
 
 
@@ -193,6 +200,53 @@ def start(session: RosSession, masters: list[int], nodes: int, *, rospy: bool) -
     return measured
 
 
+class Launches:
+    """A robot that is started again and again with one master."""
+
+    def __init__(self, session: RosSession, folder: Path, nodes: int, *, rospy: bool) -> None:
+        self._session, self._nodes = session, nodes
+        self._reports = Reports()
+        self._file = package(folder, nodes, self._reports.port, rospy=rospy)
+        self._path = {"ROS_PACKAGE_PATH": f"{folder}:/usr/share"}
+
+    def start(self) -> float:
+        """Start the robot, and end it; return the seconds until its last node is up, or infinity."""
+        began = time.monotonic()
+        launch = self._session.start(["/usr/bin/roslaunch", "--disable-title", str(self._file)], **self._path)
+        try:
+            return self._reports.wait(set(range(self._nodes))) - began
+        except TimeoutError as error:
+            print(f"{error}\n{launch.story()[-2000:]}", file=sys.stderr)
+            return math.inf
+        finally:
+            launch.stop(with_signal=signal.SIGINT, timeout=120)
+
+
+def again(nodes: int, starts: int, *, rospy: bool) -> int:
+    """Start a robot `starts` times with each of the masters, by turns; return the exit status."""
+    load, table = os.getloadavg()[0], Table("start", "rosmaster", "appliance", "ratio")
+    ratios = []
+    with contextlib.ExitStack() as stack:
+        launches = []
+        for side in (plain, deployed):
+            session, _masters = stack.enter_context(side())
+            folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+            launches.append(Launches(session, folder, nodes, rospy=rospy))
+        for number in range(starts):
+            theirs, ours = (one.start() for one in launches)
+            if not math.isfinite(theirs):
+                raise TimeoutError(f"start {number + 1}: the plain master's robot is not up: measure again")
+            ratios.append(ours / theirs)
+            table.add_row(str(number + 1), _seconds(theirs), _seconds(ours), f"{ratios[-1]:.2f}")
+    median, greatest = statistics.median(ratios), max(ratios)
+    table.title = (
+        f"{nodes} {'rospy' if rospy else 'roscpp'} nodes, {starts} starts in a row, load average {load:.1f}"
+    )
+    Console(width=110).print(table)
+    print(f"median ratio {median:.2f} (at most {MEDIAN}), greatest {greatest:.2f} (at most {GREATEST})")
+    return int(median > MEDIAN or greatest > GREATEST)
+
+
 def _used(masters: list[int]) -> dict[int, float]:
     pids = {pid for master in masters for pid in descendants(master)}
     return {pid: processor_seconds([pid]) for pid in pids}
@@ -272,9 +326,12 @@ def main() -> int:
     parser.add_argument("--rounds", type=int, default=8)
     parser.add_argument("--rospy", action="store_true")
     parser.add_argument("--busy", action="store_true")
+    parser.add_argument("--again", type=int, metavar="STARTS", default=0)
     given = parser.parse_args()
     if os.getpid() != 1:
         return _contained(sys.argv[1:])
+    if given.again:
+        return again(given.nodes, given.again, rospy=given.rospy)
     load = os.getloadavg()[0]
     programs = [
         subprocess.Popen([sys.executable, "-c", BUSY]) for _ in range(os.cpu_count() or 1) if given.busy

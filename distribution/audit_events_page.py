@@ -13,7 +13,7 @@ from typing import NamedTuple
 import appliance
 from appliance.audit.log.events import EVENTS, SEVERITIES
 from appliance.audit.log.record import Severity
-from appliance.audit.log.repetition import ABOUT
+from appliance.audit.log.repetition import ABOUT, PARAMETERS
 
 _FIELDS = frozenset(
     {
@@ -32,7 +32,7 @@ _FIELDS = frozenset(
 )
 _FOLDED = (
     "count", "of", "scope", "recorded_id", "first_id", "last_id", "first_time", "last_time", *ABOUT,
-    "callers", "resources", "calls", "hosts", "reasons", "recovered",
+    PARAMETERS, "callers", "resources", "calls", "hosts", "reasons", "recovered",
 )  # fmt: skip
 _LOGS_OWN = {
     "log begun": ("log", "earlier_log_missing"),

@@ -155,7 +155,7 @@ class LimitsSection:
     connections: Count = key(default=4096, description="of all hosts")
     nodes_per_host: Count = key(default=500, description="registered nodes of one host")
     topics_per_host: Count = key(
-        default=5000, description="registrations of one host: topics, services and parameters"
+        default=12_500, description="registrations of one host: topics, services and parameters"
     )
     node_call_seconds: Seconds = key(default=3.0, description="a call that the appliance makes to a node")
     offload_bytes: Size = key(
@@ -287,7 +287,7 @@ class ApiLimits:
     burst: Count = key(default=200, description="requests of one host at once")
     failures_per_minute: Count = key(default=20, description="requests of one host without a good token")
     connections: Count = key(default=512, description="of all hosts")
-    connections_per_host: Count = key(default=64, description="connections of one host")
+    connections_per_host: Count = key(default=320, description="connections of one host")
     header_seconds: Seconds = key(default=10.0, description="until the request's headers must have arrived")
     streams: Count = key(default=16, description="clients that follow the audit log, at once")
 

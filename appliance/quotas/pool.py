@@ -204,6 +204,11 @@ class Queue(Generic[Holder, Member]):
             self._file(member, host, since, now)
         return None
 
+    def of_host(self, host: Holder) -> list[Member]:
+        return [
+            member for line in self._lines.values() for member, (owner, _) in line.items() if owner == host
+        ]
+
     def __iter__(self) -> Iterator[Member]:
         return iter(list(self._line_of))
 

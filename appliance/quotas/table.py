@@ -3,18 +3,33 @@
 The code and docs/reference/quotas.md take the bounds from the same rows.
 """
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 from appliance.quotas.pool import Bounds
+
+
+class HonestUse(NamedTuple):
+    """The honest use that comes closest to a quota.
+
+    `needs` is its amount in the unit of the row; 0 if no honest host comes near, or if only turns are divided. `of`
+    names the bound that it meets first: that of a host or of the whole, the whole without the kept part, or the
+    robot's part of the disk. `beyond` describes what the host or person notices beyond the bound.
+    """
+
+    use: str
+    needs: int
+    of: Literal["host", "whole", "unkept", "robot"] = "host"
+    beyond: str = ""
 
 
 class QuotaRow(NamedTuple):
     """One resource and its quotas.
 
     `thing` is the resource with its unit: "connections to RVMaster". `alarm` names the audit event and the metric.
-    `shown_by` lists the tests that exhaust the resource, as paths below tests/. `setting` is the key in appliance.yaml
-    that changes the bounds, or "". `between` describes the order of hosts and which host makes room. `counting`
-    defines a host, an unknown host and the kept part, where they differ from the general rule of the page.
+    `shown_by` lists the tests that exhaust the resource, as paths below tests/. `margin` compares the bounds with an
+    honest use. `setting` is the key in appliance.yaml that changes the bounds, or "". `between` describes the order of
+    hosts and which host makes room. `counting` defines a host, an unknown host and the kept part, where they differ
+    from the general rule of the page.
     """
 
     thing: str
@@ -22,6 +37,7 @@ class QuotaRow(NamedTuple):
     at_limit: str
     alarm: str
     shown_by: tuple[str, ...]
+    margin: HonestUse
     setting: str = ""
     between: str = ""
     counting: str = ""
@@ -32,10 +48,15 @@ RVMASTER_CONNECTIONS = QuotaRow(
     bounds=Bounds(whole=4096, host=512, unknown=512, kept=1024),
     at_limit="503 with the reason",
     between="a host within its quota replaces an idle or unfinished connection of a host of the same or a lower"
-    " class, unknown hosts first",
+    " class, unknown hosts first; a host beyond it replaces its own idle connections",
     counting="unknown: no registration, and no rule or only `*` names the host; registered: the policy names it too",
     alarm="`limit exceeded`",
     setting="limits.connections",
+    margin=HonestUse(
+        "200 nodes of one machine, each with a connection to RVMaster and to five other nodes",
+        1_200,
+        beyond="its idle connections are replaced, the longest idle one first; a client connects again",
+    ),
     shown_by=(
         "integration/master/test_quotas.py::test_connections_of_two_hundred_addresses",
         "unit/control/assembly/test_listener_limits.py::test_connections_of_a_wildcard_displace_no_named_host",
@@ -48,6 +69,10 @@ RVMASTER_ARRIVALS = QuotaRow(
     between="connections are opened in turns of hosts",
     counting="unknown: no registration, and no rule or only `*` names the host; registered: the policy names it too",
     alarm="`limit exceeded`, one record for many connections",
+    margin=HonestUse(
+        "200 nodes of one machine that connect in the same instant, to RVMaster and one other node",
+        400,
+    ),
     shown_by=(
         "integration/master/test_accept_queues.py::test_a_full_queue_of_unknown_hosts",
         "unit/rpc/test_server.py::test_connections_that_come_faster_than_they_are_opened",
@@ -61,6 +86,10 @@ RVMASTER_BYTES = QuotaRow(
     at_limit="503 with the reason",
     between="the largest request of a host that holds more makes room",
     alarm="`limit exceeded`",
+    margin=HonestUse(
+        "a launch file that sets 5,000 parameters of 400 bytes in one request",
+        2_000_000,
+    ),
     shown_by=(
         "integration/master/test_quotas.py::test_requests_of_two_hundred_addresses",
         "unit/rpc/test_connection_table.py::test_bytes_are_freed_by_the_host_that_holds_most",
@@ -71,6 +100,10 @@ RVMASTER_FAREWELLS = QuotaRow(
     bounds=Bounds(whole=256, host=8, unknown=64, kept=64),
     at_limit="closed without an answer",
     alarm="`limit exceeded`",
+    margin=HonestUse(
+        "",
+        0,
+    ),
     shown_by=("unit/rpc/test_connection_table.py::test_connections_turned_away_in_all",),
 )
 RVMASTER_REQUESTS = QuotaRow(
@@ -80,6 +113,11 @@ RVMASTER_REQUESTS = QuotaRow(
     between="each host that a rule names has one more of its own, so it never waits for another host's requests; hosts"
     " that the policy names as one network, or only by `*`, share turns and get at most half of the whole",
     alarm="none: nothing is rejected",
+    margin=HonestUse(
+        "200 nodes of one machine that call at once",
+        200,
+        beyond="each waits for the calls before it; one thread carries them out in any case",
+    ),
     shown_by=(
         "integration/master/test_quotas.py::test_requests_of_two_hundred_addresses",
         "unit/rpc/test_fair_queue.py::test_requests_of_many_guests_leave_slots_for_the_robot",
@@ -94,6 +132,11 @@ RVMASTER_TIME = QuotaRow(
     between="next is the host that has used least",
     counting="all unknown hosts count as one host",
     alarm="none: nothing is rejected",
+    margin=HonestUse(
+        "200 nodes that start beside a browser",
+        0,
+        beyond="other hosts go first if the robot has used more time than they have",
+    ),
     shown_by=(
         "unit/rpc/test_processor_time.py::test_a_turn_of_the_loop_is_bounded",
         "unit/rpc/test_processor_time.py::test_the_robot_waits_for_one_piece_of_a_flood",
@@ -109,6 +152,10 @@ PARAMETER_BYTES = QuotaRow(
     counting="a replacement that is not larger stays charged to the host of the replaced value",
     alarm="`limit exceeded`",
     setting="limits.parameter_bytes (the quotas scale with it)",
+    margin=HonestUse(
+        "5,000 parameters of 200 bytes, and a robot description of 500 KB",
+        1_500_000,
+    ),
     shown_by=(
         "integration/master/test_quotas.py::test_parameters_of_two_hundred_addresses",
         "unit/master/test_parameter_charges.py::test_no_sequence_exceeds_a_quota",
@@ -119,6 +166,11 @@ LARGE_WRITES = QuotaRow(
     bounds=Bounds(whole=3, host=1, unknown=1, kept=1),
     at_limit="the value waits for its host's turn; small calls need not wait for it",
     alarm="none: nothing is rejected",
+    margin=HonestUse(
+        "one large value at a time, such as a robot description",
+        1,
+        beyond="a second one waits for the first",
+    ),
     shown_by=(
         "unit/rpc/test_bulk.py::test_large_values_of_a_host_go_one_at_a_time",
         "unit/rpc/test_bulk.py::test_a_large_value_has_its_turn_until_the_standby_has_it",
@@ -129,6 +181,11 @@ PROBES = QuotaRow(
     bounds=Bounds(whole=64, host=16, unknown=8, kept=24),
     at_limit="the check waits for its host's turn",
     alarm="none: nothing is rejected",
+    margin=HonestUse(
+        "200 nodes of one machine that are killed at once",
+        200,
+        beyond="checks go in turns; a closed port answers at once",
+    ),
     shown_by=("unit/master/reconcile/test_liveness.py::test_silent_nodes_delay_no_check_of_other_hosts",),
 )
 NODE_CALLS_UNDER_WAY = QuotaRow(
@@ -136,6 +193,11 @@ NODE_CALLS_UNDER_WAY = QuotaRow(
     bounds=Bounds(whole=512, host=128, unknown=64, kept=192),
     at_limit="the call waits for its host's turn",
     alarm="none: nothing is rejected",
+    margin=HonestUse(
+        "200 nodes of one machine that learn of a new publisher",
+        200,
+        beyond="the calls go in turns",
+    ),
     shown_by=("unit/master/endpoints/test_delivery.py::test_silent_nodes_delay_no_call_to_other_hosts",),
 )
 QUEUED_NODE_CALLS = QuotaRow(
@@ -144,6 +206,10 @@ QUEUED_NODE_CALLS = QuotaRow(
     at_limit="the oldest call in the longest queue is dropped; the node gets the present state when it answers again",
     between="the host with most bytes loses the call",
     alarm="the process log",
+    margin=HonestUse(
+        "ten waiting lists of 1 KB for each of 200 nodes",
+        2_000_000,
+    ),
     shown_by=("unit/master/endpoints/test_delivery.py::test_a_host_loses_only_its_own_calls",),
 )
 RELAY_FRAMES = QuotaRow(
@@ -154,6 +220,10 @@ RELAY_FRAMES = QuotaRow(
     between="a host gets at most as much as is left for all others",
     alarm="`limit exceeded`, `connection closed`; `rosrv_relay_memory_bytes`",
     setting="relay.memory_bytes (half of it)",
+    margin=HonestUse(
+        "ten cameras with images of 6 MB and four lidars with clouds of 2 MB, all under way",
+        68_000_000,
+    ),
     shown_by=("unit/relay/test_shares.py::test_unfinished_messages_of_a_guest_stop_no_other_host",),
 )
 RELAY_QUEUES = QuotaRow(
@@ -164,6 +234,10 @@ RELAY_QUEUES = QuotaRow(
     between="a host gets at most as much as is left for all others",
     alarm="`rosrv_relay_dropped_total`, `rosrv_relay_memory_bytes`",
     setting="relay.memory_bytes (a quarter of it)",
+    margin=HonestUse(
+        "ten subscribers that are one image of 6 MB behind",
+        60_000_000,
+    ),
     shown_by=("unit/relay/test_shares.py::test_subscribers_of_a_guest_that_never_read_stop_no_other_host",),
 )
 RELAY_LATCHED = QuotaRow(
@@ -175,6 +249,10 @@ RELAY_LATCHED = QuotaRow(
     " less",
     alarm="`limit exceeded`; `rosrv_relay_memory_bytes`",
     setting="relay.memory_bytes (a quarter of it)",
+    margin=HonestUse(
+        "three maps of 16 MB and a thousand small latched messages",
+        50_000_000,
+    ),
     shown_by=(
         "unit/relay/test_shares.py::test_latched_messages_of_a_guest_stop_no_other_host",
         "unit/relay/test_shares.py::test_latched_messages_of_two_hundred_hosts_leave_room_for_the_robots",
@@ -189,6 +267,10 @@ RELAY_CONNECTIONS = QuotaRow(
     counting="unknown: no grant",
     alarm="`connection refused`",
     setting="relay.connections",
+    margin=HonestUse(
+        "200 nodes of one machine with one relay: ten publications and ten subscriptions each",
+        4_000,
+    ),
     shown_by=("integration/master/test_quotas.py::test_connections_to_the_relay",),
 )
 RELAY_HEADERS = QuotaRow(
@@ -197,6 +279,10 @@ RELAY_HEADERS = QuotaRow(
     at_limit="the connection is closed",
     between="the long header that has waited longest makes room, those of unknown hosts first",
     alarm="`connection refused`; `rosrv_relay_memory_bytes`",
+    margin=HonestUse(
+        "200 connections at once whose headers have a message definition of 8 KB",
+        1_000_000,
+    ),
     shown_by=(
         "unit/relay/test_shares.py::test_headers_of_unknown_hosts_leave_room_for_the_robots",
         "unit/relay/connections/test_pending_connections.py::test_long_headers_make_room_for_short_ones",
@@ -210,6 +296,11 @@ RELAY_TURN = QuotaRow(
     counting="unknown: no grant; hosts with grants that no rule or only `*` names count as one; a policy change"
     " applies to new connections",
     alarm="none: nothing is rejected",
+    margin=HonestUse(
+        "a host with ten cameras beside one that sends a stop",
+        0,
+        beyond="the camera host waits for the other one",
+    ),
     shown_by=(
         "unit/relay/test_loop.py::test_a_host_with_little_to_do_waits_for_one_quantum_of_others",
         "unit/relay/test_loop.py::test_a_host_with_thousands_of_descriptors_gets_no_more_than_one_with_one",
@@ -228,6 +319,11 @@ LIMITED_TOPIC = QuotaRow(
     counting="all unknown hosts count as one host, and so do the hosts of a network that the policy names",
     alarm="`rate limited`; `rosrv_relay_limited_total`",
     setting="[Limits]",
+    margin=HonestUse(
+        "a topic at the rate for which the operator set the limit",
+        0,
+        beyond="the operator sets the limit",
+    ),
     shown_by=(
         "unit/relay/transport/test_rate_limit.py::test_a_host_within_its_part_loses_nothing_because_of_others",
         "unit/relay/transport/test_rate_limit.py::test_names_of_a_host_share_its_limit",
@@ -243,6 +339,10 @@ RELAY_MESSAGE = QuotaRow(
     counting="all hosts that no rule or only `*` names count as one publication",
     alarm="`monitor fault`",
     setting="relay.budget (milliseconds)",
+    margin=HonestUse(
+        "a monitor that publishes a changed laser scan of twice 100 numbers",
+        100,
+    ),
     shown_by=(
         "unit/relay/monitors/test_interceptor.py::test_dialogue",
         "unit/relay/monitors/test_interceptor.py::test_hosts_that_the_policy_does_not_name_have_one_pace",
@@ -259,6 +359,10 @@ DRY_RUNS = QuotaRow(
     " an error",
     counting="a host is a token",
     alarm="`rest call` with status 422 or 503",
+    margin=HonestUse(
+        "a specification that compiles in a second",
+        1,
+    ),
     shown_by=(
         "unit/compiler/test_process.py::test_a_dry_run_ends_with_its_budget",
         "unit/specifications/test_compiler_link.py::test_an_order_ends_a_dry_run",
@@ -275,6 +379,10 @@ SLICES = QuotaRow(
     counting="hosts without a registration count as one",
     alarm="`monitor fault`, a log line of the monitor; `rosrv_monitor_slices`",
     setting="slices (a declaration in the specification; its first number)",
+    margin=HonestUse(
+        "a monitor with a slice for each of 1,000 tracked objects",
+        1_000,
+    ),
     shown_by=(
         "rosmop/tests/test_slices_shares.py::test_a_guest_that_makes_up_ids_refuses_the_robot_nothing",
         "rosmop/tests/test_slices_shares.py::test_a_guest_that_makes_up_ids_pushes_out_its_own",
@@ -283,13 +391,17 @@ SLICES = QuotaRow(
 )
 REST_CONNECTIONS = QuotaRow(
     thing="connections to REST, including TLS handshakes",
-    bounds=Bounds(whole=512, host=64, unknown=192, kept=320),
+    bounds=Bounds(whole=512, host=320, unknown=192, kept=320),
     at_limit="closed at once",
     between="the unknown connection that has waited longest makes room; the peer that has used least processor time"
     " is opened next, unknown hosts together as one",
     counting="a host is a peer's address; unknown: no valid token in the last 15 minutes",
     alarm="none",
     setting="api_limits.connections",
+    margin=HonestUse(
+        "50 browsers behind one address, with six connections each",
+        300,
+    ),
     shown_by=(
         "integration/master/test_quotas.py::test_handshakes_with_rest",
         "unit/api/front/test_listener.py::test_a_known_peer_is_opened_before_waiting_unknown_hosts",
@@ -307,6 +419,12 @@ REST_STREAMS = QuotaRow(
     counting="a host is a token; kept: not for viewers",
     alarm="`rest call` with status 503",
     setting="api_limits.streams (the quotas scale with it)",
+    margin=HonestUse(
+        "12 viewers, each on a page that follows the robot",
+        12,
+        of="unkept",
+        beyond='a page shows "too many clients follow" and tries again; raise `api_limits.streams` for more',
+    ),
     shown_by=_STREAMS_SHOWN_BY,
 )
 REST_STREAM_PEERS = QuotaRow(
@@ -316,6 +434,11 @@ REST_STREAM_PEERS = QuotaRow(
     counting="a host is a machine",
     alarm="`rest call` with status 503",
     setting="api_limits.streams (the quotas scale with it)",
+    margin=HonestUse(
+        "eight browsers behind one address",
+        8,
+        beyond='a page shows "too many clients follow" and tries again; raise `api_limits.streams` for more',
+    ),
     shown_by=_STREAMS_SHOWN_BY,
 )
 REST_EXPORTS = QuotaRow(
@@ -324,6 +447,11 @@ REST_EXPORTS = QuotaRow(
     at_limit="503 with the reason and Retry-After",
     counting="a host is a token; kept: not for viewers",
     alarm="`rest call` with status 503",
+    margin=HonestUse(
+        "one export at a time for each person",
+        1,
+        beyond="a further one is answered 503 until one of them ends",
+    ),
     shown_by=_STREAMS_SHOWN_BY,
 )
 REST_WORK = QuotaRow(
@@ -334,6 +462,11 @@ REST_WORK = QuotaRow(
     between="next is the token with the longest wait since its last turn",
     counting="a host is a token; kept: not for viewers",
     alarm="`rest call` with status 503",
+    margin=HonestUse(
+        "one search at a time for each person",
+        1,
+        beyond="a further one waits",
+    ),
     shown_by=("unit/api/front/test_streams.py::test_a_viewer_with_many_requests_leaves_turns_to_an_admin",),
 )
 AUDIT_KINDS = QuotaRow(
@@ -342,6 +475,10 @@ AUDIT_KINDS = QuotaRow(
     at_limit="further denials of the host are counted as one kind",
     between="further denials of all unknown hosts are counted as one kind",
     alarm="`denials folded` with `scope` `host` or `unknown hosts`",
+    margin=HonestUse(
+        "a robot whose 20 nodes are each denied ten things, again and again",
+        200,
+    ),
     shown_by=(
         "unit/audit/log/test_folding.py::test_unknown_hosts_leave_named_hosts_their_kinds",
         "unit/audit/log/test_folding.py::test_named_hosts_keep_a_line_each",
@@ -350,33 +487,57 @@ AUDIT_KINDS = QuotaRow(
 )
 AUDIT_READ_KINDS = QuotaRow(
     thing="kinds of folded reads in the audit log",
-    bounds=Bounds(whole=8192, host=512, unknown=0, kept=0),
+    bounds=Bounds(whole=8192, host=2048, unknown=0, kept=0),
     at_limit="further reads are recorded in full and charged to the host's bytes of audit records",
     alarm="none",
+    margin=HonestUse(
+        "200 nodes of one machine that each read their own parameters, `/use_sim_time` and two others",
+        800,
+    ),
     shown_by=("unit/audit/log/test_folding.py::test_reads_beyond_the_quota_are_recorded_in_full",),
 )
+AUDIT_RATE = 64 << 10
+"""Bytes a second by which a host's debt of audit records falls."""
+AUDIT_ROBOT_PART, AUDIT_NAMED_PART, AUDIT_NAMED_MOST = 4, 64, 256 << 20
+"""The robot's part of the disk's free space is one of 4, that of an address or network of the policy one of 64, at most
+256 MiB.
+"""
 AUDIT_BYTES = QuotaRow(
     thing="bytes of audit records that a host owes; its debt falls by 64 KiB a second",
     bounds=Bounds(whole=1 << 40, host=16 << 20, unknown=16 << 20, kept=1 << 39),
-    at_limit="the host's calls wait; a multicall's excess parts are rejected with the reason",
-    between="records of unknown hosts whose calls are denied are folded; in audit-only mode, where their calls pass,"
-    " all unknown hosts owe as one",
+    at_limit="the host's calls wait once its group has also used up its part of the free disk space; a multicall's"
+    " excess parts are rejected with the reason",
+    between="the robot may owe a quarter of the free disk space; an address or network that the policy names a 64th,"
+    " at most 256 MiB (with `audit.retention_bytes`, a 64th of that if it is less); while a quarter of the log's queue"
+    " waits for the disk (for the robot three quarters), no host has a part. Records of unknown hosts whose calls are"
+    " denied are folded; in audit-only mode, where their calls pass, all unknown hosts owe as one",
     alarm="`limit exceeded`",
+    margin=HonestUse(
+        "20 starts in a row of 200 nodes with 5,000 parameters, 5 MB of records each, at 512 MB of free disk space",
+        100_000_000,
+        of="robot",
+    ),
     shown_by=(
         "unit/audit/log/test_budget.py::test_two_hundred_hosts_leave_the_robot_its_quota",
         "unit/audit/log/test_budget.py::test_a_host_in_debt_waits_until_it_is_paid",
+        "unit/audit/log/test_starts.py::test_a_robot_that_is_started_again_and_again_never_waits",
         "integration/master/test_audit_quotas.py::test_reads_with_long_keys_do_not_fill_the_disk",
     ),
 )
 AUDIT_RESERVE = QuotaRow(
     thing="bytes of free disk space reserved for the audit log",
     bounds=Bounds(whole=64 << 20, host=1 << 20, unknown=0, kept=16 << 20),
-    at_limit="a host's debt falls by 8 KiB a second and its calls wait; on a full disk every call is denied until"
-    " there is room",
+    at_limit="a host's debt falls by 8 KiB a second and its calls wait (the robot's once it owes a quarter of what is"
+    " left); on a full disk every call is denied until there is room",
     between="the last quarter is for the robot and the hosts that the policy names by address or group (for hosts with"
     " a registration if it names none); calls of others are rejected with the reason",
     alarm="`disk nearly full`; `rosrv status`",
     setting="audit.reserve_bytes",
+    margin=HonestUse(
+        "a start of 100 nodes with 60 MB left, 2.2 MB of records",
+        2_200_000,
+        of="robot",
+    ),
     shown_by=(
         "unit/control/assembly/test_quota_class.py::test_the_last_of_the_disk_is_for_named_hosts_also_after_a_restart",
         "unit/audit/log/test_disk_space.py::test_low_space_raises_an_alarm_before_the_disk_is_full",
@@ -391,6 +552,10 @@ NODE_PORTS = QuotaRow(
     counting="hosts that the policy names as one network count as one",
     alarm="`decision`: the record of the rejected call",
     setting="[Ports] range",
+    margin=HonestUse(
+        "200 nodes of one machine with four relays",
+        1_000,
+    ),
     shown_by=(
         "integration/master/test_quotas.py::test_ports_and_names",
         "unit/master/endpoints/test_node_ports.py::test_no_host_takes_all_ports",
@@ -398,12 +563,16 @@ NODE_PORTS = QuotaRow(
 )
 NAMES = QuotaRow(
     thing="registrations (topics, services and parameters of nodes)",
-    bounds=Bounds(whole=50_000, host=5000, unknown=0, kept=0),
+    bounds=Bounds(whole=50_000, host=12_500, unknown=0, kept=0),
     at_limit="the registration is rejected with the reason",
     between="a host gets at most three times what is left",
     counting="hosts that the policy names as one network count as one",
     alarm="`decision`: the record of the rejected call",
     setting="limits.topics_per_host (for a host)",
+    margin=HonestUse(
+        "200 nodes of one machine: ten publications, ten subscriptions, two services each",
+        4_400,
+    ),
     shown_by=("unit/master/calls/test_gate.py::test_a_host_has_as_many_registrations_as_are_left",),
 )
 GRANTS = QuotaRow(
@@ -412,6 +581,10 @@ GRANTS = QuotaRow(
     at_limit="the host's oldest unused grants are removed; a node that asks again gets them again",
     between="at the limit of the whole, the host with most grants loses them",
     alarm="none",
+    margin=HonestUse(
+        "200 nodes of one machine with ten subscriptions and ten service clients each",
+        4_000,
+    ),
     shown_by=("unit/master/endpoints/test_relay_control.py::test_grants_of_all_hosts_are_bounded",),
 )
 IKE_HANDSHAKES = QuotaRow(
@@ -421,6 +594,10 @@ IKE_HANDSHAKES = QuotaRow(
     between="from 30 handshakes on, an address counts only after it has answered once",
     counting="a host is an address; every host is unknown before its handshake",
     alarm="charon's log",
+    margin=HonestUse(
+        "one machine that connects, and again after a lost packet",
+        2,
+    ),
     shown_by=("unit/ipsec/test_strongswan.py::test_two_hundred_addresses_leave_handshakes_for_hosts",),
 )
 DESCRIPTORS = QuotaRow(
@@ -429,6 +606,10 @@ DESCRIPTORS = QuotaRow(
     at_limit="connections beyond half of the system's limit are rejected like those beyond any other quota",
     alarm="none",
     setting="nofile (the limit of the system)",
+    margin=HonestUse(
+        "4,096 connections to RVMaster, and those of 200 nodes with four relays",
+        10_000,
+    ),
     shown_by=("unit/quotas/test_descriptors.py::test_all_quotas_together_fit_the_descriptors",),
 )
 

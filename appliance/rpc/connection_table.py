@@ -1,7 +1,8 @@
 """Count the connections of each host and the bytes that they hold; evict connections to make room.
 
 1. A host within its own quota evicts another connection of the same or a lower quota class if the pool or its class
-   is full.
+   is full. A host beyond its own quota evicts its own idle connection that was used longest ago: the nodes of a large
+   robot keep more connections than the quota of one host.
 2. The lowest class is evicted first. In a class, idle connections are evicted before unfinished connections, and
    these before served connections. In each stage, the longest wait is evicted first.
 3. `patience` is the minimum wait before an eviction. At RVMaster, an idle connection is evicted at once, because ROS
@@ -150,13 +151,24 @@ class ConnectionTable(Generic[Holder]):
 
     def _take(self, pool: Pool[Holder], host: Holder, amount: int) -> str:
         why = pool.take(host, amount)
-        while why and pool.held(host) + amount <= pool.bounds.host:
-            victim = self._to_make_room(host) if pool is self.connected else self._to_free_bytes(host)
-            if victim is None:
-                break
+        while why and (victim := self._victim(pool, host, amount)) is not None:
             victim.abort()
             why = pool.take(host, amount)
         return why
+
+    def _victim(self, pool: Pool[Holder], host: Holder, amount: int) -> TrackedConnection | None:
+        beyond = pool.held(host) + amount > pool.bounds.host
+        if pool is self.connected:
+            return self._own_idle(host) if beyond else self._to_make_room(host)
+        return None if beyond else self._to_free_bytes(host)
+
+    def _own_idle(self, host: Holder) -> TrackedConnection | None:
+        """Return the host's idle connection that was used longest ago."""
+        idle = self._queues[Stage.IDLE].of_host(host)
+        found = min(idle, key=lambda connection: connection.progress, default=None)
+        patience = self._patience(self._connection_class(host), Stage.IDLE, True)
+        waited = found is not None and self._clock() - found.progress >= patience
+        return found if waited else None
 
     def _to_make_room(self, host: Holder) -> TrackedConnection | None:
         mine = self._connection_class(host)

@@ -1,11 +1,13 @@
 """Decide whether a property can be enforced: by handlers that drop, or by publishing (`enforced by`)."""
 
-from collections.abc import Collection, Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
 
-from rosmop.check.function_bodies import topics_of
-from rosmop.check.scope import SpecificationNames
-from rosmop.form.findings import SpecificationError
+from rosmop.check.event_functions import compile_acceptance
+from rosmop.check.function_bodies import compile_handler, topics_of
+from rosmop.check.scope import CompilationContext, SpecificationNames
+from rosmop.form import nodes
+from rosmop.form.compiled import RemedyCode
+from rosmop.form.findings import Position, SpecificationError
 from rosmop.logics.interface import CompiledProperty
 from rosmop.logics.pattern import ENFORCED, TimedPattern
 from rosmop.logics.property_lint import TIME, VerdictGraph, graph_of, shortest_trace_to
@@ -27,23 +29,14 @@ def blocking_refused(
         return refused
     for index, event in enumerate(specification.events):
         if isinstance(event.trigger, tree.TimerTrigger) and category in compiled.categories_after(index):
-            return f"the timer {shown(event.name)} can cause @{category}, and it has no message to drop"
+            return f"the timer {shown(event.name)} can make @{category} run, and it has no message to drop"
     return None
 
 
 def enforcement(
-    compiled: CompiledProperty,
-    specification: tree.Specification,
-    published: Sequence[str],
-    dropping: Collection[str],
+    compiled: CompiledProperty, specification: tree.Specification, handlers: Mapping[str, nodes.Function]
 ) -> str:
-    """Describe how violations of a property can be prevented, or which requirement is missing.
-
-    `published` are the topics of its remedy, `dropping` the categories whose handlers drop the message.
-    """
-    if compiled.remedy is not None:
-        topics = ", ".join(published)
-        return f"enforced: at the deadline {compiled.remedy} publishes the due message ({topics})"
+    """Describe how violations of a property without a remedy can be prevented, or which requirement is missing."""
     category = "violation" if "violation" in compiled.categories else "fail"
     graph = graph_of(compiled)
     if graph is not None and shortest_trace_to(compiled, category) is None:
@@ -53,7 +46,13 @@ def enforcement(
         brings = _bringing(compiled, graph, category) if graph is not None else compiled.events
         named = ", ".join(event for event in compiled.events if event in brings)
         said = f"can be enforced: @{category} may drop the message that causes it ({named})"
-        if category not in dropping:
+        topics = {
+            event.trigger.topic
+            for event in specification.events
+            if event.name in brings and isinstance(event.trigger, tree.MessageTrigger)
+        }
+        handler = handlers.get(category)
+        if handler is None or not all(_always_suppresses(handler.body, topic) for topic in topics):
             said += f"; to enforce it write `@{category} {{ DROP; }}`"
         return f"{said}; {_COUNTS[compiled.suppresses]}"
     takes = "use an event on a topic instead of the timer"
@@ -62,6 +61,21 @@ def enforcement(
         if isinstance(compiled, TimedPattern):
             refused += f", and no drop makes `{compiled.events[compiled.pattern.second]}` come"
     return f"cannot be enforced by dropping: {refused}; {takes}"
+
+
+def _always_suppresses(body: Sequence[nodes.Statement], topic: str) -> bool:
+    """Whether each path drops the message, or replaces it by the safe one of its topic."""
+    for statement in body:
+        match statement:
+            case nodes.Drop():
+                return True
+            case nodes.StopMessage(safes=safes) if any(safe.topic == topic for safe in safes):
+                return True
+            case nodes.If(yes=yes, no=no) if _always_suppresses(yes, topic) and _always_suppresses(no, topic):
+                return True
+        if any(isinstance(node, nodes.Leave) for node in nodes.walk(statement)):
+            return False
+    return False
 
 
 _COUNTS = {
@@ -89,11 +103,17 @@ def _bringing(compiled: CompiledProperty, graph: VerdictGraph, category: str) ->
     return brings
 
 
-def topics_of_remedy(names: SpecificationNames, compiled: CompiledProperty) -> list[str]:
-    name = compiled.remedy
-    if name is None:
-        return []
-    place = compiled.source.finding(compiled.formula.rindex(name), "").position
+def remedy_code(
+    shared: CompilationContext,
+    names: SpecificationNames,
+    specification: tree.Specification,
+    compiled: CompiledProperty,
+    node: tree.Property,
+) -> RemedyCode | None:
+    """Compile what `enforced by` names. Raises `SpecificationError` if it cannot publish the awaited message."""
+    if not isinstance(compiled, TimedPattern) or (name := compiled.remedy) is None:
+        return None
+    place = place_of_remedy(compiled)
     function = names.functions.get(name)
     if function is None:
         if name in names.misdeclared:
@@ -104,17 +124,32 @@ def topics_of_remedy(names: SpecificationNames, compiled: CompiledProperty) -> l
     topics = topics_of(names, name)
     if not topics:
         raise SpecificationError.at(place, f"{shown(name)} publishes nothing; write `PUBLISH(…)` in it")
-    return topics
+    awaited = compiled.events[compiled.pattern.second]
+    number, event = next(
+        (number, one) for number, one in enumerate(specification.events) if one.name == awaited
+    )
+    trigger = event.trigger
+    if not isinstance(trigger, tree.MessageTrigger) or trigger.part is not None:
+        what = "a timer" if isinstance(trigger, tree.TimerTrigger) else "an event of a service"
+        text = f"{shown(awaited)} is {what}, so no message that {shown(name)} publishes is the due one"
+        raise SpecificationError.at(place, f"{text}; await an event on a topic")
+    if trigger.topic not in topics:
+        text = f"{shown(name)} publishes {', '.join(topics)}, but the due message {shown(awaited)} is on"
+        raise SpecificationError.at(place, f"{text} {trigger.topic}; publish it there")
+    at = node.position
+    call = tree.ExpressionStatement(at, tree.CallExpression(at, tree.Name(at, (name,)), ()))
+    handler = tree.Handler(at, ENFORCED[0], tree.Block(at, (call,)))
+    called = compile_handler(shared, names, handler, "a deadline has no message to drop")
+    return RemedyCode(name, called, number, compile_acceptance(shared, names, event))
+
+
+def place_of_remedy(compiled: CompiledProperty) -> Position:
+    return compiled.source.finding(compiled.formula.rindex(compiled.remedy or ""), "").position
 
 
 def with_remedy(compiled: CompiledProperty, node: tree.Property) -> list[tree.Handler]:
+    """Return the handlers; with a remedy also of `enforced`, so that slices wait for the deadline."""
     handlers = list(node.handlers)
-    if compiled.remedy is None:
+    if compiled.remedy is None or any((handler.category,) == ENFORCED for handler in handlers):
         return handlers
-    at = node.position
-    call = tree.ExpressionStatement(at, tree.CallExpression(at, tree.Name(at, (compiled.remedy,)), ()))
-    mine = [place for place, handler in enumerate(handlers) if (handler.category,) == ENFORCED]
-    for place in mine:
-        body = handlers[place].body
-        handlers[place] = replace(handlers[place], body=replace(body, statements=(call, *body.statements)))
-    return handlers if mine else [*handlers, tree.Handler(at, ENFORCED[0], tree.Block(at, (call,)))]
+    return [*handlers, tree.Handler(node.position, ENFORCED[0], tree.Block(node.position, ()))]

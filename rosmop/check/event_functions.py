@@ -93,6 +93,26 @@ def _key(
     return function
 
 
+def compile_acceptance(
+    shared: CompilationContext, names: SpecificationNames, event: tree.EventDefinition
+) -> str:
+    """Write a function that returns whether the pattern and the `when` of an event accept a message."""
+    trigger = event.trigger
+    assert isinstance(trigger, tree.MessageTrigger)  # the caller checks this
+    scope = FunctionScope(shared, names, "action")
+    scope.message_type, scope.event, scope.notes = _message_type(shared, trigger), event.name, False
+    site = scope.lines.site = scope.symbols.site(Site(event.position))
+    bound = _bind(scope, event, trigger, scope.message_type)
+    tests_only = replace(event, action=replace(event.action, statements=()), after=())
+    conditions, _, _ = _body(scope, tests_only, trigger)
+    read_fields(scope, bound)
+    scope.lines.found += conditions
+    scope.add(nodes.Return(site, nodes.Literal(value_types.BOOL, True)))
+    function = shared.symbols.fresh("k")
+    shared.define(scope.function(function, ("m",), happens=len(scope.lines.found)))
+    return function
+
+
 def _timer(
     shared: CompilationContext, names: SpecificationNames, event: tree.EventDefinition, function: str
 ) -> EventCode:

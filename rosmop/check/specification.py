@@ -6,7 +6,7 @@ from functools import partial
 from types import MappingProxyType
 from typing import TypeVar
 
-from rosmop.check.enforcement import blocking_refused, enforcement, topics_of_remedy, with_remedy
+from rosmop.check.enforcement import blocking_refused, enforcement, remedy_code, with_remedy
 from rosmop.check.event_facts import declare_facts
 from rosmop.check.event_functions import compile_event
 from rosmop.check.expressions import value_of
@@ -30,6 +30,7 @@ from rosmop.check.pattern_references import with_references, without_references
 from rosmop.check.phases import Phases, ordered, phases_of, unknown_phases
 from rosmop.check.publication_order import bypassing
 from rosmop.check.reachable_types import identity, reached
+from rosmop.check.remedies import with_remedies_checked
 from rosmop.check.safe_messages import declare_safes
 from rosmop.check.scope import CompilationContext, SpecificationNames
 from rosmop.check.slicing import check_parameters, declare_parameters, slicing_of, unsliceable
@@ -131,6 +132,8 @@ def _compile_all(
             code, identity=whole, given_topics=replaced, ordered=code.name in named
         )
     _check_types(shared, compiled)
+    if not any(finding.severity == "error" for finding in shared.findings):
+        compiled = with_remedies_checked(shared, compiled)
     shared.findings += bypassing(compiled, shared.publications, shared.functions)
     shared.findings += rival_changes([specification for _, specification in pairs], phases)
     shared.findings += _same_names(shared.specifications)
@@ -314,8 +317,8 @@ def _property(
     if why is not None:
         shared.findings.append(Diagnostic(node.position, "error", why))
     handlers: dict[str, str] = {}
-    published = _noted(shared, partial(topics_of_remedy, names, compiled))
-    if published is None:
+    remedy = _noted(shared, partial(remedy_code, shared, names, specification, compiled, node))
+    if compiled.remedy is not None and remedy is None:
         return None
     for handler in with_remedy(compiled, node):
         text = _handler_refused(compiled, handlers, handler)
@@ -344,8 +347,14 @@ def _property(
             for category in dropping
             if nodes.Reset in made[category]
         ]
-    said = enforcement(compiled, specification, published, dropping)
-    return PropertyCode(compiled, handlers, tuple(handlers), said)
+    said = (
+        ""
+        if remedy is not None
+        else enforcement(
+            compiled, specification, {category: shared.functions[name] for category, name in handlers.items()}
+        )
+    )
+    return PropertyCode(compiled, handlers, tuple(handlers), said, remedy)
 
 
 def _handler_refused(

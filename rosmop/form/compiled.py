@@ -131,6 +131,20 @@ class Slicing:
 
 
 @dataclass(frozen=True)
+class RemedyCode:
+    """The function that publishes the due message of a property at its deadline.
+
+    It must cause the event with the number `event`, whose pattern and `when` are the function `accepts`, which
+    returns whether they fit a message.
+    """
+
+    name: str
+    function: str
+    event: int
+    accepts: str
+
+
+@dataclass(frozen=True)
 class PropertyCode:
     """A compiled property, and the function of the handler for each handled category.
 
@@ -141,6 +155,7 @@ class PropertyCode:
     handlers: Mapping[str, str]
     order: tuple[str, ...]
     enforcement: str
+    remedy: RemedyCode | None = None
 
 
 @dataclass(frozen=True)

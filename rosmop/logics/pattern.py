@@ -7,7 +7,7 @@ settles the verdict follows from the modes that are reachable from it.
 """
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 from rosmop.logics.automaton import explore
 from rosmop.logics.interface import (
@@ -165,6 +165,11 @@ class TimedPattern(ClockedProperty):
                 row.append((MODES.index(after), self.pattern.restarts_clock(mode, event, after)))
             table.append(tuple(row))
         return tuple(table)
+
+    def refuse(self, run: Any) -> None:
+        """Note that the message of the remedy did not come: what it would have settled is violated."""
+        if self.verdicts[run.state] == VALIDATION:
+            run.state = MODES.index("violated")
 
     def blocking_refused(self, category: str) -> str | None:
         super().blocking_refused(category)

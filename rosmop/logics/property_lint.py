@@ -6,7 +6,8 @@ future.
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import count
 from typing import Literal
 
 from rosmop.logics.catalogue import LOGICS
@@ -52,12 +53,32 @@ def analyse(compiled: CompiledProperty, handled: Sequence[str]) -> list[Property
     category = LOGICS[compiled.logic].failure
     if category == "violation" and category not in traces and compiled.remedy is None:
         facts.append(PropertyFact("never violated", category, "no trace violates this property"))
-    firsts = [(trace, state) for trace, state in graph.edges[graph.initial] if trace[0] != TIME]
-    if category is not None and all(category in graph.verdicts[state] for _, state in firsts):
+    if (
+        category is not None
+        and _always(graph, category)
+        and _always(graph_of(_with_another(compiled)), category)
+    ):
         word = "violated" if category == "violation" else "failed"
         text = f"the property is {word} at the first event, whatever it is"
-        facts.append(PropertyFact("violated at once", category, text, firsts[0][0]))
+        facts.append(PropertyFact("violated at once", category, text, compiled.events[:1]))
     return facts
+
+
+def _always(graph: VerdictGraph | None, category: str) -> bool:
+    """Whether each first event leads to the category, at whatever time it comes."""
+    if graph is None:
+        return False
+    firsts = [state for trace, state in graph.edges[graph.initial] if trace != (TIME,)]
+    return all(category in graph.verdicts[state] for state in firsts)
+
+
+def _with_another(compiled: CompiledProperty) -> CompiledProperty:
+    """Return the property among the same events and one that the formula does not name.
+
+    `globally: no e` depends on the event, even if `e` is the only one so far.
+    """
+    name = next(name for number in count() if (name := f"other{number}") not in compiled.events)
+    return LOGICS[compiled.logic].compile(replace(compiled.source, events=(*compiled.events, name)))
 
 
 def shortest_trace_to(compiled: CompiledProperty, category: str) -> tuple[str, ...] | None:
@@ -136,7 +157,8 @@ def _machine_graph(compiled: TimedStateMachine) -> VerdictGraph:
 
 
 def _pattern_graph(compiled: TimedPattern) -> VerdictGraph:
-    """Return a graph; with a remedy, each mode has a second node, which the remedy enters.
+    """Return a graph; with a remedy, each mode has a second node, which the remedy enters, and a third one, which
+    it enters if no due message came.
 
     In a mode without a deadline, an event may still come too late for the time bound.
     """
@@ -150,9 +172,13 @@ def _pattern_graph(compiled: TimedPattern) -> VerdictGraph:
                 row.append(((TIME, name), compiled.late[mode][event][0]))
         if expiry is not None:
             row.append(((TIME,), size + expiry))
+        if expiry is not None and size:
+            row.append(((TIME,), 2 * size + expiry))
         edges.append(tuple(row))
     late_verdicts = tuple((*compiled.at_expiry, *verdict) for verdict in compiled.verdicts)
     initial = compiled.initial
     if not size:
         return VerdictGraph(initial, tuple(edges), late_verdicts)
-    return VerdictGraph(initial, (*edges, *edges), (*compiled.verdicts, *late_verdicts))
+    return VerdictGraph(
+        initial, (*edges, *edges, *edges), (*compiled.verdicts, *late_verdicts, *[("violation",)] * size)
+    )

@@ -714,8 +714,13 @@ class MonitorSet:
             self._after_faults(outcome)
         if outcome.published:
             self._judge_published(outcome)
+        published, faults = len(outcome.published), len(outcome.faults)
+        if outcome.timer is not None and self._execution.conclude(outcome):
+            self._judge_published(outcome, published)
+            if len(outcome.faults) > faults:
+                self._after_faults(outcome, faults)
 
-    def _judge_published(self, outcome: Outcome) -> None:
+    def _judge_published(self, outcome: Outcome, first: int = 0) -> None:
         """Process published messages with the monitors after their publisher, and the messages that those publish.
 
         A message that a remedy publishes at a deadline is also processed by its own monitor if that is
@@ -723,26 +728,25 @@ class MonitorSet:
         later than the message.
         """
         judged: dict[int, Outcome] = {}
-        for number, message in enumerate(outcome.published):
+        for number, message in enumerate(outcome.published[first:], first):
             if message.is_call:
                 continue
             places, own = self._places.get(message.topic, ()), self._place_of[message.monitor]
             due = (outcome.timer or "").endswith(".deadline") and self.monitor(message.monitor).code.ordered
-            first = (bisect_left if due else bisect_right)(places, own)
-            behind = self.steps.get(message.topic, ())[first:]
+            behind = self.steps.get(message.topic, ())[(bisect_left if due else bisect_right)(places, own) :]
             if behind:
                 judged[number] = one = Outcome(bytearray(message.data), outcome.time)
                 self._execution.message(behind, one.buffer, one, NOBODY, published=True)
                 self._follow_up(one)
         if judged:
-            outcome.judged = judged
+            outcome.judged = {**outcome.judged, **judged}
 
-    def _after_faults(self, outcome: Outcome) -> None:
+    def _after_faults(self, outcome: Outcome, first: int = 0) -> None:
         """Note monitors that cannot judge, because an event that keeps their state up to date has faulted.
 
         A monitor declared `begin` starts again; any other keeps its state and holds its topics (not in shadow mode).
         """
-        for fault in outcome.faults if self.on_fault == "drop" else ():
+        for fault in outcome.faults[first:] if self.on_fault == "drop" else ():
             monitors = [
                 self.monitor(name) for name in self._guards.depending[fault.monitor] if fault.outdates
             ]

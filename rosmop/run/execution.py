@@ -12,16 +12,18 @@ from copy import copy
 from dataclasses import replace
 from functools import partial
 from math import inf
-from typing import Literal
+from types import MappingProxyType
+from typing import Any, Literal, NamedTuple
 
 from rosmop.form.findings import Position
 from rosmop.form.sites import Site, showing
 from rosmop.logics.interface import Categories, RunFaultError
+from rosmop.logics.pattern import TimedPattern
 from rosmop.run.explain import Bound, of_slice
 from rosmop.run.interpreter import Interpreter, LastFailure
 from rosmop.run.monitor import Handler, MonitorInstance, RunningProperty, SafeSender, Step
 from rosmop.run.outcomes import DROPPED, NOBODY, Fault, MessageSender, Outcome, Verdict
-from rosmop.run.slices import Key, Slice, Slices
+from rosmop.run.slices import Key, Slice, Slices, of_nan
 from rosmop.runtime import safe_messages
 from rosmop.runtime.action_context import FOLDED_NS, FaultError, LogLine, MalformedError, Published
 from rosmop.runtime.wire import Buffer, WireMessage
@@ -36,6 +38,16 @@ EXPLAINED = 3
 SLICE_SECONDS = 50e-6
 
 TICK_BUDGET = 2_000
+
+
+class Due(NamedTuple):
+    """A deadline whose remedy has been called, and its categories and its verdict if the due message came."""
+
+    monitor: MonitorInstance
+    running: RunningProperty
+    slice_: Slice | None
+    categories: Categories
+    verdict: Verdict
 
 
 class MonitorExecution:
@@ -58,6 +70,8 @@ class MonitorExecution:
         self._trailed: dict[MonitorInstance, int] = {}
         self._copies = False
         self._passed: int | None = None
+        self._due: dict[int, Due] = {}
+        """The deadlines whose remedies have been called, by the identity of their outcomes (`conclude`)."""
 
     def begin(self, monitors: Sequence[MonitorInstance], time_ns: int) -> Outcome:
         """Start monitors in common stages (constants, first values, `init`), as one may read another's variables."""
@@ -183,8 +197,7 @@ class MonitorExecution:
             self._explains = True
             return outcomes
         outcome = self._expiry(monitor, running.run.deadline or 0, running)
-        categories = running.history.expire(running.run)
-        self._tell(monitor, running, categories, None, outcome, in_order_told=True)
+        self._expired(monitor, running, running.history.expire(running.run), outcome)
         self.collect(outcome)
         return [outcome]
 
@@ -207,14 +220,105 @@ class MonitorExecution:
 
         def act(outcome: Outcome, _: WireMessage | None) -> bool:
             self._passed = deadline
-            self._tell(monitor, running, running.run.expire(), None, outcome, in_order_told=True)
+            self._expired(monitor, running, running.run.expire(), outcome)
             self._passed = None
             return False
 
-        whole = slices.is_whole(slice_)
-        (self._in_slice if whole else self._in_seed)(monitor, slice_, outcome, None, act)()
+        if not slices.is_whole(slice_):
+            self._in_seed(monitor, slice_, outcome, None, act)()
+            self.collect(outcome)
+            self.conclude(outcome)  # the messages of a seed are discarded
+            return []
+        commit = self._in_slice(monitor, slice_, outcome, None, act)
+        if id(outcome) not in self._due:
+            commit()
+        else:  # the slice does not end before its deadline is concluded
+            slice_.runs, slice_.values = tuple(one.run for one in monitor.properties), slices.own()
         self.collect(outcome)
-        return [outcome] if whole else []
+        return [outcome]
+
+    def _expired(
+        self, monitor: MonitorInstance, running: RunningProperty, categories: Categories, outcome: Outcome
+    ) -> None:
+        """Tell the categories of a deadline, or call its remedy, whose messages all monitors process before."""
+        if running.remedy is None:
+            self._tell(monitor, running, categories, None, outcome, in_order_told=True)
+            return
+        verdict, first = self._verdict(monitor, running, categories[0]), len(self._turn.published)
+        self._handle(monitor, running.remedy.publish, None, running, outcome)
+        outcome.handling = dict.fromkeys(range(first, len(self._turn.published)), verdict)
+        slice_ = monitor.slice if monitor.slices is not None else None
+        self._due[id(outcome)] = Due(monitor, running, slice_, categories, verdict)
+
+    def conclude(self, outcome: Outcome) -> bool:
+        """Judge a deadline with a remedy, once all monitors have processed its messages; return False for any other.
+
+        If the due message did not come, the deadline violates the property.
+        """
+        if (due := self._due.pop(id(outcome), None)) is None:
+            return False
+        monitor, running, slice_, categories, verdict = due
+        turn, slices = self._turn, monitor.slices
+        monitor.move_to_python()
+        monitor.touch()
+        self._sender, self._bound, self._function = NOBODY, None, None
+        turn.now = outcome.time
+        turn.begin()
+        monitor.context.begin()
+        turn.log, turn.published, turn.looked = [*outcome.log], [*outcome.published], {**outcome.looked}
+
+        def act(outcome: Outcome, _: WireMessage | None) -> bool:
+            seed = slices is not None and slice_ is not None and not slices.is_whole(slice_)
+            if seed or self._is_answered(monitor, running, slice_, outcome):
+                known = {verdict.category: verdict}
+                self._tell(monitor, running, categories, None, outcome, in_order_told=True, known=known)
+                return False
+            assert isinstance(running.code.property, TimedPattern)  # noqa: S101  only it has remedies
+            running.code.property.refuse(running.run)
+            violated = replace(verdict, category="violation")
+            handling = outcome.handling.items()
+            outcome.handling = {key: violated if one is verdict else one for key, one in handling}
+            if "violation" in running.code.handlers:
+                known = {"violation": violated}
+                self._tell(monitor, running, ("violation",), None, outcome, known=known)
+            else:
+                outcome.verdicts = (*outcome.verdicts, violated)
+            return False
+
+        if slices is None or slice_ is None:
+            act(outcome, None)
+        elif slices.is_whole(slice_):
+            slices.revive(slice_)
+            self._in_slice(monitor, slice_, outcome, None, act)()
+        else:
+            self._in_seed(monitor, slice_, outcome, None, act)()
+        self.collect(outcome)
+        return True
+
+    def _is_answered(
+        self, monitor: MonitorInstance, running: RunningProperty, slice_: Slice | None, outcome: Outcome
+    ) -> bool:
+        """Whether subscribers got a message, as monitors left it, that the awaited event accepts."""
+        remedy = running.remedy
+        assert remedy is not None  # noqa: S101  the caller checks this
+        for sent in outcome.sent():
+            if sent.is_call or sent.topic != remedy.event.topic:
+                continue
+            message = WireMessage(sent.data, outcome.time, sent.topic)
+            try:
+                if not remedy.accepts(message):
+                    continue
+                key: Any = remedy.key(message) if remedy.key is not None else True
+            except Exception as error:  # noqa: BLE001  any exception is a recorded fault of the event
+                self._fault(error, monitor, remedy.event.position, outcome)
+                continue
+            if slice_ is None or monitor.slices is None:
+                return True
+            bound = zip(remedy.event.binds, of_nan((True,) if key is True else tuple(key))[1:], strict=True)
+            values = monitor.slices.values(slice_)
+            if all(values[number] is value or values[number] == value for number, value in bound):
+                return True
+        return False
 
     def _catch_up(self, monitor: MonitorInstance, behind: Sequence[Slice], outcome: Outcome) -> None:
         turn, go_on = self._turn, monitor.context.put_off()
@@ -524,13 +628,14 @@ class MonitorExecution:
         outcome: Outcome,
         *,
         in_order_told: bool = False,
+        known: Mapping[str, Verdict] = MappingProxyType({}),
     ) -> None:
         handlers = [(category, handler) for category, handler in running.handlers if category in categories]
         if in_order_told:
             handlers.sort(key=lambda pair: categories.index(pair[0]))
         self._turn.reset = False
         for category, handler in handlers:
-            verdict = self._verdict(monitor, running, category)
+            verdict = known.get(category) or self._verdict(monitor, running, category)
             outcome.verdicts = (*outcome.verdicts, verdict)
             published, dropped = len(self._turn.published), message is not None and message.dropped
             self._handle(monitor, handler, message, running, outcome)

@@ -4,7 +4,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, Protocol, cast
+from typing import Any, NamedTuple, Protocol, cast
 
 import msgspec
 
@@ -73,6 +73,18 @@ class MonitorGroup:
 Handler = Callable[[WireMessage | None], None]
 
 
+class Remedy(NamedTuple):
+    """Publishes the due message of a property; `accepts` returns whether the awaited event accepts a message.
+
+    In slices, `key` returns the values that the event binds.
+    """
+
+    publish: Handler
+    event: EventCode
+    accepts: Callable[[WireMessage], Any]
+    key: Callable[[WireMessage], Any] | None
+
+
 @dataclass(eq=False, slots=True)
 class RunningProperty:
     """A property of a running specification. Its history explains verdicts."""
@@ -82,6 +94,7 @@ class RunningProperty:
     handlers: tuple[tuple[str, Handler], ...]
     run: Run
     history: Exits | Steps
+    remedy: "Remedy | None" = None
 
     @property
     def drawable(self) -> bool:
@@ -231,6 +244,7 @@ def _monitor(
             tuple((category, function(declared.handlers[category])) for category in declared.order),
             declared.property.start(time_ns),
             history_of(declared.property, time_ns),
+            _remedy(function, code, declared),
         )
         for index, declared in enumerate(code.properties)
     )
@@ -254,3 +268,13 @@ def _monitor(
         Timer(step, step.event.period_ns) for step in steps if step.event.period_ns is not None
     )
     return monitor
+
+
+def _remedy(
+    function: Callable[[str], Callable[..., Any]], code: SpecificationCode, declared: PropertyCode
+) -> Remedy | None:
+    if (remedy := declared.remedy) is None:
+        return None
+    event = code.events[remedy.event]
+    key = function(event.key) if event.key else None
+    return Remedy(function(remedy.function), event, function(remedy.accepts), key)

@@ -374,6 +374,10 @@ class Slices:
         elif self._timed:
             self._await(slice_)
 
+    def revive(self, slice_: Slice) -> None:
+        """Undo the end of a slice whose last deadline is not concluded yet, unless its binding has begun again."""
+        self._undo_end(slice_)
+
     def forgotten(self, time_ns: int) -> str:
         """Report the slices forgotten for newer ones of the same host, at most once in `FOLDED_NS`."""
         number = self._forgotten

@@ -344,7 +344,7 @@ def test_a_remedy_is_published_for_each_binding() -> None:
     )
     enforced = enforced.replace(
         "static std_msgs::Empty stop;",
-        "static std_msgs::Empty stop; void halt() { PUBLISH(/stop, std_msgs/Empty, stop); }",
+        "static std_msgs::String stop; void halt() { stop.data = id; PUBLISH(/result, std_msgs/String, stop); }",
     )
     monitors = running(enforced, 0)
     for number in range(3):

@@ -1,19 +1,23 @@
-"""Limit the bytes of audit records that each host causes over time, and more strictly on a nearly full disk. No I/O.
+"""Limit the bytes of audit records that each host causes, by the free space of the disk. No I/O.
 
-A host's debt shrinks by `RATE`, and only the calls of a host above its quota wait. The last part of the disk's
-reserve is kept for the robot and for hosts that the policy names. Unknown hosts are not charged, but folded.
+1. A host's debt shrinks by `RATE`. Only calls of a host wait that owes more than its own bound, and whose group also
+   owes more than the group's part of the free space (`disk_parts`).
+2. A bound that shrinks forgives what it shrank by.
+3. On a nearly full disk all bounds are smaller. The last part of the reserve is kept for the robot and for hosts that
+   the policy names. Unknown hosts are not charged, but folded.
 """
 
 import dataclasses
 from collections import deque
 from collections.abc import Callable
 
+from appliance.audit.log.disk_parts import DiskParts, forgiven
 from appliance.audit.log.record import AuditRecord
 from appliance.base import clock
 from appliance.quotas.pool import Bounds, Pool, QuotaClass
-from appliance.quotas.table import AUDIT_BYTES, AUDIT_RESERVE
+from appliance.quotas.table import AUDIT_BYTES, AUDIT_RATE, AUDIT_RESERVE
 
-RATE = 64 << 10
+RATE = AUDIT_RATE
 """Bytes per second; divided by `_SCARCE` on a nearly full disk."""
 
 _SCARCE = 8
@@ -33,7 +37,7 @@ def weight(record: AuditRecord) -> int:
 class Budget:
     """The debts of hosts, for one thread; only `correct` and `room` may be called from several.
 
-    `reserve` has the bounds for the disk's reserve, whose last part is left to hosts for which `kept_for` is true.
+    `reserve` has the bounds for the disk's reserve, whose last part is left to hosts that have a part in `parts`.
     """
 
     def __init__(
@@ -42,20 +46,23 @@ class Budget:
         *,
         bounds: Bounds = AUDIT_BYTES.bounds,
         reserve: Bounds = AUDIT_RESERVE.bounds,
-        kept_for: Callable[[str], bool] = lambda _host: False,
+        parts: DiskParts | None = None,
         clock: Callable[[], float] = clock.now,
     ) -> None:
         self.quota_class = quota_class
         self._plenty = bounds
         self._scarce = dataclasses.replace(bounds, host=reserve.host, unknown=reserve.host)
-        self._kept, self._kept_for = reserve.kept, kept_for
+        self._kept = reserve.kept
+        self.parts = parts or DiskParts()
         self._clock = clock
         self.owed: Pool[str] = Pool("bytes of audit records to pay off", bounds, quota_class)
         self._paid = clock()
         self._charged: dict[str, int] = {}  # bytes that `owed` does not have yet
         self._charged_bytes = 0
         self._changes: deque[tuple[str, int]] = deque()
+        self._within: set[str] = set()  # hosts above their own bound, and within their part when last paid
         self._left: int | None = None
+        self._free = 0
 
     def charge(self, record: AuditRecord) -> None:
         host = record.host
@@ -69,15 +76,16 @@ class Budget:
         if record.host is not None and not record.unknown:
             self._changes.append((record.host, sign * weight(record)))
 
-    def room(self, left: int | None) -> None:
-        """Set how many bytes of the disk's reserve are left; None while more than the reserve is free."""
-        self._left = left
-        self.owed.bounds = self._plenty if left is None else self._scarce
+    def room(self, left: int | None, free: int = 0) -> None:
+        """Set how many bytes of the reserve are left (None: more than the reserve), and how many of the disk are
+        free.
+        """
+        self._left, self._free = left, free
 
     def shut_out(self, host: str) -> str:
         """Return why a nearly full disk blocks this host, or an empty string."""
         left = self._left
-        if left is None or left >= self._kept or self._kept_for(host):
+        if left is None or left >= self._kept or self.parts.has_part(host):
             return ""
         return (
             f"the disk of the audit log has {left} bytes left, which are kept for the robot and for hosts that the"
@@ -86,28 +94,44 @@ class Budget:
 
     def owing(self, host: str) -> str:
         """Return why calls of this host must wait, or an empty string."""
-        if self._left is None and not self._changes and self._is_usual(host):
+        if self._left is None and self._is_usual(host):
             return ""
         self._pay()
-        return self.owed.refusal(host, 0)
+        reason = self.owed.refusal(host, 0)
+        if not reason:
+            return ""
+        beyond = self.parts.beyond(host)
+        if beyond is None:
+            return reason
+        if beyond > 0:
+            return f"{reason}, and its part of the free disk space is used up"
+        self._within.add(host)
+        return ""
 
     def pause(self, host: str) -> float:
         if not self.owing(host):
             return 0.0
-        over = (self.owed.held(host) - self.owed.bounds.host) / self._pace
-        return min(_LONGEST_PAUSE_SECONDS, max(_PAID_EVERY_SECONDS, over))
+        over, beyond = self.owed.held(host) - self.owed.bounds.host, self.parts.beyond(host)
+        if beyond is not None:
+            over = min(over, beyond)
+        return min(_LONGEST_PAUSE_SECONDS, max(_PAID_EVERY_SECONDS, over / self._pace))
 
     def _is_usual(self, host: str) -> bool:
+        recent = self._clock() - self._paid < _PAID_EVERY_SECONDS
+        if recent and host in self._within:
+            return True
+        if self._changes:
+            return False
         if not (self.owed.held(host) or host in self._charged):
             return True
-        owed = self.owed.total + self._charged_bytes
-        return owed <= self._plenty.host and self._clock() - self._paid < _PAID_EVERY_SECONDS
+        return recent and self.owed.total + self._charged_bytes <= self._plenty.host
 
     @property
     def _pace(self) -> int:
         return RATE if self._left is None else RATE // _SCARCE
 
     def _pay(self) -> None:
+        self._forgive()
         charged, self._charged, self._charged_bytes = self._charged, {}, 0
         while self._changes:
             host, change = self._changes.popleft()
@@ -117,11 +141,22 @@ class Budget:
                 self.owed.charge(host, change)
             else:
                 self._lower(host, -change)
+            self.parts.charge(host, change)
         now = self._clock()
         if now - self._paid >= _PAID_EVERY_SECONDS:
             paid, self._paid = int((now - self._paid) * self._pace), now
+            self._within.clear()
             for host, _owed in list(self.owed.holders()):
                 self._lower(host, paid)
+            self.parts.pay(paid)
+
+    def _forgive(self) -> None:
+        bounds, before = self._plenty if self._left is None else self._scarce, self.owed.bounds
+        if bounds.host < before.host:
+            for host, owed in list(self.owed.holders()):
+                self._lower(host, owed - forgiven(owed, before.host, bounds.host))
+        self.owed.bounds = bounds
+        self.parts.resize(self._free)
 
     def _lower(self, host: str, amount: int) -> None:
         self.owed.give_back(host, min(amount, self.owed.held(host)))

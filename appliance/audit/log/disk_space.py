@@ -11,10 +11,10 @@ _AGAIN = 1.25  # times the reserve must be free before space is no longer scarce
 class DiskSpace:
     """The free space on the disk of the log at `path`.
 
-    `tell` gets the bytes left of the last `reserve` bytes, or None while more is free.
+    `tell` gets the bytes left of the last `reserve` bytes, or None while more is free, and the free bytes.
     """
 
-    def __init__(self, path: Path, reserve: int, tell: Callable[[int | None], None]) -> None:
+    def __init__(self, path: Path, reserve: int, tell: Callable[[int | None, int], None]) -> None:
         self._folder = path.parent
         self._reserve = reserve
         self._tell = tell
@@ -28,7 +28,7 @@ class DiskSpace:
         free, before = disk.f_bavail * disk.f_frsize, self.left
         enough = self._reserve if before is None else self._reserve * _AGAIN
         self.left = None if free >= enough else min(free, self._reserve)
-        self._tell(self.left)
+        self._tell(self.left, free)
         return None if (before is None) == (self.left is None) else self.left is not None
 
     @property

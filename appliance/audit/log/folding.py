@@ -7,7 +7,8 @@
 3. An allow ends the denial kinds of the same host, caller and request, and a denial ends the allow kinds. Their
    summaries are written first, then the new record in full.
 4. Counts are stored on disk, so the key of a kind has only storable texts (`storable`).
-5. A `would deny` of an audit-only policy is never folded.
+5. A node's reads of its own parameters are one kind. Its summary lists them, and is written early if the list is full.
+6. A `would deny` of an audit-only policy is never folded.
 """
 
 from collections.abc import Callable, Iterator
@@ -24,8 +25,9 @@ from appliance.audit.log.repetition import (
     Key,
     kind_of,
     new_state,
+    reads_its_own,
     storable,
-    subject,
+    subjects,
     summary,
 )
 from appliance.quotas.pool import Bounds, Pool, QuotaClass
@@ -118,29 +120,33 @@ class RecordFolder:
         plain = storable(record)
         if denial or record.decision == "allow":
             yield from self._end_contradicted(plain)
-        if not (denial or record.folds) or not self._counted(plain, denial=denial, now=now):
+        counted = self._counted(plain, denial=denial, now=now) if denial or record.folds else None
+        if counted is None:
             yield record
+        elif self._kinds[counted].state.is_full:
+            yield from self._summary(counted)
         key = self._coming_as.pop(record.id, None)
         if key is not None:
             del self._coming[key]  # now the record's kind, or its host's kind, exists
 
-    def _counted(self, record: AuditRecord, *, denial: bool, now: float) -> bool:
+    def _counted(self, record: AuditRecord, *, denial: bool, now: float) -> Key | None:
+        """Count a repetition and return its kind; None if the record is the first one of its kind, or of no kind."""
         key, scope = self._denial_key(record) if denial else self._passing_key(record)
         kind = self._kinds.get(key)
         if kind is not None:
             kind.state.count_in(record)
             self.touched.add(key)
-            return True
+            return key
         pool, holder = self._denials if denial else self._reads, _holder(record)
         if record.decision == "allow" and pool.refusal(holder):
-            return False
+            return None
         pool.charge(holder)
-        about = subject(record) if scope == KIND else None
+        about = subjects(record)[-1 if reads_its_own(record) else 0] if scope == KIND else None
         self._kinds[key] = _Kind(new_state(record, scope), pool, holder, about)
         self._due[key] = now + self._settings.seconds
         if about is not None:
             self._by_subject.setdefault(about, set()).add(key)
-        return False
+        return None
 
     def _denial_key(self, record: AuditRecord, coming: int = 0) -> tuple[Key, str]:
         key = kind_of(record)
@@ -161,7 +167,8 @@ class RecordFolder:
         return (HOST, record.host, record.event, record.decision), HOST
 
     def _end_contradicted(self, record: AuditRecord) -> Iterator[AuditRecord]:
-        for key in tuple(self._by_subject.get(subject(record), ())):
+        found = [key for about in subjects(record) for key in self._by_subject.get(about, ())]
+        for key in found:
             if self._kinds[key].state.decision != record.decision:
                 yield from self._summary(key)
                 self._forget(key)

@@ -235,6 +235,7 @@ class AuditLog:
 
     def _turn(self, now: float) -> float | None:
         closing = self._closing  # the queue has everything that was recorded before
+        self.budget.parts.queue(self._backlog / self._queue_limit)
         more = self._drain(now)
         for due in self._folder.expire(now):
             self._held.append(due)
@@ -277,7 +278,10 @@ class AuditLog:
             if isinstance(item, AuditRecord):
                 written = list(offer(item, now))
                 self._held.extend(written)
-                if not written or written[-1] is not item:
+                for record in written:
+                    if record is not item:
+                        self.budget.correct(record, 1)
+                if not any(record is item for record in written):
                     self.budget.correct(item, -1)
             elif isinstance(item, asyncio.Future):
                 self._waiting.append(item)

@@ -3,6 +3,9 @@
 Texts from peers cannot create an unlimited number of kinds: only the plain words of an error are part of a key, not
 the numbers, names and quotations that the peer chooses, and the key of an unknown host's kind has neither resource
 nor caller.
+
+A node's reads of parameters below its own name are one kind, whose summary lists all their names: a robot reads
+thousands of them when it starts.
 """
 
 from typing import Any
@@ -16,12 +19,17 @@ Key = tuple[str | int | None, ...]
 KIND, UNKNOWN, HOST, ALL_UNKNOWN, ALL = "kind", "unknown host", "host", "unknown hosts", "all"
 """The scopes of kinds; `ALL_UNKNOWN` and `ALL` cover many hosts."""
 
+PARAMETERS = "parameters"
+"""The field of a summary with the names of read parameters; none is left out."""
+
 OTHERS = "(others)"  # no ROS name or address has a bracket
 _NAMES = 8
+_PARAMETERS, _PARAMETER_CHARACTERS = 256, 16 << 10  # the most in one list of read parameters
 _LONGEST_NAME = 256
 _LONGEST_KEY = 1024
 ABOUT = ("call", "key", "node", "subgraph", "method", "status", "who", "monitor", "topics")
 """The fields of `detail` that identify a request."""
+_KEY = ABOUT.index("key")
 
 
 class FoldState(msgspec.Struct, kw_only=True):
@@ -47,6 +55,7 @@ class FoldState(msgspec.Struct, kw_only=True):
     about: dict[str, str] = {}
     tallies: dict[str, dict[str, int]] = {}
     folds: bool = False
+    own: bool = False
 
     def count_in(self, record: AuditRecord) -> None:
         if not self.count:
@@ -58,8 +67,18 @@ class FoldState(msgspec.Struct, kw_only=True):
             named = {"hosts": record.host, "callers": record.caller_id, "resources": record.resource}
             for what, name in (named | {"calls": record.detail.get("call")}).items():
                 self._tally(what, name, number)
+        if self.own:
+            read = self.tallies.setdefault(PARAMETERS, {})
+            name = str(record.detail["key"])
+            read[name] = read.get(name, 0) + number
         if self.scope != KIND or record.reason != self.reason:
             self._tally("reasons", record.reason, number)
+
+    @property
+    def is_full(self) -> bool:
+        """Return whether the list of read parameters has no room for another one."""
+        read = self.tallies.get(PARAMETERS, {})
+        return len(read) >= _PARAMETERS or sum(map(len, read)) >= _PARAMETER_CHARACTERS
 
     def _tally(self, what: str, name: object, number: int) -> None:
         if name:
@@ -74,18 +93,44 @@ class FoldState(msgspec.Struct, kw_only=True):
 
 
 def new_state(record: AuditRecord, scope: str) -> FoldState:
-    known = {name: record.detail.get(name) for name in ABOUT}
+    own = scope == KIND and reads_its_own(record)
+    known = {name: record.detail.get(name) for name in ABOUT if not (own and name == "key")}
     about = {name: str(value)[:_LONGEST_KEY] for name, value in known.items() if value is not None}
     return FoldState(
         scope=scope, event=record.event, severity=record.severity, decision=record.decision, host=record.host,
         caller_id=record.caller_id, category=record.category, resource=record.resource, rule=record.rule,
         revision=record.revision, reason=record.reason, recorded_id=record.id, about=about, folds=record.folds,
+        own=own,
     )  # fmt: skip
 
 
 def subject(record: AuditRecord) -> Key:
+    """Return the request; a contrary decision about it ends a kind."""
     about = map(str, map(record.detail.get, ABOUT))
     return (record.host, record.caller_id, record.category, record.resource, *about)
+
+
+def subject_of_own(record: AuditRecord) -> Key | None:
+    """Return the subject of a node's reads of its own parameters; None for other requests."""
+    if not _concerns_its_own(record):
+        return None
+    about = [str(record.detail.get(name)) for name in ABOUT]
+    about[_KEY] = f"{record.caller_id}/"  # no parameter's name ends in a slash
+    return (record.host, record.caller_id, record.category, record.resource, *about)
+
+
+def reads_its_own(record: AuditRecord) -> bool:
+    return record.folds and record.decision == "allow" and _concerns_its_own(record)
+
+
+def _concerns_its_own(record: AuditRecord) -> bool:
+    key, caller = record.detail.get("key"), record.caller_id
+    return bool(caller) and type(key) is str and len(key) <= _LONGEST_NAME and key.startswith(f"{caller}/")
+
+
+def subjects(record: AuditRecord) -> list[Key]:
+    own = subject_of_own(record)
+    return [subject(record)] if own is None else [subject(record), own]
 
 
 def kind_of(record: AuditRecord) -> Key:
@@ -94,8 +139,9 @@ def kind_of(record: AuditRecord) -> Key:
         return (UNKNOWN, record.host, record.event, record.decision, *asked, _plain_words(record.reason))
     rule = record.rule
     where: Key = () if rule is None else (rule.section, rule.key, rule.file, rule.line)
+    own = subject_of_own(record) if reads_its_own(record) else None
     return (
-        *subject(record),
+        *(own or subject(record)),
         record.event,
         record.decision,
         record.revision,

@@ -182,7 +182,7 @@ def _open_log(settings: Settings, lifeline: ControlLifeline, quota_class: HostQu
         signing,
         held_by,
         class_of=quota_class.of_text,
-        kept_for=quota_class.has_reserve,
+        group_of=quota_class.disk_group,
         receipts=receipts,
     )
     log.set(audit)

@@ -9,6 +9,7 @@ import socket
 from collections.abc import Callable
 from functools import partial
 
+from appliance.audit.log.disk_parts import THE_ROBOT, DiskGroup
 from appliance.audit.log.record import Severity
 from appliance.configuration.settings import Settings
 from appliance.master.calls.call import with_record
@@ -210,20 +211,21 @@ class HostQuotaClass:
         except ValueError:
             return QuotaClass.NAMED
 
-    def has_reserve(self, host: str) -> bool:
-        """Return whether the host gets the last part of the audit log's reserve.
+    def disk_group(self, host: str) -> DiskGroup | None:
+        """Return the hosts with which a host shares its part of the audit log's disk, and the last of its reserve.
 
-        A policy that names only `*` keeps it for hosts with a registration.
+        Only the robot and hosts that the policy names by address or network have a part. If a policy names only `*`,
+        each host with a registration has one.
         """
         try:
             address = address_of(host)
         except ValueError:
-            return False
+            return None
         if not self._policy:
-            return False
+            return None
         policy = self._policy()
         if address.is_loopback or any(address in network for network in policy.robot):
-            return policy.blocked(address) is None
+            return None if policy.blocked(address) is not None else THE_ROBOT
         if policy.named <= {EVERYONE}:
-            return self(address) is QuotaClass.REGISTERED
-        return policy.names(address)
+            return DiskGroup(host) if self(address) is QuotaClass.REGISTERED else None
+        return DiskGroup(policy.alike(address)) if policy.names(address) else None

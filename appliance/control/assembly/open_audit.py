@@ -3,6 +3,7 @@
 from collections.abc import Callable
 
 from appliance.audit.log.budget import Budget
+from appliance.audit.log.disk_parts import DiskParts, GroupOf
 from appliance.audit.log.log import AuditLog
 from appliance.audit.log.retention import Retention
 from appliance.configuration.settings import Settings
@@ -19,14 +20,17 @@ def open_audit(
     held_by: Callable[[list[int]], None],
     *,
     class_of: Callable[[str], QuotaClass],
-    kept_for: Callable[[str], bool],
+    group_of: GroupOf,
     receipts: ReceiptFloor,
 ) -> AuditLog:
-    """Open the log. `kept_for(host)`: the host gets the last of the reserve. `held_by` gets processes that lock it."""
+    """Open the log. `group_of(host)`: the hosts with which it shares a part of the free disk space. `held_by` gets
+    processes that lock it.
+    """
     audit = settings.audit
     reserve = AUDIT_RESERVE.bounds.sized(
         int(audit.reserve_bytes), int(audit.reserve_bytes) // _HOSTS_IN_RESERVE
     )
+    size = None if audit.retention_bytes is None else int(audit.retention_bytes)
     return AuditLog(
         settings.state / "control" / "audit.db",
         durability=audit.durability,
@@ -35,11 +39,11 @@ def open_audit(
         signer=signing.want,
         removals=signing.want_removal,
         held_by=held_by,
-        budget=Budget(class_of, reserve=reserve, kept_for=kept_for),
+        budget=Budget(class_of, reserve=reserve, parts=DiskParts(group_of, size)),
         reserve=reserve.whole,
         retention=Retention(
             days=audit.retention_days,
-            size=None if audit.retention_bytes is None else int(audit.retention_bytes),
+            size=size,
             collected=receipts.through,
         ),
     )

@@ -1,7 +1,7 @@
 """The quotas of approvals."""
 
 from appliance.quotas.pool import Bounds
-from appliance.quotas.table import QuotaRow
+from appliance.quotas.table import HonestUse, QuotaRow
 
 APPROVALS = QuotaRow(
     thing="calls that wait for an approval, and approvals",
@@ -11,6 +11,10 @@ APPROVALS = QuotaRow(
     counting="hosts that the policy names as one network count as one; unknown: only `*` names the host; repetitions of"
     " a call are one; each ends after two minutes, or with its lease",
     alarm="`approval-unanswered`, `rosrv limits`",
+    margin=HonestUse(
+        "one person or agent with three calls that wait",
+        3,
+    ),
     shown_by=(
         "unit/features/approvals/test_approval_orders.py::test_a_host_has_a_quota_of_waiting_calls",
         "unit/features/approvals/test_approval_orders.py::test_many_addresses_leave_another_host_its_calls",

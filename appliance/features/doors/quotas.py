@@ -1,7 +1,7 @@
 """The quotas of doors."""
 
 from appliance.quotas.pool import Bounds
-from appliance.quotas.table import QuotaRow
+from appliance.quotas.table import HonestUse, QuotaRow
 
 HOST_SHARE = 3
 """A host gets at most this many times what it leaves for all others."""
@@ -16,6 +16,11 @@ DOOR_CONNECTIONS = QuotaRow(
     counting="host: a door",
     alarm="`rosrv door list`, `rosrv limits`",
     setting="doors.connections",
+    margin=HonestUse(
+        "20 browsers of one door",
+        20,
+        beyond="raise `doors.connections` for more",
+    ),
     shown_by=(
         "unit/features/doors/test_session.py::test_connections_of_a_door_are_bounded_in_number_and_rate",
         "unit/features/doors/test_connections.py::test_a_host_leaves_connections_for_others",
@@ -36,6 +41,11 @@ DOOR_BYTES = QuotaRow(
     " as clients: messages to other nodes, and arguments of calls that wait for answers",
     counting="host: a client's connection",
     alarm="`rosrv_door_messages_dropped_total`",
+    margin=HonestUse(
+        "20 clients that are one image of 1 MB behind",
+        20_000_000,
+        of="whole",
+    ),
     shown_by=(
         "unit/features/doors/test_door_memory.py::test_greedy_clients_leave_memory_for_the_next_one",
         "unit/features/doors/test_door_memory.py::test_the_clients_of_one_host_leave_memory_for_other_hosts",
@@ -51,6 +61,10 @@ DOOR_TOPICS = QuotaRow(
     between="a host gets at most three times what is left for all others; a topic without a client ends early",
     counting="host: the address of a client",
     alarm="`rosrv_door_refusals_total`",
+    margin=HonestUse(
+        "20 clients with ten topics each",
+        200,
+    ),
     shown_by=(
         "unit/features/doors/test_session.py::test_topics_of_a_door_are_bounded_over_all_its_hosts",
         "unit/features/doors/test_session.py::test_a_client_that_goes_through_a_thousand_topics_a_second_takes_none_of_another",
@@ -64,6 +78,10 @@ DOOR_CALLS = QuotaRow(
     between="a client has at most 100; a host gets at most three times what is left for all others",
     counting="host: the address of a client",
     alarm="`rosrv_door_refusals_total`",
+    margin=HonestUse(
+        "20 clients with two calls that wait",
+        40,
+    ),
     shown_by=(
         "unit/features/doors/test_session.py::test_a_thousand_calls_that_get_no_answer_leave_calls_for_other_hosts",
     ),
@@ -76,6 +94,10 @@ DOOR_SERVICES = QuotaRow(
     between="a client offers at most 100; a host gets at most three times what is left for all others",
     counting="host: the address of a client",
     alarm="`rosrv_door_refusals_total`",
+    margin=HonestUse(
+        "20 clients that offer two services each",
+        40,
+    ),
     shown_by=(
         "unit/features/doors/test_session.py::test_services_that_one_host_offers_leave_some_for_others",
     ),
@@ -88,6 +110,10 @@ DOOR_PARAMETERS = QuotaRow(
     between="a client has at most 1000; a host gets at most three times what is left for all others",
     counting="host: the address of a client",
     alarm="`rosrv_door_refusals_total`",
+    margin=HonestUse(
+        "20 clients with 20 parameters each",
+        400,
+    ),
     shown_by=("unit/features/doors/test_session.py::test_parameters_of_one_host_leave_some_for_others",),
 )
 

@@ -9,6 +9,8 @@ from typing import Annotated
 import typer
 
 from appliance.audit.log.log_database import LogUnreadableError
+from appliance.audit.log.record import AuditRecord
+from appliance.audit.log.repetition import PARAMETERS
 from appliance.audit.search.filter_options import Since
 from appliance.audit.search.query import Filter, FilterError
 from appliance.base import clock
@@ -72,20 +74,24 @@ def learn_policy(
 def _observations(appliance: Appliance, since: str | None) -> Iterator[Observation]:
     try:
         start = None if since is None else parse_timestamp(since, clock.wall_ns())
-        passed = Filter(decision=("allow", "would deny"), event="decision", since=start)
-        for entry in appliance.audit().export(passed):
-            record = entry.record
-            if record.reason == _OWN_NODE or record.host is None or record.category not in set(Category):
-                continue
-            request = request_of(
-                record.host, record.caller_id or "", str(record.category), record.resource or ""
-            )
-            detail = record.detail
-            yield Observation(
-                request, str(detail.get("call", "")), str(detail.get("key", "")), "approval" in detail
-            )
+        for event in ("decision", "repetitions folded"):
+            passed = Filter(decision=("allow", "would deny"), event=event, since=start)
+            for entry in appliance.audit().export(passed):
+                yield from _of_record(entry.record)
     except (LogUnreadableError, NotRunningError, TimestampError, FilterError) as error:
         raise usage_error(str(error)) from error
+
+
+def _of_record(record: AuditRecord) -> Iterator[Observation]:
+    if record.reason == _OWN_NODE or record.host is None or record.category not in set(Category):
+        return
+    request = request_of(record.host, record.caller_id or "", str(record.category), record.resource or "")
+    detail = record.detail
+    call, approval = str(detail.get("call", "")), "approval" in detail
+    if record.event == "decision":
+        yield Observation(request, call, str(detail.get("key", "")), approval)
+    for name in detail.get(PARAMETERS, ()):  # reads that this record only counts
+        yield Observation(request, call, str(name), approval)
 
 
 def _members(appliance: Appliance, robot: list[Network]) -> list[Network]:

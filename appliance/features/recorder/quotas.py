@@ -1,7 +1,7 @@
 """The quotas of the memory and of the disk that recordings use."""
 
 from appliance.quotas.pool import Bounds
-from appliance.quotas.table import QuotaRow
+from appliance.quotas.table import HonestUse, QuotaRow
 
 RECORDER_MEMORY = QuotaRow(
     thing="bytes of messages that the flight recorder keeps, divided among the relays",
@@ -10,6 +10,11 @@ RECORDER_MEMORY = QuotaRow(
     between="any host may use free memory; messages older than `recorder.before` are overwritten first",
     alarm="the recording lists what is missing",
     setting="recorder.memory (half of it for a host, a quarter for a topic)",
+    margin=HonestUse(
+        "40 topics of one machine with 1 KB at 50 Hz for ten seconds",
+        20_000_000,
+        beyond="large images are kept for a shorter time",
+    ),
     shown_by=(
         "unit/features/recorder/test_ring.py::test_a_flood_displaces_only_itself",
         "unit/features/recorder/test_ring.py::test_many_topics_of_a_host_displace_only_its_own",
@@ -25,6 +30,10 @@ RECORDER_DISK = QuotaRow(
     counting="unknown: no rule names the host, or no host caused the recording; kept: for the robot and operators",
     alarm="`recording removed`, `recording missed`; `detail.not_recorded` of the record",
     setting="recorder.disk (an eighth of it for one recording)",
+    margin=HonestUse(
+        "ten recordings of 30 MB by one host",
+        300_000_000,
+    ),
     shown_by=(
         "unit/features/recorder/test_recording_store.py::test_a_guest_makes_room_from_its_own_recordings",
         "unit/features/recorder/test_recording_store.py::test_no_guest_displaces_a_recording_of_the_robot",

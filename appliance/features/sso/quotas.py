@@ -1,7 +1,7 @@
 """The quotas of single sign-on."""
 
 from appliance.quotas.pool import Bounds
-from appliance.quotas.table import QuotaRow
+from appliance.quotas.table import HonestUse, QuotaRow
 
 SIGN_ONS = QuotaRow(
     thing="sign-ons at the provider that are not finished",
@@ -10,6 +10,11 @@ SIGN_ONS = QuotaRow(
     between="if all are taken, the oldest one of the address with most ends",
     counting="an IPv6 network (/64) is one address",
     alarm="none: the person signs in again",
+    margin=HonestUse(
+        "ten people behind one address who sign on at once",
+        10,
+        beyond="the first of them signs on again",
+    ),
     shown_by=("unit/features/sso/test_sign_on.py::test_a_flood_of_sign_ons_ends_only_its_own",),
 )
 SESSIONS = QuotaRow(
@@ -18,6 +23,10 @@ SESSIONS = QuotaRow(
     at_limit="the oldest session of the person ends; beyond the whole, a sign-on is refused",
     counting="a person is a `sub` of the provider",
     alarm="`sign-on refused`",
+    margin=HonestUse(
+        "one person with a browser on four machines",
+        4,
+    ),
     shown_by=("unit/features/sso/test_sessions.py::test_a_person_and_all_people_have_a_quota_of_sessions",),
 )
 

@@ -1,3 +1,4 @@
+import re
 from itertools import accumulate, product
 
 import pytest
@@ -5,7 +6,7 @@ import pytest
 from rosmop.logics.dot import to_dot
 from rosmop.logics.past_monitors import ClockedPastProperty
 from rosmop.logics.property_lint import TIME, PropertyFact, analyse, shortest_trace_to
-from rosmop.tests.logics.driving import compiled, seeded, told, traces
+from rosmop.tests.logics.driving import compiled, play, seeded, told, traces
 from rosmop.tests.logics.temporal import draw
 from rosmop.tests.logics.test_mtl import ARITY, PRINTER, TEMPORAL, bounded
 
@@ -67,6 +68,59 @@ def test_shortest_traces_of_bounded_past_formulas_lead_to_the_category() -> None
                     ]
                     assert (category,) not in told_of, (monitor.formula, trace, times)
     assert none
+
+
+SCOPES = ("globally:", "after a:", "until a:", "until b:", "after a until b:", "after b until a:")
+BODIES = ("no a", "some a", "no b", "some b", "a causes b", "a requires b", "a forbids b", "b causes a")
+CLAIMED = [
+    *(
+        ("pattern", f"{scope} {body}{within}")
+        for scope in SCOPES
+        for body in BODIES
+        for within in ("", " within 2ns")
+    ),
+    *(
+        ("ltl", one)
+        for one in ("[] !a", "a", "false", "<> a", "o a", "a U b", "[] (a => o b)", "!a and !b", "[] a")
+    ),
+    *(("ptltl", one) for one in ("!a", "a", "(*) a", "[*] a", "b => <*> a", "!a and !b", "a and b", "<*> a")),
+    *(
+        ("mtl", one)
+        for one in ("once[0,2ns] a", "!a", "historically[0,2ns] !a", "b => once[0,2ns] a", "previously a")
+    ),
+    *(("ere", one) for one in ("a b", "a*", "empty", "epsilon", "a+", "~(a b)")),
+]
+
+
+@pytest.mark.parametrize("events", [("a",), ("a", "b"), ("b", "a", "c")])
+def test_facts_hold_for_every_trace(events: tuple[str, ...]) -> None:
+    found = {"never runs": 0, "never violated": 0, "violated at once": 0}
+    for logic, formula in CLAIMED:
+        names = set(re.findall(r"\b[ab]\b", formula))
+        if not names <= set(events):
+            continue
+        monitor = compiled(logic, formula, events)
+        wider = compiled(logic, formula, (*events, "other"))
+        facts = {(fact.kind, fact.category) for fact in analyse(monitor, monitor.categories)}
+        for kind, _ in facts:
+            found[kind] += 1
+        reached, first = set[str](), list[bool]()
+        for trace in traces(events, 4 if len(events) < 3 else 3):
+            for delays in product((0, 1, 3), repeat=len(trace)):
+                timed = [*zip(accumulate(delays), trace, strict=True)]
+                record = play(monitor.start(0), events, timed, timed[-1][0] + 5)
+                reached |= {category for _, categories in record for category in categories}
+        failure = "fail" if logic == "ere" else "violation"
+        for event, delay in product((*events, "other"), (0, 1, 3)):
+            record = play(wider.start(0), wider.events, [(delay, event)])
+            first.append(failure in record[-1][1])
+        unreached = set(monitor.categories) - reached
+        assert {category for kind, category in facts if kind == "never runs"} == unreached, (formula, facts)
+        assert (("never violated", failure) in facts) == (failure in unreached and failure == "violation"), (
+            formula
+        )
+        assert (("violated at once", failure) in facts) == all(first), (formula, first)
+    assert all(found.values()) or events == ("a",)
 
 
 def test_categories_after_an_event() -> None:

@@ -1,12 +1,24 @@
 import ast
 from pathlib import Path
 
+from appliance.features.sso.quotas import SIGN_ONS
 from appliance.quotas import table
-from appliance.quotas.table import QUOTA_ROWS, RELAY_MESSAGE, QuotaRow
+from appliance.quotas.table import (
+    LIMITED_TOPIC,
+    NODE_CALLS_UNDER_WAY,
+    PROBES,
+    QUOTA_ROWS,
+    RELAY_MESSAGE,
+    RVMASTER_CONNECTIONS,
+    RVMASTER_FAREWELLS,
+    RVMASTER_REQUESTS,
+    QuotaRow,
+)
 from appliance.relay.monitors.time_budget import TimeBudget
-from distribution.quotas_page import all_rows, page
+from distribution.quotas_page import all_rows, allowed, page
 
 ROOT = Path(__file__).parents[3]
+WITHOUT_NUMBER = {RVMASTER_FAREWELLS.thing, LIMITED_TOPIC.thing}
 _FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 
 
@@ -16,6 +28,20 @@ def test_the_page_is_up_to_date() -> None:
 
 def test_every_row_is_on_the_page() -> None:
     assert tuple(row for row in vars(table).values() if isinstance(row, QuotaRow)) == QUOTA_ROWS
+
+
+def test_each_row_fits_an_honest_use_or_says_what_it_notices() -> None:
+    for row in all_rows():
+        use, needs, _of, beyond = row.margin
+        assert use or row is RVMASTER_FAREWELLS, row.thing  # no honest host is rejected
+        assert needs <= allowed(row) or beyond, f"{use} needs {needs} of {allowed(row)} {row.thing}"
+        assert needs or "wait" in row.at_limit or row.thing in WITHOUT_NUMBER, row.thing
+
+
+def test_only_turns_are_too_few_for_an_honest_use() -> None:
+    """Beyond these bounds work waits for its turn, or costs a connection: nothing of an honest host is rejected."""
+    short = [row for row in all_rows() if row.margin.needs > allowed(row)]
+    assert short == [RVMASTER_CONNECTIONS, RVMASTER_REQUESTS, PROBES, NODE_CALLS_UNDER_WAY, SIGN_ONS]
 
 
 def test_each_row_is_attacked_by_a_test_that_exists() -> None:

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from appliance.policy.model import Address
 from appliance.quotas.pool import Bounds, QuotaClass
+from appliance.quotas.table import RVMASTER_CONNECTIONS
 from appliance.rpc.connection_table import ConnectionTable, Stage
 
 ROBOT, OTHER = ipaddress.ip_address("10.0.0.1"), ipaddress.ip_address("10.0.0.2")
@@ -123,14 +124,32 @@ def test_an_unfinished_request_of_the_same_class_has_its_time() -> None:
     assert slow.cut
 
 
-def test_a_host_at_its_own_quota_ends_no_connection() -> None:
-    quota_classes = QuotaClasses({ROBOT: QuotaClass.NAMED, OTHER: QuotaClass.NAMED})
-    connection_table = books(quota_classes, Bounds(whole=4, host=2, unknown=0, kept=0))
-    there = [come(connection_table, ROBOT), come(connection_table, ROBOT), come(connection_table, OTHER)]
+def test_a_host_at_its_own_quota_ends_only_its_own_idle_connections() -> None:
+    quota_classes = QuotaClasses({ROBOT: QuotaClass.NAMED, OTHER: QuotaClass.UNKNOWN})
+    connection_table = books(quota_classes, Bounds(whole=4, host=2, unknown=1, kept=0))
+    recent, old, other = (come(connection_table, host) for host in (ROBOT, ROBOT, OTHER))
+    assert recent and old and other
+    recent.progress = quota_classes.now = 5.0
+    assert come(connection_table, ROBOT, Stage.SERVED)
+    assert (recent.cut, old.cut, other.cut) == (False, True, False)
+    assert come(connection_table, ROBOT, Stage.UNFINISHED)
     assert connection_table.enter(Guest(connection_table, ROBOT), ROBOT).startswith(
         "10.0.0.1 has 2 connections open"
     )
-    assert not any(one.cut for one in there if one)
+    assert not other.cut
+
+
+def test_two_hundred_nodes_of_one_machine_are_all_served() -> None:
+    """Each keeps a connection to RVMaster and to five other nodes, more than the quota of its machine."""
+    quota_classes = QuotaClasses({ROBOT: QuotaClass.REGISTERED})
+    connection_table: ConnectionTable[Address] = ConnectionTable(quota_classes, clock=quota_classes.clock)
+    for _ in range(200 * 6):
+        quota_classes.now += 0.001
+        connection = come(connection_table, ROBOT, Stage.SERVED)
+        assert connection is not None
+        connection.progress = quota_classes.now
+        connection_table.file(connection, Stage.IDLE)
+    assert connection_table.connected.total == RVMASTER_CONNECTIONS.bounds.host
 
 
 def test_a_host_that_registers_is_no_longer_unknown() -> None:

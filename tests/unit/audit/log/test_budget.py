@@ -1,4 +1,5 @@
 from appliance.audit.log.budget import RATE, Budget, weight
+from appliance.audit.log.disk_parts import THE_ROBOT, DiskGroup, DiskParts
 from appliance.audit.log.record import AuditRecord
 from appliance.quotas.pool import Bounds, QuotaClass
 
@@ -11,13 +12,19 @@ class Desk:
     def __init__(self) -> None:
         self.now = 100.0
         self.registered = {ROBOT}
+        self.network: list[str] = []
         self.budget = Budget(
             self.quota_class,
             bounds=BOUNDS,
             reserve=RESERVE,
-            kept_for=lambda host: host == ROBOT,
+            parts=DiskParts(self.group_of),
             clock=lambda: self.now,
         )
+
+    def group_of(self, host: str) -> DiskGroup | None:
+        if host in self.network:
+            return DiskGroup("10.5.0.0/24")
+        return THE_ROBOT if host == ROBOT else None
 
     def quota_class(self, host: str) -> QuotaClass:
         return QuotaClass.REGISTERED if host in self.registered else QuotaClass.NAMED
@@ -73,12 +80,82 @@ def test_unknown_hosts_have_no_debt() -> None:
 def test_a_nearly_full_disk_lowers_every_quota() -> None:
     desk = Desk()
     desk.spend(GUEST, 1 << 18)
+    desk.now += 0.2
     assert desk.budget.pause(GUEST) == 0
     desk.budget.room(RESERVE.whole - 1)
+    assert desk.budget.pause(GUEST) == 0  # records that were cheap when they were made
+    desk.spend(GUEST, 1 << 14)
     assert desk.budget.pause(GUEST) == 1.0
     assert desk.budget.pause(ROBOT) == 0
     desk.budget.room(None)
     assert desk.budget.pause(GUEST) == 0
+
+
+def test_a_debt_beyond_the_bound_stays_one_when_the_disk_fills() -> None:
+    desk = Desk()
+    desk.spend(GUEST, 1 << 21)
+    assert desk.budget.pause(GUEST) == 1.0
+    desk.budget.room(RESERVE.whole - 1)
+    assert desk.budget.pause(GUEST) == 1.0
+
+
+def test_the_robot_waits_once_it_owes_its_part_of_the_disk() -> None:
+    desk = Desk()
+    desk.budget.room(None, 1 << 30)
+    for _ in range(120):
+        desk.spend(ROBOT)
+    assert desk.budget.pause(ROBOT) == 0
+    for _ in range(12):
+        desk.spend(ROBOT)
+    desk.now += 0.2
+    assert desk.budget.pause(ROBOT) == 1.0
+    assert "its part of the free disk space is used up" in desk.budget.owing(ROBOT)
+    desk.budget.room(None, 1 << 33)
+    desk.now += 0.2
+    assert desk.budget.pause(ROBOT) == 0
+
+
+def test_a_part_that_shrinks_forgives_what_it_shrank_by() -> None:
+    desk = Desk()
+    desk.budget.room(None, 1 << 30)
+    for _ in range(120):
+        desk.spend(ROBOT)
+    assert desk.budget.pause(ROBOT) == 0
+    desk.budget.room(None, 1 << 28)  # another program filled the disk
+    desk.now += 0.2
+    assert desk.budget.pause(ROBOT) == 0
+    desk.spend(ROBOT)
+    desk.now += 0.2
+    assert desk.budget.pause(ROBOT) == 1.0
+
+
+def test_hosts_of_a_network_share_its_part_and_keep_their_own() -> None:
+    desk = Desk()
+    desk.network = [f"10.5.0.{number}" for number in range(8)]
+    first, second, *_ = desk.network
+    desk.budget.room(None, 64 << 22)  # the network's part is 4 MiB
+    desk.spend(first)
+    assert desk.budget.pause(first) == 0
+    for _ in range(3):
+        desk.spend(first)
+    desk.now += 0.2
+    assert desk.budget.pause(first) == 1.0
+    desk.spend(second, 1 << 19)
+    assert desk.budget.pause(second) == 0
+
+
+def test_a_log_that_is_behind_holds_guests_first_and_the_robot_last() -> None:
+    desk = Desk()
+    desk.network = [GUEST]
+    desk.budget.room(None, 1 << 40)
+    held = {}
+    for host in (GUEST, ROBOT):
+        desk.spend(host)
+    for full in (0.0, 0.3, 0.8, 0.0):
+        desk.budget.parts.queue(full)
+        desk.now += 0.2
+        held[full] = [desk.budget.pause(host) > 0 for host in (GUEST, ROBOT)]
+    assert held == {0.0: [False, False], 0.3: [True, False], 0.8: [True, True]}
 
 
 def test_the_last_of_the_disk_is_kept() -> None:

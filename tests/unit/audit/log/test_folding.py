@@ -5,9 +5,10 @@ from typing import Any
 import msgspec
 import pytest
 
+from appliance.audit.log.columns import LARGEST_DETAIL
 from appliance.audit.log.folding import FoldSettings, RecordFolder
 from appliance.audit.log.record import AuditRecord, RuleReference
-from appliance.audit.log.repetition import HOST, new_state, summary
+from appliance.audit.log.repetition import HOST, FoldState, new_state, summary
 from appliance.quotas.pool import Bounds
 
 _numbers = itertools.count(1)
@@ -361,6 +362,61 @@ def test_another_key_ends_no_folding() -> None:
     flood = [one for n in range(100) for one in (read(f"/a/{n}"), read("/b", decision="deny", folds=False))]
     written = offer(folder, *flood)
     assert [one.detail["key"] for one in written].count("/b") == 1
+
+
+def test_a_nodes_reads_of_its_own_parameters_are_one_record_with_their_list() -> None:
+    folder = make_folder(seconds=10, keys_per_host=2)
+    reads = [read(f"/n/gain_{number % 20}") for number in range(60)]
+    assert offer(folder, *reads) == reads[:1]
+    others = [
+        read("/m/gain"),
+        read("/nn/gain"),
+        read("/n"),
+        read("/n/" + "x" * 300),
+        read("/n/a", caller_id="/m"),
+    ]
+    assert offer(folder, *others) == others
+    assert offer(folder, read("/n/late")) == []
+    (one, *_rest) = folder.expire(10)
+    assert (one.event, one.caller_id, one.resource) == ("repetitions folded", "/n", "hasParam")
+    assert one.detail["recorded_id"] == reads[0].id
+    assert "key" not in one.detail
+    assert one.detail["parameters"] == {"/n/gain_0": 2} | {
+        f"/n/gain_{number}": 3 for number in range(1, 20)
+    } | {"/n/late": 1}
+    assert one.detail["count"] == sum(one.detail["parameters"].values())
+
+
+@pytest.mark.parametrize("name", ["gain", "a_rather_long_name_of_a_parameter_" * 6])
+def test_no_read_parameter_is_left_out_of_the_lists(name: str) -> None:
+    """A list that is full is written at once, and a record of it fits into the log."""
+    folder = make_folder(seconds=10)
+    reads = [read(f"/n/{name}{number}") for number in range(5000)]
+    written = offer(folder, *reads)
+    lists = [one.detail["parameters"] for one in [*written[1:], *folder.finish()]]
+    assert [name for one in lists for name in one] == [one.detail["key"] for one in reads[1:]]
+    assert all(len(msgspec.json.encode(one)) < LARGEST_DETAIL / 2 for one in lists)
+    assert len(lists) < 100
+
+
+def test_a_denial_of_one_own_parameter_ends_the_folding() -> None:
+    folder = make_folder()
+    offer(folder, read("/n/a"), read("/n/b"))
+    refused = read("/n/c", decision="deny", folds=False)
+    summary, written = offer(folder, refused)
+    assert (summary.detail["parameters"], written) == ({"/n/b": 1}, refused)
+    again = read("/n/a")
+    assert offer(folder, again) == [again]
+    others = [read(f"/n/{name}", decision="deny", folds=False) for name in "de"]
+    assert [one for one in offer(folder, *others) if one.decision == "deny"] == others
+
+
+def test_lists_of_parameters_survive_a_crash() -> None:
+    folder = make_folder()
+    offer(folder, read("/n/a"), read("/n/b"))
+    (key,) = folder.touched
+    stored = msgspec.json.decode(msgspec.json.encode(folder.state(key)), type=FoldState)
+    assert summary(stored, "s", 1, recovered=True).detail["parameters"] == {"/n/b": 1}
 
 
 def test_events_beyond_the_budget_are_counted() -> None:

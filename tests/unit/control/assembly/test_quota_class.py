@@ -2,6 +2,7 @@ import ipaddress
 from dataclasses import replace
 
 from appliance.audit.log.budget import Budget
+from appliance.audit.log.disk_parts import DiskParts
 from appliance.base.actors import APPLIANCE, ROBOT, UNKNOWN
 from appliance.control.assembly.listener_limits import HostQuotaClass
 from appliance.control.assembly.robot import charged_to
@@ -61,7 +62,7 @@ def test_the_last_of_the_disk_is_for_named_hosts_also_after_a_restart() -> None:
     registered: dict[object, int] = {ipaddress.ip_address("10.0.0.66"): 1}
     current = CurrentPolicy()
     quota_class = HostQuotaClass(current, lambda host: registered.get(host, 0))
-    budget = Budget(quota_class.of_text, kept_for=quota_class.has_reserve)
+    budget = Budget(quota_class.of_text, parts=DiskParts(quota_class.disk_group))
     budget.room(1)
     assert budget.shut_out("127.0.0.1")
     assert quota_class.of_text("10.0.0.67") is QuotaClass.NAMED

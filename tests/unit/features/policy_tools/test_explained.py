@@ -161,6 +161,7 @@ def check(row: Row, *, together: bool, shadow: bool = False) -> None:
 
 
 INT = "std_msgs/Int32 '{data:%s}'"
+DONE = "event done() /alarm std_msgs/Int32 '{}' { }"
 CLOCK = "event clock() /clock std_msgs/Int32 '{}' { }"
 A, B = (f"event {name}(int {name}) /{name} std_msgs/Int32 '{{data:{name}}}'" for name in "ab")
 ARM, STICK = "/arm", "/stick"
@@ -274,12 +275,12 @@ OUTCOMES = {
     ),
     "a publication that is enforced": Row(
         f"m() {{ warn() {{ {ALARM} }} {A} {{ }} {B} {{ }} {CLOCK}\n"
-        " pattern: globally: a causes b within 20ms enforced by warn @violation { } }",
+        f" {DONE} pattern: globally: a causes done within 20ms enforced by warn @violation {{ }} }}",
         given("b1 a1 . . . c0"), "publish", "", "PUBLISH", [("a", ARM)], {},
     ),
     "a verdict of what is enforced": Row(
         f"m() {{ warn() {{ {ALARM} }} {A} {{ }} {B} {{ }} {CLOCK}\n"
-        " pattern: globally: a causes b within 20ms enforced by warn @violation { } }",
+        f" {DONE} pattern: globally: a causes done within 20ms enforced by warn @violation {{ }} }}",
         given("b1 a1 . . . c0"), "verdict", "", "pattern:", [("a", ARM)], {},
     ),
     "a fault": Row(

@@ -114,7 +114,7 @@ SPECIFICATIONS = {
     "ECHO": """s() { std_msgs::String said; event e(std::string t) /chatter std_msgs/String '{data:t}' {
         said.data = t; PUBLISH(/alarm, std_msgs/String, said); } event tick() every 10ms { ROS_INFO("tick"); } }""",
     "DEADLINE": """s() { std_msgs::String said; warn() { said.data = "late"; PUBLISH(/alarm, std_msgs/String, said); }
-        event e() /chatter std_msgs/String '{}' { } event done() /done std_msgs/String '{}' { }
+        event e() /chatter std_msgs/String '{}' { } event done() /alarm std_msgs/String '{}' { }
         pattern: globally: e causes done within 10ms enforced by warn @violation { } }""",
     "SERVICE": """s() { event ask(bool on) service /mode std_srvs/SetBool request '{data:on}' { if (on) { return; } }
         event told(std::string m) service /mode std_srvs/SetBool response '{message:m}' { m = "changed"; } }""",

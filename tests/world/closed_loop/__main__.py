@@ -1,0 +1,94 @@
+"""Run guards in simulated worlds, and report each law that is broken.
+
+python -m tests.world.closed_loop --worlds 100000 --seed 1 --jobs 2    run many worlds, the same number for each preset
+python -m tests.world.closed_loop --replay PRESET SEED                 run one world, with everything that happens in it
+"""
+
+import argparse
+import datetime
+import json
+import multiprocessing
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+from tests.world.closed_loop.worlds import WORLDS, Summary, replay, run_many, run_one
+
+_AT_ONCE = 50
+
+
+def _chunks(presets: list[str], worlds: int, first: int) -> Iterator[tuple[str, int, int]]:
+    each = -(-worlds // len(presets))
+    for begin in range(0, each, _AT_ONCE):
+        for preset in presets:
+            yield preset, first + begin, first + min(each, begin + _AT_ONCE)
+
+
+def _run(chunk: tuple[str, int, int]) -> tuple[str, Summary]:
+    preset, begin, end = chunk
+    return preset, run_many(preset, range(begin, end))
+
+
+def _print(line: str) -> None:
+    sys.stdout.write(f"{line}\n")
+
+
+def _as_data(first: int, summaries: dict[str, Summary]) -> dict[str, object]:
+    commit = subprocess.run(
+        ["git", "rev-parse", "--short=12", "HEAD"], capture_output=True, text=True, check=True
+    )
+    return {
+        "commit": commit.stdout.strip(),
+        "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
+        "first_seed": first,
+        "presets": {
+            preset: {
+                "worlds": one.worlds,
+                "seconds": round(one.seconds),
+                "closest": round(one.clearance, 4) if one.clearance < float("inf") else None,
+                "violations": dict(one.violations),
+            }
+            for preset, one in summaries.items()
+        },
+    }
+
+
+def main(arguments: list[str]) -> int:
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.world.closed_loop", description=(__doc__ or "").partition("\n")[0]
+    )
+    parser.add_argument(
+        "--worlds", type=int, default=1000, help="the number of worlds (default: %(default)s)"
+    )
+    parser.add_argument("--seed", type=int, default=1, help="the first seed (default: %(default)s)")
+    parser.add_argument("--jobs", type=int, default=1, help="the number of processes (default: %(default)s)")
+    parser.add_argument("--preset", action="append", choices=WORLDS, help="only this preset; may be repeated")
+    parser.add_argument("--json", type=Path, help="write the summary to this file")
+    parser.add_argument(
+        "--replay", nargs=2, metavar=("PRESET", "SEED"), help="run one world, and print all that happens"
+    )
+    chosen = parser.parse_args(arguments)
+    if chosen.replay:
+        preset, seed = chosen.replay
+        report = run_one(preset, int(seed), trace=_print)
+        return 1 if report.violations else 0
+    presets = chosen.preset or list(WORLDS)
+    summaries = {preset: Summary() for preset in presets}
+    with multiprocessing.get_context("spawn").Pool(chosen.jobs) as pool:
+        for preset, found in pool.imap_unordered(_run, _chunks(presets, chosen.worlds, chosen.seed)):
+            summaries[preset].join(found)
+            for seed, text in found.broken:
+                sys.stdout.write(f"{preset} {seed}: {text}\n    {replay(preset, seed)}\n")
+                sys.stdout.flush()
+    for preset, one in summaries.items():
+        sys.stdout.write(f"{preset}: {one}\n")
+    if chosen.json:
+        chosen.json.write_text(
+            json.dumps(_as_data(chosen.seed, summaries), indent=1) + "\n", encoding="utf-8"
+        )
+    return 1 if any(one.broken for one in summaries.values()) else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,272 @@
+"""A world in virtual time: a guard, the nodes around it, the commands that reach the base, and the laws that hold.
+
+The worlds of `motion.py` and `streams.py` say what happens in it; each is one seed.
+
+The laws are those of the guards' page and of the clauses that it names, not of the presets' texts:
+
+- L1  A limit of a velocity shortens the vector and keeps its direction.
+- L2  Nothing moves without evidence: after a measurement that is absent, invalid, out of its range or unreadable.
+- L3  Nothing collides, and nothing leaves a fence, whatever the age of the last measurement.
+- L4  What one node says stays in force when another node says something else.
+- L5  A guard that holds lets no motion pass, drops nothing that it only observes, and still knows it afterwards.
+- L6  A reset, an `enable`, a restart or a late command moves nothing.
+- live  An honest robot in an honest place does move.
+
+The declared assumptions:
+
+- A base stands still at the latest when its `reaction` has passed and it has slowed at `braking` from then on; for a
+  fence, after `ahead`. The delay of sensor and network is part of `reaction` or `ahead`.
+- A sensor sends at least every `silent` while it works, and the guard's host runs its timers when they are due.
+- A person walks at most at `person`, straight at the base, and stops for nothing; only a base that moves towards
+  a person or a wall that it touches collides. A person who steps into the base's way from beside it, nearer than
+  the separation distance, is not protected: the guard lets a base drive along a wall.
+- Between the base's outline and the `margin` are at least 6 cm, for the angles between the rays.
+- A link that was cut delivers at once what it held: within 10 ms.
+- A position is exact, or wrong by less than half of the `margin`. A scan or a position is never frozen.
+"""
+
+import heapq
+import math
+import random
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+from tests.world.closed_loop.guard_run import Change, RunningGuard, Value, parameters_of, unchanged
+from tests.world.closed_loop.messages import STILL, TWIST, Legs, command, legs_of, moves, travels
+
+LAWS = ("L1", "L2", "L3", "L4", "L5", "L6", "live")
+SLACK = 30
+"""Milliseconds that a guard has for an act: its timers run every 10 or 20 ms."""
+
+
+@dataclass(frozen=True)
+class Violation:
+    law: str
+    at: int
+    text: str
+
+    def __str__(self) -> str:
+        return f"{self.law} at {self.at / 1000:.3f} s: {self.text}"
+
+
+@dataclass
+class Report:
+    """The simulated seconds of a world, the smallest distance in metres, if any was measured, and the broken laws."""
+
+    seconds: float = 0.0
+    clearance: float = float("inf")
+    violations: list[Violation] = field(default_factory=list)
+
+
+class BrokenLawError(AssertionError):
+    """Ends a world."""
+
+
+class World:
+    """One world, by the number of its seed."""
+
+    preset: ClassVar[str]
+    span = 8000
+    """Milliseconds."""
+
+    def __init__(
+        self, seed: int, change: Change = unchanged, trace: Callable[[str], None] | None = None
+    ) -> None:
+        self.random = random.Random(f"{type(self).__name__} {seed}")  # noqa: S311  a seed gives the same world again
+        self.report = Report()
+        self.now = 0
+        self.kind = TWIST
+        self.force: tuple[int, Legs] = (0, STILL)
+        """The last command that the base got, and when."""
+        self.switched_off = False
+        self.fresh_from = 0
+        """A motion is only allowed if its command came after this time."""
+        self.made = 0
+        """When the command was made that goes through the guard now."""
+        self._change, self._trace = change, trace
+        self._queue: list[tuple[int, int, Callable[[], None]]] = []
+        self._number = 0
+
+    def plan(self) -> None:
+        """Set up the world: call `guarded`, and `after` for everything that happens."""
+        raise NotImplementedError
+
+    def watch(self) -> None:
+        """Check what must hold at any time; called every 10 ms."""
+
+    def passed(self, node: int, wanted: Legs, got: Legs | None) -> None:
+        """Check a command that has gone through the guard; None: it was dropped."""
+
+    def ended(self) -> None:
+        """Check the whole world."""
+
+    def moves(self, legs: Legs) -> bool:
+        return moves(self.kind, legs)
+
+    # For `plan`
+
+    def guarded(self, values: Mapping[str, Value], types: Mapping[str, str] | None = None) -> None:
+        types = {"command": self.kind, **(types or {})}
+        values = {name: value for name, value in values.items() if name in parameters_of(self.preset)}
+        self.guard = RunningGuard(self.preset, types, values, self._change)
+        self.trace(f"{self.preset} {types} {dict(values)}")
+
+    def after(self, at: float, act: Callable[[], None]) -> None:
+        self._number += 1
+        heapq.heappush(self._queue, (max(int(at), self.now), self._number, act))
+
+    def every(self, period: Callable[[], float], act: Callable[[], None], *, first: float = 0.0) -> None:
+        """Do something again and again; `period()` returns ms, and a negative number ends it."""
+
+        def again() -> None:
+            act()
+            pause = period()
+            if pause >= 0:
+                self.after(self.now + max(1, pause), again)
+
+        self.after(first, again)
+
+    def trace(self, text: str) -> None:
+        if self._trace is not None:
+            self._trace(f"{self.now / 1000:8.3f}  {text}")
+
+    def broken(self, law: str, text: str) -> None:
+        self.report.violations.append(Violation(law, self.now, text))
+        self.trace(f"BROKEN {law}: {text}")
+        raise BrokenLawError(text)
+
+    # Events
+
+    def run(self) -> Report:
+        self.plan()
+        self.every(lambda: 10, self.watch, first=10)
+        try:
+            while self._queue and self._queue[0][0] <= self.span:
+                at, _number, act = heapq.heappop(self._queue)
+                self._reach(at)
+                act()
+            self._reach(self.span)
+            self.ended()
+        except BrokenLawError:
+            pass
+        self.report.seconds = self.now / 1000
+        return self.report
+
+    def _reach(self, at: int) -> None:
+        for time, topic, data in self.guard.advance(at):
+            self._receive(time, topic, data)
+        self.move(at)
+        self.now = at
+
+    def move(self, until: int) -> None:
+        """Move what moves."""
+
+    def _receive(self, at: int, topic: str, data: bytes) -> None:
+        if topic == self.guard.topics["command"]:
+            self.received(max(at, self.now), legs_of(self.kind, data))
+
+    def received(self, at: int, legs: Legs) -> None:
+        """Take a command that the base gets."""
+        if legs != self.force[1]:
+            self.trace(f"the base gets {_shown(legs)}")
+        self.force = (at, legs)
+
+    def say(self, given: str, data: bytes, node: int = 6) -> bytes | None:
+        """Publish a message on a topic of the guard that is not the command's."""
+        passed, sent = self.guard.tell(self.guard.topics[given], data, self.now, node)
+        for one in sent:
+            self._receive(*one)
+        if passed is None and self.guard.holds and given != "command":
+            self.broken(
+                "L5", f"a guard that holds drops a message on {self.guard.topics[given]}, which it observes"
+            )
+        return passed
+
+    def drive(self, legs: Legs, node: int = 1, made: int | None = None) -> Legs | None:
+        """Publish a command that was made at `made` (now)."""
+        self.made = self.now if made is None else made
+        return self.publish(command(self.kind, legs, self.made), node)
+
+    def publish(self, data: bytes, node: int = 1) -> Legs | None:
+        legs = legs_of(self.kind, data)
+        passed, sent = self.guard.tell(self.guard.topics["command"], data, self.now, node)
+        got = None if passed is None else legs_of(self.kind, passed)
+        for one in sent:
+            self._receive(*one)
+        if got is not None:
+            self.received(self.now, got)
+            if passed != data:
+                self._shortened(legs, got)
+            if self.moves(got) and self.guard.holds:
+                self.broken("L5", f"a motion passes a guard that holds: {_shown(got)}")
+        if not self.switched_off:
+            self.passed(node, legs, got)
+        return got
+
+    def _shortened(self, wanted: Legs, got: Legs) -> None:
+        """Check that the linear velocity keeps its direction, and that no part of it grows."""
+        if not travels(got) or not all(map(math.isfinite, wanted[:3])):
+            return
+        largest = max(abs(leg) for leg in wanted[:3]) or 1e-300
+        scale = max(abs(leg) for leg in got[:3]) / largest
+        near = 1e-6 * largest * scale
+        if scale > 1 + 1e-9 or any(
+            not abs(leg * scale - other) <= near for leg, other in zip(wanted[:3], got[:3], strict=True)
+        ):
+            self.broken("L1", f"{_shown(wanted)} becomes {_shown(got)}: another direction, or more")
+
+    # Acts of operators
+
+    def interrupt(self, kinds: str = "hold restart switch", part: float = 0.3) -> None:
+        """Plan, in a part of the worlds, one hold, restart or pause of the guard."""
+        if self.random.random() < part:
+            self.after(
+                self.random.uniform(0.2, 0.7) * self.span, getattr(self, self.random.choice(kinds.split()))
+            )
+
+    def hold(self) -> None:
+        self.trace("the guard holds")
+        self.guard.hold()
+        self.after(self.now + self.random.choice((50, 300, 1000)), self._resume)
+
+    def _resume(self) -> None:
+        self.trace("the guard is resumed")
+        self.guard.resume()
+        self.fresh_from = self.now
+
+    def restart(self) -> None:
+        self.trace("the process is replaced")
+        self.guard.restart(self.now, lost=False)
+        self.fresh_from = self.now
+
+    def switch(self) -> None:
+        self.trace("the guard is disabled")
+        self.switched_off = True
+        self.guard.switch(self.now, enabled=False)
+        self.after(self.now + self.random.choice((50, 300, 1500)), self._enable)
+
+    def _enable(self) -> None:
+        self.trace("the guard is enabled")
+        self.switched_off = False
+        self.guard.switch(self.now, enabled=True)
+        self.fresh_from = self.now
+
+    def only_fresh(self) -> None:
+        """Check that no motion from before a restart, an `enable` or a hold is still in force."""
+        at, legs = self.force
+        if self.switched_off or self.guard.holds or at >= self.fresh_from or not self.moves(legs):
+            return
+        if self.now > self.fresh_from + 100 + SLACK:
+            ago = (self.fresh_from - at) / 1000
+            self.broken(
+                "L6", f"{_shown(legs)} is in force, which came {ago:.2f} s before the guard began again"
+            )
+
+
+def _shown(legs: Legs) -> str:
+    return "(" + ", ".join(f"{leg:.4g}" for leg in legs) + ")"
+
+
+def void(_result: object) -> None:
+    """Take the result of a call whose result does not matter."""

@@ -1,0 +1,106 @@
+"""The worlds by preset, the presets that no world can judge, and runs of many worlds."""
+
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+
+from tests.world.closed_loop.guard_run import Change, unchanged
+from tests.world.closed_loop.motion import FenceWorld, SeparationWorld
+from tests.world.closed_loop.streams import (
+    AgreeWorld,
+    ArmWorld,
+    DeadmanWorld,
+    EstopWorld,
+    RateWorld,
+    SaneWorld,
+    SensorWorld,
+    SpeedWorld,
+)
+from tests.world.closed_loop.world import LAWS, Report, World
+
+WORLDS: dict[str, type[World]] = {
+    one.preset: one
+    for one in (
+        DeadmanWorld, SpeedWorld, SeparationWorld, FenceWorld, SensorWorld, EstopWorld, ArmWorld, RateWorld, AgreeWorld,
+        SaneWorld,
+    )
+}  # fmt: skip
+
+NOT_MODELLED = {
+    "answer": "it cancels goals of an action, whose server moves the robot; there is no velocity to follow",
+    "joints": "it judges a trajectory as a whole; the rig has no arm",
+    "withhold": "it keeps a topic from hosts, and commands no motion",
+}
+"""Presets without a world, each with the reason."""
+
+WAITING = {
+    "deadman": "commands that a cut link delivers late move the base",
+    "speed": "each axis is limited on its own, and the rest of a steered command is not",
+    "separation": "each axis is limited on its own, and a scan without evidence is permission",
+    "fence": "the age of a position costs no distance",
+    "sensor": "an operator's hold drops the sensor for everybody",
+    "estop": "the buttons of several nodes are one state",
+    "arm": "a motion that has begun goes on without evidence",
+    "rate": "a slower command is dropped",
+    "agree": "sources are compared by one part of the velocity",
+    "sane": "a steered command is judged by its speed alone",
+}
+"""Presets that do not keep the laws yet, each with what is missing; no gate runs their worlds."""
+
+
+def run_one(
+    preset: str, seed: int, change: Change = unchanged, trace: Callable[[str], None] | None = None
+) -> Report:
+    return WORLDS[preset](seed, change, trace).run()
+
+
+def replay(preset: str, seed: int) -> str:
+    return f"python -m tests.world.closed_loop --replay {preset} {seed}"
+
+
+@dataclass
+class Summary:
+    """The worlds of one preset."""
+
+    worlds: int = 0
+    seconds: float = 0.0
+    """Simulated seconds."""
+    clearance: float = float("inf")
+    """The smallest distance, in metres, of a moving base to what it moves towards, or to its fence."""
+    cost: float = 0.0
+    """Seconds of the processor."""
+    violations: Counter[str] = field(default_factory=Counter)
+    """Worlds that broke a law, by law."""
+    broken: list[tuple[int, str]] = field(default_factory=list)
+    """The seeds of these worlds, with what happened."""
+
+    def add(self, seed: int, report: Report) -> None:
+        self.worlds += 1
+        self.seconds += report.seconds
+        self.clearance = min(self.clearance, report.clearance)
+        for one in report.violations:
+            self.violations[one.law] += 1
+            self.broken.append((seed, str(one)))
+
+    def join(self, other: "Summary") -> None:
+        self.worlds += other.worlds
+        self.seconds += other.seconds
+        self.cost += other.cost
+        self.clearance = min(self.clearance, other.clearance)
+        self.violations += other.violations
+        self.broken += other.broken
+
+    def __str__(self) -> str:
+        near = f", closest {self.clearance:.3f} m" if self.clearance < float("inf") else ""
+        laws = ", ".join(f"{law} {self.violations[law]}" for law in LAWS if self.violations[law]) or "none"
+        return f"{self.worlds} worlds, {self.seconds:.0f} simulated s, {self.cost:.1f} s{near}; violations: {laws}"
+
+
+def run_many(preset: str, seeds: Iterable[int], change: Change = unchanged) -> Summary:
+    summary = Summary()
+    began = time.process_time()
+    for seed in seeds:
+        summary.add(seed, run_one(preset, seed, change))
+    summary.cost = time.process_time() - began
+    return summary
