@@ -59,7 +59,7 @@ class Robot:
     def _save(self, record: witness.LeaseRecord) -> None:
         self._record = record
 
-    def _nft(self, command: list[str], text: str) -> str:
+    def _nft(self, command: list[str], text: str, _left: witness.Left) -> str:
         if command[1] == "-f":
             self._rules = text
         return self._rules

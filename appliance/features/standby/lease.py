@@ -62,6 +62,7 @@ class WitnessAnswer:
     expired: bool
     """Whether no appliance has renewed the lease in time."""
     trouble: str = ""
+    follower_trouble: str = ""
 
 
 @dataclass(frozen=True)

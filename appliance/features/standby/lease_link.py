@@ -36,6 +36,8 @@ class LeaseState(Message):
     """Why the appliance that is not active could not claim now."""
     trouble: str
     """Why the witness could not carry out a takeover."""
+    follower_trouble: str = ""
+    """The troubles that followers report to the witness."""
     sole: bool = False
     """Whether the witness's in-sync set names only this appliance."""
     expired_since: float | None = None

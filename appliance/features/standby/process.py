@@ -210,6 +210,7 @@ class LeaseProcess:
             other_witnessed=lease.other_witnessed,
             takeover_obstacle=lease.takeover_obstacle(now),
             trouble=seen.trouble if seen is not None else "",
+            follower_trouble=seen.follower_trouble if seen is not None else "",
         )
         if state != self._told or now - self._told_at >= _CONTROL_SECONDS:
             self._told, self._told_at = state, now

@@ -119,6 +119,7 @@ def state_of(
             holder=lease.holder if lease is not None else "",
             refusal=lease.refusal if lease is not None else "",
             trouble=lease.trouble if lease is not None else "",
+            follower_trouble=lease.follower_trouble if lease is not None else "",
         ),
         obstacle=obstacle,
         troubles=[],

@@ -49,6 +49,13 @@ class WitnessSeen(msgspec.Struct, frozen=True):
     trouble: Annotated[
         str, doc("why it could not carry out a takeover, such as a full disk, or empty if it could")
     ]
+    follower_trouble: Annotated[
+        str,
+        doc(
+            "the troubles of followers, such as `arm: it shut out both appliances 5 times in a minute`, or empty"
+            " if none reported one within a minute"
+        ),
+    ]
 
 
 class StandbyState(msgspec.Struct, frozen=True):

@@ -53,6 +53,16 @@ def standby_troubles(state: StandbyState, patience: float = 0.0) -> Iterator[Tro
         yield _unsaved(state.witness)
 
 
+def follower_troubles(state: StandbyState) -> Iterator[Trouble]:
+    """Return the troubles of other computers of the robot, which prevent no takeover."""
+    if state.witness.follower_trouble and not is_silent(state.witness):
+        text = (
+            f"a computer that follows the witness reports: {state.witness.follower_trouble}; check its load there, and"
+            " journalctl -u rosrv-witness-follow"
+        )
+        yield Trouble("warning", "follower-trouble", text)
+
+
 def both_active(state: StandbyState) -> bool:
     witness = state.witness
     return state.role == "active" and not is_silent(witness) and witness.holder not in ("", state.name)

@@ -11,12 +11,15 @@ from appliance.cli.output import moment
 from appliance.cli.status_watch import StatusView
 from appliance.features.standby.standby_answers import StandbyState
 from appliance.features.standby.standby_line import answer_in_words, connection, lag_in_words
+from appliance.features.standby.standby_summary import follower_troubles
 
 _RED = "bold red"
 
 
 def standby_view(state: StandbyState) -> StatusView:
-    return StatusView(1 if state.troubles else 0, StandbyScreen(state), in_full(state))
+    return StatusView(
+        1 if state.troubles or state.witness.follower_trouble else 0, StandbyScreen(state), in_full(state)
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,7 +30,7 @@ class StandbyScreen:
 
     def __rich_console__(self, _console: Console, _options: ConsoleOptions) -> RenderResult:
         state = self.state
-        for trouble in state.troubles:
+        for trouble in [*state.troubles, *(trouble.text for trouble in follower_troubles(state))]:
             yield Text(f"! {trouble}", style=_RED)
         other, witness = state.other, state.witness
         grid = Table.grid(padding=(0, 2))

@@ -5,7 +5,7 @@ from typing import Any
 from appliance.base.metric import counter, gauge
 from appliance.features.standby.samples import samples_of
 from appliance.features.standby.standby_answers import StandbyState
-from appliance.features.standby.standby_summary import PATIENCE_SECONDS, standby_troubles
+from appliance.features.standby.standby_summary import PATIENCE_SECONDS, follower_troubles, standby_troubles
 from appliance.features.view import FeatureView, StateView
 
 _METRICS = (
@@ -62,7 +62,7 @@ STANDBY_VIEW = FeatureView(
             StandbyState,
             "this appliance as one of two, or null on a single one",
             before="handled_alarms",
-            alarms=lambda state: standby_troubles(state, PATIENCE_SECONDS),
+            alarms=lambda state: (*standby_troubles(state, PATIENCE_SECONDS), *follower_troubles(state)),
             metrics=_METRICS,
             samples=samples_of,
             line=_line,

@@ -16,7 +16,8 @@ This file runs alone, with the standard library of Python 3.5 to 3.12 and the pr
    the holder admits it again, since no other appliance has had a grant.
 4. A damaged or missing lease shuts out both appliances, until an operator runs `begin`.
 5. A full disk prevents no change: the file of the lease keeps its size. Each answer says why the next takeover would
-   fail: a disk that cannot be written, or a program that cannot list the rules. Both stop no renewal of the holder.
+   fail: a disk that cannot be written, or a program that cannot list the rules or fails a trial of those of the next
+   takeover. Neither stops a renewal of the holder.
 6. After a change that may be on the disk or not, each appliance counts as in sync for the holder, and the lease is
    saved again before the next change.
 
@@ -41,6 +42,7 @@ import platform
 import re
 import select
 import shutil
+import signal
 import socket
 import stat
 import struct
@@ -48,6 +50,7 @@ import subprocess
 import sys
 import threading
 import time
+import traceback
 from typing import Any, Callable, Dict, Iterable, Iterator, List, NamedTuple, Optional, Set, Tuple
 
 EXPIRY = 1.2  # seconds after a renewal until another appliance may have the lease
@@ -74,7 +77,8 @@ _FREEBIND, _SO_MARK = (
     36,
 )  # socket options that Python 3.5 does not name; FREEBIND: the network may be down
 _PROGRAM_SECONDS = 20.0  # at a boot, the first rule loads kernel modules from a slow disk
-_CHECK_SECONDS = 1.0
+_CHECK_SECONDS, _TRIAL_SECONDS = 1.0, 10.0  # between two listings; between two trials of the next rules
+_POLL_SECONDS = 0.05  # between two checks whether a running program is still wanted
 _NETFILTER, _CT_DELETE, _NLM_REQUEST = 12, 0x102, 1
 _RESET_SECONDS, _RESET_ROUNDS = 0.6, 8  # a kernel answers one segment outside the window each half second
 _BATCH = 64  # datagrams of unknown sources between two checks of the time, and of the sockets of known ones
@@ -85,6 +89,13 @@ _CONFIDENCE = 0.9  # of the time that an answer has left
 _CLOCK_BOOTTIME = 7  # runs while the computer sleeps; Python 3.5 does not name it
 _MOST_FOLLOWERS = 32
 _LINES, _LINES_SECONDS = 20, 10.0
+_FLAPS, _FLAP_SECONDS, _MOST_FLAPS = (
+    3,
+    60.0,
+    100,
+)  # interruptions in this time that are reported; that are counted
+_REPORT = 160  # characters
+_NOT_REPORTED = re.compile(r"[^ !#-\[\]-~]")  # an escaped character would need more bytes of a datagram
 _COPY = 4096  # bytes of each of the two copies of the lease: a block of the disk
 _DISK_SECONDS, _SLOW_SECONDS = 30.0, 5.0  # between two checks of the disk; that a write may take
 # States in /proc/net/tcp: the peer may still send; it has not answered yet.
@@ -92,7 +103,8 @@ _ESTABLISHED, _CONNECTING = ("01", "03", "04", "05", "06", "08"), ("02",)
 _ACK, _SYN = 0x10, 0x02
 _MAPPED = "0000000000000000FFFF0000"  # an IPv4 address in /proc/net/tcp6
 
-Program = Callable[[List[str], str], str]
+Left = Callable[[], float]
+Program = Callable[[List[str], str, Left], str]
 Ends = Tuple[str, int, str, int]  # of a connection: the own address and port, those of the peer
 
 
@@ -103,6 +115,13 @@ class WitnessError(Exception):
 class UncertainError(WitnessError):
     """The change may have been made, or a part of it."""
 
+
+class PostponedError(WitnessError):
+    """A check was ended for something more urgent, so its earlier result stays."""
+
+
+Answered = NamedTuple("Answered", [("epoch", int), ("holder", str), ("until", float)])
+"""The newest answer to a follower: it may admit `holder` (or no appliance, "") until a time of its clock."""
 
 LeaseRecord = NamedTuple(
     "LeaseRecord", [("epoch", int), ("holder", str), ("in_sync", Tuple[str, ...]), ("boot", str)]
@@ -313,13 +332,15 @@ class RegularCheck:
     def _run_always(self, seconds: float) -> None:
         while True:
             self.run()
-            select.select([], [], [], seconds)
+            select.select([], [], [], _CHECK_SECONDS if self._failure else seconds)
 
     def run(self) -> None:
         self._began = self._clock()
         try:
             self._check()
             self._failure = ""
+        except PostponedError:
+            pass
         except (OSError, WitnessError) as error:
             self._failure = "%s: %s" % (self._text, error)
         self._began = None
@@ -355,7 +376,9 @@ class Witness:
         self._clock = clock
         self._expires = clock() + EXPIRY
         self.trouble = ""  # why the next takeover would fail
-        self.unknown_rules = ""  # why the rules cannot be listed
+        self.unknown_rules = (
+            ""  # why the rules cannot be listed, or those of the next takeover not be written
+        )
         self.unsettled = False  # whether the disk may have another lease than `record`
         # Within one boot the rules of an earlier process stay, so that its end alone changes nothing.
         self.admitted = record.holder if record is not None and record.boot == boot else ""
@@ -370,6 +393,9 @@ class Witness:
         if self.record is not None:
             self._save(self.record)
         self.unsettled = False
+
+    def now(self) -> float:
+        return self._clock()
 
     def left(self) -> float:
         return max(0.0, self._expires - self._clock())
@@ -449,7 +475,8 @@ class WitnessGate:
     """Checks datagrams: each request is authenticated, and newer than all earlier ones of its appliance.
 
     A request has the witness's nonce of this start, which no earlier recording can have, and a rising number. An
-    old nonce or number is answered with the present ones.
+    old nonce or number is answered with the present ones. A follower's request may have a `report` of its troubles,
+    which the answers to the appliances repeat.
 
     """
 
@@ -466,6 +493,7 @@ class WitnessGate:
         self._peers.update(appliances)
         self._nonce = nonce
         self._last = dict.fromkeys(self._peers, 0)
+        self._reports = {}  # type: Dict[str, Tuple[float, str]]
         self.rejected = 0
         self.fresh = ""  # the name in the last datagram, if it was authentic and new
 
@@ -486,7 +514,8 @@ class WitnessGate:
 
     def _well_formed(self, body: Dict[str, Any]) -> bool:
         return (
-            set(body) == {"boot", "session", "number", "do", "epoch"}
+            set(body) - {"report"} == {"boot", "session", "number", "do", "epoch"}
+            and isinstance(body.get("report", ""), str)
             and all(isinstance(body[field], str) and len(body[field]) <= 32 for field in ("boot", "session"))
             and is_count(body["number"])
             and is_count(body["epoch"])
@@ -514,13 +543,29 @@ class WitnessGate:
             expired=not self._witness.left(),
             trouble=self._witness.trouble[:200].encode("ascii", "replace").decode("ascii"),
         )
-        if name not in self._appliances:
-            admitted = self._witness.admitted
-            answer.update(
-                admitted=admitted if admitted in self._appliances else "",
-                left=int(self._witness.left() * 1000),
-            )
+        if name in self._appliances:
+            answer.update(followers=self._reported())
+            return answer
+        self._reports[name] = self._witness.now(), _NOT_REPORTED.sub("?", body.get("report", ""))[:_REPORT]
+        admitted = self._witness.admitted
+        answer.update(
+            admitted=admitted if admitted in self._appliances else "",
+            left=int(self._witness.left() * 1000),
+            reports=True,
+        )
         return answer
+
+    def _reported(self) -> str:
+        """Return the troubles of the followers. The last one of a follower that is silent now is repeated for a
+        minute.
+        """
+        since = self._witness.now() - _FLAP_SECONDS
+        found = [
+            "%s: %s" % (name, text)
+            for name, (at, text) in sorted(self._reports.items())
+            if text and at > since
+        ]
+        return "; ".join(found)[:_REPORT]
 
 
 class WitnessFollower:
@@ -528,8 +573,11 @@ class WitnessFollower:
 
     It admits an appliance only for 0.9 of the time that its lease has left, counted from the time the request was
     *sent*; the rest allows for clocks of different speeds. So while the robot admits one appliance, no follower
-    admits the other, unless the first has given the lease up. Without answers, both are shut out after at most one
-    expiry.
+    begins to admit the other, unless the first has given the lease up: rules that are still being written when this
+    time ends are abandoned. Without answers, both are shut out after at most one expiry.
+
+    A slow disk or firewall delays no answer: `request` and `receive` belong to the thread that asks, `save_epoch` to
+    one that saves, all others to the one that writes the rules. Each field is assigned by one of them.
     """
 
     def __init__(
@@ -541,12 +589,13 @@ class WitnessFollower:
         session: str,
         epoch: int,  # the greatest saved; no smaller one, of a witness restored from an old disk, is accepted
         save: Callable[[int], None],
-        admit: Callable[[str], None],
+        admit: Callable[[str, Left], None],  # raises `UncertainError` if the time that is left ends
         clock: Callable[[], float],  # runs even while the computer sleeps
     ) -> None:
         self.epoch = epoch
         self.refusal = ""
         self.answered = clock()
+        self.report = ""  # for the witness
         self._name = name
         self._key = key
         self._appliances = frozenset(appliances)
@@ -556,10 +605,13 @@ class WitnessFollower:
         self._clock = clock
         self._boot = ""
         self._number = 0
+        self._reporting = False
         self._pending = {}  # type: Dict[int, float]
-        self._holder = ""
-        self._until = 0.0
+        self._newest = self._used = Answered(0, "", 0.0)
+        self._saved = epoch
         self._admitted = "?"  # unknown: an earlier process may have written rules
+        self._opened = False
+        self._interrupted = []  # type: List[float]
         self.tick()
 
     def request(self) -> bytes:
@@ -567,18 +619,16 @@ class WitnessFollower:
         self._pending[self._number] = self._clock()
         if len(self._pending) > _MOST_PENDING:
             del self._pending[min(self._pending)]
-        return seal(
-            REQUEST,
-            self._name,
-            self._key,
-            {
-                "boot": self._boot,
-                "session": self._session,
-                "number": self._number,
-                "do": "look",
-                "epoch": self.epoch,
-            },
-        )
+        body = {
+            "boot": self._boot,
+            "session": self._session,
+            "number": self._number,
+            "do": "look",
+            "epoch": self.epoch,
+        }
+        if self._reporting:  # an earlier version of the witness rejects the field
+            body["report"] = self.report
+        return seal(REQUEST, self._name, self._key, body)
 
     def receive(self, datagram: bytes) -> None:
         body = unseal(ANSWER, self._key, datagram) if name_in(datagram) == self._name else None
@@ -597,6 +647,7 @@ class WitnessFollower:
         epoch, left, admitted = body.get("epoch"), body.get("left"), body.get("admitted")  # type: Any, Any, Any
         if not (is_count(epoch) and is_count(left) and isinstance(admitted, str)):
             return
+        self._reporting = body.get("reports") is True
         self.refusal = ""
         if body.get("ok") is not True:
             self.refusal = str(body.get("reason"))[:200]
@@ -604,25 +655,66 @@ class WitnessFollower:
             self.refusal = "the witness has epoch %d, but had %d before" % (epoch, self.epoch)
         if self.refusal or (admitted and admitted not in self._appliances):
             return
-        if epoch > self.epoch:
-            self._save(epoch)
-            self.epoch = epoch
-        self._holder, self._until = admitted, sent + _CONFIDENCE * min(left / 1000.0, EXPIRY)
-        self.tick()
+        self.epoch = epoch
+        self._newest = Answered(epoch, admitted, sent + _CONFIDENCE * min(left / 1000.0, EXPIRY))
+
+    def save_epoch(self) -> bool:
+        """Save a new epoch, and return whether there was one. Until then no answer with it admits an appliance."""
+        epoch = self._newest.epoch
+        if epoch <= self._saved:
+            return False
+        self._save(epoch)
+        self._saved = epoch
+        return True
 
     def tick(self) -> None:
-        wanted = self._holder if self._clock() < self._until else ""
-        if wanted != self._admitted:
+        wanted = self._wanted()
+        if wanted == self._admitted:
+            return
+        try:
             self.enforce(wanted)
+        except UncertainError:
+            if self._wanted() == wanted:
+                raise
+            self.enforce("")  # the lease ended, so the writing was abandoned
 
     def enforce_again(self) -> None:
-        self.enforce(self._holder if self._clock() < self._until else "")
+        self.enforce(self._wanted())
 
     def enforce(self, name: str) -> None:
         """Write the rules; after a `WitnessError`, the next `tick` tries again."""
-        self._admitted = "?"
-        self._admit(name)
+        if self._opened and not name:
+            self._interrupted = [*self._interrupted[1 - _MOST_FLAPS :], self._clock()]
+        self._admitted, self._opened = "?", bool(name)
+        self._admit(name, lambda: self._left(name))
         self._admitted = name
+
+    def pause(self) -> float:
+        """Return the seconds until the next `tick` is due, if no answer comes."""
+        now, wanted = self._clock(), self._wanted()
+        if self._admitted not in (wanted, "?"):
+            return 0.0
+        return min(_LOOK_SECONDS, self._used.until - now) if wanted else _LOOK_SECONDS
+
+    def note(self, trouble: str) -> None:
+        """Report a trouble of this computer, or that topics are interrupted again and again."""
+        now = self._clock()
+        interrupted = sum(now - at < _FLAP_SECONDS for at in self._interrupted)
+        if not trouble and interrupted >= _FLAPS:
+            trouble = "it shut out both appliances %d times in a minute" % interrupted
+        self.report = trouble[:_REPORT]
+
+    def _wanted(self) -> str:
+        newest = self._newest
+        if newest.epoch <= self._saved:
+            self._used = newest
+        return self._used.holder if self._clock() < self._used.until else ""
+
+    def _left(self, name: str) -> float:
+        """Return the seconds that rules may still need until they are in force."""
+        if not name:
+            return EXPIRY  # to shut out is always right
+        return self._used.until - self._clock() if self._wanted() == name else 0.0
 
 
 # ---- The firewall
@@ -762,25 +854,44 @@ def without_iptables_rules(saved: str) -> str:
     return "\n".join(lines) + "\n"
 
 
-def run_program(command: List[str], text: str) -> str:
+def always() -> float:
+    return _PROGRAM_SECONDS
+
+
+def run_program(command: List[str], text: str, left: Left = always) -> str:
+    """Run a program of the firewall; `left` returns the seconds for which it is still wanted."""
+    streams = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}  # type: Dict[str, Any]
+    began = time.monotonic()
     try:
-        done = subprocess.run(
-            command,
-            input=text.encode("utf-8"),
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            timeout=_PROGRAM_SECONDS,
-            check=False,
-        )
+        process = subprocess.Popen(command, start_new_session=True, **streams)
     except OSError as error:
         raise WitnessError("%s: %s" % (command[0], error)) from error
-    except subprocess.TimeoutExpired as error:
-        raise UncertainError("%s: %s" % (command[0], error)) from error
-    said, failed = (one.decode("utf-8", "replace") for one in (done.stdout, done.stderr))
-    if done.returncode:
-        failure = WitnessError if done.returncode > 0 else UncertainError  # it was killed
-        raise failure("%s: %s" % (command[0], " ".join(failed.split())[:150] or done.returncode))
+    with contextlib.ExitStack() as ended:
+        for stream in (process.stdin, process.stdout, process.stderr):
+            ended.callback(_close, stream)
+        given = text.encode("utf-8")  # type: Optional[bytes]
+        while True:
+            try:
+                done = process.communicate(given, timeout=max(0.0, min(_POLL_SECONDS, left())))
+                break
+            except subprocess.TimeoutExpired:
+                given = None  # it has the input already
+            seconds = time.monotonic() - began
+            if left() <= 0 or seconds > _PROGRAM_SECONDS:
+                with contextlib.suppress(ProcessLookupError):
+                    os.killpg(process.pid, signal.SIGKILL)  # also what a script has started
+                process.wait()
+                raise UncertainError("%s: ended after %.1f s" % (command[0], seconds))
+    said, failed = (one.decode("utf-8", "replace") for one in done)
+    if process.returncode:
+        failure = WitnessError if process.returncode > 0 else UncertainError  # it was killed
+        raise failure("%s: %s" % (command[0], " ".join(failed.split())[:150] or process.returncode))
     return said
+
+
+def _close(stream: Any) -> None:
+    with contextlib.suppress(OSError):  # input that the program did not read
+        stream.close()
 
 
 def chosen_backend(release: str, find: Callable[[str], Optional[str]]) -> str:
@@ -795,9 +906,10 @@ def chosen_backend(release: str, find: Callable[[str], Optional[str]]) -> str:
 
 def remove_rules(backend: str, run: Program = run_program) -> None:
     if backend == "nft":
-        run(["nft", "-f", "-"], "table ip %s\ndelete table ip %s\n" % (TABLE, TABLE))
+        run(["nft", "-f", "-"], "table ip %s\ndelete table ip %s\n" % (TABLE, TABLE), always)
     else:
-        run(["iptables-restore", "--noflush"], without_iptables_rules(run(["iptables-save"], "")))
+        present = run(["iptables-save"], "", always)
+        run(["iptables-restore", "--noflush"], without_iptables_rules(present), always)
 
 
 class LeaseFirewall:
@@ -807,22 +919,59 @@ class LeaseFirewall:
         self._settings = settings
         self._backend = backend
         self._run = run
-        self._written = []  # type: List[str]
+        self._written = None  # type: Optional[List[str]]
         self._rules = 0
+        self._restoring = threading.Lock()
+        self._waiting = False
 
-    def admit(self, name: str) -> None:
-        if self._backend == "nft":
-            self._run(["nft", "-f", "-"], nft_rules(self._settings, name))  # changes all rules, or none
-        else:
-            text = iptables_rules(self._settings, name, self._chains())
+    def admit(self, name: str, left: Left = always) -> None:
+        """Raise `UncertainError` if the time that is left ends before the rules are in force."""
+        before, self._written = self._written, None
+        self._waiting = True  # a trial ends, because only one program may have the lock of iptables
+        with self._restoring:
+            self._waiting = False
             try:
-                self._run(["iptables-restore", "--noflush"], text)
-            except WitnessError as error:
-                raise UncertainError(str(error)) from error  # each table is changed separately
-            self._rules = text.count("-A %s-" % _CHAINS)
-        self._written = []
+                self._write(name, left)
+            except UncertainError:
+                raise
+            except WitnessError:
+                self._written = before
+                raise
         with contextlib.suppress(WitnessError):  # unread rules are not intact: they are written again
-            self._written = self.present()
+            self._written = self.present(left)
+
+    def _write(self, name: str, left: Left) -> None:
+        if self._backend == "nft":
+            self._run(["nft", "-f", "-"], nft_rules(self._settings, name), left)  # changes all rules, or none
+            return
+        text = iptables_rules(self._settings, name, self._chains(left))
+        try:
+            self._run(["iptables-restore", "--noflush"], text, left)
+        except WitnessError as error:
+            raise UncertainError(str(error)) from error  # each table is changed separately
+        self._rules = text.count("-A %s-" % _CHAINS)
+
+    def try_out(self, name: str) -> None:
+        """Let the kernel check the rules that admit an appliance, without a change. A change is not delayed."""
+        with self._restoring:
+            try:
+                if self._backend == "nft":
+                    self._run(["nft", "-c", "-f", "-"], nft_rules(self._settings, name), self._unhindered)
+                else:
+                    text = iptables_rules(self._settings, name, self._chains(self._unhindered))
+                    self._run(["iptables-restore", "--test", "--noflush"], text, self._unhindered)
+            except UncertainError as error:
+                if self._waiting:
+                    raise PostponedError(str(error)) from error
+                raise
+
+    def _unhindered(self) -> float:
+        return 0.0 if self._waiting else _PROGRAM_SECONDS
+
+    @property
+    def read(self) -> bool:
+        """Whether the rules were read after they were written."""
+        return self._written is not None
 
     def intact(self, present: List[str]) -> bool:
         """Return whether the rules are still those that were written.
@@ -834,23 +983,25 @@ class LeaseFirewall:
         whole = present[: len(jumps)] == jumps and len(present) == len(jumps) + self._rules
         return present == self._written and (whole or self._backend == "nft")
 
-    def _chains(self) -> Dict[str, List[str]]:
+    def _chains(self, left: Left = always) -> Dict[str, List[str]]:
         found, table = {}, ""  # type: Dict[str, List[str]], str
-        for line in self._run(["iptables-save"], "").splitlines():
+        for line in self._run(["iptables-save"], "", left).splitlines():
             table = line[1:] if line.startswith("*") else table
             if line.startswith("-A "):
                 found.setdefault("%s %s" % (table, line.split()[1]), []).append(line)
         return found
 
-    def present(self) -> List[str]:
+    def present(self, left: Left = always) -> List[str]:
         if self._backend == "nft":
             try:
-                return [self._run(["nft", "list", "table", "ip", TABLE], "")]
+                return [self._run(["nft", "list", "table", "ip", TABLE], "", left)]
+            except UncertainError:
+                raise
             except WitnessError:
-                if "table ip " + TABLE in self._run(["nft", "list", "tables"], "").splitlines():
+                if "table ip " + TABLE in self._run(["nft", "list", "tables"], "", left).splitlines():
                     raise
                 return [""]  # the table is gone
-        chains = self._chains()
+        chains = self._chains(left)
         jumps = [chains.get("%s %s" % (table, chain), [""])[0] for table, rows in _JUMPS for chain, _ in rows]
         return jumps + [rule for name in sorted(chains) if _CHAINS in name for rule in chains[name]]
 
@@ -1061,8 +1212,13 @@ class BoundedLog:
         self._clock = clock
         self._since = clock()
         self._lines = 0
+        self._one = threading.Lock()
 
     def add(self, text: str) -> None:
+        with self._one:
+            self._add(text)
+
+    def _add(self, text: str) -> None:
         now = self._clock()
         if now - self._since > _LINES_SECONDS:
             if self._lines > _LINES:
@@ -1079,39 +1235,68 @@ def _write_error(text: str) -> None:
 
 
 class LeaseEnforcement:
-    """The firewall and the idle connections of this computer."""
+    """The firewall and the idle connections of this computer. One thread uses all but the checks."""
 
-    def __init__(self, settings: WitnessSettings, backend: str, log: BoundedLog) -> None:
-        self._firewall = LeaseFirewall(settings, backend)
-        self._idle = IdleConnections(settings)
+    def __init__(
+        self,
+        firewall: LeaseFirewall,
+        idle: IdleConnections,
+        appliances: Iterable[str],
+        log: BoundedLog,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._firewall = firewall
+        self._idle = idle
         self._log = log
-        self._checked = self._reset = time.monotonic()
-        self._changes = 0
+        self._names = sorted(appliances)
+        self._clock = clock
+        self._admitted = ""
+        self._checked = self._reset = clock()
+        self._changes = 0  # odd while rules are written
         self._listed = None  # type: Optional[Tuple[int, List[str]]]
-        self.listing = RegularCheck("the firewall rules cannot be listed", self._list, time.monotonic)
+        self.listing = RegularCheck("the firewall rules cannot be listed", self._list, clock)
+        text = "the firewall rules of a takeover cannot be written"
+        self.trial = RegularCheck(text, self._try_next, clock)
+
+    def start_checks(self) -> None:
+        self.listing.start(_CHECK_SECONDS)
+        self.trial.start(_TRIAL_SECONDS)
+
+    def trouble(self) -> str:
+        return self.listing.trouble() or self.trial.trouble()
 
     def _list(self) -> None:
         changes = self._changes
-        self._listed = changes, self._firewall.present()
+        present = self._firewall.present()
+        if changes % 2 == 0:
+            self._listed = changes, present
 
-    def admit(self, name: str) -> None:
+    def _try_next(self) -> None:
+        self._firewall.try_out(next(name for name in self._names if name != self._admitted))
+
+    def admit(self, name: str, left: Left = always) -> None:
         self._changes += 1
-        connecting = self._idle.connecting()
-        self._firewall.admit(name)
+        try:
+            connecting = self._idle.connecting()
+            self._firewall.admit(name, left)
+        finally:
+            self._changes += 1
+        self._admitted = name
         self._idle.reset(name, connecting)
         self._log.add("the robot admits %s" % (name or "no appliance"))
 
     def go_on(self, enforce_again: Callable[[], None]) -> bool:
-        now = time.monotonic()
+        now = self._clock()
         if now - self._reset >= _RESET_SECONDS:
             self._reset = now
             self._idle.go_on()
         listed, self._listed = self._listed, None
         try:
             if listed is not None and listed[0] == self._changes and not self._firewall.intact(listed[1]):
-                self._log.add(
-                    "another program changed the firewall rules of the witness; they are written again"
-                )
+                cause = "another program changed the firewall rules of the witness"
+                if not self._firewall.read:
+                    cause = "the firewall rules of the witness could not be read after they were written"
+                self._log.add(cause + "; they are written again")
                 enforce_again()
         except WitnessError as error:
             self._log.add(str(error))
@@ -1119,6 +1304,11 @@ class LeaseEnforcement:
             return False
         self._checked = now
         return True
+
+
+def enforcement_of(settings: WitnessSettings, backend: str, log: BoundedLog) -> LeaseEnforcement:
+    firewall, idle = LeaseFirewall(settings, backend), IdleConnections(settings)
+    return LeaseEnforcement(firewall, idle, settings.appliances, log)
 
 
 def _shut(settings: WitnessSettings, backend: str) -> None:
@@ -1132,7 +1322,7 @@ def _shut(settings: WitnessSettings, backend: str) -> None:
 
 def serve(settings: WitnessSettings, backend: str, lease: LeaseFile) -> None:
     log = BoundedLog(_write_error, time.monotonic)
-    enforcement = LeaseEnforcement(settings, backend, log)
+    enforcement = enforcement_of(settings, backend, log)
     try:
         record = lease.read()  # type: Optional[LeaseRecord]
     except WitnessError as error:
@@ -1148,7 +1338,7 @@ def serve(settings: WitnessSettings, backend: str, lease: LeaseFile) -> None:
         "the disk of the lease %s cannot be written" % lease.path, lease.check_disk, time.monotonic
     )
     disk.start(_DISK_SECONDS)
-    enforcement.listing.start(_CHECK_SECONDS)
+    enforcement.start_checks()
     with RequestSockets(settings.listen) as requests:
         log.add("the witness answers at %s:%d and uses %s" % (*settings.listen, backend))
         rejected = 0
@@ -1159,7 +1349,7 @@ def serve(settings: WitnessSettings, backend: str, lease: LeaseFile) -> None:
                         break
             if not enforcement.go_on(witness.enforce_again):
                 continue
-            witness.unknown_rules = enforcement.listing.trouble()
+            witness.unknown_rules = enforcement.trouble()
             _note_trouble(witness, lease, disk, log)
             if gate.rejected > rejected:
                 log.add("%d requests without a valid authentication code" % (gate.rejected - rejected))
@@ -1252,7 +1442,7 @@ def _answer_one(one: socket.socket, gate: WitnessGate, requests: RequestSockets)
 
 def follow(settings: WitnessSettings, backend: str, lease: LeaseFile) -> None:
     log = BoundedLog(_write_error, time.monotonic)
-    enforcement = LeaseEnforcement(settings, backend, log)
+    enforcement = enforcement_of(settings, backend, log)
     names = tuple(sorted(settings.appliances))
     own = settings.followers[settings.follows_as]
     follower = WitnessFollower(
@@ -1272,29 +1462,86 @@ def follow(settings: WitnessSettings, backend: str, lease: LeaseFile) -> None:
         log.add(
             "%s follows the witness at %s:%d and uses %s" % (settings.follows_as, *settings.listen, backend)
         )
-        enforcement.listing.start(_CHECK_SECONDS)
-        asked = time.monotonic() - _LOOK_SECONDS
+        enforcement.start_checks()
+        writing, saving = Wake(), Wake()
+        _start(lambda: _ask_always(asking, settings.listen, follower, (writing, saving)))
+        _start(lambda: _save_always(follower, (writing, saving), log))
         shown = ""
         while True:  # until the process is ended; each turn is bounded
-            left = asked + _LOOK_SECONDS - time.monotonic()
-            ready, _, _ = select.select([asking], [], [], max(0.0, left))
+            writing.wait(follower.pause())
             try:
-                for _ in range(_BATCH if ready else 0):
-                    if not _receive_one(asking, settings.listen, follower):
-                        break
                 follower.tick()
             except WitnessError as error:
                 log.add(str(error))
-            if time.monotonic() - asked >= _LOOK_SECONDS:
-                asked = time.monotonic()
-                _send_look(asking, settings.listen, follower)
+            follower.note(enforcement.trouble())
             silent = _boot_seconds() - follower.answered > EXPIRY
             state = "the witness at %s:%d does not answer" % settings.listen if silent else follower.refusal
-            state = state or enforcement.listing.trouble()
+            state = state or follower.report
             if state != shown:
                 shown = state
-                log.add(state or "the witness answers, and the rules can be listed")
+                log.add(state or "the witness answers, and the rules can be written")
             enforcement.go_on(follower.enforce_again)
+
+
+class Wake:
+    """Wakes a waiting thread. Unlike those of `threading`, a wait is not prolonged by a change of the wall clock,
+    which Python before 3.11 uses for them.
+    """
+
+    def __init__(self) -> None:
+        self._reader, self._writer = socket.socketpair()
+        self._reader.setblocking(False)
+        self._writer.setblocking(False)
+
+    def set(self) -> None:
+        with contextlib.suppress(BlockingIOError):  # it has enough to wake for
+            self._writer.send(b".")
+
+    def wait(self, seconds: float) -> None:
+        ready, _, _ = select.select([self._reader], [], [], max(0.0, seconds))
+        if ready:
+            self._reader.recv(_COPY)
+
+
+def _start(run: Callable[[], None]) -> None:
+    """Run a thread, without which the process must end."""
+
+    def run_or_end() -> None:
+        try:
+            run()
+        except Exception:  # noqa: BLE001  whatever it is: systemd starts the program again
+            traceback.print_exc()
+        os._exit(1)
+
+    threading.Thread(target=run_or_end, daemon=True).start()
+
+
+def _ask_always(
+    asking: socket.socket, witness: Tuple[str, int], follower: WitnessFollower, wakes: Iterable[Wake]
+) -> None:
+    asked = time.monotonic() - _LOOK_SECONDS
+    while True:
+        left = asked + _LOOK_SECONDS - time.monotonic()
+        ready, _, _ = select.select([asking], [], [], max(0.0, left))
+        for _ in range(_BATCH if ready else 0):
+            if not _receive_one(asking, witness, follower):
+                break
+        for wake in wakes if ready else ():
+            wake.set()
+        if time.monotonic() - asked >= _LOOK_SECONDS:
+            asked = time.monotonic()
+            _send_look(asking, witness, follower)
+
+
+def _save_always(follower: WitnessFollower, wakes: Tuple[Wake, Wake], log: BoundedLog) -> None:
+    writing, saving = wakes
+    while True:
+        saving.wait(_CHECK_SECONDS)
+        try:
+            if follower.save_epoch():
+                writing.set()
+        except WitnessError as error:
+            log.add(str(error))
 
 
 def _boot_seconds() -> float:

@@ -25,6 +25,7 @@ class _AnswerBody(msgspec.Struct, frozen=True):
     in_sync: frozenset[str] = frozenset()
     expired: bool = False
     trouble: str = ""
+    followers: str = ""
 
 
 class WitnessChannel:
@@ -70,6 +71,13 @@ class WitnessChannel:
             self._boot, self._number = body.boot, max(self._number, body.last)
             return None
         answer = WitnessAnswer(
-            body.ok, body.reason, body.epoch, body.holder, body.in_sync, body.expired, body.trouble
+            body.ok,
+            body.reason,
+            body.epoch,
+            body.holder,
+            body.in_sync,
+            body.expired,
+            body.trouble,
+            body.followers,
         )
         return request, answer

@@ -22,6 +22,7 @@ from tests.support.features.standby.witness_site import (
     MASTER,
     NODE,
     ROBOT,
+    THE_PROGRAM,
     WITNESS,
     Peer,
     Site,
@@ -102,6 +103,23 @@ def test_a_follower_changes_over_with_the_robot(site: Site) -> None:
             seconds_until_reset([idle])
             eventually(lambda: reaches(site, "b"), "the follower admits b")
             assert site.refused(site.follower, ADDRESSES["a"], MASTER)
+
+
+@pytest.mark.parametrize("seconds", [0.4, 1.1])
+def test_a_slow_firewall_interrupts_nothing_while_the_witness_answers(site: Site, seconds: float) -> None:
+    """`seconds` is the time of each run of the program; a change of the rules needs one to three."""
+    with held(site, "a", 1) as first:
+        with site.firewall_program(f"sleep {seconds}\n{THE_PROGRAM}"):
+            following = site.follow()
+            eventually(lambda: reaches(site, "a"), lambda: f"the follower admits a: {following.errors}")
+            renewed = first.renewed
+            eventually(lambda: first.renewed > renewed + 50, lambda: "the lease is renewed")
+            assert "no appliance" not in "\n".join(following.errors[2:]), following.errors
+            assert reaches(site, "a")
+        first.end()
+        with held(site, "b", first.epoch):
+            eventually(lambda: reaches(site, "b"), lambda: f"the follower admits b: {following.errors}")
+    assert "another program" not in "\n".join(following.errors) + site.log()
 
 
 def test_without_the_witness_a_follower_shuts_out_both(site: Site) -> None:

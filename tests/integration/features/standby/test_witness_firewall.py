@@ -23,6 +23,7 @@ from tests.support.features.standby.witness_site import (
     MASTER,
     NODE,
     ROBOT,
+    THE_PROGRAM,
     WITNESS,
     Site,
     broken_disk,
@@ -180,6 +181,28 @@ def test_a_firewall_program_that_fails_or_hangs_stops_no_renewal(site: Site, scr
         assert site.lease.read().epoch == epoch
     eventually(lambda: a.ask("renew", epoch).trouble == "", site.log)
     assert "another program changed" not in site.log()
+    assert a.ask("release", epoch).ok
+    assert b.granted(epoch) == epoch + 1
+
+
+def test_a_program_that_lists_but_cannot_write_is_reported_before_a_takeover_needs_it(site: Site) -> None:
+    site.serve()
+    a, b = site.peer("a"), site.peer("b")
+    epoch = a.granted(1)
+    failing = f'case "$*" in *-f*|*--noflush*) echo no memory >&2; exit 1;; esac\n{THE_PROGRAM}'
+    with site.firewall_program(failing):
+        for peer, operation in ((a, "renew"), (b, "look")):
+            eventually(
+                lambda peer=peer, operation=operation: (
+                    "takeover cannot be written" in peer.ask(operation, epoch).trouble
+                ),
+                site.log,
+            )
+        assert a.ask("release", epoch).ok
+        assert "takeover cannot be written" in b.ask("claim", epoch).reason
+        assert site.lease.read().epoch == epoch
+        assert a.ask("renew", epoch).ok
+    eventually(lambda: a.ask("renew", epoch).trouble == "", site.log)
     assert a.ask("release", epoch).ok
     assert b.granted(epoch) == epoch + 1
 

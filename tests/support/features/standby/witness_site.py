@@ -26,6 +26,9 @@ ADDRESSES = {"a": "10.77.0.2", "b": "10.77.0.3"}
 KEYS = {"a": b"\xaa" * 32, "b": b"\xbb" * 32}
 FOLLOWER, FOLLOWER_KEY = "10.77.0.20", b"\xff" * 32
 MASTER, NODE, WITNESS = 11311, 40000, 7411
+THE_PROGRAM = 'exec "$(readlink "$0.real" || echo /usr/sbin/nft)" "$@"'
+"""The end of a script that goes on as the program whose place it has."""
+
 AT_ONCE = LIMIT  # seconds; a hanging connection would last for hours
 BACKENDS = ("nft", "iptables-nft", "iptables-legacy")
 

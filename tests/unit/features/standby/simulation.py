@@ -368,7 +368,7 @@ class SimulatedRobot(Host):
         if fault == "power":
             raise _PowerLost
 
-    def _nft(self, command: list[str], text: str) -> str:
+    def _nft(self, command: list[str], text: str, _left: witness.Left) -> str:
         if command[1] == "-f":
             fails, product = self.firewall_fails, self.history.product.witness
             if fails and self.history.random.random() < 0.5:

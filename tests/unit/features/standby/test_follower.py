@@ -1,6 +1,9 @@
+import contextlib
 import json
 import random
 from pathlib import Path
+from types import ModuleType
+from typing import Any
 
 import pytest
 
@@ -15,6 +18,7 @@ from appliance.features.standby.witness import (
     BoundedLog,
     LeaseFile,
     LeaseRecord,
+    Left,
     Witness,
     WitnessError,
     WitnessFollower,
@@ -26,6 +30,7 @@ from appliance.features.standby.witness import (
     seal,
     unseal,
 )
+from tests.unit.features.standby.mutants import Mutant, product_of
 
 BOTH = ("a", "b")
 KEY = b"f" * 32
@@ -42,6 +47,7 @@ class Robot:
         self.follower_admits: list[str] = []
         self.saved: list[int] = []
         self.broken = False
+        self.number = 0
         self.start_witness(LeaseRecord(1, "", BOTH, ""))
         self.start_follower(epoch)
 
@@ -72,7 +78,7 @@ class Robot:
             raise WitnessError("the disk is full")
         self.saved.append(epoch)
 
-    def _admit(self, name: str) -> None:
+    def _admit(self, name: str, _left: Left) -> None:
         if self.broken:
             raise WitnessError("nft: no")
         self.follower_admits.append(name)
@@ -87,8 +93,28 @@ class Robot:
     def look(self) -> str:
         answer = self.answer()
         assert answer is not None
-        self.follower.receive(answer)
+        self.receive(answer)
         return self.follower_admits[-1]
+
+    def told(self) -> dict[str, object]:
+        """Return what the answers to the appliances say of followers."""
+        found = {}
+        for name in BOTH:
+            self.number += 1
+            body = {"boot": f"nonce {id(self.witness)}", "session": "x", "number": self.number}
+            body |= {"do": "look", "epoch": 0}
+            answer = self.gate.answer(
+                seal(REQUEST, name, APPLIANCES[name].key, body), APPLIANCES[name].address
+            )
+            assert answer is not None
+            found[name] = (unseal(ANSWER, APPLIANCES[name].key, answer) or {})["followers"]
+        return found
+
+    def receive(self, datagram: bytes) -> None:
+        """Let each of the follower's threads do its part once."""
+        self.follower.receive(datagram)
+        self.follower.save_epoch()
+        self.follower.tick()
 
 
 def following(holder: str = "a") -> Robot:
@@ -115,7 +141,7 @@ def test_a_follower_never_admits_an_appliance_whose_lease_may_be_over() -> None:
     answer = robot.answer(request)
     assert answer is not None
     robot.now += 0.8
-    robot.follower.receive(answer)
+    robot.receive(answer)
     assert robot.follower_admits[-1] == "a"
     robot.now += 0.31
     assert robot.witness.handle("b", "claim", 0, "") == ""
@@ -148,13 +174,13 @@ def test_an_answer_is_used_once_and_only_by_the_process_that_asked() -> None:
     robot.claim("b")
     assert robot.look() == "b"
     for old in (first, second):
-        robot.follower.receive(old)
+        robot.receive(old)
         assert robot.follower_admits[-1] == "b"
     request = robot.follower.request()
     robot.start_follower(session="second")
     answer = robot.answer(request)
     assert answer is not None
-    robot.follower.receive(answer)
+    robot.receive(answer)
     assert robot.follower_admits[-1] == ""
 
 
@@ -165,7 +191,7 @@ def test_an_older_answer_does_not_replace_a_newer_one() -> None:
     for _ in range(2):
         robot.look()
     assert robot.follower_admits[-1] == "" and first is not None
-    robot.follower.receive(first)
+    robot.receive(first)
     assert robot.follower_admits[-1] == ""
 
 
@@ -174,7 +200,7 @@ def test_an_answer_that_was_delayed_for_an_expiry_admits_no_appliance() -> None:
     answer = robot.answer()
     assert answer is not None
     robot.now += EXPIRY
-    robot.follower.receive(answer)
+    robot.receive(answer)
     assert robot.follower_admits[-1] == ""
 
 
@@ -202,7 +228,7 @@ def test_a_smaller_epoch_is_rejected_whatever_the_witness_says() -> None:
     request = unseal(REQUEST, KEY, robot.follower.request())
     assert request is not None
     lie = {"boot": "", "session": "first", "number": request["number"], "ok": True, "epoch": 6}
-    robot.follower.receive(seal(ANSWER, "arm", KEY, lie | {"admitted": "a", "left": 1000}))
+    robot.receive(seal(ANSWER, "arm", KEY, lie | {"admitted": "a", "left": 1000}))
     assert robot.follower_admits == [""]
     assert robot.follower.refusal == "the witness has epoch 6, but had 7 before"
 
@@ -214,7 +240,7 @@ def test_an_epoch_that_cannot_be_saved_admits_no_appliance() -> None:
     answer = robot.answer()
     assert answer is not None
     with pytest.raises(WitnessError, match="disk is full"):
-        robot.follower.receive(answer)
+        robot.receive(answer)
     robot.broken = False
     robot.follower.tick()
     assert robot.follower_admits[-1] == ""
@@ -272,7 +298,7 @@ ANSWERED = {"session": "first", "number": 1, "ok": True, "epoch": 2, "admitted":
 def test_a_malformed_answer_changes_nothing(change: dict[str, object]) -> None:
     robot = Robot()
     robot.follower.request()
-    robot.follower.receive(seal(ANSWER, "arm", KEY, ANSWERED | change))
+    robot.receive(seal(ANSWER, "arm", KEY, ANSWERED | change))
     assert robot.follower_admits == [""]
     assert robot.saved == []
 
@@ -281,9 +307,9 @@ def test_a_malformed_answer_changes_nothing(change: dict[str, object]) -> None:
 def test_an_answer_that_is_not_authentic_is_ignored(datagram: bytes) -> None:
     robot = Robot()
     robot.follower.request()
-    robot.follower.receive(datagram)
+    robot.receive(datagram)
     assert robot.follower_admits == [""]
-    robot.follower.receive(seal(ANSWER, "arm", KEY, ANSWERED | {"left": HIGHEST}))
+    robot.receive(seal(ANSWER, "arm", KEY, ANSWERED | {"left": HIGHEST}))
     assert robot.follower_admits == ["", "a"]
     robot.now += EXPIRY
     robot.follower.tick()
@@ -314,13 +340,24 @@ def test_a_damaged_epoch_accepts_no_answer(tmp_path: Path) -> None:
 
 
 class RandomHistory:
-    """Appliances that come and go, a witness that restarts, a network that loses, delays and repeats, and drift."""
+    """Appliances that come and go, a witness that restarts, a network that loses, delays and repeats, and drift.
 
-    def __init__(self, seed: int) -> None:
+    A write of the follower's rules takes about `slow` seconds, in which its other threads go on. It ends at once if
+    it is no longer wanted, as the program of the firewall then does, before or after its change: `iptables-restore`
+    changes one table after the other.
+    """
+
+    def __init__(
+        self, seed: int, *, slow: float = 0.0, faults: bool = True, product: ModuleType = witness
+    ) -> None:
         self.random = random.Random(seed)  # noqa: S311  a reproducible history
+        self.product = product
+        self.slow, self.faults, self.asking = slow, faults, True
         self.seconds = 0.0
         self.speeds = [self.random.uniform(0.97, 1.03) for _ in range(2)]
         self.robot_admits = self.follower_admits = ""
+        self.writing = False
+        self.interrupted = 0
         self.record, self.boot, self.saved = LeaseRecord(1, "", BOTH, ""), 1, 0
         self.up = dict.fromkeys(BOTH, True)
         self.wire: list[tuple[float, bytes, bool]] = []
@@ -340,57 +377,164 @@ class RandomHistory:
         self.gate = WitnessGate(self.witness, APPLIANCES, f"{self.random.random()}", FOLLOWERS)
 
     def start_follower(self) -> None:
-        self.follower = WitnessFollower(
+        self.follower: Any = None  # it writes its first rules before it asks
+        self.follower = self.product.WitnessFollower(
             name="arm",
             key=KEY,
             appliances=BOTH,
             session=f"{self.random.random()}",
             epoch=self.saved,
             save=lambda epoch: setattr(self, "saved", epoch),
-            admit=lambda name: setattr(self, "follower_admits", name),
+            admit=self.write,
             clock=lambda: self.seconds * self.speeds[1],
         )
 
+    def write(self, name: str, left: Left) -> None:
+        end = self.seconds + self.slow * self.random.uniform(0.8, 1.2)
+        changed = end - self.random.choice([0, self.random.random() * (end - self.seconds)])
+        self.writing = True
+        while self.seconds < end:
+            if left() <= 0:
+                self.writing = False
+                raise self.product.UncertainError("the program was ended")
+            if changed <= self.seconds:
+                self.admit(name)
+            self.pass_time()
+        self.admit(name)
+        self.writing = False
+
+    def admit(self, name: str) -> None:
+        assert self.robot_admits in ("", name) or not name, f"after {self.seconds} s {name} is admitted late"
+        self.interrupted += bool(self.follower_admits and not name)
+        self.follower_admits = name
+
     def send(self, datagram: bytes, *, answer: bool) -> None:
-        chosen = self.random.random()
+        chosen = self.random.random() if self.faults else 0.5
         for _ in range(0 if chosen < 0.1 else 2 if chosen > 0.9 else 1):
-            delay = self.random.uniform(0, 2) if self.random.random() < 0.2 else 0.01
+            delay = self.random.uniform(0, 2) if self.faults and self.random.random() < 0.2 else 0.01
             self.wire.append((self.seconds + delay, datagram, answer))
 
-    def step(self) -> None:
+    def is_time(self, period: float) -> bool:
+        """Without faults, appliances and follower ask in time."""
+        return (
+            self.random.random() < 0.1 if self.faults else round(self.seconds * 50) % round(period * 50) == 0
+        )
+
+    def pass_time(self) -> None:
         self.seconds += 0.02
-        if self.random.random() < 0.03:
+        if self.faults and self.random.random() < 0.03:
             self.up[self.random.choice(BOTH)] ^= True
-        if self.random.random() < 0.004:
+        if self.faults and self.random.random() < 0.004:
             self.start_witness()
-        if self.random.random() < 0.002:
-            self.start_follower()
-        for name in [one for one in BOTH if self.up[one] and self.random.random() < 0.1]:
+        for name in [one for one in BOTH if self.up[one] and self.is_time(0.3)]:
             other = "b" if name == "a" else "a"
             operation = "renew" if self.record.holder == name else "claim"
             self.witness.handle(name, operation, self.record.epoch, other)
-        if self.random.random() < 0.1:
-            self.send(self.follower.request(), answer=False)
         due = [one for one in self.wire if one[0] <= self.seconds]
         self.wire = [one for one in self.wire if one[0] > self.seconds]
+        if self.follower is None or not (self.asking or not self.writing):
+            return
+        if self.is_time(0.2):
+            self.send(self.follower.request(), answer=False)
         for _, datagram, answer in due:
             if answer:
                 self.follower.receive(datagram)
             elif (made := self.gate.answer(datagram, "10.0.0.20")) is not None:
                 self.send(made, answer=True)
-        self.follower.tick()
+        if self.random.random() < 0.5:
+            self.follower.save_epoch()
+
+    def step(self) -> None:
+        self.pass_time()
+        if self.faults and self.random.random() < 0.002:
+            self.start_follower()
+        with contextlib.suppress(self.product.UncertainError):
+            self.follower.tick()
         both = {self.robot_admits, self.follower_admits} - {""}
-        assert len(both) < 2, f"after {self.seconds} s"
+        assert len(both) < 2 or self.follower.pause() == 0, f"after {self.seconds} s"
         self.admitted_seconds += 0.02 if self.follower_admits else 0
 
 
-@pytest.mark.parametrize("seed", range(30))
-def test_robot_and_follower_never_admit_different_appliances(seed: int) -> None:
-    history = RandomHistory(seed)
-    for _ in range(3_000):
+@pytest.mark.parametrize("slow", [0.0, 0.05, 0.3, 0.9, 1.1, 2.0])
+@pytest.mark.parametrize("seed", range(10))
+def test_robot_and_follower_never_admit_different_appliances(seed: int, slow: float) -> None:
+    history = RandomHistory(seed, slow=slow)
+    for _ in range(2_000):
         history.step()
     assert history.record.epoch > 3, "there were takeovers"
-    assert history.admitted_seconds > 10
+    assert history.admitted_seconds > (10 if slow < 0.5 else 0)
+
+
+@pytest.mark.parametrize("slow", [0.0, 0.1, 0.5, 0.9, 1.1, 1.5, 3.0, 6.0])
+def test_a_slow_follower_shuts_out_none_while_the_witness_answers(slow: float) -> None:
+    history = RandomHistory(1, slow=slow, faults=False)
+    while history.seconds < 120:
+        history.step()
+    assert history.follower_admits == history.record.holder != ""
+    assert history.interrupted == 0
+
+
+def test_a_follower_that_asks_nothing_while_it_writes_would_never_admit_an_appliance() -> None:
+    history = RandomHistory(1, slow=1.5, faults=False)
+    history.asking = False
+    while history.seconds < 120:
+        history.step()
+    assert history.admitted_seconds == 0
+
+
+FOLLOWER_MUTANTS = {
+    "rules are written to the end although the lease has ended": (
+        "return self._used.until - self._clock() if self._wanted() == name else 0.0",
+        "return EXPIRY",
+    ),
+    "the lease counts from the answer": ("sent + _CONFIDENCE", "self._clock() + _CONFIDENCE"),
+    "the lease counts longer than the witness says": ("_CONFIDENCE = 0.9", "_CONFIDENCE = 1.4"),
+}
+
+
+@pytest.mark.parametrize("mutant", FOLLOWER_MUTANTS)
+def test_a_history_finds_a_wrong_rule_of_the_follower(mutant: str, tmp_path: Path) -> None:
+    product = product_of(Mutant(witness, *FOLLOWER_MUTANTS[mutant], 0), tmp_path).witness
+    with pytest.raises(AssertionError):
+        for seed in range(20):
+            history = RandomHistory(seed, slow=0.5, product=product)
+            for _ in range(2_000):
+                history.step()
+
+
+def test_both_appliances_learn_that_a_follower_interrupts_topics_again_and_again() -> None:
+    robot = following()
+    for _ in range(3):
+        robot.now += EXPIRY
+        robot.follower.tick()
+        assert robot.witness.handle("a", "renew", 2, "b") == ""
+        assert robot.look() == "a"
+    robot.follower.note("")
+    robot.look()
+    report = "arm: it shut out both appliances 3 times in a minute"
+    assert robot.told() == dict.fromkeys(BOTH, report)
+    robot.now += 60
+    assert robot.told() == dict.fromkeys(BOTH, ""), "the follower is silent"
+    robot.follower.note("")
+    robot.look()
+    assert robot.told() == dict.fromkeys(BOTH, "")
+
+
+def test_a_report_neither_fills_an_answer_nor_replaces_its_text() -> None:
+    robot = following()
+    robot.follower.note('\\"\n\u20ac' * 100)
+    robot.look()
+    assert robot.told() == dict.fromkeys(BOTH, "arm: " + "?" * 155)
+
+
+def test_an_earlier_version_of_the_witness_gets_no_report() -> None:
+    robot = Robot()
+    robot.follower.note("the disk is full")
+    request = unseal(REQUEST, KEY, robot.follower.request())
+    assert request is not None and "report" not in request
+    robot.receive(seal(ANSWER, "arm", KEY, ANSWERED | {"number": 1}))
+    request = unseal(REQUEST, KEY, robot.follower.request())
+    assert request is not None and "report" not in request
 
 
 # ---- Settings and rules
