@@ -29,12 +29,13 @@ class ActiveRole:
     """The right to serve, and its consequences.
 
     `paired`: another appliance can serve in place of this one, so it may have written the state. `took_over`: this
-    process waited for the role.
+    process waited for the role. `ports`: the TCP ports that exist at `address`, or None for all.
     """
 
     paired = False
     name = ""
     address: str | None = None
+    ports: tuple[range, ...] | None = None
     robot: str | None = None
     took_over = False
     api: Channel | None = None

@@ -16,6 +16,18 @@ from appliance.store.state_file import StateStore
 _SETTING = "handled alarms"
 
 
+def silences_moved(store: StateStore, seconds: float) -> None:
+    """Move the silences to a clock that is ahead by `seconds`."""
+    kept = msgspec.json.decode(store.settings().get(_SETTING, "{}"), type=dict[str, HandledAlarm])
+    moved = {
+        kind: row
+        if row.until is None
+        else msgspec.structs.replace(row, since=row.since + seconds, until=row.until + seconds)
+        for kind, row in kept.items()
+    }
+    store.save_setting(_SETTING, msgspec.json.encode(moved).decode())
+
+
 class HandledAlarms:
     """The alarms that an operator has acknowledged or silenced, by kind."""
 

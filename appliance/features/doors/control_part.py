@@ -9,6 +9,7 @@ import structlog
 from appliance.base.withdrawal import take_effect
 from appliance.channel.answers.limit_answers import LimitUse
 from appliance.configuration.sections import Sections
+from appliance.control.assembly.active_role import ActiveRole
 from appliance.control.assembly.foundation import Foundation
 from appliance.control.errors import SenselessError, UnavailableError, UnknownThingError
 from appliance.control.links.supervisor_link import ControlLifeline
@@ -267,6 +268,7 @@ class DoorOrders:
             port=row.port,
             source=row.source,
             trouble=trouble,
+            warning=missing_port(row.port, self._base.role),
             connections=counts.connections,
             received=counts.received,
             sent=counts.sent,
@@ -304,6 +306,16 @@ def _new_ticket(row: TicketRow, text: str) -> door_requests.NewTicket:
         door=row.door,
         ticket=text,
         path=f"/door/{row.door}?ticket={text}",
+    )
+
+
+def missing_port(port: int | None, role: ActiveRole) -> str:
+    if port is None or role.ports is None or any(port in ports for ports in role.ports):
+        return ""
+    there = ", ".join(f"{one[0]}-{one[-1]}" if len(one) > 1 else str(one[0]) for one in role.ports)
+    return (
+        f"port {port} does not exist at {role.address}, the fixed address of the two appliances, so an agent there is"
+        f" cut off: use a free port of {there}, or make new kits: rosrv standby join … --again --ports …"
     )
 
 

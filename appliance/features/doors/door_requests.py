@@ -47,6 +47,13 @@ class DoorState(msgspec.Struct, frozen=True, kw_only=True):
     port: Annotated[int | None, doc("the port of an agent, or null if only tickets open this door")]
     source: Annotated[str, doc("the address or network of the agent, or empty if any may connect")]
     trouble: Annotated[str, doc("why it does not serve, or empty if it serves")]
+    warning: Annotated[
+        str,
+        doc(
+            "why an agent may not reach its port, such as a port that two appliances lack at their fixed address,"
+            " or empty"
+        ),
+    ]
     connections: Annotated[int, doc("at present")]
     received: Annotated[int, doc("frames from clients since the start of its process")]
     sent: Annotated[int, doc("frames to clients since the start of its process")]

@@ -56,6 +56,8 @@ def add(
             f"! every host that reaches port {body.port} has the rights of door:{body.name}: add --from",
             "yellow",
         )
+    if body.warning:
+        say(f"! {body.warning}", "yellow")
     say(f"It may do what the policy lets door:{body.name} do: rosrv policy explain --host door:{body.name}")
 
 
@@ -77,8 +79,8 @@ def list_doors(appliance: Appliance) -> None:
                 say(f"    {_client(client)}")
             if row.connections > len(row.clients) > 0:
                 say(f"    and {row.connections - len(row.clients)} more")
-            if row.trouble:
-                say(f"    ! {row.trouble}", "yellow")
+            for problem in filter(None, (row.trouble, row.warning)):
+                say(f"    ! {problem}", "yellow")
     if appliance.as_json:
         return
     if doors:

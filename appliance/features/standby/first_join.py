@@ -3,9 +3,10 @@
 import contextlib
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from ipaddress import IPv4Address
+from itertools import groupby
 from pathlib import Path
 
 import msgspec
@@ -29,6 +30,9 @@ from appliance.features.standby.process import EPOCH, stored_epoch
 from appliance.features.standby.sealed_authority import sealed_authority
 from appliance.supervisor.state_directory import foreign
 from rosmop.tool.terminal import refused, say
+
+AGENT_PORTS = range(9090, 9100)
+"""Ports at the fixed address for the doors of agents, which may be added later."""
 
 _VERB = "rosrv standby"
 
@@ -182,7 +186,15 @@ def _ports(options: JoinOptions, settings: Settings) -> tuple[str, ...]:
         raise usage_error(
             "port 0 differs at each start; choose a port in the configuration, or give --ports", _VERB
         )
-    return (*map(str, single), f"{nodes.start}-{nodes.stop - 1}")
+    return (*map(str, single), f"{nodes.start}-{nodes.stop - 1}", *_free_of([*single, *nodes]))
+
+
+def _free_of(taken: Iterable[int]) -> Iterator[str]:
+    """Return the ranges of agents' ports without those that are taken: the rules of the robot allow no overlap."""
+    free = sorted(set(AGENT_PORTS) - set(taken))
+    for _, run in groupby(enumerate(free), lambda one: one[1] - one[0]):
+        ports = [port for _, port in run]
+        yield f"{ports[0]}-{ports[-1]}" if len(ports) > 1 else str(ports[0])
 
 
 def _followers(texts: tuple[str, ...]) -> dict[str, str]:

@@ -71,6 +71,7 @@ def make_kits(plan: PairPlan) -> Kits:
             witness=plan.witness,
             witness_port=WITNESS_PORT,
             port=plan.port,
+            ports=plan.ports,
             witness_key=keys[name],
             peer_key=peer_key,
             certificate=links[name].certificate,

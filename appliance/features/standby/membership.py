@@ -22,6 +22,7 @@ PORT = 7412
 
 _Name = Annotated[str, msgspec.Meta(pattern=r"^[a-z][a-z0-9-]{0,31}\Z")]
 _Key = Annotated[str, msgspec.Meta(pattern=r"^([0-9a-f]{64})?\Z")]
+_Ports = Annotated[str, msgspec.Meta(pattern=r"^[0-9]{1,5}(-[0-9]{1,5})?\Z")]
 _Port = Annotated[int, msgspec.Meta(ge=1, le=65_535)]
 
 
@@ -44,6 +45,8 @@ class Membership(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     """The address at which the robot's nodes reach the active appliance."""
     witness: str
     witness_port: _Port
+    ports: tuple[_Ports, ...] = ()
+    """The TCP ports and ranges at the fixed address; an earlier version did not store them."""
     port: _Port = PORT
     witness_key: _Key
     """Authenticates datagrams to the witness (hexadecimal)."""
@@ -73,6 +76,11 @@ class Membership(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
 
     def unsealed(self) -> "Membership":
         return msgspec.structs.replace(self, sealed_certificate="", sealed_key="")
+
+    def port_ranges(self) -> tuple[range, ...] | None:
+        """Return the TCP ports at the fixed address, or None if they are not known."""
+        found = [[int(end) for end in text.split("-")] for text in self.ports]
+        return tuple(range(ends[0], ends[-1] + 1) for ends in found) or None
 
     def for_lease(self) -> "Membership":
         return msgspec.structs.replace(self, certificate="", key="", other_certificate="")

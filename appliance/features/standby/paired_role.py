@@ -27,6 +27,7 @@ class PairedRole(ActiveRole):
         self._settings = settings
         self._replication: Replication | None = None
         self.name, self.address = pair.membership.name, pair.membership.fixed
+        self.ports = pair.membership.port_ranges()
         self.robot = pair.membership.witness
         self.took_over = pair.taken_over
         self.api, self.pin = pair.api, pair.tunnels.pin

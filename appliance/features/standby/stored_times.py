@@ -11,6 +11,7 @@ from collections.abc import Callable
 import msgspec
 
 from appliance.base import clock
+from appliance.control.operators.handled_alarms import silences_moved
 from appliance.features.standby.replication import Pair
 from appliance.specifications.timed_switches import returns_moved
 from appliance.store.revisions import LIMITS, limit_moved
@@ -48,6 +49,7 @@ def adopt_times(store: StateStore, pair: Pair, age: Callable[[], int]) -> None:
         for name in LIMITS:
             store.save_setting(name, limit_moved(settings.get(name, ""), shift))
         returns_moved(store, shift)
+        silences_moved(store, shift)
         for awaited in store.hosts.awaited():
             store.hosts.save_awaited(awaited._replace(expires=awaited.expires + shift))
         if pair.away_seconds is not None:

@@ -882,7 +882,7 @@ def run_program(command: List[str], text: str, left: Left = always) -> str:
                     os.killpg(process.pid, signal.SIGKILL)  # also what a script has started
                 process.wait()
                 raise UncertainError("%s: ended after %.1f s" % (command[0], seconds))
-    said, failed = (one.decode("utf-8", "replace") for one in done)
+    said, failed = (one.decode("utf-8", "replace") for one in done)  # type: str, str
     if process.returncode:
         failure = WitnessError if process.returncode > 0 else UncertainError  # it was killed
         raise failure("%s: %s" % (command[0], " ".join(failed.split())[:150] or process.returncode))

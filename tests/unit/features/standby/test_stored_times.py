@@ -8,7 +8,9 @@ import pytest
 
 from appliance.base import clock
 from appliance.base.age_clock import AgeClock
+from appliance.channel.answers.status import HandledAlarm, Status
 from appliance.control.assembly.host_blocks import BlockTable
+from appliance.control.operators.handled_alarms import HandledAlarms
 from appliance.features.standby.lease_client import LeaseClient
 from appliance.features.standby.replication import Pair
 from appliance.features.standby.standby_tunnels import StandbyTunnels
@@ -19,6 +21,7 @@ from appliance.store.access_tokens import make_token
 from appliance.store.host_tables import EnrolmentTokenRow
 from appliance.store.revisions import LIMITS
 from appliance.store.state_file import SCHEMA, StateStore
+from tests.support.answers import example
 from tests.support.engines import InlineDatabase
 from tests.support.features.standby.standby_site import memberships
 from tests.support.virtual_clock import VirtualClock
@@ -76,10 +79,21 @@ class Two:
         return {
             **{name: float(settings[name].split()[1]) - now for name in LIMITS},
             "disable": float(returns[1]) - now,
+            "silence": self.silenced() - now,
             "block": blocks.seconds_left() or 0.0,
             "token": row.expires - now,
             "awaited": awaited.expires - now,
         }
+
+    def silenced(self) -> float:
+        """Return the end of the silence, or now if it has ended."""
+        for row in self.handled().marked(example(Status)).handled_alarms:
+            if row.until is not None:
+                return row.until
+        return clock.wall()
+
+    def handled(self) -> HandledAlarms:
+        return HandledAlarms(self.store)
 
     def begin(self, blocks: BlockTable) -> None:
         now = clock.wall()
@@ -87,6 +101,7 @@ class Two:
             self.store.save_setting(name, f"1 {now + HOUR} {HOUR}")
         returns = f'{{"gun":{{"until":{now + HOUR},"seconds":{HOUR},"back":true}}}}'
         self.store.save_setting("monitor returns", returns)
+        self.handled().put(HandledAlarm("rosmaster", "ann", now, now + HOUR))
         blocks.put(HOST, seconds=HOUR, who="ann", note="")
         self.store.save_tokens(make_token("ci", "viewer", now=now, seconds=HOUR)[0])
         self.store.hosts.save_awaited(

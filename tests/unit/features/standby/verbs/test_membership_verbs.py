@@ -97,8 +97,31 @@ def test_the_ports_are_those_of_the_running_appliance() -> None:
     Path("first/run/config.json").write_text(json.dumps(running))
     Path("first/lock").touch()
     join_first()
-    assert read_settings("kit/witness/witness.json").ports == ("12345", "19001-19100")
+    assert read_settings("kit/witness/witness.json").ports == ("12345", "19001-19100", "9090-9099")
     assert "http://192.0.2.100:12345" in Path("kit/witness/install.sh").read_text()
+
+
+@pytest.mark.parametrize(
+    ("listen", "nodes", "expected"),
+    [
+        (11311, "9000-9050", ("11311", "9000-9050", "9090-9099")),
+        (9090, "9300-9400", ("9090", "9300-9400", "9091-9099")),
+        (9094, "9300-9400", ("9094", "9300-9400", "9090-9093", "9095-9099")),
+        (11311, "9000-9097", ("11311", "9000-9097", "9098-9099")),
+        (11311, "9000-9098", ("11311", "9000-9098", "9099")),
+    ],
+)
+def test_the_ports_of_agents_overlap_no_others(listen: int, nodes: str, expected: tuple[str, ...]) -> None:
+    Path("p.ini").write_text(f"[Nodes]\n/talker = *\n[Ports]\nrange = {nodes}\n")
+    running = plain(resolve(Path("appliance.yaml"), {}, {"listen": f"0.0.0.0:{listen}", "api": "off"}))
+    Path("first/run").mkdir(parents=True)
+    Path("first/run/config.json").write_text(json.dumps(running))
+    Path("first/lock").touch()
+    join_first()
+    assert read_settings("kit/witness/witness.json").ports == expected
+    membership = load_membership(path_of(Path("first")))
+    assert membership is not None and membership.ports == expected
+    assert range(listen, listen + 1) in (membership.port_ranges() or ())
 
 
 def test_a_running_appliance_does_not_become_the_other_one() -> None:
