@@ -13,7 +13,9 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-from tests.world.closed_loop.worlds import WORLDS, Summary, replay, run_many, run_one
+from appliance.features.guards.evidence import text_digest
+from appliance.features.guards.presets import PRESETS
+from tests.world.closed_loop.worlds import WORLDS, Summary, replay, run_chunk, run_one
 
 _AT_ONCE = 50
 
@@ -23,11 +25,6 @@ def _chunks(presets: list[str], worlds: int, first: int) -> Iterator[tuple[str, 
     for begin in range(0, each, _AT_ONCE):
         for preset in presets:
             yield preset, first + begin, first + min(each, begin + _AT_ONCE)
-
-
-def _run(chunk: tuple[str, int, int]) -> tuple[str, Summary]:
-    preset, begin, end = chunk
-    return preset, run_many(preset, range(begin, end))
 
 
 def _print(line: str) -> None:
@@ -44,6 +41,7 @@ def _as_data(first: int, summaries: dict[str, Summary]) -> dict[str, object]:
         "first_seed": first,
         "presets": {
             preset: {
+                "digest": text_digest(PRESETS[preset].text),
                 "worlds": one.worlds,
                 "seconds": round(one.seconds),
                 "closest": round(one.clearance, 4) if one.clearance < float("inf") else None,
@@ -76,7 +74,7 @@ def main(arguments: list[str]) -> int:
     presets = chosen.preset or list(WORLDS)
     summaries = {preset: Summary() for preset in presets}
     with multiprocessing.get_context("spawn").Pool(chosen.jobs) as pool:
-        for preset, found in pool.imap_unordered(_run, _chunks(presets, chosen.worlds, chosen.seed)):
+        for preset, found in pool.imap_unordered(run_chunk, _chunks(presets, chosen.worlds, chosen.seed)):
             summaries[preset].join(found)
             for seed, text in found.broken:
                 sys.stdout.write(f"{preset} {seed}: {text}\n    {replay(preset, seed)}\n")

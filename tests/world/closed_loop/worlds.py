@@ -104,3 +104,9 @@ def run_many(preset: str, seeds: Iterable[int], change: Change = unchanged) -> S
         summary.add(seed, run_one(preset, seed, change))
     summary.cost = time.process_time() - began
     return summary
+
+
+def run_chunk(chunk: tuple[str, int, int]) -> tuple[str, Summary]:
+    """Run the worlds of a preset from one seed to another, in a process of `python -m tests.world.closed_loop`."""
+    preset, begin, end = chunk
+    return preset, run_many(preset, range(begin, end))

@@ -1,0 +1,24 @@
+"""Compute the digest that binds a guard to its preset, its text and its values.
+
+The same digest in `rosrv guard list`, in a report and in a record means the same guard. The digest of a preset's text
+is also on the evidence page, beside what was proved and simulated of this text.
+"""
+
+import hashlib
+import json
+from collections.abc import Mapping
+
+from appliance.features.guards.presets import Preset
+
+_DIGITS = 16
+
+
+def text_digest(text: str) -> str:
+    """Return the first 16 hexadecimal digits of the SHA-256 of a text, such as a preset as it is shipped."""
+    return hashlib.sha256(text.encode()).hexdigest()[:_DIGITS]
+
+
+def guard_digest(preset: Preset, text: str, values: Mapping[str, str]) -> str:
+    """Return the digest of a guard with this text, made from the preset, and with these values in force."""
+    bound = json.dumps([preset.name, text_digest(preset.text), text, sorted(values.items())])
+    return text_digest(bound)

@@ -1,0 +1,307 @@
+"""Write the evidence page: `python -m distribution.guards_evidence_page > docs/reference/guards-evidence.md`.
+
+The page is made from the presets, from the table of proofs in docs/dev/assurance.md, from the last long run of the
+simulated worlds (`tests/world/closed_loop/results.json`), and from the rows below.
+"""
+
+import json
+import re
+import sys
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from appliance.features.guards.evidence import text_digest
+from appliance.features.guards.presets import PRESETS, Preset
+
+ROOT = Path(__file__).parents[1]
+RESULTS = ROOT / "tests/world/closed_loop/results.json"
+ASSURANCE = ROOT / "docs/dev/assurance.md"
+RELAY_MS = 68
+"""The longest of 1,000 measured times from the end of `silent` to a stop at the base, on a busy machine."""
+
+_TICK = re.compile(r"event tick\(\) every (\d+)ms")
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """The facts about a preset that an assessor needs beyond its text."""
+
+    clauses: tuple[str, ...]
+    """The standards that it follows in part. Nobody here has compared it with their texts."""
+    notices: str
+    """The faults that it notices, and when."""
+    silence: str = ""
+    """The parameter that bounds how long it goes on without a message, if any."""
+    assumed: tuple[str, ...] = ()
+    """Assumptions about the robot and its sensors."""
+    fails: tuple[str, ...] = ()
+    """How it can fail without a notice."""
+    live: tuple[str, ...] = ()
+    """Tests with real nodes."""
+    unit: tuple[str, ...] = ()
+    """Tests of the text in the engine."""
+
+
+_STOPS = ("test_a_restart_sends_stops_until_a_command_comes", "test_the_base_gets_stops_and_nothing_else")
+
+EVIDENCE: Mapping[str, Evidence] = {
+    "deadman": Evidence(
+        ("IEC 60204-1, loss of communication of cableless controls",),
+        "a node that commanded a motion sends nothing for `silent`",
+        "silent",
+        (
+            "the base executes the last command until the next",
+            "a cut link delivers what it held within `resume`",
+        ),
+        ("a node that repeats its last motion for ever looks alive",),
+        _STOPS,
+        (
+            "test_a_deadman_stops_for_each_node_that_falls_silent",
+            "test_a_deadman_stops_within_its_time_and_a_tick",
+        ),
+    ),
+    "speed": Evidence(
+        ("ISO 10218-1, reduced speed",),
+        "a command beyond the limits, in that command",
+        assumed=("the base drives at the velocity that it is commanded",),
+        fails=("a base that drives faster than its command",),
+    ),
+    "separation": Evidence(
+        (
+            "ISO/TS 15066, speed and separation monitoring",
+            "ISO 13855, approach of persons",
+            "IEC 61496-3, scanners",
+        ),
+        "a nearer thing in the next scan; a scanner that is silent for `silent`",
+        "silent",
+        (
+            "the base brakes at `braking` after `reaction`, which includes the delay of scanner and network",
+            "the scanner sees what is to be protected, and every direction of the motion",
+            "a person walks at most at `person`, and does not step from beside the way into the stopping distance",
+        ),
+        ("a scan that is frozen", "glass, and things above or below the plane of the scanner"),
+        unit=(
+            "test_a_scan_that_is_too_large_to_judge_stops_the_base",
+            "test_a_faulty_sensor_never_releases_the_base",
+        ),
+    ),
+    "fence": Evidence(
+        ("no standard: a limit of the workspace by the robot's own position",),
+        "the edge in the next position; a position that is silent for `silent`",
+        "silent",
+        (
+            "the base stands still `ahead` after a command, which includes the delay of the position",
+            "the position is in the frame of the polygon, and wrong by less than half of `margin`",
+        ),
+        ("a position that drifts, jumps or is frozen", "a heading that is wrong"),
+        unit=("test_a_base_stays_inside_a_fence", "test_a_base_outside_a_fence_only_comes_back"),
+    ),
+    "sensor": Evidence(
+        ("IEC 61496-3, detection of faults",),
+        "a sensor that is silent for `silent`, repeats its values `frozen` times, or has too few finite values",
+        "silent",
+        ("a working sensor never repeats all its values",),
+        ("wrong values that change",),
+        unit=(
+            "test_a_sensor_is_silent_frozen_or_blind",
+            "test_a_moving_base_is_stopped_when_its_sensor_falls_silent",
+        ),
+    ),
+    "estop": Evidence(
+        (
+            "ISO 13850, stop and reset",
+            "ISO 13851, two hands",
+            "IEC 60204-1, stop category 1 or 2 by the base's driver",
+        ),
+        "a press, in that message; a button that is silent for `silent`",
+        "silent",
+        ("each button is a node that sends its state at least every `silent`",),
+        ("the button's computer or cable, before `silent`", "a base that ignores a zero velocity"),
+        _STOPS,
+        ("test_an_emergency_stop_stays_until_a_reset", "test_an_emergency_stop_is_sent_at_once_and_repeated"),
+    ),
+    "arm": Evidence(
+        ("no standard: an interlock of preconditions",),
+        "a condition that is missing or older than `silent`",
+        "silent",
+        ("the charge, the fix and the check are measured",),
+        ("a battery that reports a wrong charge",),
+    ),
+    "answer": Evidence(
+        ("no standard: a deadline of a goal",),
+        "a goal without a result after its deadline",
+        assumed=("the action's server stops when its goal is cancelled",),
+        fails=("a server that ignores the cancel",),
+    ),
+    "joints": Evidence(
+        ("ISO 10218-1, soft limits of axes",),
+        "a point beyond a limit, before the trajectory begins",
+        assumed=("the controller follows the trajectory",),
+        fails=("a path within all limits that meets something",),
+    ),
+    "rate": Evidence(
+        ("no standard: a bound of the number of commands",),
+        "a command beyond the rate, in that command",
+        fails=("a fast motion: only the number is bounded",),
+        unit=("test_a_rate_drops_motions_and_never_a_stop",),
+    ),
+    "agree": Evidence(
+        ("ISO 13849-1, cross monitoring of two channels",),
+        "`samples` measurements in a row that differ; a source that is silent for `silent`",
+        "silent",
+        ("the two sources have no common cause of an error",),
+        ("both are wrong alike, as when one is calculated from the other",),
+    ),
+    "sane": Evidence(
+        ("no standard: finite numbers",),
+        "a number that is infinite or NaN, in that command",
+        fails=("a finite velocity that is too high",),
+        unit=("test_only_finite_commands_are_sane",),
+    ),
+    "withhold": Evidence(
+        ("no standard: privacy",),
+        "the switch, in that message; a switch that is silent for `silent`",
+        "silent",
+        ("all topics that show the same scene are withheld",),
+        ("the same picture on another topic, by a service, or in a recording",),
+    ),
+}
+
+_HEAD = """\
+# Evidence about guards
+
+Generated by `python -m distribution.guards_evidence_page`; do not edit.
+
+**A guard is a protective measure beside the driver's own timeout and a hardware stop. It is not a safety function
+with a performance level**: it runs on a computer and a network without a claimed reliability, and Linux gives no
+guaranteed time. An assessor takes no credit for it in the calculation of a performance level or a safety integrity
+level.
+
+- **Clauses** name the subject of a standard that a preset follows in part. All are *unchecked*: the authors of this
+  page had no access to the texts of ISO and IEC standards. The equation of speed and separation monitoring is discussed
+  in a [public article of NIST](https://pmc.ncbi.nlm.nih.gov/articles/PMC5117641).
+- **Proved** means that for every message and state the compiled code of the event does what its text says
+  ([the proofs](../dev/assurance.md#the-code-of-an-event)). Whether the text keeps the promise is not proved. Timers
+  (`tick`) are outside of the proofs, and the `tick` of a `deadman` is the guard: it is tested and simulated.
+- **Simulated** means random [worlds](../dev/assurance.md#guards-in-simulated-worlds) with a robot, its sensors, persons
+  and operators, within the assumptions that are listed for each preset.
+- **Digest**: the first 16 hexadecimal digits of the SHA-256 of the preset's text that this page describes.
+
+## The time to stop
+
+From the cause to the stop at the base. The guard's part follows from its text, with the values by default. The relay's
+part has no guaranteed bound: of 1,000 stops on a busy machine the slowest took {relay} ms
+([measured](monitor-cost.md#how-fast-a-guard-stops)). Add the base's own reaction and the time in which it brakes from
+its speed, and choose the values so that the sum is safe.
+
+| preset | it notices | silence | timer | relay, at most measured | sum |
+|---|---|---|---|---|---|
+"""
+
+_COMMON = (
+    ("the appliance's machine, its power or its network dies", "no message comes, and no stop",
+     "the driver's timeout: [measure it](../guards.md#does-the-driver-stop-the-base)"),
+    ("guard and controller on one computer, which hangs or is overloaded", "commands and stops are late together",
+     "the driver's timeout, on another processor"),
+    ("one sensor is the source of navigation and of the guard", "both believe the same wrong measurement",
+     "a second source (`agree`), the bumper, the hardware stop"),
+    ("one clock for all timers of a relay", "all timers are late together", "the driver's timeout"),
+    ("a node commands the base's driver directly, or by another topic", "the guard does not see the command",
+     "a network on which only the appliance reaches the base"),
+    ("a wrong value, topic or frame", "the guard works as configured",
+     "a test drive: shadow mode, then `--confirm-within`"),
+)  # fmt: skip
+"""Causes that make several guards fail together, their effects, and what remains."""
+
+
+def page() -> str:
+    return "\n".join((_HEAD.format(relay=RELAY_MS) + "".join(_times()), *_presets(), *_common()))
+
+
+def _common() -> Iterator[str]:
+    yield "## Common causes\n\nThese make several guards fail together. The robot's own stop must not share them.\n"
+    yield "| cause | effect | what remains |\n|---|---|---|"
+    for row in _COMMON:
+        yield f"| {' | '.join(row)} |"
+    yield ""
+
+
+def _default(preset: Preset, name: str) -> float | None:
+    """Return the milliseconds of a parameter by default."""
+    found = {one.name: one for one in preset.parameters}.get(name)
+    return None if found is None else float(found.default) * 1000
+
+
+def _times() -> Iterator[str]:
+    for name, preset in PRESETS.items():
+        row = EVIDENCE[name]
+        found = _TICK.search(preset.text)
+        tick = int(found[1]) if found and row.silence else 0
+        silence = _default(preset, row.silence) if row.silence else None
+        total = (silence or 0) + tick + RELAY_MS
+        off = row.silence and not silence
+        summed = "never by silence: it is off by default" if off else f"{total:.0f} ms"
+        parts = (f"`{row.silence}`, {silence:.0f} ms" if silence else "-", f"{tick} ms" if tick else "-")
+        yield f"| `{name}` | {row.notices} | {parts[0]} | {parts[1]} | {RELAY_MS} ms | {summed} |\n"
+
+
+def _presets() -> Iterator[str]:
+    proofs, results = _proofs(), _results()
+    for name, preset in PRESETS.items():
+        row = EVIDENCE[name]
+        yield f"## {name}\n\n{preset.what}\n"
+        yield "| | |\n|---|---|"
+        yield f"| version, digest | {preset.version}, `{text_digest(preset.text)}` |"
+        yield f"| clauses | {'; '.join(row.clauses)} (unchecked) |"
+        values = ", ".join(f"`{one.name}` = {one.default} {one.unit}".strip() for one in preset.parameters)
+        yield f"| values by default | {values or 'none'} |"
+        yield f"| assumed | {'; '.join(row.assumed) or 'nothing beyond the common causes'} |"
+        proved, open_ = proofs[name]
+        yield f"| proved | {proved or 'nothing'} |"
+        ticks = "`tick` and all other timers" if _TICK.search(preset.text) else "timers, of which it has none"
+        yield f"| not proved | {f'{open_}; ' if open_ else ''}{ticks} |"
+        yield f"| simulated | {_simulated(name, results)} |"
+        yield f"| tested in the engine | {_named(row.unit) or 'by the tests of its messages and types'} |"
+        yield f"| tested with real nodes | {_named(row.live) or 'no test of its own'} |"
+        yield f"| fails without a notice | {'; '.join(row.fails)} |\n"
+
+
+def _named(tests: tuple[str, ...]) -> str:
+    return " ".join(f"`{one}`" for one in tests)
+
+
+def _proofs() -> dict[str, tuple[str, str]]:
+    table = (
+        ASSURANCE.read_text(encoding="utf-8")
+        .partition("| preset | proved | not proved |")[2]
+        .partition("\n\n")[0]
+    )
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()[2:]]
+    return {name.strip("`"): (proved, open_) for name, proved, open_ in rows}
+
+
+def _results() -> dict[str, Any]:
+    return json.loads(RESULTS.read_text(encoding="utf-8")) if RESULTS.exists() else {}
+
+
+def _simulated(name: str, results: Mapping[str, Any]) -> str:
+    if not results:
+        return "no long run yet"
+    one = results["presets"].get(name)
+    if one is None:
+        return "no: a world has nothing that it guards"
+    if one["digest"] != text_digest(PRESETS[name].text):
+        return f"not since its text changed ({results['date']}, commit `{results['commit']}`)"
+    near = "" if one["closest"] is None else f", closest {one['closest'] * 100:.1f} cm"
+    broken = sum(one["violations"].values())
+    laws = f"{broken} broke a law" if broken else "none broke a law"
+    return (
+        f"{one['worlds']:,} worlds from seed {results['first_seed']}, {one['seconds']:,} s, {laws}{near}"
+        f" ({results['date']}, commit `{results['commit']}`)"
+    )
+
+
+if __name__ == "__main__":
+    sys.stdout.write(page())

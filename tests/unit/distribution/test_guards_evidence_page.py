@@ -1,0 +1,30 @@
+import ast
+from pathlib import Path
+
+from appliance.features.guards.presets import PRESETS
+from distribution.guards_evidence_page import EVIDENCE, page
+
+ROOT = Path(__file__).parents[3]
+
+
+def test_the_page_is_up_to_date() -> None:
+    assert (ROOT / "docs/reference/guards-evidence.md").read_text() == page()
+
+
+def test_every_preset_has_its_evidence() -> None:
+    assert EVIDENCE.keys() == PRESETS.keys()
+    for name, row in EVIDENCE.items():
+        assert row.clauses and row.notices and row.fails, name
+        assert not row.silence or PRESETS[name].parameter(row.silence)
+
+
+def test_every_test_on_the_page_exists() -> None:
+    known = {
+        node.name
+        for folder in ("tests/unit", "tests/integration")
+        for path in (ROOT / folder).rglob("test_*.py")
+        for node in ast.parse(path.read_text()).body
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+    }
+    named = {one for row in EVIDENCE.values() for one in (*row.live, *row.unit)}
+    assert named <= known, named - known
