@@ -1,7 +1,6 @@
 import ast
 from pathlib import Path
 
-from appliance.features.sso.quotas import SIGN_ONS
 from appliance.quotas import table
 from appliance.quotas.table import (
     LIMITED_TOPIC,
@@ -40,8 +39,8 @@ def test_each_row_fits_an_honest_use_or_says_what_it_notices() -> None:
 
 def test_only_turns_are_too_few_for_an_honest_use() -> None:
     """Beyond these bounds work waits for its turn, or costs a connection: nothing of an honest host is rejected."""
-    short = [row for row in all_rows() if row.margin.needs > allowed(row)]
-    assert short == [RVMASTER_CONNECTIONS, RVMASTER_REQUESTS, PROBES, NODE_CALLS_UNDER_WAY, SIGN_ONS]
+    short = [row for row in QUOTA_ROWS if row.margin.needs > allowed(row)]
+    assert short == [RVMASTER_CONNECTIONS, RVMASTER_REQUESTS, PROBES, NODE_CALLS_UNDER_WAY]
 
 
 def test_each_row_is_attacked_by_a_test_that_exists() -> None:
