@@ -3,6 +3,8 @@
 import re
 from datetime import UTC, datetime, timedelta
 
+from appliance.base import clock
+
 _SECOND = 1_000_000_000
 _UNITS = {"s": 1, "m": 60, "h": 3600, "d": 86_400, "w": 604_800}
 
@@ -54,3 +56,15 @@ def parse_date(text: str) -> int:
 
 def _bounded(time: int) -> int:
     return max(-(1 << 63), min(time, (1 << 63) - 1))
+
+
+def age(since: float, now: float | None = None) -> str:
+    seconds = max(0, int((clock.wall() if now is None else now) - since))
+    days, rest = divmod(seconds, 86_400)
+    hours, rest = divmod(rest, 3_600)
+    minutes, left = divmod(rest, 60)
+    if days:
+        return f"{days} d {hours} h"
+    if hours:
+        return f"{hours} h {minutes} min"
+    return f"{minutes} min {left} s" if minutes else f"{left} s"

@@ -13,8 +13,8 @@ from rich.text import Text
 
 from appliance.api.front.moments import in_full
 from appliance.base.actors import DISK
-from appliance.base.ages import age
 from appliance.base.counted import counted
+from appliance.base.timestamps import age
 from appliance.channel.admin import A, AdminAnswer, StatusWanted
 from appliance.channel.alarms import Alarm, activity, open_alarms
 from appliance.channel.answers.host_answers import PortsSeen

@@ -31,6 +31,7 @@ from appliance.features.selftest.feature import SELFTEST
 from appliance.features.sign.feature import SIGN
 from appliance.features.sso.feature import SSO
 from appliance.features.standby.feature import STANDBY
+from appliance.features.survey.feature import SURVEY
 from appliance.features.syslog.feature import SYSLOG
 from appliance.features.tokens.feature import TOKENS
 from appliance.features.topics.feature import TOPICS
@@ -61,6 +62,7 @@ FEATURES: tuple[Feature, ...] = (
     TOKENS,
     SELFTEST,
     DEMO,
+    SURVEY,
     SSO,
     AUTHORITY,
     APPROVALS,

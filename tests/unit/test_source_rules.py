@@ -309,7 +309,7 @@ WALL_CLOCK = {
         "api/front/moments.py", "audit/search/filter_options.py",
         "features/evidence/evidence_verbs.py",
         "features/monitor_tools/offline.py", "features/policy_tools/learn_verb.py", "features/tunnels/protect_verb.py",
-        "base/ages.py",
+        "base/timestamps.py",
         "features/topics/topic_verbs.py", "features/recorder/recorder_input.py", "features/recorder/record_verbs.py",
     ],
 }  # fmt: skip

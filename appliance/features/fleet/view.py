@@ -6,8 +6,8 @@ from typing import Annotated, Any
 import msgspec
 
 from appliance.base import clock
-from appliance.base.ages import age
 from appliance.base.metric import counter, gauge
+from appliance.base.timestamps import age
 from appliance.channel.answers.field_docs import Moment, doc
 from appliance.features.view import FeatureView, Samples, StateView, Trouble
 from appliance.forwarding.forwarding_state import ForwardingState, samples_of

@@ -1,4 +1,4 @@
-from appliance.base.ages import age
+from appliance.base.timestamps import age
 from appliance.cli.status_verb import shortened
 
 

@@ -1,0 +1,276 @@
+"""Read a graph from its ROS master and its nodes, with calls that register and change nothing.
+
+The answers come from programs that are not checked: each call has a time and a size, each list a most number, and the
+whole survey a time. The inventory names the parts that a limit leaves out. A node that does not answer costs only its
+own time.
+"""
+
+import asyncio
+import ipaddress
+import itertools
+import socket
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
+from typing import NamedTuple
+
+from appliance.base import clock
+from appliance.base.counted import counted
+from appliance.features.survey.inventory import (
+    LISTENERS,
+    MASTER_PORT,
+    GraphInventory,
+    NodeConnection,
+    OpenPort,
+    SurveyedNode,
+    SurveyedService,
+    SurveyedTopic,
+)
+from appliance.rpc.xmlrpc_client import CallFailedError, XmlRpcClient
+from roswire.errors import InvalidUriError
+from roswire.uris import NodeUri, parse_node_uri
+from roswire.xmlrpc import Value, XmlRpcLimits
+
+_CALLER = "/rosrv_survey"
+_LIMITS = XmlRpcLimits(body=16 << 20)
+_LONGEST = 256  # characters of a name or text
+
+
+class SurveyLimits(NamedTuple):
+    """The bounds of a survey; times are in seconds."""
+
+    call: float = 3.0
+    whole: float = 60.0
+    at_once: int = 16
+    """Nodes that are asked at the same time."""
+    rows: int = 20_000
+    """Nodes, topics, services or parameters, each; connections of a node."""
+    sample: float = 1.0
+    """How long messages are counted."""
+
+
+class SurveyError(Exception):
+    """The master does not answer as a ROS master; the message says what to do."""
+
+
+async def survey(uri: str, limits: SurveyLimits) -> GraphInventory:
+    """Return the inventory of the graph of the master at `uri`. Raises `SurveyError`."""
+    try:
+        master = parse_node_uri(uri)
+    except InvalidUriError as error:
+        raise SurveyError(f"{error}: give it like --master http://robot:11311") from None
+    return await _Survey(master, uri, limits).read()
+
+
+class _Survey:
+    def __init__(self, master: NodeUri, uri: str, limits: SurveyLimits) -> None:
+        self._master, self._uri, self._limits = master, uri, limits
+        self._began = clock.now()
+        self._calls = 0
+        self._left_out: list[str] = []
+        self._turns = asyncio.Semaphore(limits.at_once)
+        self._addresses: dict[str, str] = {}
+
+    async def read(self) -> GraphInventory:
+        master = XmlRpcClient(
+            self._master, timeout=self._limits.call, pool=self._limits.at_once, limits=_LIMITS
+        )
+        try:
+            state = await self._asked(master, "getSystemState")
+            types = dict(_pairs(await self._asked(master, "getTopicTypes")))
+            parameters = _names(await self._asked(master, "getParamNames"))
+            publishers, subscribers, services = (
+                {_text(row[0]): _names(row[1]) for row in _rows(part, 2)} for part in _parts(state, 3)
+            )
+            names = self._cut(
+                "nodes",
+                sorted(
+                    {
+                        node
+                        for part in (publishers, subscribers, services)
+                        for row in part.values()
+                        for node in row
+                    }
+                ),
+            )
+            nodes, rates = await self._nodes(master, names)
+            found = await self._services(master, self._cut("services", sorted(services)), services)
+        except CallFailedError as error:
+            raise SurveyError(f"{error}. Is {self._uri} the robot's ROS_MASTER_URI?") from None
+        finally:
+            master.close()
+        topics = tuple(
+            SurveyedTopic(
+                name,
+                types.get(name, "*"),
+                publishers.get(name, ()),
+                subscribers.get(name, ()),
+                rates.get(name),
+            )
+            for name in self._cut("topics", sorted({*publishers, *subscribers}))
+        )
+        host = await self._address(self._master.host)
+        return GraphInventory(
+            self._uri, host, nodes, topics, found, tuple(self._cut("parameters", sorted(parameters))),
+            await self._listeners({host, *(node.host for node in nodes)}), self._calls,
+            round(clock.now() - self._began, 2), tuple(self._left_out),
+        )  # fmt: skip
+
+    def _cut(self, what: str, names: Sequence[str]) -> Sequence[str]:
+        if len(names) > self._limits.rows:
+            self._left_out.append(f"{len(names) - self._limits.rows} of {len(names)} {what}")
+        return names[: self._limits.rows]
+
+    async def _counts(self, client: XmlRpcClient) -> Value:
+        """Return the answer to `getBusStats`, which roscpp gives without a code and a text."""
+        answer = await self._answer(client, "getBusStats")
+        return answer[2] if isinstance(answer, list) and len(answer) == 3 else answer
+
+    async def _asked(self, client: XmlRpcClient, method: str, *parameters: Value) -> Value:
+        """Return the value of an answer. Raises `CallFailedError`."""
+        answer = await self._answer(client, method, *parameters)
+        if not (isinstance(answer, list) and len(answer) == 3 and answer[0] == 1):
+            said = _text(answer[1]) if isinstance(answer, list) and len(answer) > 1 else "not a ROS answer"
+            raise CallFailedError(f"{method} was answered with: {said}")
+        return answer[2]
+
+    async def _answer(self, client: XmlRpcClient, method: str, *parameters: Value) -> Value:
+        if clock.now() - self._began > self._limits.whole:
+            raise CallFailedError(f"the survey takes longer than {self._limits.whole:g} s")
+        self._calls += 1
+        return await client.call(method, _CALLER, *parameters)
+
+    async def _nodes(
+        self, master: XmlRpcClient, names: Sequence[str]
+    ) -> tuple[tuple[SurveyedNode, ...], dict[str, float]]:
+        counts: list[dict[str, tuple[float, int]]] = []
+        nodes = tuple(await asyncio.gather(*(self._node(master, name, counts) for name in names)))
+        late = sum(node.problem.startswith("the survey takes longer") for node in nodes)
+        if late:
+            self._left_out.append(f"{late} of {counted(len(nodes), 'node')}: the time was over")
+        rates: dict[str, float] = {}
+        for sample in counts:
+            for topic, (rate, _number) in sample.items():
+                rates[topic] = round(rates.get(topic, 0) + rate, 1)
+        return nodes, rates
+
+    async def _node(
+        self, master: XmlRpcClient, name: str, counts: list[dict[str, tuple[float, int]]]
+    ) -> SurveyedNode:
+        uri = host = ""
+        try:
+            async with self._turns:
+                uri = _text(await self._asked(master, "lookupNode", name))
+                place = parse_node_uri(uri)
+                host = await self._address(place.host)
+                client = XmlRpcClient(place, timeout=self._limits.call, limits=_LIMITS)
+                pid = await self._asked(client, "getPid")
+                bus = _rows(await self._asked(client, "getBusInfo"), 5)[: self._limits.rows]
+                before, began = _sent(await self._counts(client)), clock.now()
+            if before:
+                await asyncio.sleep(self._limits.sample)
+                async with self._turns:
+                    after = _sent(await self._counts(client))
+                seconds = max(self._limits.sample, clock.now() - began)
+                counts.append({
+                    topic: ((after[topic] - sent) / seconds, after[topic])
+                    for topic, sent in before.items() if after.get(topic, 0) >= sent
+                })  # fmt: skip
+        except (CallFailedError, InvalidUriError) as error:
+            return SurveyedNode(name, uri, host, problem=str(error))
+        rows = tuple(map(_connection, bus))
+        return SurveyedNode(name, uri, host, pid if isinstance(pid, int) else None, "", rows)
+
+    async def _services(
+        self, master: XmlRpcClient, names: Iterable[str], providers: dict[str, tuple[str, ...]]
+    ) -> tuple[SurveyedService, ...]:
+        async def one(name: str) -> SurveyedService:
+            uri = ""
+            with suppress(CallFailedError):  # it has ended since
+                async with self._turns:
+                    uri = _text(await self._asked(master, "lookupService", name))
+            return SurveyedService(name, providers[name], uri)
+
+        return tuple(await asyncio.gather(*map(one, names)))
+
+    async def _address(self, host: str) -> str:
+        if host not in self._addresses:
+            try:
+                self._addresses[host] = str(ipaddress.ip_address(host))
+            except ValueError:
+                self._addresses[host] = await self._resolved(host)
+        return self._addresses[host]
+
+    async def _resolved(self, host: str) -> str:
+        with suppress(OSError, UnicodeError, TimeoutError):
+            async with asyncio.timeout(self._limits.call):
+                rows = await asyncio.get_running_loop().getaddrinfo(host, None, type=socket.SOCK_STREAM)
+                return str(rows[0][4][0])
+        return ""
+
+    async def _listeners(self, hosts: set[str]) -> tuple[OpenPort, ...]:
+        """Connect to well-known ports of the graph's own hosts, and close at once."""
+
+        async def one(host: str, port: int) -> OpenPort | None:
+            async with self._turns:
+                try:
+                    async with asyncio.timeout(min(1.0, self._limits.call)):
+                        _reader, writer = await asyncio.open_connection(host, port)
+                except (OSError, TimeoutError):
+                    return None
+            writer.close()
+            return OpenPort(host, port, LISTENERS[port])
+
+        master = OpenPort(await self._address(self._master.host), self._master.port, LISTENERS[MASTER_PORT])
+        pairs = itertools.product(sorted(filter(None, hosts)), LISTENERS)
+        found = await asyncio.gather(*(one(host, port) for host, port in pairs))
+        return tuple(dict.fromkeys([master, *filter(None, found)]))
+
+
+def _text(value: object) -> str:
+    """Return a text of a node, without control characters, or its type in brackets."""
+    if not isinstance(value, str):
+        return f"<{type(value).__name__}>"
+    return "".join(char if char.isprintable() else "?" for char in value[:_LONGEST])
+
+
+def _connection(row: list[Value]) -> NodeConnection:
+    peer, direction, transport, topic = (_text(cell) for cell in row[1:5])
+    return NodeConnection(topic, peer, direction, transport, bool(row[5]) if len(row) > 5 else True)
+
+
+def _parts(value: Value, number: int) -> list[Value]:
+    if not (isinstance(value, list) and len(value) == number):
+        raise CallFailedError(f"an answer does not have the length {number}")
+    return value
+
+
+def _rows(value: Value, least: int) -> list[list[Value]]:
+    if not isinstance(value, list):
+        raise CallFailedError("an answer is not a list")
+    return [row for row in value if isinstance(row, list) and len(row) >= least]
+
+
+def _pairs(value: Value) -> list[tuple[str, str]]:
+    return [(_text(row[0]), _text(row[1])) for row in _rows(value, 2)]
+
+
+def _names(value: Value) -> tuple[str, ...]:
+    return tuple(_text(name) for name in value if isinstance(name, str)) if isinstance(value, list) else ()
+
+
+def _sent(value: Value) -> dict[str, int]:
+    """Return the messages sent so far for each topic, by `getBusStats`.
+
+    A row of rospy is `[topic, bytes, [[id, bytes, messages, …], …]]`; one of roscpp is
+    `[topic, [[id, bytes, bytes of messages, messages, …], …]]`.
+    """
+    publications = value[0] if isinstance(value, list) and value else None
+    sent: dict[str, int] = {}
+    for row in publications if isinstance(publications, list) else ():
+        if not (isinstance(row, list) and len(row) > 1 and isinstance(row[-1], list)):
+            continue
+        column = 3 if len(row) == 2 else 2
+        numbers = [link[column] for link in row[-1] if isinstance(link, list) and len(link) > column]
+        if counts := [number for number in numbers if isinstance(number, int)]:
+            sent[_text(row[0])] = max(counts)
+    return sent

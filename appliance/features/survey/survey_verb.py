@@ -1,0 +1,109 @@
+"""The command `rosrv survey`."""
+
+import asyncio
+import ipaddress
+import os
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+import typer
+
+from appliance.cli.output import Json, say_json, usage_error
+from appliance.features.survey.draft import DraftError, PolicyDraft, draft
+from appliance.features.survey.inventory import GraphInventory, problems
+from appliance.features.survey.page import page, report
+from appliance.features.survey.reader import SurveyError, SurveyLimits
+from appliance.features.survey.reader import survey as read_graph
+from appliance.policy.policy_findings import PolicyError
+from rosmop.tool.terminal import say
+
+_HOSTS = Path("/etc/hosts")
+_MOST_HOSTS = 1 << 20  # bytes of the file
+
+
+def survey(
+    master: Annotated[
+        str, typer.Option(metavar="URI", envvar="ROS_MASTER_URI", help="The robot's ROS master")
+    ] = "http://localhost:11311",
+    html: Annotated[Path | None, typer.Option(metavar="FILE", help="Write one page; must not exist")] = None,
+    policy: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Write a draft policy, and its tests to FILE.tests.yaml; must not exist"
+        ),
+    ] = None,
+    seconds: Annotated[
+        float, typer.Option(min=1, max=600, metavar="N", help="The longest time of the whole survey")
+    ] = 60.0,
+    as_json: Json = False,
+) -> None:
+    """List the hosts, nodes, topics and services of a robot, and what looks wrong. Nothing is registered or changed.
+
+    It asks the ROS master and each node with calls that only read, and connects to ports 11311, 9090 and 8765 of the
+    graph's hosts. It needs no appliance: run it on the robot, or on a computer of its network. Exit status 1 if the
+    master does not answer.
+
+    Example: rosrv survey --master http://robot:11311 --html survey.html --policy draft.ini
+    """
+    tests = None if policy is None else policy.with_name(f"{policy.name}.tests.yaml")
+    for file in filter(None, (html, policy, tests)):
+        if file.exists():
+            raise usage_error(f"{file} exists already: give the name of a new file", verb="rosrv survey")
+    try:
+        inventory = asyncio.run(read_graph(master, SurveyLimits(whole=seconds)))
+    except SurveyError as error:
+        typer.echo(f"rosrv survey: {error}", err=True)
+        raise typer.Exit(1) from None
+    drafted = _drafted(inventory, required=policy is not None) if html or policy else None
+    if html is not None:
+        _write(html, page(inventory, drafted))
+    if policy is not None and tests is not None and drafted is not None:
+        _write(policy, drafted.text)
+        _write(tests, drafted.tests)
+    if as_json:
+        say_json({**msgspec.to_builtins(inventory), "problems": list(problems(inventory))})
+        return
+    for line in report(inventory):
+        say(line)
+    for file in filter(None, (html, policy, tests)):
+        say(f"wrote {file}")
+    for name in drafted.left_out if drafted else ():
+        typer.echo(f"rosrv survey: no rule can be written for {name!r}", err=True)
+
+
+def _drafted(inventory: GraphInventory, *, required: bool) -> PolicyDraft | None:
+    try:
+        return draft(inventory, names_of_hosts(_HOSTS))
+    except (DraftError, PolicyError) as error:
+        typer.echo(f"rosrv survey: no draft policy: {error}", err=True)
+        if required:
+            raise typer.Exit(1) from None
+        return None
+
+
+def names_of_hosts(file: Path) -> dict[str, str]:
+    """Return the first name of each address in a file like /etc/hosts; nothing if it cannot be read."""
+    try:
+        with file.open("rb") as lines:
+            text = lines.read(_MOST_HOSTS).decode("ascii", "replace")
+    except OSError:
+        return {}
+    names: dict[str, str] = {}
+    for line in text.splitlines():
+        words = line.partition("#")[0].split()
+        if len(words) > 1:
+            try:
+                names.setdefault(str(ipaddress.ip_address(words[0])), words[1])
+            except ValueError:
+                continue
+    return names
+
+
+def _write(file: Path, text: str) -> None:
+    try:
+        descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644)
+    except OSError as error:
+        raise usage_error(f"cannot write {file}: {error.strerror}", verb="rosrv survey") from error
+    with os.fdopen(descriptor, "w", encoding="utf-8") as output:
+        output.write(text)

@@ -1,0 +1,135 @@
+import asyncio
+from typing import Any
+
+import pytest
+
+from appliance.features.survey import reader
+from appliance.features.survey.inventory import GraphInventory
+from appliance.features.survey.reader import SurveyError, SurveyLimits, survey
+from appliance.rpc.xmlrpc_client import UnansweredError
+from roswire.uris import NodeUri
+
+MASTER: dict[str, Any] = {
+    "getSystemState": [[["/scan", ["/laser"]]], [["/scan", ["/base"]]], [["/reset", ["/base"]]]],
+    "getTopicTypes": [["/scan", "sensor_msgs/LaserScan"]],
+    "getParamNames": ["/speed"],
+    "lookupService": "rosrpc://127.0.0.1:5001",
+    "lookupNode": "http://127.0.0.1:4000/",
+}
+NODE: dict[str, Any] = {
+    "getPid": 12,
+    "getBusInfo": [[1, "/base", "o", "TCPROS", "/scan", True, "text"]],
+    "getBusStats": [[["/scan", 100, [[1, 100, 10, True]]]], []],
+}
+
+
+class FakeClient:
+    """Answers for the master at port 11311, and for each node at another port."""
+
+    answers: dict[str, Any]
+    asked: list[str]
+
+    def __init__(self, uri: NodeUri, **_options: object) -> None:
+        self._master = uri.port == 11311
+
+    async def call(self, method: str, *_parameters: object) -> Any:
+        self.asked.append(method)
+        await asyncio.sleep(0)
+        answer = self.answers.get(method, (MASTER if self._master else NODE).get(method))
+        if isinstance(answer, Exception):
+            raise answer
+        return [1, "", answer]
+
+    def close(self) -> None:
+        pass
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch) -> Any:
+    monkeypatch.setattr(reader, "XmlRpcClient", FakeClient)
+    FakeClient.asked = []
+
+    async def refused(_host: str, _port: int) -> None:
+        raise ConnectionRefusedError
+
+    monkeypatch.setattr(asyncio, "open_connection", refused)
+
+    def surveyed(limits: SurveyLimits | None = None, **answers: Any) -> GraphInventory:
+        FakeClient.answers = answers
+        return asyncio.run(survey("http://127.0.0.1:11311", limits or SurveyLimits(sample=0.001)))
+
+    return surveyed
+
+
+def test_all_that_the_master_and_the_nodes_say_is_read(run: Any) -> None:
+    found = run()
+    assert [node.name for node in found.nodes] == ["/base", "/laser"]
+    assert found.topics[0].type == "sensor_msgs/LaserScan"
+    assert found.services[0].uri == "rosrpc://127.0.0.1:5001"
+    assert found.nodes[1].connections[0].peer == "/base"
+    assert found.calls == len(FakeClient.asked)
+
+
+@pytest.mark.parametrize(
+    "row", [["/scan", 100, [[1, 100, 10, True]]], ["/scan", [[1, 100, 90, 10, 0]]]], ids=["rospy", "roscpp"]
+)
+def test_messages_are_counted_by_both_clients(run: Any, row: list[object]) -> None:
+    assert run(getBusStats=[[row], []]).topics[0].rate == 0.0
+    assert run(getBusStats=[[["/scan", 0, []]], []]).topics[0].rate is None
+
+
+def test_only_calls_that_read_are_made(run: Any) -> None:
+    run()
+    assert set(FakeClient.asked) == {*MASTER, *NODE}
+    assert not any(
+        method.startswith(("register", "unregister", "set", "delete", "shutdown"))
+        for method in FakeClient.asked
+    )
+
+
+@pytest.mark.parametrize("method", [*NODE, "lookupNode", "lookupService"])
+@pytest.mark.parametrize(
+    "answer",
+    [
+        None,
+        3,
+        "x",
+        [],
+        [[]],
+        [[[[]]]],
+        {"a": 1},
+        [[["/scan", 1, [["x"]]]]],
+        "\x00" * 999,
+        UnansweredError("late"),
+    ],
+)
+def test_a_node_that_answers_nonsense_costs_its_own_row_only(run: Any, method: str, answer: object) -> None:
+    found = run(**{method: answer})
+    assert [topic.name for topic in found.topics] == ["/scan"]
+    assert len(found.nodes) == 2
+
+
+@pytest.mark.parametrize("method", ["getSystemState", "getTopicTypes", "getParamNames"])
+@pytest.mark.parametrize("answer", [None, 3, "x", {"a": 1}, [1], [[], []], UnansweredError("late")])
+def test_a_master_that_answers_nonsense_is_an_error_or_an_empty_list(
+    run: Any, method: str, answer: object
+) -> None:
+    try:
+        found = run(**{method: answer})
+    except SurveyError as error:
+        assert "ROS_MASTER_URI" in str(error)
+    else:
+        assert method != "getSystemState"
+        assert len(found.nodes) == 2
+
+
+def test_a_limit_is_named_in_the_inventory(run: Any) -> None:
+    many = [[f"/topic{number}", ["/laser"]] for number in range(30)]
+    found = run(SurveyLimits(rows=10, sample=0.001), getSystemState=[many, [], []])
+    assert len(found.topics) == 10
+    assert "20 of 30 topics" in found.left_out
+
+
+def test_an_address_that_is_not_a_uri_is_an_error_with_an_example() -> None:
+    with pytest.raises(SurveyError, match="--master http://robot:11311"):
+        asyncio.run(survey("robot:11311", SurveyLimits()))
