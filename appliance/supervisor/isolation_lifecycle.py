@@ -30,6 +30,7 @@ from appliance.network.firewall.firewall_rules import (
     MAX_PORT,
     FirewallSettings,
     ForwarderAccess,
+    OwnNetworkAccess,
     OwnNodeAccess,
     PeerAccess,
     PortRange,
@@ -332,7 +333,8 @@ class ContainerIsolation(NoIsolation):
             tunnel_only=(self._tunnels[0],) if self._tunnels else (),
             forwarders=self._forwarders(),
             peer=self._ports.peer,
-            own_network=self._own_network,
+            own_network=self._own_network
+            and OwnNetworkAccess(self._own_network, account_of("rosrv-relay").uid),
             own_ports=self._own_ports,
             tunnel_interface=USER_SPACE_INTERFACE
             if self._tunnels and self._tunnels[1] == "user space"

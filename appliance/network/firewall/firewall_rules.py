@@ -252,12 +252,25 @@ class OwnNodeAccess:
             raise ValueError(f"own node: {min(self.uid, self.relay_uid)} is not a user id")
 
 
+@dataclass(frozen=True)
+class OwnNetworkAccess:
+    """The network of doors. Control makes each of their sockets; only control and the relay connect to their nodes."""
+
+    network: str
+    relay_uid: int
+
+    def __post_init__(self) -> None:
+        family_of(self.network)
+        if self.relay_uid < 0:
+            raise ValueError(f"the network of doors: {self.relay_uid} is not a user id")
+
+
 @dataclass(frozen=True, kw_only=True)
 class FirewallSettings:
     """The values for the rules of the appliance's namespace.
 
     Hosts in `tunnel_only` are accepted through IPsec only: on `tunnel_interface` if ESP runs in user space.
-    `own_network` has addresses of the appliance's own doors. `neighbours` are addresses of the machine at the other
+    `neighbours` are addresses of the machine at the other
     end of the link (isolation netns); only packets with a full TTL may have them. Even with ROS_IP, rosout listens on
     every address in `client_ports`.
     """
@@ -277,7 +290,7 @@ class FirewallSettings:
     tunnel_interface: str | None = None
     forwarders: tuple[ForwarderAccess, ...] = ()
     peer: PeerAccess | None = None
-    own_network: str | None = None
+    own_network: OwnNetworkAccess | None = None
     own_ports: tuple[PortRange, ...] = ()
     new_connections: RateLimit | None = RateLimit(per_second=1000, burst=2000)
 
@@ -322,7 +335,7 @@ def appliance_rules(settings: FirewallSettings) -> tuple[PacketRule, ...]:
             for network in settings.tunnel_only
             for rule in _tunnel_only(network, settings.tunnel_interface)
         ),
-        *_own_network(settings.own_network),
+        *_own_network(settings.own_network, settings.control_uid),
         *inner_port("ROS master port", settings.rosmaster_port, "control", settings.control_uid),
         *inner_port("master-side proxy endpoint", settings.inner_port, "rosmaster", settings.rosmaster_uid),
         *_rosmaster(settings),
@@ -415,13 +428,25 @@ def _tunnel_only(network: str, interface: str | None) -> tuple[PacketRule, ...]:
     )
 
 
-def _own_network(network: str | None) -> tuple[PacketRule, ...]:
-    if network is None:
+def _own_network(access: OwnNetworkAccess | None, control_uid: int) -> tuple[PacketRule, ...]:
+    if access is None:
         return ()
+    network = access.network
     outside = partial(PacketRule, verdict=PacketVerdict.DROP, chain=Chain.IN, arrives_on=OUTSIDE)
+    # The kernel gives a connection to a door's node the node's own address as its source, so these rules come first.
+    calls = partial(_sending, destination=network, tcp_ports=_ANY_PORT, opening=True)
+    begins = partial(_sending, source=network, tcp_ports=_ANY_PORT, opening=True)
+    answers = partial(_sending, source=network, accepting=True)
     return (
         outside(f"{network}: doors have no other machine's packets", source=network),
         outside(f"{network}: no other machine reaches a door's node", destination=network),
+        calls(f"{network}: control calls doors' nodes", PacketVerdict.RETURN, uid=control_uid),
+        calls(f"{network}: the relay connects to doors' nodes", PacketVerdict.RETURN, uid=access.relay_uid),
+        calls(f"{network}: no other user reaches a door's node", PacketVerdict.RESET),
+        begins(f"{network}: control connects for doors", PacketVerdict.RETURN, uid=control_uid),
+        begins(f"{network}: no other user connects as a door", PacketVerdict.RESET),
+        answers(f"{network}: control listens for doors", PacketVerdict.RETURN, uid=control_uid),
+        answers(f"{network}: no other user listens as a door", PacketVerdict.DROP),
     )
 
 

@@ -2,6 +2,8 @@ import json
 import re
 import socket
 import ssl
+import subprocess
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -171,6 +173,39 @@ def test_a_client_that_does_not_finish_a_message_is_disconnected_and_recorded(
         return [one["reason"] for one in appliance.audit(event="door disconnected", resource="agent-1")]
 
     eventually(lambda: any("of what it has begun" in one for one in reasons()), "the record has the reason")
+
+
+AS_A_DOOR = """
+import socket, sys
+address, role = sys.argv[1:]
+with socket.socket() as own:
+    own.settimeout(5)
+    own.bind((address, 0))
+    try:
+        if role == "begins":
+            own.connect(("10.77.0.2", 11311))
+        else:
+            own.listen()
+            with socket.socket() as other:
+                other.settimeout(2)
+                other.connect(own.getsockname())
+        print("passed")
+    except OSError as error:
+        print("refused")
+"""
+
+
+@pytest.mark.parametrize("role", ["begins", "listens"])
+def test_no_other_account_uses_the_address_of_a_door(appliance: Appliance, role: str) -> None:
+    address = appliance.rows("door", "list")[0]["address"]
+
+    def used(source: str) -> str:
+        script = [sys.executable, "-c", AS_A_DOOR, source, role]
+        ran = subprocess.run(script, user=65534, stdout=subprocess.PIPE, check=True, timeout=SECONDS)
+        return ran.stdout.decode().strip()
+
+    assert appliance.host.run(lambda: used("10.77.0.2")) == "passed"
+    assert appliance.host.run(lambda: used(address)) == "refused"
 
 
 def test_a_ticket_opens_the_door_of_a_person_until_it_is_over(

@@ -11,6 +11,7 @@ from appliance.network.firewall.firewall_rules import (
     FirewallSettings,
     ForwarderAccess,
     Interface,
+    OwnNetworkAccess,
     OwnNodeAccess,
     PacketRule,
     PacketVerdict,
@@ -37,8 +38,11 @@ FULL = FirewallSettings(
 )
 
 
+DOORS = OwnNetworkAccess("198.19.240.0/20", relay_uid=61013)
+
+
 def test_no_other_machine_uses_or_reaches_the_own_network() -> None:
-    settings = replace(FULL, own_network="198.19.240.0/20", own_ports=(PortRange.one(9091),))
+    settings = replace(FULL, own_network=DOORS, own_ports=(PortRange.one(9091),))
     rules = appliance_rules(settings)
     added = [rule for rule in rules if rule not in appliance_rules(FULL)]
     first, second, *_limits = added
@@ -50,6 +54,30 @@ def test_no_other_machine_uses_or_reaches_the_own_network() -> None:
     passed = next(rule for rule in rules if rule.verdict is PacketVerdict.RETURN and rule.chain is Chain.IN)
     assert rules.index(passed) > rules.index(second)
     assert any(rule.above for rule in added if rule.tcp_ports == PortRange.one(9091))
+
+
+def test_the_addresses_of_doors_are_bound_to_control() -> None:
+    """In each direction, the users that may come first, and all others are refused."""
+    rules = appliance_rules(replace(FULL, own_network=DOORS))
+    sent = [
+        (
+            "to" if rule.destination else "from",
+            "syn" if rule.opening else "syn ack",
+            rule.uid,
+            rule.verdict,
+        )
+        for rule in rules
+        if rule.chain is Chain.OUT and DOORS.network in (rule.source, rule.destination)
+    ]
+    assert sent == [
+        ("to", "syn", FULL.control_uid, PacketVerdict.RETURN),
+        ("to", "syn", DOORS.relay_uid, PacketVerdict.RETURN),
+        ("to", "syn", None, PacketVerdict.RESET),
+        ("from", "syn", FULL.control_uid, PacketVerdict.RETURN),
+        ("from", "syn", None, PacketVerdict.RESET),
+        ("from", "syn ack", FULL.control_uid, PacketVerdict.RETURN),
+        ("from", "syn ack", None, PacketVerdict.DROP),
+    ]
 
 
 def test_the_rules_only_ever_refuse() -> None:
