@@ -9,6 +9,7 @@ import os
 import socket
 import ssl
 import sys
+from collections.abc import Awaitable, Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from ipaddress import ip_network
@@ -71,7 +72,9 @@ class _Api:
         self._settings = settings
         self._lifeline = Channel(socket.socket(fileno=lifeline_fd), messages.Lifeline)
         self._doorkeeper = TokenAuthenticator(settings.api_limits.failures_per_minute, self._token_used)
-        self._control = ControlLink(self._doorkeeper.state, self._await_control)
+        self._control = ControlLink(
+            self._doorkeeper.state, self._await_control, blocks_stated=self._doorkeeper.state_blocks
+        )
         self._journal = Journal(self._control.tell)
         self._stopping = asyncio.Event()
         self._given = asyncio.Event()
@@ -116,7 +119,10 @@ class _Api:
             return
         self._await_control()
         self._report(messages.Ready({"tls": self._settings.api_tls}))
-        work = {"the journal of calls": self._flush, "the history of measurements": history.run}
+        work: dict[str, Callable[[], Awaitable[object]]] = {
+            "the journal of calls": partial(self._flush, gate),
+            "the history of measurements": history.run,
+        }
         if context is not None:
             work["the certificate of REST"] = partial(self._renew, context)
         running = [loop.create_task(run_always(what, one)) for what, one in work.items()]
@@ -155,10 +161,11 @@ class _Api:
             names.append(address[0])
         return self._settings.state / "api", names, clock.utc_now()
 
-    async def _flush(self) -> None:
+    async def _flush(self, gate: RequestGate) -> None:
         while True:
             await asyncio.sleep(FOLD_SECONDS)
             self._journal.flush()
+            self._control.state_running(gate.long_requests())
 
     def _await_control(self) -> None:
         if self._control.connected or self._without_control is not None:

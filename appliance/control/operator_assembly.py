@@ -11,6 +11,7 @@ from appliance.control.assembly.foundation import Foundation
 from appliance.control.operators.administration import Administration
 from appliance.control.operators.clock_check import ClockCheck
 from appliance.control.operators.handled_alarms import HandledAlarms
+from appliance.control.operators.host_uses import RestUses
 from appliance.control.operators.overview import graph_of
 from appliance.control.operators.queries import Queries
 from appliance.control.operators.request_methods import request_methods
@@ -89,6 +90,9 @@ def make_operators(base: Foundation, parts: Parts) -> Operators:
         durable=partial(_durable, base),
         require_room=base.store.database.require_room,
     )
+    uses = RestUses()
+    base.uses.add(uses.of)
+    base.blocks.on_change(lambda: rest().state_tokens())
     rest.set(
         RestLink(
             administration,
@@ -98,6 +102,8 @@ def make_operators(base: Foundation, parts: Parts) -> Operators:
             certified=RestCertificate(base.store, trail, base.role.name).stated,
             connected=base.features.connected,
             require_proof=settings.api_require_proof,
+            uses=uses,
+            blocked=lambda: base.blocks.reasons,
         )
     )
     return Operators(

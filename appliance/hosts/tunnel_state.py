@@ -4,12 +4,12 @@
    that also works in clear text does not identify a host.
 2. Every update sends charon the complete wanted state; updates keep the order of the changes.
 3. Every tunnel that comes up, moves, goes down or is rejected is recorded.
-4. A tunnel is closed when its certificate ends.
+4. A tunnel is closed when its certificate ends, and while its host is blocked.
 """
 
 import asyncio
 import contextlib
-from collections.abc import Callable
+from collections.abc import Callable, Container
 
 import structlog
 
@@ -21,7 +21,7 @@ from appliance.hosts.appliances import CERTIFICATE_DAYS, Appliances
 from appliance.hosts.certificate_requests import AuthorityError
 from appliance.hosts.host_table import HostRefusedError, HostTable
 from appliance.hosts.stored_authority import StoredAuthority
-from appliance.policy.model import Address
+from appliance.policy.model import Address, address_of
 from appliance.telemetry.audit_trail import AuditTrail
 
 _log = structlog.get_logger()
@@ -66,6 +66,7 @@ class Tunnels:
         *,
         listen: tuple[str, int],
         say: Callable[[messages.Message], None],
+        blocked: Callable[[], Container[Address]] = tuple,
     ) -> None:
         self._table = table
         self._trail = trail
@@ -73,6 +74,7 @@ class Tunnels:
         self._appliances = appliances
         self._listen = listen
         self._say = say
+        self._blocked = blocked
         self.revocations = SignedRevocations(table, authority)
         self.seen: dict[str, messages.TunnelSeen] = {}
         self.last: dict[str, float] = {}
@@ -203,11 +205,11 @@ class Tunnels:
             return
         authority = await self._authority.certificate()
         revocations = await self.revocations.signed()
-        now = clock.wall()
+        now, blocked = clock.wall(), self._blocked()
         hosts = [
             messages.TunnelHost(row.name, row.address, row.serial)
             for row in self._table.admitted()
-            if row.expires > now
+            if row.expires > now and address_of(row.address) not in blocked
         ]
         self._number += 1
         self._stated[self._number] = self._changes

@@ -333,8 +333,9 @@ class ContainerIsolation(NoIsolation):
             tunnel_only=(self._tunnels[0],) if self._tunnels else (),
             forwarders=self._forwarders(),
             peer=self._ports.peer,
-            own_network=self._own_network
-            and OwnNetworkAccess(self._own_network, account_of("rosrv-relay").uid),
+            own_network=None
+            if self._own_network is None
+            else OwnNetworkAccess(self._own_network, account_of("rosrv-relay").uid),
             own_ports=self._own_ports,
             tunnel_interface=USER_SPACE_INTERFACE
             if self._tunnels and self._tunnels[1] == "user space"

@@ -32,6 +32,7 @@ from appliance.channel.operations import CHANGES, request_named
 from appliance.configuration.settings import ApiLimits, Settings
 from appliance.control.assembly.policies import Policies
 from appliance.control.operators.administration import Administration
+from appliance.control.operators.host_uses import RestUses
 from appliance.control.operators.queries import Queries
 from appliance.control.operators.request_method import RequestMethod
 from appliance.control.operators.request_methods import request_methods
@@ -151,7 +152,7 @@ class RestWorld:
         )
         rest = RestLink(
             administration, cast(Any, self.tokens), cast(Any, self.trail),
-            served=lambda _pin: None, certified=lambda _sha256: None, require_proof=False,
+            served=lambda _pin: None, certified=lambda _sha256: None, require_proof=False, uses=RestUses(),
         )  # fmt: skip
         rest.attach(self._ends[0])
         self.control.attach(self._ends[1])

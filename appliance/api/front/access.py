@@ -10,6 +10,7 @@
 import asyncio
 import hashlib
 import hmac
+import ipaddress
 import secrets
 from collections import OrderedDict
 from collections.abc import Callable, Iterable
@@ -30,6 +31,7 @@ from appliance.store.access_tokens import is_secret, parse_token
 USE_SECONDS = 60.0
 _KNOWN_SECONDS = 900.0
 _MOST_KNOWN = 1024
+_BLOCKED = "this host is blocked by an operator"
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,6 +70,7 @@ class TokenAuthenticator:
         self._wrong = Buckets(failures_per_minute / 60, failures_per_minute)
         self._checking = asyncio.Lock()
         self._of_token: dict[str, asyncio.Lock] = {}
+        self._blocked: frozenset[str] = frozenset()
         self._shown: OrderedDict[str, float] = OrderedDict()  # by peer: the time of its last valid token
 
     def quota_class(self, peer: str) -> QuotaClass:
@@ -86,10 +89,25 @@ class TokenAuthenticator:
         self._reported.clear()
         self._of_token = {}
 
-    def still_good(self, bearer: Bearer) -> bool:
+    def state_blocks(self, hosts: Iterable[str]) -> None:
+        self._blocked = frozenset(hosts)
+
+    def is_blocked(self, peer: str) -> bool:
+        return bool(self._blocked) and plain_address(peer) in self._blocked
+
+    def require_unblocked(self, peer: str) -> None:
+        """Raise `ProblemError` (403) if an operator blocks the peer."""
+        if self.is_blocked(peer):
+            raise ProblemError(403, "host-blocked", _BLOCKED)
+
+    def end_of(self, bearer: Bearer, peer: str) -> str:
+        """Return why a long answer must end, or an empty text."""
+        if self.is_blocked(peer):
+            return _BLOCKED
         kept = self._tokens.get(bearer.id)
         # A rotation may have brought its end forward.
-        return kept is not None and not self._ends.passed(kept.id, kept.expires)
+        good = kept is not None and not self._ends.passed(kept.id, kept.expires)
+        return "" if good else "the token has expired"
 
     async def recognise(self, authorization: str | None, host: str) -> Bearer:
         """Return the bearer. Raises `ProblemError` (401, 429, 503)."""
@@ -165,3 +183,10 @@ def _require_patience(failures: Buckets, host: str) -> None:
     if seconds:
         text = "too many requests from this host came without a valid token"
         raise too_many("too-many-failures", text, seconds)
+
+
+def plain_address(peer: str) -> str:
+    """Return an address in the form of the blocks: IPv4 also if the socket is IPv6."""
+    address = ipaddress.ip_address(peer.partition("%")[0])
+    mapped = address.ipv4_mapped if isinstance(address, ipaddress.IPv6Address) else None
+    return str(mapped or address)

@@ -20,8 +20,10 @@ from appliance.channel.link import Link
 from appliance.channel.messages.api import (
     ConnectionAnswered,
     ConnectionPassed,
+    LongRequest,
     RequestAnswered,
     RequestMade,
+    RequestsRunning,
     RequestWithdrawn,
     RestCalled,
     RestServed,
@@ -64,8 +66,16 @@ def _made(
 class ControlLink:
     """The link to control; `tokens_stated(tokens)` gets the present tokens; `lost()` is called when control is gone."""
 
-    def __init__(self, tokens_stated: Callable[[list[TokenKept]], None], lost: Callable[[], None]) -> None:
+    def __init__(
+        self,
+        tokens_stated: Callable[[list[TokenKept]], None],
+        lost: Callable[[], None],
+        *,
+        blocks_stated: Callable[[list[str]], None] = lambda _hosts: None,
+    ) -> None:
         self._tokens_stated = tokens_stated
+        self._blocks_stated = blocks_stated
+        self._running: list[LongRequest] = []
         self._lost = lost
         self._link = Link(self._received, self._ended)
         self._kept: deque[RestCalled] = deque()
@@ -80,6 +90,7 @@ class ControlLink:
 
     def attach(self, channel: Channel) -> None:
         self.known = False
+        self._running = []
         self._link.attach(channel)
         self._tell_pin()
 
@@ -166,6 +177,12 @@ class ControlLink:
         with contextlib.suppress(ChannelFullError):
             self._link.send(TokenUsed(token))
 
+    def state_running(self, requests: list[LongRequest]) -> None:
+        if requests != self._running and self._link.channel is not None:
+            with contextlib.suppress(ChannelFullError):  # it is stated again later
+                self._link.send(RequestsRunning(requests))
+                self._running = requests
+
     def tell(self, call: RestCalled) -> None:
         self._kept.append(call)
         if len(self._kept) > _MOST_KEPT:
@@ -198,7 +215,8 @@ class ControlLink:
                 self._link.answered(number, answer)
             case ConnectionAnswered(number):
                 self._link.answered(number, message)
-            case TokensStated(tokens):
+            case TokensStated(tokens, blocked):
+                self._blocks_stated(blocked)
                 self.known = True
                 self._tokens_stated(tokens)
                 self._tell_kept()

@@ -1,6 +1,6 @@
 """Check every request before it reaches a route, and report its answer.
 
-Order: rate → Host → Origin → tunnel → token → size of the body.
+Order: rate → block → Host → Origin → tunnel → token → size of the body.
 
 1. A request that fails a check before its body costs no more than reading its headers.
 2. Without a token, an unknown path gets the same answer as a known path.
@@ -12,6 +12,7 @@ Order: rate → Host → Origin → tunnel → token → size of the body.
 import asyncio
 import ipaddress
 import re
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import replace
 
@@ -24,7 +25,7 @@ from appliance.api.front.journal import Journal
 from appliance.api.front.problems import REASON, ProblemError, defect, too_many
 from appliance.api.front.rates import Buckets
 from appliance.base import clock
-from appliance.channel.messages.api import ClientRequest
+from appliance.channel.messages.api import ClientRequest, LongRequest
 from appliance.channel.rest_meaning import is_dry_run
 from appliance.configuration.settings import ApiLimits
 from appliance.features.table import FEATURES
@@ -49,6 +50,8 @@ _REQUEST_BODY = (
 _RENEWAL = re.compile(r"/v1/hosts/[^/]{1,63}/renew(ed)?")  # for hosts, which their tunnels identify
 _IN_TUNNELS = frozenset({"/v1/revocations", "/v1/authority"})
 _SEND_SECONDS = 30.0
+_LONG_SECONDS = 5.0
+_MOST_LONG = 200
 _PAGE_SHARE = 10  # the rate limit of the console's files, as a multiple of REST's rate limit
 _HEADERS = {
     "X-Content-Type-Options": "nosniff",
@@ -86,12 +89,13 @@ class RequestGate:
         self._names = {"localhost", *(name.lower() for name in names)}
         self._rate = Buckets(limits.requests_per_second, limits.burst)
         # A page loads many small files at once, and they cost only this process time.
+        self._running: dict[_Answer, float] = {}  # since when
         self._page_rate = Buckets(limits.requests_per_second * _PAGE_SHARE, limits.burst * _PAGE_SHARE)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
             return
-        answer = _Answer(scope, send, self._journal)
+        answer = _Answer(scope, send, self._journal, self._doorkeeper)
         gone: asyncio.Future[None] | None = None
         try:
             bearer, body = await self._pass(scope, receive)
@@ -99,6 +103,7 @@ class RequestGate:
                 gone = asyncio.ensure_future(_disconnected(receive))
                 bearer = replace(bearer, gone=gone)
             answer.bearer = scope[BEARER] = bearer
+            self._running[answer] = clock.now()
             await self._app(scope, _replay(body, receive), answer.send)
         except ProblemError as problem:
             await answer.fail(problem, receive)
@@ -111,14 +116,26 @@ class RequestGate:
             _log.exception("a REST call failed", path=scope["path"])
             await answer.fail(defect(error), receive)
         finally:
+            self._running.pop(answer, None)
             if gone is not None:
                 gone.cancel()
+
+    def long_requests(self) -> list[LongRequest]:
+        """Return the requests with a token that run for `_LONG_SECONDS`, such as followers."""
+        now = clock.now()
+        rows = Counter(
+            answer.caller
+            for answer, since in self._running.items()
+            if now - since >= _LONG_SECONDS and answer.bearer
+        )
+        return [LongRequest(*caller, count) for caller, count in rows.most_common(_MOST_LONG)]
 
     def admit_websocket(self, host: str, path: str) -> None:
         """Check the rate and the tunnel of a WebSocket's request. Raises `ProblemError`."""
         wait = self._rate.take(host, clock.now())
         if wait:
             raise too_many("too-many-requests", "too many requests from this host", wait)
+        self._doorkeeper.require_unblocked(host)
         self._check_tunnel(host, path, renewal=False)
 
     async def _pass(self, scope: Scope, receive: Receive) -> tuple[Bearer | None, bytes]:
@@ -127,6 +144,7 @@ class RequestGate:
         wait = rate.take(host, clock.now())
         if wait:
             raise too_many("too-many-requests", "too many requests from this host", wait)
+        self._doorkeeper.require_unblocked(host)
         headers = Headers(scope=scope)
         self._check_host(headers)
         _check_origin(scope, headers)
@@ -184,13 +202,18 @@ def asked_of(scope: Scope, headers: Headers, body: bytes) -> ClientRequest:
 class _Answer:
     """An answer, which gets hardening headers and a time limit, and is reported when its status is known."""
 
-    def __init__(self, scope: Scope, send: Send, journal: Journal) -> None:
+    def __init__(self, scope: Scope, send: Send, journal: Journal, doorkeeper: TokenAuthenticator) -> None:
+        self._doorkeeper = doorkeeper
         self._scope = scope
         self._send = send
         self._journal = journal
         self._started = clock.now_ns()
         self._begun = self._ended = False
         self.bearer: Bearer | None = None
+
+    @property
+    def caller(self) -> tuple[str, str, str]:
+        return self._scope["client"][0], self.bearer.name if self.bearer else "", self._scope["path"][:100]
 
     async def send(self, message: Message) -> None:
         if message["type"] == "http.response.start":
@@ -199,6 +222,8 @@ class _Answer:
             for name, value in _HEADERS.items():
                 headers.setdefault(name, value)
             self._report(message["status"])
+        elif self.bearer is not None and self._doorkeeper.is_blocked(self._scope["client"][0]):
+            raise ConnectionAbortedError("this host was blocked by an operator")
         async with asyncio.timeout(_SEND_SECONDS):
             await self._send(message)
         self._ended = message["type"] == "http.response.body" and not message.get("more_body", False)

@@ -85,9 +85,25 @@ class TokenKept(msgspec.Struct, frozen=True):
 
 
 class TokensStated(Message):
-    """All usable tokens, at the start of a link and after every change."""
+    """All usable tokens and all blocked hosts, at the start of a link and after every change."""
 
     tokens: list[TokenKept]
+    blocked: list[str] = msgspec.field(default_factory=list)
+
+
+class LongRequest(msgspec.Struct, frozen=True):
+    """Requests of one client that run for seconds, such as those of followers."""
+
+    host: str
+    who: str
+    path: str
+    count: int
+
+
+class RequestsRunning(Message):
+    """All long requests, after every change."""
+
+    requests: list[LongRequest]
 
 
 class TokenUsed(Message):
@@ -125,6 +141,7 @@ ApiLink = (
     | RequestWithdrawn
     | RequestAnswered
     | TokensStated
+    | RequestsRunning
     | TokenUsed
     | RestCalled
     | RestServed

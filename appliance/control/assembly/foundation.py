@@ -21,6 +21,7 @@ from appliance.control.assembly.policies import Policies
 from appliance.control.assembly.robot import charged_to, robot_addresses
 from appliance.control.links.signer_requests import ReceiptFloor, SignerRequests
 from appliance.control.links.supervisor_link import ControlLifeline
+from appliance.control.operators.host_uses import HostUses
 from appliance.features.feature import FeatureContext
 from appliance.features.parts import FeatureParts
 from appliance.hosts.host_table import HostTable
@@ -56,6 +57,7 @@ class Foundation:
     monitors: Current[SpecificationManager]
     store: StateStore
     blocks: BlockTable
+    uses: HostUses
     table: HostTable
     tunnels: Tunnels
     policies: Policies
@@ -109,7 +111,17 @@ async def make_foundation(
     # start the tunnels before the policy.
     table = make_host_table(settings, store)
     host_authority = role.host_authority(signing.link, store, trail, table)
-    tunnels.set(Tunnels(table, trail, *host_authority, listen=settings.listen_address, say=lifeline.say))
+    tunnels.set(
+        Tunnels(
+            table,
+            trail,
+            *host_authority,
+            listen=settings.listen_address,
+            say=lifeline.say,
+            blocked=lambda: blocks.reasons,
+        )
+    )
+    blocks.on_change(tunnels().state_anew)
     role.hand_tunnels_to(tunnels())
     await tunnels().start()
 
@@ -146,6 +158,7 @@ async def make_foundation(
         monitors=monitors,
         store=store,
         blocks=blocks,
+        uses=HostUses(),
         table=table,
         tunnels=tunnels(),
         policies=policies,

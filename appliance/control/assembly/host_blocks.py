@@ -27,9 +27,13 @@ class BlockTable:
         self._rows = {address_of(row.address): row for row in store.hosts.blocks()}
         self._now, self._wall, self._seen = age() if self._rows else 0, clock.wall(), clock.since_boot_ns()
         self.reasons: Mapping[Address, str] = self._described()
+        self._listeners: list[Callable[[], None]] = []
 
     def __len__(self) -> int:
         return len(self._rows)
+
+    def on_change(self, changed: Callable[[], None]) -> None:
+        self._listeners.append(changed)
 
     def rows(self) -> dict[Address, HostBlockRow]:
         return dict(self._rows)
@@ -50,20 +54,23 @@ class BlockTable:
         return None if row.ends is None else self._wall + (row.ends - self._now) / _SECOND
 
     def put(self, address: Address, *, seconds: float | None, who: str, note: str) -> HostBlockRow:
-        ends = None if seconds is None else self._now + int(seconds * _SECOND)
-        row = HostBlockRow(str(address), clock.wall(), ends, who, note)
+        row = self.planned(address, seconds, who, note)
         self._store.hosts.save_block(row)
         self._rows.pop(address, None)
         self._rows[address] = row
-        self.reasons = self._described()
+        self._changed()
         return row
+
+    def planned(self, address: Address, seconds: float | None, who: str, note: str) -> HostBlockRow:
+        ends = None if seconds is None else self._now + int(seconds * _SECOND)
+        return HostBlockRow(str(address), clock.wall(), ends, who, note)
 
     def take(self, address: Address) -> HostBlockRow | None:
         row = self._rows.get(address)
         if row is not None:
             self._store.hosts.forget_block(row.address)
             del self._rows[address]
-            self.reasons = self._described()
+            self._changed()
         return row
 
     def due(self) -> list[Address]:
@@ -74,6 +81,11 @@ class BlockTable:
     def seconds_left(self) -> float | None:
         ends = [row.ends for row in self._rows.values() if row.ends is not None]
         return max(0.0, (min(ends) - self._now) / _SECOND) if ends else None
+
+    def _changed(self) -> None:
+        self.reasons = self._described()
+        for changed in self._listeners:
+            changed()
 
     def _described(self) -> dict[Address, str]:
         return {address: self._description(row) for address, row in self._rows.items()}

@@ -14,13 +14,14 @@ A flooded or compromised api cannot block RVMaster:
 import asyncio
 import os
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import structlog
 
 from appliance.audit.log.record import Severity
 from appliance.base import clock
+from appliance.base.callers import called_from
 from appliance.base.withdrawal import awaited
 from appliance.channel import messages
 from appliance.channel.admin import AdminAnswer, ChallengeWanted, WaitingRequest, encode, verb_of
@@ -31,6 +32,7 @@ from appliance.channel.messages.api import (
     ConnectionPassed,
     RequestAnswered,
     RequestMade,
+    RequestsRunning,
     RequestWithdrawn,
     RestCalled,
     RestServed,
@@ -39,8 +41,10 @@ from appliance.channel.messages.api import (
 )
 from appliance.channel.operations import ORDERS
 from appliance.control.operators.administration import Administration
+from appliance.control.operators.host_uses import RestUses
 from appliance.control.operators.token_orders import TokenOrders
 from appliance.control.rest.rest_proof import RequestAuthenticator, UnprovenError
+from appliance.policy.model import Address
 from appliance.telemetry.audit_trail import AuditTrail
 
 _log = structlog.get_logger()
@@ -68,6 +72,8 @@ class RestLink:
         served: Callable[[str], None],
         certified: Callable[[str], None],
         require_proof: bool,
+        uses: RestUses,
+        blocked: Callable[[], Iterable[Address]] = tuple,
         connected: Callable[[str, str, str, int], tuple[int, str]] = lambda *_connection: NO_DOORS,
     ) -> None:
         self._administration = administration
@@ -76,6 +82,8 @@ class RestLink:
         self._trail = trail
         self._link = Link(self._received, self._lost, self._took)
         self._connected = connected
+        self._uses = uses
+        self._blocked = blocked
         self._waiting: deque[RequestMade] = deque()
         self._withdrawn: dict[int, bool] = {}  # unanswered requests of the present link, by number
         self._worker: asyncio.Task[None] | None = None  # the worker of the present link
@@ -108,6 +116,8 @@ class RestLink:
                     self._withdrawn[number] = True
             case RestCalled():
                 self._record(message)
+            case RequestsRunning(requests):
+                self._uses.running(requests)
             case TokenUsed(token):
                 self._tokens.used(token)
             case RestServed(pin, certificate):
@@ -151,7 +161,8 @@ class RestLink:
             gone = withdrawn.get(made.number, False) or channel is not self._link.channel
             return gone or clock.now() > made.until
 
-        with awaited(given_up):
+        host = made.asked.host if made.asked is not None else ""
+        with awaited(given_up), called_from(host):
             answer = await self._answer(made)
         if channel is self._link.channel:
             self._send_answer(made.number, answer)
@@ -186,6 +197,7 @@ class RestLink:
         )
 
     def _record(self, call: RestCalled) -> None:
+        self._uses.called(call.host, call.who)
         denied = call.status in _DENIED or (call.method in _METHODS and call.status >= 400 and not call.dry)
         self._trail.happened(
             "rest call",
@@ -204,7 +216,7 @@ class RestLink:
         )
 
     def state_tokens(self) -> None:
-        self._send(TokensStated(self._tokens.usable()))
+        self._send(TokensStated(self._tokens.usable(), [*map(str, self._blocked())]))
 
     def _send_answer(self, number: int, answer: AdminAnswer[Any]) -> None:
         self._withdrawn.pop(number, None)

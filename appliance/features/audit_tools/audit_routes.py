@@ -182,7 +182,9 @@ def _add_searches(router: Routes, services: Services, desk: LogReader) -> None:
         start = int(last_event_id) if last_event_id is not None else after
         follower = await desk.read(bearer, Follower, desk.path, wanted, start)
         give_back = streams.take(bearer, peer_of(request), "clients follow the audit log")
-        following = _follow(services, desk, follower, bearer, wanted.text, equality=equality)
+        following = _follow(
+            services, desk, follower, bearer, wanted.text, peer=peer_of(request), equality=equality
+        )
         return StreamResponse(EventSourceResponse(following, ping=_PING_SECONDS), give_back)
 
 
@@ -245,11 +247,12 @@ async def _follow(
     bearer: Bearer,
     text: str | None,
     *,
+    peer: str,
     equality: bool,
 ) -> AsyncIterator[ServerSentEvent]:
     while not services.stopping.is_set():
-        if not services.doorkeeper.still_good(bearer):
-            yield ServerSentEvent(event="end", data=json.dumps({"reason": "the token has expired"}))
+        if reason := services.doorkeeper.end_of(bearer, peer):
+            yield ServerSentEvent(event="end", data=json.dumps({"reason": reason}))
             return
         entries = await desk.in_thread(follower.poll, _STREAM_PAGE)
         for entry in readable(entries, bearer, text):

@@ -9,6 +9,7 @@ from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping
 
 from msgspec.structs import asdict, replace
 
+from appliance.base.callers import caller_host
 from appliance.base.counted import counted
 from appliance.base.withdrawal import take_effect
 from appliance.control.assembly.assembly import Parts
@@ -63,6 +64,7 @@ async def inherit(base: Foundation, parts: Parts) -> FeaturePart:
             **{name: str(address) for name, address in base.features.addresses().items()},
         },
         remotes=lambda: {name: seen.remote for name, seen in base.tunnels.seen.items()},
+        uses=base.uses.of,
         carried_out=parts.endpoints.relay.carried_out,
     )
     return FeaturePart(
@@ -89,8 +91,10 @@ class BlockOrders:
         connected: Callable[[], Iterable[Collection[str]]],  # the two hosts of each connection
         enrolled: Callable[[], Mapping[str, str]],  # addresses of enrolled hosts and doors, by name
         remotes: Callable[[], Mapping[str, str]],  # outer addresses of hosts in tunnels, by name
+        uses: Callable[[Address], list[str]],  # besides registrations, connections and tunnels
         carried_out: Callable[[], Awaitable[None]],
     ) -> None:
+        self._uses = uses
         self._blocks = blocks
         self._policies = policies
         self._store = store
@@ -116,15 +120,22 @@ class BlockOrders:
         before = self._held_by(address)
         if not request.force:
             self._require_not_the_robot(address, before)
+            self._require_not_the_caller(address)
         earlier = self._blocks.rows().get(address)
         if earlier is None and len(self._blocks) >= MOST:
             raise HostRefusedError(f"{MOST} hosts are blocked, the limit: lift a block (rosrv host blocks)")
-        take_effect()
         replaced = None if earlier is None else self._row(earlier)
+        if request.dry_run:
+            return self._answer(
+                self._blocks.planned(address, request.for_seconds, who, request.note), before, replaced
+            )
+        take_effect()
         row = self._blocks.put(address, seconds=request.for_seconds, who=who, note=request.note)
         self._apply()
         # The relays report later that they closed the connections.
-        ended = replace(_difference(before, self._held_by(address)), connections=before.connections)
+        ended = replace(
+            _difference(before, self._held_by(address)), connections=before.connections, uses=before.uses
+        )
         shown = self._row(row)
         self._trail.happened(
             "host blocked",
@@ -146,9 +157,16 @@ class BlockOrders:
                 f"{address} is blocked now, but a stop of the appliance ends it: {error}"
             ) from error
         await self._carried_out()
+        return self._answer(row, ended, replaced)
+
+    def _answer(
+        self, row: HostBlockRow, ended: requests.BlockEnded, replaced: requests.BlockedHost | None
+    ) -> requests.HostBlocked:
         knows = self._policies.current.knows
         others = sorted(other for other in self._same_machine(row.address) if knows(address_of(other)))
-        return requests.HostBlocked(**asdict(shown), ended=ended, replaced=replaced, other_addresses=others)
+        return requests.HostBlocked(
+            **asdict(self._row(row)), ended=ended, replaced=replaced, other_addresses=others
+        )
 
     async def unblock(self, request: HostUnblock, who: str) -> requests.HostUnblocked:
         address = self._address(request.address)
@@ -242,6 +260,15 @@ class BlockOrders:
             " (REST: `force`)"
         )
 
+    def _require_not_the_caller(self, address: Address) -> None:
+        caller = caller_host()
+        own = "" if not caller else str(plain_address(caller))
+        if str(address) in {own, *self._same_machine(own)}:
+            raise HostRefusedError(
+                f"your own requests come from {address}: blocking it would end your way in; the admin socket (rosrv on"
+                " the appliance) stays open. To block it anyway, use --force (REST: `force`)"
+            )
+
     def _same_machine(self, address: str) -> set[str]:
         enrolled = self._enrolled()
         pairs = ({enrolled[name], remote} for name, remote in self._remotes().items() if name in enrolled)
@@ -252,8 +279,15 @@ class BlockOrders:
     def _held_by(self, address: Address) -> requests.BlockEnded:
         count = Counter(_REGISTERED.get(one.call, "") for one in self._live() if one.host == address)
         connections = sum(str(address) in hosts for hosts in self._connected())
+        tunnels = [
+            f"the tunnel of {name}, from {remote}"
+            for name, remote in self._remotes().items()
+            if self._enrolled().get(name) == str(address)
+        ]
         return requests.BlockEnded(
-            **{name: count[name] for name in _REGISTERED.values()}, connections=connections
+            **{name: count[name] for name in _REGISTERED.values()},
+            connections=connections,
+            uses=[*tunnels, *self._uses(address)],
         )
 
     def _registrations(self) -> int:
@@ -298,7 +332,8 @@ def _is_own(address: Address) -> bool:
 
 def _difference(before: requests.BlockEnded, after: requests.BlockEnded) -> requests.BlockEnded:
     left = asdict(after)
-    return requests.BlockEnded(**{name: count - left[name] for name, count in asdict(before).items()})
+    numbers = {name: count for name, count in asdict(before).items() if isinstance(count, int)}
+    return requests.BlockEnded(**{name: count - left[name] for name, count in numbers.items()})
 
 
 def in_words(held: requests.BlockEnded) -> str:

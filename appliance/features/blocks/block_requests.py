@@ -22,7 +22,8 @@ class NewBlock(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         doc("the block ends after this time; by default, only by an order"),
     ] = None
     note: Annotated[str, doc("reason for the block, shown to operators", max_length=200)] = ""
-    force: Annotated[bool, doc("block the robot's own host also")] = False
+    force: Annotated[bool, doc("block the robot's own host, or the caller's own, also")] = False
+    dry_run: Annotated[bool, doc("only answer what the block would end")] = False
 
 
 class BlockedHost(msgspec.Struct, frozen=True):
@@ -43,17 +44,20 @@ class BlockedHosts(msgspec.Struct, frozen=True):
 
 
 class BlockEnded(msgspec.Struct, frozen=True):
-    """The registrations and the connections through the relay that a block ended."""
+    """The registrations, connections and further uses that a block ended."""
 
     publications: Annotated[int, doc("registered topics that its nodes publish")]
     subscriptions: Annotated[int, doc("registered topics to which its nodes subscribe")]
     services: Annotated[int, doc("registered services of its nodes")]
     parameters: Annotated[int, doc("subscriptions to parameters")]
     connections: Annotated[int, doc("connections through the relay, to or from the host")]
+    uses: Annotated[
+        list[str], doc("sessions, followers, connections to doors and the tunnel of the host, in words")
+    ] = []
 
 
 class HostBlocked(BlockedHost, frozen=True, kw_only=True):
-    """A host was blocked."""
+    """A host was blocked, or would be in a dry run."""
 
     ended: BlockEnded
     replaced: Annotated[BlockedHost | None, doc("its earlier block, or null if it was not blocked")]
@@ -74,7 +78,8 @@ class HostUnblocked(BlockedHost, frozen=True, kw_only=True):
     problems={422: "The address cannot be blocked, or only with `force`."},
 )  # fmt: skip
 class HostBlock(AdminRequest[HostBlocked], frozen=True, tag="host block"):
-    """Block a host: deny its requests and end its registrations and connections, for `for_seconds`, or until `DELETE`.
+    """Block a host at every entrance, and end its registrations, connections, sessions and tunnel, for `for_seconds`,
+    or until `DELETE`.
 
     The block of a host that is already blocked is replaced.
     """
@@ -83,6 +88,7 @@ class HostBlock(AdminRequest[HostBlocked], frozen=True, tag="host block"):
     for_seconds: float | None = None
     note: str = ""
     force: bool = False
+    dry_run: bool = False
 
 
 @rest(

@@ -44,11 +44,13 @@ def block(
     force: Annotated[
         bool,
         typer.Option(
-            "--force", help="Block even the robot's own host, or a host with most of the registrations"
+            "--force",
+            help="Block even the robot's own host, a host with most of the registrations, or your own",
         ),
     ] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only show what the block would end")] = False,
 ) -> None:
-    """Block a host at once: deny all its calls, and end its registrations and connections.
+    """Block a host at once at every entrance, and end its registrations, connections, sessions and tunnel.
 
     The block survives restarts. It ends after the given time, or with `rosrv host unblock`. Blocking it again
     replaces the block.
@@ -60,13 +62,18 @@ def block(
         raise _usage_error(
             f"--for {time}: a block lasts 1s to {LONGEST_BLOCK_SECONDS // 86_400}d; without --for it has no end"
         )
-    body = running.answer_or_exit(HostBlock(address, seconds, note, force))
+    body = running.answer_or_exit(HostBlock(address, seconds, note, force, dry_run))
     end = (
         f"until {moment(body.until)}"
         if body.until is not None
         else f"until `rosrv host unblock {body.address}`"
     )
-    say(f"{_named(body, running)} is blocked {end}; it lost {_in_words(body.ended)}")
+    if dry_run:
+        say(f"{_named(body, running)} would be blocked {end}; it would lose {_in_words(body.ended)}")
+    else:
+        say(f"{_named(body, running)} is blocked {end}; it lost {_in_words(body.ended)}")
+    for use in body.ended.uses:
+        say(f"{'would end' if dry_run else 'ended'}: {use}")
     if body.replaced is not None:
         say(f"this replaces the block by {_whose(body.replaced)}")
     for other in body.other_addresses:

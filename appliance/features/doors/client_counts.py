@@ -25,7 +25,7 @@ class CountedClient:
     def __init__(self, session: DoorSession, peer: str, ticket: str, queues: list[ViewerQueue[Any]]) -> None:
         self.session = session
         self.ticket = ticket
-        self._peer = peer
+        self.peer = peer
         self._since = clock.wall()
         self._queues = queues
         self._samples: deque[_Counts] = deque([_Counts(0, 0, 0)], maxlen=_SAMPLES)
@@ -42,7 +42,7 @@ class CountedClient:
 
     def shown(self) -> ClientShown:
         lately = (now - before for now, before in zip(self._counts(), self._samples[0], strict=True))
-        return ClientShown(self._peer, self.ticket, self.session.protocol_name, self._since, *lately)
+        return ClientShown(self.peer, self.ticket, self.session.protocol_name, self._since, *lately)
 
 
 def shown(clients: Iterable[CountedClient]) -> Iterator[ClientShown]:

@@ -60,6 +60,8 @@ async def inherit(base: Foundation, parts: Any) -> FeaturePart:
         definitions=lambda: parts.monitors.sources.definitions,
         host_of=lambda node: None if (held := parts.core.registry.holder(node)) is None else held.host,
     )
+    base.blocks.on_change(processes.blocks_changed)
+    base.uses.add(processes.uses_of)
     orders = kept.orders = DoorOrders(base, parts, table, tickets=tickets, visits=visits, processes=processes)
     return FeaturePart(
         links=processes.links(),
@@ -199,18 +201,14 @@ class DoorOrders:
         return problem
 
     def enter(self, door: str, ticket: str, peer: str, descriptor: int) -> tuple[int, str]:
+        if self._base.policies.current.blocked(address_of(peer)) is not None:
+            self._refuse_entry(peer, door, "the host is blocked by an operator")
+            return 403, "this host is blocked by an operator"
         row = next((one for one in self._table.live() if one.name == door), None)
         visit = self._visits.find(door, ticket)
         found = visit or self._tickets.find(door, ticket)
         if row is None or found is None:
-            self._base.trail.happened(
-                "door entry refused",
-                "the ticket is wrong, over, or for another door",
-                host=peer,
-                decision="deny",
-                category="rest",
-                resource=door[:31],
-            )
+            self._refuse_entry(peer, door, "the ticket is wrong, over, or for another door")
             return 401, "the ticket is wrong or over: ask the operator for a new one (rosrv door ticket NAME)"
         if not self._processes.pass_on(row, descriptor, peer, found.id):
             return 503, self._processes.state(row)[1] or "the door is busy: try again"
@@ -219,6 +217,11 @@ class DoorOrders:
         else:
             self._visits.opened(found.id)
         return 101, ""
+
+    def _refuse_entry(self, peer: str, door: str, reason: str) -> None:
+        self._base.trail.happened(
+            "door entry refused", reason, host=peer, decision="deny", category="rest", resource=door[:31]
+        )
 
     async def watch(self) -> None:
         self._processes.start()

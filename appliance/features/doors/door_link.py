@@ -31,6 +31,8 @@ class DoorGiven(Message, frozen=True):
     in_ten_seconds: int
     tickets: list[str]
     """Connections with another ticket end, because it may have expired while control was down."""
+    blocked: list[str]
+    """The hosts that operators block."""
 
 
 class TypesGiven(Message, frozen=True):
@@ -41,6 +43,12 @@ class TypesGiven(Message, frozen=True):
 
 class PolicyChanged(Message, frozen=True):
     """A new policy is in force, which may allow requests that were denied."""
+
+
+class BlocksGiven(Message, frozen=True):
+    """All hosts that operators block, after a change."""
+
+    hosts: list[str]
 
 
 class DoorEnded(Message, frozen=True):
@@ -156,8 +164,8 @@ class ClientsShown(Message, frozen=True):
 
 
 DoorLink = (
-    DoorStarted | DoorGiven | TypesGiven | PolicyChanged | DoorEnded | AgentListener | ViewerGiven | TicketEnded
-    | SocketWanted | SocketGiven | SocketRefused | HostsWanted | HostsGiven | ConnectionsChanged
+    DoorStarted | DoorGiven | TypesGiven | PolicyChanged | BlocksGiven | DoorEnded | AgentListener | ViewerGiven
+    | TicketEnded | SocketWanted | SocketGiven | SocketRefused | HostsWanted | HostsGiven | ConnectionsChanged
     | DoorCounted | ClientsShown
 )  # fmt: skip
 

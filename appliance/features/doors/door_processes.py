@@ -12,7 +12,7 @@
 import asyncio
 import socket
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -230,11 +230,27 @@ class DoorProcesses:
             self._settings.connections,
             self._settings.connections_in_ten_seconds,
             self._tickets(row.name),
+            self._blocked(),
         )
         slot.definitions = {}
         self._define(slot)
         if self._send(slot, given) and row.port is not None and not process.listens:
             self._listen(slot, row, row.port)
+
+    def blocks_changed(self) -> None:
+        for slot in self._slots:
+            if slot.started:
+                self._send(slot, door_link.BlocksGiven(self._blocked()))
+
+    def _blocked(self) -> list[str]:
+        return [*map(str, self._base.blocks.reasons)]
+
+    def uses_of(self, host: Address) -> Iterator[str]:
+        """Yield the connections of a host to each door."""
+        for row in self._table.live():
+            count = sum(one.peer == str(host) for one in self._slots[row.slot or 0].clients)
+            if count:
+                yield f"{counted(count, 'connection')} to the door {row.name}"
 
     def define(self) -> None:
         changed, self._revision = self._revision != self._base.policies.revision, self._base.policies.revision

@@ -5,6 +5,7 @@ It outlives control. Without control, the node can make no new connections, beca
 
 import asyncio
 import ipaddress
+import os
 import socket
 from collections import Counter
 from collections.abc import Callable
@@ -45,6 +46,7 @@ from roswire.standard import standard_definitions
 _AGAIN_SECONDS = 1.0
 _REPORT_SECONDS = 1.0
 _MOST_PEERS = 256  # in one report
+_BLOCKED = "this host is blocked by an operator"
 _log = structlog.get_logger()
 
 
@@ -108,6 +110,7 @@ class DoorProcess:
         self._failure = ""
         self._listens = False
         self._clients: set[CountedClient] = set()
+        self._blocked: frozenset[str] = frozenset()
         self._tickets: Counter[str] = Counter()  # connections that control passed on, until they end
         self._shown: list[door_link.ClientShown] = []
         self._changes: dict[tuple[str, str], _Change] = {}
@@ -152,20 +155,33 @@ class DoorProcess:
                     self._over.set()
                 self._given = message
                 self._end_tickets(lambda ticket: ticket not in message.tickets)
+                self._block(message.blocked)
             case door_link.TypesGiven(definitions):
                 self._define(definitions)
             case door_link.PolicyChanged():
                 if self._door is not None:
                     self._door.lookout.policy_changed()
+            case door_link.BlocksGiven(hosts):
+                self._block(hosts)
             case door_link.DoorEnded():
                 self._over.set()
             case door_link.TicketEnded(ticket):
                 self._end_tickets(lambda one: one == ticket)
+            case _:
+                self._answered(message)
+
+    def _answered(self, message: Any) -> None:
+        match message:
             case door_link.HostsGiven(number, hosts):
                 self._hosts.given(number, hosts)
             case door_link.SocketRefused(number, reason):
                 if self._network is not None:
                     self._network.refused(number, reason)
+
+    def _block(self, hosts: list[str]) -> None:
+        self._blocked = frozenset(hosts)
+        for client in [one for one in self._clients if one.peer in self._blocked]:
+            client.session.disconnect(_BLOCKED)
 
     def _end_tickets(self, ended: Callable[[str], bool]) -> None:
         self._tickets = Counter({one: count for one, count in self._tickets.items() if not ended(one)})
@@ -180,6 +196,7 @@ class DoorProcess:
                 self._listens = True
                 self._tasks.start(self._accept(socket.socket(fileno=descriptors[0]), source))
             case door_link.ViewerGiven(peer, ticket) if self._connections is not None:
+                peer = str(_plain(peer))
                 self._tickets[ticket] += 1
                 self._admit(self._connections, descriptors[0], peer, ticket)
 
@@ -248,6 +265,10 @@ class DoorProcess:
                     self._admit(self._connections, connection.detach(), str(peer), "")
 
     def _admit(self, connections: DoorConnections, descriptor: int, peer: str, ticket: str) -> None:
+        if peer in self._blocked:
+            os.close(descriptor)
+            self._ended(peer, ticket, _BLOCKED)
+            return
         serve, refused = partial(self._serve, peer, ticket), partial(self._ended, peer, ticket)
         connections.adopt(descriptor, serve, refused, host=peer_key(peer))
 
@@ -256,9 +277,14 @@ class DoorProcess:
     ) -> None:
         await self._started.wait()
         door, given = self._door, self._given
-        if door is None or given is None or (ticket and ticket not in self._tickets):
+        over = (
+            "the ticket was over before the door could serve"
+            if ticket and ticket not in self._tickets
+            else ""
+        )
+        if door is None or given is None or (over := over or (_BLOCKED if peer in self._blocked else "")):
             writer.close()
-            self._ended(peer, ticket, "the ticket was over before the door could serve")
+            self._ended(peer, ticket, over)
             return
         queues: list[ViewerQueue[Any]] = []
         memory = door.memory.client(peer_key(peer))

@@ -88,20 +88,22 @@ def routes(services: Services) -> Routes:
         if seen.active:
             raise only_standby(seen.away or "", seen.active)
         give_back = streams.take(bearer, peer_of(request), "clients follow")
-        following = _follow(services, bearer, graph)
+        following = _follow(services, bearer, graph, peer_of(request))
         return StreamResponse(EventSourceResponse(following, ping=_PING_SECONDS), give_back)
 
     return router
 
 
-async def _follow(services: Services, bearer: Bearer, graph: bool) -> AsyncIterator[ServerSentEvent]:
+async def _follow(
+    services: Services, bearer: Bearer, graph: bool, peer: str
+) -> AsyncIterator[ServerSentEvent]:
     history = services.history
     number = max(0, history.seen.number - 1)  # the last sample is sent at once
     graph_due = 0.0
     with history.following():
         while not services.stopping.is_set():
-            if not services.doorkeeper.still_good(bearer):
-                yield ServerSentEvent(event="end", data=json.dumps({"reason": "the token has expired"}))
+            if reason := services.doorkeeper.end_of(bearer, peer):
+                yield ServerSentEvent(event="end", data=json.dumps({"reason": reason}))
                 return
             try:
                 async with asyncio.timeout(BUSY_SECONDS * 2):

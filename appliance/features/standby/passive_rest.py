@@ -42,6 +42,8 @@ class ReplicatedTokens:
         self._path = path
         self._rows: dict[str, TokenRow] | None = None
         self._ends = Deadlines()
+        self.blocked: list[str] = []
+        """The addresses that operators block."""
 
     @property
     def known(self) -> bool:
@@ -53,9 +55,11 @@ class ReplicatedTokens:
                 connection.execute("BEGIN")  # one snapshot: keys and tokens of the same time
                 keys = {row[0]: TokenKeys(*row[1:]) for row in connection.execute("SELECT * FROM token_keys")}
                 found = connection.execute("SELECT * FROM token").fetchall()
+                blocked = [row[0] for row in connection.execute("SELECT address FROM host_block")]
                 self._ends.limit(dict(connection.execute("SELECT id, seconds FROM token_left")))
             rows = {row[0]: TokenRow._make((*row, keys.get(row[0]))) for row in found}
-            changed, self._rows = rows != self._rows, rows
+            changed = (rows, blocked) != (self._rows, self.blocked)
+            self._rows, self.blocked = rows, blocked
             self.usable()  # from now on, no step of the clock postpones an end
             return changed
         return False
@@ -125,7 +129,7 @@ class PassiveRest:
         self._send(RequestAnswered(number, encode(answer)))
 
     def _state_tokens(self) -> None:
-        self._send(TokensStated(self._tokens.usable()))
+        self._send(TokensStated(self._tokens.usable(), self._tokens.blocked))
 
     def _send(self, message: Any) -> None:
         try:

@@ -16,6 +16,7 @@ from appliance.channel import admin
 from appliance.channel.admin import A, AdminAnswer, AdminRequest, TokenAdd, TokenRevoke, decode
 from appliance.channel.messages.api import ApiLink, ClientRequest, RequestAnswered, RequestMade
 from appliance.channel.operations import AnyRequest
+from appliance.control.operators.host_uses import RestUses
 from appliance.control.operators.token_orders import TokenOrders
 from appliance.control.rest.rest import RestLink
 from appliance.signing.request_signing import proof_of, reading_key, statement
@@ -44,7 +45,13 @@ class World:
         self.tokens = TokenOrders(self.store, self, Deadlines(), self.token_changed)  # type: ignore[arg-type]  # as above
         parts: Any = self
         self.link = RestLink(
-            parts, self.tokens, parts, served=print, certified=print, require_proof=require_proof
+            parts,
+            self.tokens,
+            parts,
+            served=print,
+            certified=print,
+            require_proof=require_proof,
+            uses=RestUses(),
         )
 
     def token_changed(self) -> None: ...

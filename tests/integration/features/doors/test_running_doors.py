@@ -8,7 +8,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
@@ -204,8 +204,9 @@ def test_no_other_account_uses_the_address_of_a_door(appliance: Appliance, role:
         ran = subprocess.run(script, user=65534, stdout=subprocess.PIPE, check=True, timeout=SECONDS)
         return ran.stdout.decode().strip()
 
-    assert appliance.host.run(lambda: used("10.77.0.2")) == "passed"
-    assert appliance.host.run(lambda: used(address)) == "refused"
+    machine = cast(Host, appliance.host)
+    assert on_robot(machine, lambda: used("10.77.0.2")) == "passed"
+    assert on_robot(machine, lambda: used(address)) == "refused"
 
 
 def test_a_ticket_opens_the_door_of_a_person_until_it_is_over(

@@ -32,9 +32,9 @@ def test_a_token_has_the_name_role_and_expiry_it_was_made_with() -> None:
     for scheme in ("Bearer", "bearer"):
         bearer = recognise(door, f"{scheme} {text}")
         assert (bearer.name, bearer.role, bearer.expires) == ("alice", "operator", row.expires)
-    assert door.still_good(bearer)
+    assert not door.end_of(bearer, "10.0.0.9")
     door.state([])
-    assert not door.still_good(bearer)
+    assert door.end_of(bearer, "10.0.0.9")
     assert recognise(door, f"Bearer {text}") == 401
 
 
@@ -57,10 +57,10 @@ def test_a_step_back_of_the_clock_revives_no_token() -> None:
         bearer = Bearer(row.id, row.name, "viewer", row.expires, text)
         machine.set_wall(clock.wall() - 86_400)
         machine.advance(59)
-        assert door.still_good(bearer)
+        assert not door.end_of(bearer, "10.0.0.9")
         machine.advance(2)
         door.state([kept(row)])
-        assert not door.still_good(bearer)
+        assert door.end_of(bearer, "10.0.0.9")
 
 
 def test_an_expired_token_is_refused() -> None:
@@ -171,6 +171,6 @@ def test_a_stream_ends_with_the_grace_time_of_its_token() -> None:
     door.state([kept(row)])
     bearer = recognise(door, f"Bearer {text}")
     door.state([kept(row._replace(expires=clock.wall() + 30))])
-    assert door.still_good(bearer)
+    assert not door.end_of(bearer, "10.0.0.9")
     door.state([kept(row._replace(expires=clock.wall() - 1))])
-    assert not door.still_good(bearer)
+    assert door.end_of(bearer, "10.0.0.9")

@@ -25,6 +25,7 @@ from appliance.channel.messages.api import (
     TokenUsed,
 )
 from appliance.channel.operations import AnyRequest
+from appliance.control.operators.host_uses import RestUses
 from appliance.control.rest.rest import RestLink
 from appliance.store.access_tokens import TokenRow, make_token
 from tests.support.answers import example
@@ -113,7 +114,13 @@ def world() -> Iterator[Everything]:
 def link(world: Everything, pins: list[str]) -> RestLink:
     parts: Any = world  # `Everything` is all three
     return RestLink(
-        parts, parts, parts, served=pins.append, certified=lambda _sha256: None, require_proof=False
+        parts,
+        parts,
+        parts,
+        served=pins.append,
+        certified=lambda _sha256: None,
+        require_proof=False,
+        uses=RestUses(),
     )
 
 

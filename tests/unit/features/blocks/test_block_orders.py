@@ -8,6 +8,7 @@ from typing import Any, cast
 
 import pytest
 
+from appliance.base.callers import called_from
 from appliance.base.clock import using
 from appliance.base.withdrawal import WithdrawnError, awaited
 from appliance.channel.admin import PolicyReload
@@ -72,6 +73,7 @@ class Control(ControlParts):
         self.state = StateStore(state, failed=print, kind=InlineDatabase)
         self.blocks = host_blocks.BlockTable(self.state, clock)
         self.remotes: dict[str, str] = {}
+        self.uses: list[str] = []
         self.policies = Policies(
             state / "policy.ini", self.state, cast(Any, self.records), CurrentPolicy(),
             robot=[ipaddress.ip_network(ROBOT)], hosts=dict, blocks=lambda: self.blocks.reasons, holders=dict,
@@ -82,7 +84,8 @@ class Control(ControlParts):
         self.current = self.policies.current
         self.orders = BlockOrders(
             self.blocks, self.policies, self.state, cast(Any, self.records), live=self.revocation.live,
-            connected=lambda: connected, enrolled=self.enrolled, remotes=lambda: self.remotes, carried_out=at_once,
+            connected=lambda: connected, enrolled=self.enrolled, remotes=lambda: self.remotes,
+            uses=lambda _host: self.uses, carried_out=at_once,
         )  # fmt: skip
 
     def keep(self, task: asyncio.Task[None]) -> None:
@@ -388,3 +391,40 @@ async def test_a_policy_that_is_loaded_keeps_the_blocks(tmp_path: Path) -> None:
         made.policies.hosts_changed()
         assert made.denial(NODE) is not None
         assert made.policies.known.blocks.keys() == {address_of(NODE)}
+
+
+async def test_a_dry_run_names_everything_and_blocks_nothing(tmp_path: Path) -> None:
+    async with control(tmp_path, Clock(), [{NODE, ROBOT}]) as made:
+        await made.register(made.node("/talker"), Kind.PUBLICATION, "/scan")
+        made.uses = ["session of ann (REST, last call 3 s ago)", "1 connection to the door alice"]
+        answer = await made.block(NODE, 60, dry_run=True)
+        assert answer.ended == BlockEnded(1, 0, 0, 0, 1, made.uses)
+        assert answer.until is not None and await made.blocked() == []
+        assert made.denial(NODE) is None
+        assert [event for event, _resource in made.records.events if event.startswith("host")] == []
+        assert (await made.block(NODE)).ended.uses == made.uses
+
+
+async def test_a_tunnel_is_named_that_the_block_ends(tmp_path: Path) -> None:
+    async with control(tmp_path, Clock()) as made:
+        made.remotes = {"ocu-1": "192.0.2.20"}
+        assert (await made.block("ocu-1", dry_run=True)).ended.uses == [
+            "the tunnel of ocu-1, from 192.0.2.20"
+        ]
+        assert (await made.block(NODE, dry_run=True)).ended.uses == []
+
+
+@pytest.mark.parametrize("address", [NODE, "ocu-1"])
+async def test_the_callers_own_way_in_is_blocked_only_by_force(tmp_path: Path, address: str) -> None:
+    async with control(tmp_path, Clock()) as made:
+        made.remotes = {"ocu-1": NODE}
+        for dry_run in (True, False):
+            with (
+                called_from(f"::ffff:{NODE}"),
+                pytest.raises(HostRefusedError, match="your own requests come from"),
+            ):
+                await made.block(address, dry_run=dry_run)
+        await made.block(address, dry_run=True)  # on the admin socket, which stays open
+        with called_from(NODE):
+            assert (await made.block(address, force=True)).address in (NODE, "10.99.0.2")
+            await made.block(OTHER)

@@ -37,6 +37,7 @@ class Bench:
             settings=settings,
             port=lambda _name: 11311,
             policies=SimpleNamespace(current=SimpleNamespace(ports=range(19001, 20001)), revision=7),
+            blocks=SimpleNamespace(reasons={}),
             lifeline=SimpleNamespace(say=self.asked.append),
             trail=SimpleNamespace(happened=lambda event, *_words, **_more: self.records.append(event)),
         )

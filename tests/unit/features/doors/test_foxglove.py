@@ -425,7 +425,7 @@ async def test_a_read_of_many_parameters_gives_those_that_the_door_may_read() ->
 
         async def denies(call: MethodCall) -> Value:
             if call.method == "getParam" and str(call.params[1]).startswith("/secret"):
-                return [-1, f"denied by [Parameters] (site.ini:9): {call.params[1]}", 0]
+                return [-1, f"denied by [Parameters] (site.ini:9): {call.params[1]!s}", 0]
             return [1, "", 5] if call.method == "getParam" else await answer(call)
 
         world.master.answer = denies  # type: ignore[method-assign]

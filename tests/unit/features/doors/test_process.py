@@ -12,7 +12,7 @@ from tests.support.memory_network import MemoryNetwork
 
 pytestmark = pytest.mark.anyio
 SLOTS = 32
-GIVEN = door_link.DoorGiven("alice", 1.0, "10.0.0.2", 11311, [], SLOTS, 200, ["ticket"])
+GIVEN = door_link.DoorGiven("alice", 1.0, "10.0.0.2", 11311, [], SLOTS, 200, ["ticket"], [])
 
 
 class Control:
@@ -21,6 +21,7 @@ class Control:
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.network = MemoryNetwork()
         self.reports: list[Any] = []
+        self.starts = asyncio.Event()
         self.serving: list[asyncio.Task[None]] = []
         self._arrived: asyncio.Queue[Any] = asyncio.Queue()
         self.network.listen(DOOR[0], lambda *streams: self._arrived.put(streams), DOOR[1])
@@ -47,9 +48,8 @@ class Control:
         self.reports.append(report)
         return True
 
-    @staticmethod
-    async def _waits() -> None:
-        await asyncio.sleep(3600)
+    async def _waits(self) -> None:
+        await self.starts.wait()
 
     def _adopted(self) -> Any:
         def adopt(limited: DoorConnections, _number: int, serve: Any, refused: Any, *, host: str) -> None:
@@ -57,6 +57,12 @@ class Control:
             self.serving.append(asyncio.ensure_future(work))
 
         return adopt
+
+    async def end(self) -> None:
+        for task in self.serving:
+            task.cancel()
+        self.ended.set()
+        await self.running
 
     async def pass_on(self, host: str) -> WebSocketClient:
         client = WebSocketClient(*self.network.connect(host, DOOR))
@@ -80,7 +86,24 @@ async def test_viewers_that_wait_for_the_node_are_bounded_like_connections(
     assert sum(not task.done() for task in control.serving) == most
     changes = [one for one in control.reports if isinstance(one, door_link.ConnectionsChanged)]
     assert (sum(one.began for one in changes), sum(one.ended for one in changes)) == (0, 100 - most)
-    for task in control.serving:
-        task.cancel()
-    control.ended.set()
-    await control.running
+    await control.end()
+
+
+@pytest.mark.parametrize("when", ["before", "while it waits"])
+async def test_a_blocked_host_is_not_served(monkeypatch: pytest.MonkeyPatch, when: str) -> None:
+    control, closed = Control(monkeypatch), list[int]()
+    monkeypatch.setattr("appliance.features.doors.process.os.close", closed.append)
+    control.say(GIVEN)
+    if when == "before":
+        control.say(door_link.BlocksGiven(["10.0.0.7"]))
+        control.give(door_link.ViewerGiven("::ffff:10.0.0.7", "ticket"), (3,))
+        assert closed == [3]
+    else:
+        await control.pass_on("10.0.0.7")
+        control.say(door_link.BlocksGiven(["10.0.0.7"]))
+    await control.pass_on("10.0.0.8")
+    control.starts.set()
+    await asyncio.sleep(3)
+    ends = {one.peer: one.reason for one in control.reports if isinstance(one, door_link.ConnectionsChanged)}
+    assert ends.get("10.0.0.7") == "this host is blocked by an operator"
+    await control.end()
