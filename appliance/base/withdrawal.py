@@ -23,8 +23,9 @@ class WithdrawnError(Exception):
 class _Order:
     """An order of a client; `given_up()` no longer matters once `begun` is true."""
 
-    def __init__(self, given_up: Callable[[], bool]) -> None:
+    def __init__(self, given_up: Callable[[], bool], host: str) -> None:
         self.given_up = given_up
+        self.host = host
         self.begun = False
 
 
@@ -32,15 +33,21 @@ _PRESENT: ContextVar[_Order | None] = ContextVar("order", default=None)
 
 
 @contextlib.contextmanager
-def awaited(given_up: Callable[[], bool]) -> Iterator[None]:
-    """Run an order in the block; `given_up()` returns whether its client stopped waiting."""
-    order = _Order(given_up)
+def awaited(given_up: Callable[[], bool], host: str = "") -> Iterator[None]:
+    """Run an order in the block; `given_up()` returns whether its client, at this address, stopped waiting."""
+    order = _Order(given_up, host)
     before = _PRESENT.set(order)
     try:
         yield
     finally:
         order.begun = True  # tasks that outlive the order have a copy of the variable
         _PRESENT.reset(before)
+
+
+def caller_host() -> str:
+    """Return the address from which the order came over REST; empty for the admin socket."""
+    order = _PRESENT.get()
+    return "" if order is None else order.host
 
 
 def require_awaited() -> None:

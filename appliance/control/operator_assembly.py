@@ -11,7 +11,6 @@ from appliance.control.assembly.foundation import Foundation
 from appliance.control.operators.administration import Administration
 from appliance.control.operators.clock_check import ClockCheck
 from appliance.control.operators.handled_alarms import HandledAlarms
-from appliance.control.operators.host_uses import RestUses
 from appliance.control.operators.overview import graph_of
 from appliance.control.operators.queries import Queries
 from appliance.control.operators.request_methods import request_methods
@@ -19,6 +18,7 @@ from appliance.control.operators.switched_off import SwitchedOffWatch
 from appliance.control.operators.token_orders import TokenOrders
 from appliance.control.rest.rest import RestLink
 from appliance.control.rest.rest_certificate import RestCertificate
+from appliance.control.rest.rest_uses import RestUses
 from appliance.store.stored_deadlines import StoredDeadlines
 
 
@@ -90,8 +90,8 @@ def make_operators(base: Foundation, parts: Parts) -> Operators:
         durable=partial(_durable, base),
         require_room=base.store.database.require_room,
     )
-    uses = RestUses()
-    base.uses.add(uses.of)
+    uses = RestUses(lambda: base.blocks.reasons)
+    base.blocks.uses.add(uses.of)
     base.blocks.on_change(lambda: rest().state_tokens())
     rest.set(
         RestLink(
@@ -103,7 +103,6 @@ def make_operators(base: Foundation, parts: Parts) -> Operators:
             connected=base.features.connected,
             require_proof=settings.api_require_proof,
             uses=uses,
-            blocked=lambda: base.blocks.reasons,
         )
     )
     return Operators(

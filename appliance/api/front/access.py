@@ -186,7 +186,7 @@ def _require_patience(failures: Buckets, host: str) -> None:
 
 
 def plain_address(peer: str) -> str:
-    """Return an address in the form of the blocks: IPv4 also if the socket is IPv6."""
+    """Return an address in the form of the blocks: IPv4 even if the socket is IPv6."""
     address = ipaddress.ip_address(peer.partition("%")[0])
     mapped = address.ipv4_mapped if isinstance(address, ipaddress.IPv6Address) else None
     return str(mapped or address)

@@ -103,8 +103,9 @@ EVENTS: dict[str, str] = {
     "door removed": "An operator removed a door: its connections and tickets ended; `detail` has who.",
     "door ticket made": "A ticket for a door was made; `detail` has who, its id and its end.",
     "door connected": "Connections to a door began; `detail` has the peer, the ticket's id, and how many in a second.",
-    "door disconnected": "Connections to a door ended; `reason` has that of the last one.",
-    "door entry refused": "A WebSocket at the REST port had no valid ticket for the door.",
+    "door disconnected": "Connections to a door ended that had begun; `reason` has that of the last one.",
+    "door entry refused": "A connection to a door was refused: its ticket, address or handshake is not valid, or the"
+    " door is full; `host` is the peer.",
     "door failed": "The process of a door ended, or its port could not be listened on.",
     "recording ordered": "A recording was ordered; `detail` has who ordered it, and the seconds before and after.",
     "recording closed": "The flight recorder finished a recording; `detail` has its sha256 and its triggers.",

@@ -27,7 +27,7 @@ _NAMES = 8
 _PARAMETERS, _PARAMETER_CHARACTERS = 256, 16 << 10  # the most in one list of read parameters
 _LONGEST_NAME = 256
 _LONGEST_KEY = 1024
-ABOUT = ("call", "key", "node", "subgraph", "method", "status", "who", "monitor", "topics")
+ABOUT = ("call", "key", "node", "subgraph", "method", "status", "who", "monitor", "topics", "peer")
 """The fields of `detail` that identify a request."""
 _KEY = ABOUT.index("key")
 

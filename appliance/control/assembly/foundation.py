@@ -21,7 +21,6 @@ from appliance.control.assembly.policies import Policies
 from appliance.control.assembly.robot import charged_to, robot_addresses
 from appliance.control.links.signer_requests import ReceiptFloor, SignerRequests
 from appliance.control.links.supervisor_link import ControlLifeline
-from appliance.control.operators.host_uses import HostUses
 from appliance.features.feature import FeatureContext
 from appliance.features.parts import FeatureParts
 from appliance.hosts.host_table import HostTable
@@ -57,7 +56,6 @@ class Foundation:
     monitors: Current[SpecificationManager]
     store: StateStore
     blocks: BlockTable
-    uses: HostUses
     table: HostTable
     tunnels: Tunnels
     policies: Policies
@@ -158,7 +156,6 @@ async def make_foundation(
         monitors=monitors,
         store=store,
         blocks=blocks,
-        uses=HostUses(),
         table=table,
         tunnels=tunnels(),
         policies=policies,

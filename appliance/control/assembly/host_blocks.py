@@ -5,7 +5,7 @@
 3. `reasons` is never changed, only replaced, so a policy keeps the blocks with which it was put into force.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from datetime import UTC, datetime
 
 from appliance.base import clock
@@ -18,6 +18,22 @@ _SECOND = 1_000_000_000
 _NOTE_SHOWN = 60  # characters; the reason of a decision is bounded
 
 
+class HostUses:
+    """How hosts use the appliance besides their nodes: sessions, followers, doors. A block ends all of them.
+
+    Each part of control that has some adds a function, which names them.
+    """
+
+    def __init__(self) -> None:
+        self._parts: list[Callable[[Address], Iterable[str]]] = []
+
+    def add(self, of: Callable[[Address], Iterable[str]]) -> None:
+        self._parts.append(of)
+
+    def of(self, host: Address) -> list[str]:
+        return [use for part in self._parts for use in part(host)]
+
+
 class BlockTable:
     """All blocks, by canonical address; `age()` is the age clock."""
 
@@ -27,6 +43,7 @@ class BlockTable:
         self._rows = {address_of(row.address): row for row in store.hosts.blocks()}
         self._now, self._wall, self._seen = age() if self._rows else 0, clock.wall(), clock.since_boot_ns()
         self.reasons: Mapping[Address, str] = self._described()
+        self.uses = HostUses()
         self._listeners: list[Callable[[], None]] = []
 
     def __len__(self) -> int:

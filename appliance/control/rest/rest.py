@@ -14,14 +14,13 @@ A flooded or compromised api cannot block RVMaster:
 import asyncio
 import os
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import Any
 
 import structlog
 
 from appliance.audit.log.record import Severity
 from appliance.base import clock
-from appliance.base.callers import called_from
 from appliance.base.withdrawal import awaited
 from appliance.channel import messages
 from appliance.channel.admin import AdminAnswer, ChallengeWanted, WaitingRequest, encode, verb_of
@@ -41,10 +40,9 @@ from appliance.channel.messages.api import (
 )
 from appliance.channel.operations import ORDERS
 from appliance.control.operators.administration import Administration
-from appliance.control.operators.host_uses import RestUses
 from appliance.control.operators.token_orders import TokenOrders
 from appliance.control.rest.rest_proof import RequestAuthenticator, UnprovenError
-from appliance.policy.model import Address
+from appliance.control.rest.rest_uses import RestUses
 from appliance.telemetry.audit_trail import AuditTrail
 
 _log = structlog.get_logger()
@@ -73,7 +71,6 @@ class RestLink:
         certified: Callable[[str], None],
         require_proof: bool,
         uses: RestUses,
-        blocked: Callable[[], Iterable[Address]] = tuple,
         connected: Callable[[str, str, str, int], tuple[int, str]] = lambda *_connection: NO_DOORS,
     ) -> None:
         self._administration = administration
@@ -83,7 +80,6 @@ class RestLink:
         self._link = Link(self._received, self._lost, self._took)
         self._connected = connected
         self._uses = uses
-        self._blocked = blocked
         self._waiting: deque[RequestMade] = deque()
         self._withdrawn: dict[int, bool] = {}  # unanswered requests of the present link, by number
         self._worker: asyncio.Task[None] | None = None  # the worker of the present link
@@ -162,7 +158,7 @@ class RestLink:
             return gone or clock.now() > made.until
 
         host = made.asked.host if made.asked is not None else ""
-        with awaited(given_up), called_from(host):
+        with awaited(given_up, host):
             answer = await self._answer(made)
         if channel is self._link.channel:
             self._send_answer(made.number, answer)
@@ -216,7 +212,7 @@ class RestLink:
         )
 
     def state_tokens(self) -> None:
-        self._send(TokensStated(self._tokens.usable(), [*map(str, self._blocked())]))
+        self._send(TokensStated(self._tokens.usable(), [*map(str, self._uses.blocked())]))
 
     def _send_answer(self, number: int, answer: AdminAnswer[Any]) -> None:
         self._withdrawn.pop(number, None)

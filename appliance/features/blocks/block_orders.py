@@ -9,9 +9,8 @@ from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping
 
 from msgspec.structs import asdict, replace
 
-from appliance.base.callers import caller_host
 from appliance.base.counted import counted
-from appliance.base.withdrawal import take_effect
+from appliance.base.withdrawal import caller_host, take_effect
 from appliance.control.assembly.assembly import Parts
 from appliance.control.assembly.foundation import Foundation
 from appliance.control.assembly.host_blocks import BlockTable
@@ -64,7 +63,7 @@ async def inherit(base: Foundation, parts: Parts) -> FeaturePart:
             **{name: str(address) for name, address in base.features.addresses().items()},
         },
         remotes=lambda: {name: seen.remote for name, seen in base.tunnels.seen.items()},
-        uses=base.uses.of,
+        uses=base.blocks.uses.of,
         carried_out=parts.endpoints.relay.carried_out,
     )
     return FeaturePart(

@@ -61,7 +61,7 @@ async def inherit(base: Foundation, parts: Any) -> FeaturePart:
         host_of=lambda node: None if (held := parts.core.registry.holder(node)) is None else held.host,
     )
     base.blocks.on_change(processes.blocks_changed)
-    base.uses.add(processes.uses_of)
+    base.blocks.uses.add(processes.uses_of)
     orders = kept.orders = DoorOrders(base, parts, table, tickets=tickets, visits=visits, processes=processes)
     return FeaturePart(
         links=processes.links(),

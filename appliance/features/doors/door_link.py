@@ -117,12 +117,13 @@ class HostsGiven(Message, frozen=True):
 
 
 class ConnectionsChanged(Message, frozen=True):
-    """Connections of one peer began or ended in the last second."""
+    """Connections of one peer began, ended, or were refused before they began, in the last second."""
 
     peer: str
     ticket: str
     began: int
     ended: int
+    refused: int
     reason: str
 
 

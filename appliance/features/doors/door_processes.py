@@ -333,7 +333,7 @@ class DoorProcesses:
 
     def _record(self, row: DoorRow, change: door_link.ConnectionsChanged) -> None:
         happened = partial(
-            self._base.trail.happened, host=row.address, resource=row.name, peer=change.peer[:64]
+            self._base.trail.happened, host=row.address, resource=row.name, reads=True, peer=change.peer[:64]
         )
         ticket = {"ticket": change.ticket[:12]} if change.ticket else None
         if change.began:
@@ -343,8 +343,20 @@ class DoorProcesses:
                 more=ticket,
                 count=change.began,
             )
-        if change.ended:
+        if change.ended or change.refused:
             self._left(row.name, change.ticket)
+        if change.refused:  # of the peer, so unknown hosts are folded as everywhere
+            self._base.trail.happened(
+                "door entry refused",
+                f"{counted(change.refused, 'connection')} to {row.name} refused: {change.reason}",
+                host=change.peer[:64] or None,
+                decision="deny",
+                category="rest",
+                resource=row.name,
+                more=ticket,
+                count=change.refused,
+            )
+        if change.ended:
             reason = change.reason or "the client left"
             happened(
                 "door disconnected",

@@ -58,6 +58,7 @@ def main(lifeline_fd: int, _index: int) -> None:
 class _Change:
     began: int = 0
     ended: int = 0
+    refused: int = 0
     reason: str = ""
 
 
@@ -260,16 +261,16 @@ class DoorProcess:
                 peer = _plain(address[0])
                 if allowed is not None and peer not in allowed:
                     connection.close()
-                    self._ended(str(peer), "", f"the agent's address is {source}")
+                    self._refused(str(peer), "", f"the agent's address is {source}")
                 else:
                     self._admit(self._connections, connection.detach(), str(peer), "")
 
     def _admit(self, connections: DoorConnections, descriptor: int, peer: str, ticket: str) -> None:
         if peer in self._blocked:
             os.close(descriptor)
-            self._ended(peer, ticket, _BLOCKED)
+            self._refused(peer, ticket, _BLOCKED)
             return
-        serve, refused = partial(self._serve, peer, ticket), partial(self._ended, peer, ticket)
+        serve, refused = partial(self._serve, peer, ticket), partial(self._refused, peer, ticket)
         connections.adopt(descriptor, serve, refused, host=peer_key(peer))
 
     async def _serve(
@@ -284,7 +285,7 @@ class DoorProcess:
         )
         if door is None or given is None or (over := over or (_BLOCKED if peer in self._blocked else "")):
             writer.close()
-            self._ended(peer, ticket, over)
+            self._refused(peer, ticket, over)
             return
         queues: list[ViewerQueue[Any]] = []
         memory = door.memory.client(peer_key(peer))
@@ -297,32 +298,43 @@ class DoorProcess:
             subprotocols=SUBPROTOCOLS,
             options=SessionOptions(origins=tuple(given.origins)),
             memory=memory,
+            opened=partial(self._changed, peer, ticket, began=1),
         )
         client = CountedClient(session, peer, ticket, queues)
         self._clients.add(client)
-        self._changed(peer, ticket, began=1)
         try:
             await session.run()
         finally:
             self._clients.discard(client)
             self._totals.add(client)
-            self._ended(peer, ticket, session.end)
+            (self._ended if session.began else self._refused)(peer, ticket, session.end)
 
     # --- reports ---
 
     def _ended(self, peer: str, ticket: str, reason: str) -> None:
         """Report the end of a connection. Control then forgets its visit."""
         self._changed(peer, ticket, ended=1, reason=reason)
+        self._left(ticket)
+
+    def _refused(self, peer: str, ticket: str, reason: str) -> None:
+        """Report a connection that ended before its handshake."""
+        self._changed(peer, ticket, refused=1, reason=reason)
+        self._left(ticket)
+
+    def _left(self, ticket: str) -> None:
         self._tickets[ticket] -= 1
         self._tickets = +self._tickets
 
-    def _changed(self, peer: str, ticket: str, *, began: int = 0, ended: int = 0, reason: str = "") -> None:
+    def _changed(
+        self, peer: str, ticket: str, *, began: int = 0, ended: int = 0, refused: int = 0, reason: str = ""
+    ) -> None:
         key = (peer, ticket)
         if key not in self._changes and len(self._changes) >= _MOST_PEERS:
             key = ("", "")
         change = self._changes.setdefault(key, _Change())
         change.began += began
         change.ended += ended
+        change.refused += refused
         change.reason = reason or change.reason
 
     async def _report(self) -> None:
@@ -330,7 +342,9 @@ class DoorProcess:
             await asyncio.sleep(_REPORT_SECONDS)
             changes, self._changes = self._changes, {}
             for (peer, ticket), one in changes.items():
-                message = door_link.ConnectionsChanged(peer, ticket, one.began, one.ended, one.reason[:300])
+                message = door_link.ConnectionsChanged(
+                    peer, ticket, one.began, one.ended, one.refused, one.reason[:300]
+                )
                 if not self._child.tell(message):
                     self._changes.setdefault((peer, ticket), one)
             counted = self._counts()

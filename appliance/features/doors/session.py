@@ -137,8 +137,11 @@ class DoorSession:
         subprotocols: Sequence[str],
         options: SessionOptions,
         memory: ClientMemory,
+        opened: Callable[[], None] = lambda: None,  # called after the handshake
     ) -> None:
         self.end = ""
+        self.began = False
+        self._opened = opened
         self.received = self.sent = 0  # frames
         self.received_bytes = self.sent_bytes = self.refusals = 0
         self._reader, self._writer = reader, writer
@@ -216,6 +219,8 @@ class DoorSession:
             self.end = rejected or f"no WebSocket handshake: {self._socket.handshake_exc}"
             return False
         self._protocol = self._protocols(self._socket.subprotocol)
+        self.began = True
+        self._opened()
         return True
 
     async def _serve(self) -> None:

@@ -110,7 +110,7 @@ DENIALS: dict[str, str | Callable[[AuditRecord], DecidedRequest]] = {
     "rest call": "tokens and their roles (rosrv token list) decide on REST, not the policy",
     "authority refused": "[Authority] and the present holder decide it (rosrv drive status)",
     "sign-on refused": "the provider and `sso.roles` decide who signs on",
-    "door entry refused": "a valid ticket opens a door (rosrv door ticket NAME)",
+    "door entry refused": "a valid ticket (rosrv door ticket NAME) or the address of its agent opens a door",
     "enrolment refused": "enrolment needs a valid one-time token (rosrv host add)",
     "renewal refused": "a host renews its certificate in its own tunnel",
     "tunnel refused": "a tunnel needs a valid certificate of this appliance (rosrv host list)",

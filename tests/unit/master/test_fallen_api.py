@@ -16,9 +16,9 @@ from appliance.channel import admin
 from appliance.channel.admin import A, AdminAnswer, AdminRequest, TokenAdd, TokenRevoke, decode
 from appliance.channel.messages.api import ApiLink, ClientRequest, RequestAnswered, RequestMade
 from appliance.channel.operations import AnyRequest
-from appliance.control.operators.host_uses import RestUses
 from appliance.control.operators.token_orders import TokenOrders
 from appliance.control.rest.rest import RestLink
+from appliance.control.rest.rest_uses import RestUses
 from appliance.signing.request_signing import proof_of, reading_key, statement
 from appliance.store.state_file import StateStore
 from tests.support.engines import InlineDatabase

@@ -14,7 +14,8 @@ from appliance.api.front.request_gate import PUBLIC, RequestGate
 from appliance.base import clock
 from appliance.channel.messages.api import LongRequest
 from appliance.configuration.settings import ApiLimits
-from appliance.control.operators.host_uses import HostUses, RestUses
+from appliance.control.assembly.host_blocks import HostUses
+from appliance.control.rest.rest_uses import RestUses
 from appliance.policy.model import address_of
 from tests.support.asgi import sent as sent_to
 from tests.support.virtual_clock import VirtualClock

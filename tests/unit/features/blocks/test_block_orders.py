@@ -8,7 +8,6 @@ from typing import Any, cast
 
 import pytest
 
-from appliance.base.callers import called_from
 from appliance.base.clock import using
 from appliance.base.withdrawal import WithdrawnError, awaited
 from appliance.channel.admin import PolicyReload
@@ -420,11 +419,11 @@ async def test_the_callers_own_way_in_is_blocked_only_by_force(tmp_path: Path, a
         made.remotes = {"ocu-1": NODE}
         for dry_run in (True, False):
             with (
-                called_from(f"::ffff:{NODE}"),
+                awaited(lambda: False, f"::ffff:{NODE}"),
                 pytest.raises(HostRefusedError, match="your own requests come from"),
             ):
                 await made.block(address, dry_run=dry_run)
         await made.block(address, dry_run=True)  # on the admin socket, which stays open
-        with called_from(NODE):
+        with awaited(lambda: False, NODE):
             assert (await made.block(address, force=True)).address in (NODE, "10.99.0.2")
             await made.block(OTHER)

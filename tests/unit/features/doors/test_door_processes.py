@@ -25,6 +25,7 @@ class Bench:
         self.sent: list[Any] = []
         self.asked: list[Any] = []
         self.records: list[str] = []
+        self.details: list[dict[str, Any]] = []
         self.made: list[int] = []
         self.left: list[tuple[str, str]] = []
         self.full = False
@@ -39,7 +40,7 @@ class Bench:
             policies=SimpleNamespace(current=SimpleNamespace(ports=range(19001, 20001)), revision=7),
             blocks=SimpleNamespace(reasons={}),
             lifeline=SimpleNamespace(say=self.asked.append),
-            trail=SimpleNamespace(happened=lambda event, *_words, **_more: self.records.append(event)),
+            trail=SimpleNamespace(happened=self._happened),
         )
         self.policies = base.policies
         self.rows = [ALICE]
@@ -60,6 +61,10 @@ class Bench:
         )
         self.link = cast(Any, self.processes.links()["door"][0])
         monkeypatch.setattr(self.processes, "_given", self._given)
+
+    def _happened(self, event: str, *_words: str, **more: Any) -> None:
+        self.records.append(event)
+        self.details.append(more)
 
     def _link(self, heard: Any, lost: Any) -> SimpleNamespace:
         return SimpleNamespace(heard=heard, lost=lost, send=self._send, channel=object(), close=self._close)
@@ -215,9 +220,20 @@ def test_a_process_learns_of_another_policy_once(bench: Bench) -> None:
 def test_a_process_gets_the_valid_tickets_and_reports_ended_connections(bench: Bench) -> None:
     bench.hears(door_link.DoorStarted("alice", 1.0, False))
     assert bench.sent[0].tickets == ["3f9a0c5d17e2"]
-    bench.hears(door_link.ConnectionsChanged("10.0.0.7", "3f9a0c5d17e2", 1, 0, ""))
-    bench.hears(door_link.ConnectionsChanged("10.0.0.7", "3f9a0c5d17e2", 0, 1, ""))
+    bench.hears(door_link.ConnectionsChanged("10.0.0.7", "3f9a0c5d17e2", 1, 0, 0, ""))
+    bench.hears(door_link.ConnectionsChanged("10.0.0.7", "3f9a0c5d17e2", 0, 1, 0, ""))
     assert bench.left == [("alice", "3f9a0c5d17e2")]
+
+
+def test_refusals_are_denials_of_the_peer_and_connections_are_folded(bench: Bench) -> None:
+    """So unknown hosts at a door's port are folded as everywhere, and none of them in the door's name."""
+    bench.hears(NEW)
+    bench.hears(door_link.ConnectionsChanged("10.0.0.66", "", 0, 0, 9, "the agent's address is 10.0.0.7"))
+    bench.hears(door_link.ConnectionsChanged("10.0.0.7", "", 2, 1, 0, "the client left"))
+    refused, began, ended = bench.details
+    assert (refused["host"], refused["decision"], refused["count"]) == ("10.0.0.66", "deny", 9)
+    for one in (began, ended):
+        assert (one["host"], one["reads"], one["peer"]) == (ALICE.address, True, "10.0.0.7")
 
 
 def test_a_full_door_and_one_that_keeps_ending_are_alarms(bench: Bench) -> None:

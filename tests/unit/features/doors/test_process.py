@@ -85,7 +85,7 @@ async def test_viewers_that_wait_for_the_node_are_bounded_like_connections(
     assert refused == [503] * (100 - most)
     assert sum(not task.done() for task in control.serving) == most
     changes = [one for one in control.reports if isinstance(one, door_link.ConnectionsChanged)]
-    assert (sum(one.began for one in changes), sum(one.ended for one in changes)) == (0, 100 - most)
+    assert (sum(one.began for one in changes), sum(one.refused for one in changes)) == (0, 100 - most)
     await control.end()
 
 

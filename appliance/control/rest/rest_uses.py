@@ -1,7 +1,4 @@
-"""Collect how a host uses the appliance besides its nodes: sessions, followers, doors, tunnels.
-
-A block ends all of them, so an operator sees them before and after it.
-"""
+"""Note who uses REST and the console from which host, for the answer to a block (`HostUses`)."""
 
 from collections import OrderedDict
 from collections.abc import Callable, Iterable
@@ -16,23 +13,14 @@ _RECENT_SECONDS = 900.0
 _MOST_RECENT = 1000
 
 
-class HostUses:
-    """The uses of each host. Each part of control that has some adds a function, which names them."""
-
-    def __init__(self) -> None:
-        self._parts: list[Callable[[Address], Iterable[str]]] = []
-
-    def add(self, of: Callable[[Address], Iterable[str]]) -> None:
-        self._parts.append(of)
-
-    def of(self, host: Address) -> list[str]:
-        return [use for part in self._parts for use in part(host)]
-
-
 class RestUses:
-    """The people and programs that lately used REST and the console, and the requests that still run."""
+    """The people and programs that lately used REST and the console, and the requests that still run.
 
-    def __init__(self) -> None:
+    `blocked()` returns the hosts that REST must refuse.
+    """
+
+    def __init__(self, blocked: Callable[[], Iterable[Address]] = tuple) -> None:
+        self.blocked = blocked
         self._recent: OrderedDict[tuple[Address, str], float] = OrderedDict()  # oldest first
         self._running: list[LongRequest] = []
 
