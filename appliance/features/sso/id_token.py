@@ -2,7 +2,7 @@
 
 Only a key of the provider that fits the token's algorithm in kind, curve and use verifies it. `jwk`, `jku` and `x5u`
 in the token are ignored, and a symmetric key is never used. Issuer, audience, nonce, subject, expiry and time of
-issue are required.
+issue are required. The claims are parsed only after the signature is verified.
 """
 
 import base64
@@ -18,7 +18,7 @@ from joserfc.jws import JWSRegistry
 
 from appliance.features.sso.errors import SignOnRefusedError
 
-_LONGEST = 32_768
+_LONGEST, _LONGEST_HEADER = 262_144, 32_768  # characters: a person with some thousand groups
 _OLDEST_SECONDS = 600.0  # since the time of issue: the token comes from an exchange that has just happened
 _LEAST_RSA_BITS = 2048
 _LONGEST_SUBJECT = 255
@@ -49,9 +49,10 @@ def verify(token: str, keys: Sequence[dict[str, Any]], expected: Expected, now: 
     header = _header_of(token, expected.algorithms)
     key = _key_for(header, keys)
     registry = JWSRegistry(algorithms=list(expected.algorithms), strict_check_header=False)
-    registry.max_header_length = registry.max_payload_length = _LONGEST
+    registry.max_header_length, registry.max_payload_length = _LONGEST_HEADER, _LONGEST
     try:
         claims = jwt.decode(token, key, algorithms=[header["alg"]], registry=registry).claims
+        _require_texts(claims, "iss", "nonce", "sub")
         jwt.JWTClaimsRegistry(
             now=int(now),
             leeway=int(expected.skew),
@@ -83,17 +84,27 @@ def _check_rest(claims: dict[str, Any], expected: Expected, now: float) -> None:
     if now - claims["iat"] > _OLDEST_SECONDS + expected.skew:
         raise _refused(f"it was issued more than {_OLDEST_SECONDS:g} s ago{_CLOCKS}")
     subject = claims["sub"]
-    if not 0 < len(subject) <= _LONGEST_SUBJECT or not subject.isascii() or not subject.isprintable():
-        raise _refused("sub is not 1 to 255 printable ASCII characters")
+    if not 0 < len(subject) <= _LONGEST_SUBJECT:
+        raise _refused("sub is not 1 to 255 characters")
+
+
+def _require_texts(claims: dict[str, Any], *names: str) -> None:
+    """The library takes a list that contains the expected value for the value."""
+    for name in names:
+        if name in claims and not isinstance(claims[name], str):
+            raise _refused(f"{name} is not a string")
 
 
 def _header_of(token: str, algorithms: Sequence[str]) -> dict[str, Any]:
     if len(token) > _LONGEST:
-        raise _refused(f"it has more than {_LONGEST} characters")
+        raise _refused(f"it has more than {_LONGEST} characters: let the provider put fewer groups into it")
     if not token.isascii() or token.count(".") != 2:
         raise _refused("it is not a signed token with three parts")
+    text = token.partition(".")[0]
+    if len(text) > _LONGEST_HEADER:
+        raise _refused(f"its header has more than {_LONGEST_HEADER} characters")
     try:
-        header = json.loads(_decoded(token.partition(".")[0]))
+        header = json.loads(_decoded(text))
     except (ValueError, RecursionError):
         raise _refused("its header is not JSON") from None
     if not isinstance(header, dict) or not isinstance(header.get("kid", ""), str):

@@ -4,16 +4,45 @@ There is no default: without a value that gives a role, or without a name, a per
 domain from `email` needs `email_verified`, because people can claim any address at some providers.
 """
 
+import hashlib
 import re
-from collections.abc import Mapping
+import unicodedata
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from appliance.features.sso.errors import SignOnRefusedError
 from appliance.features.sso.link import SignedInPerson
 from appliance.features.sso.settings import Sso
 
-_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._@+|:-]{0,127}")
-_MOST_VALUES = 1000
+_ESCAPED = re.compile(rb"[^A-Za-z0-9._@+|:-]|^[^A-Za-z0-9]")
+_LONGEST_NAME, _DIGITS = 128, 32
+_UNPRINTABLE = re.compile(rb"[^!-$&-~]")
+_MOST_VALUES = 5000
+_UPPER = {ord(letter): ord(letter.lower()) for letter in "ABCDEFGHIJKLMNOPQRSTUVWXYZ"}
+
+
+def name_of(text: str) -> str:
+    """Return a name for the audit log: letters, digits and `. _ @ + | : -` stay, and all others are `%` and two
+    hexadecimal digits for each byte of UTF-8.
+
+    Two texts have one name only if Unicode's form C of both is the same. The end of a long name is its SHA-256.
+    """
+    data = unicodedata.normalize("NFC", text).encode("utf-8", "surrogatepass")
+    name = _escaped(_ESCAPED, data)
+    if len(name) <= _LONGEST_NAME:
+        return name
+    start = name[: _LONGEST_NAME - _DIGITS - 1].rpartition("%")
+    kept = start[0] if len(start[2]) < len("XX") and start[1] else "".join(start)
+    return f"{kept}~{hashlib.sha256(data).hexdigest()[:_DIGITS]}"
+
+
+def subject_of(text: str) -> str:
+    """Return a `sub` in printable ASCII. It is the identity of a person, so no two texts have one."""
+    return _escaped(_UNPRINTABLE, text.encode("utf-8", "surrogatepass"))
+
+
+def _escaped(pattern: re.Pattern[bytes], data: bytes) -> str:
+    return pattern.sub(lambda found: b"%%%02X" % found[0][0], data).decode("ascii")
 
 
 def identity_of(claims: Mapping[str, Any], wanted: Sso, now: float) -> SignedInPerson:
@@ -23,12 +52,13 @@ def identity_of(claims: Mapping[str, Any], wanted: Sso, now: float) -> SignedInP
             f"sso.domains lets in only verified e-mail addresses of {', '.join(wanted.domains)};"
             f" the provider gives {mail or 'none'}"
         )
-    name = mail if wanted.name_claim == "email" else claims.get(wanted.name_claim)
-    if not isinstance(name, str) or not _NAME.fullmatch(name):
+    given = mail if wanted.name_claim == "email" else _found(claims, wanted.name_claim)
+    if not isinstance(given, str) or not given.strip():
         raise SignOnRefusedError(
-            f"the claim {wanted.name_claim} (sso.name_claim) gives no usable name: letters, digits and . _ @ + | : -,"
-            " at most 128; `email` must also be verified"
+            f"the claim {wanted.name_claim} (sso.name_claim) gives no name: it must be a string in the ID token;"
+            " `email` must also be verified"
         )
+    name = name_of(given)
     values = _values(claims, wanted.roles_claim)
     role = wanted.role_of(values)
     if role is None:
@@ -42,25 +72,42 @@ def identity_of(claims: Mapping[str, Any], wanted: Sso, now: float) -> SignedInP
         ends = min(ends, float(claims["exp"]))
     if ends <= now:
         raise SignOnRefusedError("the ID token has just expired: compare the clocks")
-    return SignedInPerson(claims["sub"], name, mail, role, wanted.door_groups_of(values), ends)
+    return SignedInPerson(subject_of(claims["sub"]), name, mail, role, wanted.door_groups_of(values), ends)
 
 
 def _verified_mail(claims: Mapping[str, Any]) -> str:
-    mail = claims.get("email")
-    return mail.lower() if isinstance(mail, str) and claims.get("email_verified") is True else ""
+    """Return the address with A to Z in lower case: other letters are not changed, or two addresses could be one."""
+    mail, verified = claims.get("email"), claims.get("email_verified")
+    if isinstance(mail, str) and (verified is True or verified == "true"):  # a string at some providers
+        return mail.translate(_UPPER)
+    return ""
+
+
+def _found(claims: Mapping[str, Any], path: str) -> Any:
+    return next(_at(claims, path), None)
+
+
+def _at(claims: Any, path: str) -> Iterator[Any]:
+    """Return the values at a path; a name in it may have dots, and the longest name counts first."""
+    if not isinstance(claims, Mapping):
+        return
+    if path in claims:
+        yield claims[path]
+    end = path.rfind(".")
+    while end > 0:
+        if path[:end] in claims:
+            yield from _at(claims[path[:end]], path[end + 1 :])
+        end = path.rfind(".", 0, end)
 
 
 def _values(claims: Mapping[str, Any], path: str) -> frozenset[str]:
-    found: Any = claims
-    if path in claims:
-        found = claims[path]
-    else:
-        for part in path.split("."):
-            found = found.get(part) if isinstance(found, Mapping) else None
+    found = _found(claims, path)
     found = [found] if isinstance(found, str) else found
     if not isinstance(found, list) or len(found) > _MOST_VALUES:
+        overage = "_claim_names" in claims or claims.get("hasgroups") in (True, "true")
+        hint = "it leaves out the groups of a person who has many: use app roles" if overage else ""
         raise SignOnRefusedError(
-            f"the claim {path} (sso.roles_claim) must be a string or a list of at most {_MOST_VALUES}: let the provider"
-            " put it into the ID token"
+            f"the claim {path} (sso.roles_claim) must be a string or a list of at most {_MOST_VALUES}: "
+            + (hint or "let the provider put it into the ID token")
         )
-    return frozenset(value for value in found if isinstance(value, str))
+    return frozenset(unicodedata.normalize("NFC", value) for value in found if isinstance(value, str))

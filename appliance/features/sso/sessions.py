@@ -12,6 +12,7 @@ from typing import NamedTuple
 from appliance.base import clock
 from appliance.control.errors import TokenRefusedError, UnknownThingError
 from appliance.control.operators.sessions import Session
+from appliance.features.sso.identity import name_of
 from appliance.features.sso.link import SessionKeys, SignedInPerson
 from appliance.features.sso.quotas import SESSIONS
 from appliance.signing.request_signing import TokenKeys
@@ -86,7 +87,8 @@ class SessionTable:
         return found
 
     def end_all(self, name: str) -> list[Session]:
-        ended = [one for one in self.sessions() if one.name in (name, f"{_PREFIX}{name}")]
+        spellings = {name, *(f"{_PREFIX}{one}" for one in (name, name_of(name)))}
+        ended = [one for one in self.sessions() if one.name in spellings]
         if not ended:
             names = ", ".join(sorted({one.name for one in self.sessions()})[:20]) or "none"
             raise UnknownThingError(f"no person is signed in as {name[:140]!r}; there are: {names}")

@@ -1,6 +1,8 @@
 """The section `sso` of `appliance.yaml`."""
 
 import re
+import unicodedata
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal, get_args
 from urllib.parse import urlsplit
@@ -81,6 +83,10 @@ def _checked_door_group(text: str) -> str:
     return text
 
 
+def _in_form_c(texts: Iterable[str]) -> Iterator[str]:
+    return (unicodedata.normalize("NFC", text) for text in texts)
+
+
 _Values = Annotated[
     list[Annotated[str, rules(min_length=1, max_length=256)]], rules(min_length=1, max_length=256)
 ]
@@ -127,13 +133,14 @@ class Sso(FeatureSection):
         min_length=1,
         max_length=256,
         description="claim with the name in the audit log, which must identify a person for ever; `email` must be"
-        " verified",
+        " verified. A nested one has dots; so may a name in it",
     )
     roles_claim: str = key(
         default="groups",
         min_length=1,
         max_length=256,
-        description="claim with the values for `roles` and `doors`; a nested one has dots: realm_access.roles",
+        description="claim with the values for `roles` and `doors`; a nested one has dots: realm_access.roles. A name"
+        " in it may have dots too",
     )
     roles: dict[TokenRole, _Values] = key(
         default_factory=dict,
@@ -206,7 +213,9 @@ class Sso(FeatureSection):
         return {"proxy" if self.proxy else "address": (self.proxy or self.address, self.destination[0])}
 
     def role_of(self, values: frozenset[str]) -> TokenRole | None:
-        return next((role for role in _RANKING if values.intersection(self.roles.get(role, ()))), None)
+        return next(
+            (role for role in _RANKING if values.intersection(_in_form_c(self.roles.get(role, ())))), None
+        )
 
     def door_groups_of(self, values: frozenset[str]) -> tuple[str, ...]:
-        return tuple(group for group, wanted in self.doors.items() if values.intersection(wanted))
+        return tuple(group for group, wanted in self.doors.items() if values.intersection(_in_form_c(wanted)))

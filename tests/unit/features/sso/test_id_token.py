@@ -82,7 +82,8 @@ HOSTILE: dict[str, tuple[Callable[[], str], str]] = {
     "a header that is a list": (lambda: f"{part([1])}.b.c", "another form"),
     "a header of deep nesting": (lambda: f"{part(b'[' * 9000)}.b.c", "not JSON"),
     "a key id that is a number": (lambda: _unsigned({"alg": "RS256", "kid": 1}), "another form"),
-    "too long": (lambda: "a" * 40_000, "more than 32768"),
+    "too long": (lambda: "a" * 300_000, "more than 262144"),
+    "a header that is too long": (lambda: "a" * 40_000 + ".b.c", "header has more than 32768"),
     "another issuer": (lambda: _signed(iss="https://id.example.org/other"), "iss"),
     "an issuer with a slash": (lambda: _signed(iss=f"{ISSUER}/"), "iss"),
     "no issuer": (lambda: _signed(iss=None), "iss"),
@@ -103,7 +104,6 @@ HOSTILE: dict[str, tuple[Callable[[], str], str]] = {
     "not valid yet": (lambda: _signed(nbf=_ago(-120)), "not yet valid"),
     "no subject": (lambda: _signed(sub=None), "sub"),
     "an empty subject": (lambda: _signed(sub=""), "sub"),
-    "a subject with a line break": (lambda: _signed(sub="u\n1"), "sub"),
     "a subject that is a number": (lambda: _signed(sub=7), "sub"),
 }
 
