@@ -52,6 +52,7 @@ class DataPlane:
             changed=self._monitors_changed,
             holder=lambda host: host if self._table.is_registered(host) else "",
             payer=self._table.payer,
+            publishers=self._publishers,
         )
         self._context = RelayContext.of(loop, limits, self._reporter, self.interceptor, self._table)
         self.memory = self._context.memory
@@ -251,6 +252,13 @@ class DataPlane:
         if node is not None and node.monitors:
             return None
         return self._flows.of(grant.limit, grant.topic, grant.host, grant.caller_id)
+
+    def _publishers(self, topic: str) -> list[ObservationPoint]:
+        return [
+            ObservationPoint(relayed.key, topic, relayed.host, relayed.name)
+            for relayed in self.topics.values()
+            if relayed.topic == topic and isinstance(relayed.upstream, PublisherConnection)
+        ]
 
     def _attach_monitors(self, relayed: RelayedTopic) -> None:
         interceptor, topic = self.interceptor, relayed.topic

@@ -90,7 +90,9 @@ def contents(
         {one.name: unbuilt[one.code.file] for one in monitors.monitors if one.code.file in unbuilt},
         {
             one.name: StateOwner(
-                monitors.identity(one.code).hex(), monitors.holds_if_lost(one.code), str(one.code.position)
+                monitors.identity(one.code).hex(),
+                frozenset(one.held_channels) if monitors.holds_if_lost(one.code) else frozenset(),
+                str(one.code.position),
             )
             for one in monitors.monitors
         },

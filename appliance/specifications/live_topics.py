@@ -85,10 +85,10 @@ def judge_holds(
     Only monitors that are `acting` now and later hold topics. The files `moved` go to another relay.
     """
     found = TopicFindings([], [])
-    for name in (one for one in acting if one in present.states and coming.states[one].holds):
+    for name in (one for one in acting if one in present.states):
         owner = coming.states[name]
         changed = owner.identity != present.states[name].identity
-        topics = sorted(coming.topics[name] & published.keys())
+        topics = sorted(owner.held & published.keys())
         if topics and (changed or coming.monitors[name] in moved):
             why = "its text, or a definition, changes" if changed else "it moves to another relay"
             text = f"{name} loses its state, because {why}, and then holds {', '.join(topics)}: it drops every message"

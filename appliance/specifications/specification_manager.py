@@ -61,6 +61,7 @@ from appliance.telemetry.audit_trail import AuditTrail
 
 _log = structlog.get_logger()
 _ACTS = "monitor acts"
+_STOPS = "monitor stops"
 _GIVEN = "monitor given"
 ALLOCATION = "relays"
 _NO_FOLDER = (
@@ -162,7 +163,13 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         self.returns = TimedSwitches(store, self._come_back)
         self.sources = Sources()
         self.checked = CheckedSpecifications()
-        self.records = MonitorRecords(trail, lambda topic, data: self.checked.fields(topic, data), [*told])  # noqa: PLW0108 - of whatever is in force then
+        self.records = MonitorRecords(
+            trail,
+            lambda topic, data: self.checked.fields(topic, data),  # noqa: PLW0108 - of whatever is in force then
+            [*told],
+            lambda stops: store.save_setting(_STOPS, stops),
+        )
+        self._ticking: asyncio.TimerHandle | None = None
         self._published = published
 
     # --- start ---
@@ -176,6 +183,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         settings = self.store.settings()
         self.switches.restore(settings.get(SWITCHES, "{}"))
         self.givens.said = json.loads(settings.get(_GIVEN, "{}"))
+        self.records.start(settings.get(_STOPS, "[]"))
         self._acts = int(settings.get(_ACTS, "0"))
         last = self.in_force if self._find_last(restarted=restarted or taken_over) else None
         named = () if restarted else self.switches.named
@@ -650,8 +658,15 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
     def received(self, message: messages.Message, relay: int = 0) -> None:
         if isinstance(message, messages.MonitorsReported):
             self.records.reported(message.events, message.lost)
+            if self._ticking is None:
+                self._tick()
         else:
             self.rollout.received(message, relay)
+
+    def _tick(self) -> None:
+        self.records.tick()
+        going_on = self.records.some
+        self._ticking = asyncio.get_running_loop().call_later(1.0, self._tick) if going_on else None
 
     def relay_lost(self, relay: int) -> None:
         self.rollout.lost(relay)

@@ -4,7 +4,8 @@ from collections.abc import Collection, Mapping
 from dataclasses import replace
 from types import MappingProxyType
 
-from rosmop.check.givens import Topics
+from rosmop.check.acted_topics import written_topics
+from rosmop.check.givens import Topics, with_topics
 from rosmop.check.specification import compile_files, findings_of
 from rosmop.form.compiled import Compiled
 from rosmop.form.findings import Diagnostic, SpecificationError
@@ -23,19 +24,31 @@ def compiled_from(
 ) -> Compiled:
     """Compile files (name to text) in this order. Raises `SpecificationError` with all errors.
 
-    The specifications of files in `without_code` keep only their names, topics and services, and do nothing.
+    The specifications of files in `without_code` keep only their names, topics and services, and do nothing; they
+    act on the topics on which their text may act.
     """
     files: list[tree.SpecificationFile] = []
+    written: dict[str, tuple[str, ...]] = {}
     findings: list[Diagnostic] = []
     for name, text in sources.items():
         try:
             parsed = parse(text, name)
-            files.append(_without_code(parsed) if name in without_code else parsed)
+            if name in without_code:
+                written |= {
+                    one.name: written_topics(with_topics(one, topics.get(one.name, {})))
+                    for one in parsed.specifications
+                }
+                parsed = _without_code(parsed)
+            files.append(parsed)
         except SpecificationError as error:
             findings += error.findings
     if findings:
         raise SpecificationError([*findings, *findings_of(files, definitions)])
-    return compile_files(files, definitions, margins=margins, topics=topics)
+    compiled = compile_files(files, definitions, margins=margins, topics=topics)
+    if not written:
+        return compiled
+    codes = tuple(replace(one, acts_on=written.get(one.name, one.acts_on)) for one in compiled.specifications)
+    return replace(compiled, specifications=codes)
 
 
 def _without_code(file: tree.SpecificationFile) -> tree.SpecificationFile:
@@ -59,4 +72,5 @@ def _idle(specification: tree.Specification) -> tree.Specification:
         inits=(),
         events=observing or events,
         properties=(),
+        withholds=(),
     )

@@ -42,6 +42,7 @@ from rosmop.check.specification_lint import (
     unused_events,
 )
 from rosmop.check.traps import rival_changes, traps
+from rosmop.check.observed_topics import with_observed_topics
 from rosmop.check.withholdings import withholdings
 from rosmop.form import nodes
 from rosmop.form.compiled import Compiled, PropertyCode, SpecificationCode
@@ -85,7 +86,7 @@ def compile_files(
     findings = list(dict.fromkeys(shared.findings))
     if any(finding.severity == "error" for finding in findings):
         raise SpecificationError(findings)
-    return Compiled(
+    whole = Compiled(
         tuple(compiled),
         tuple(sorted(findings, key=lambda finding: finding.position)),
         shared.functions,
@@ -95,6 +96,7 @@ def compile_files(
         tuple(shared.publications),
         tuple(shared.calls),
     )
+    return with_observed_topics(whole, shared.symbols)
 
 
 def findings_of(files: Sequence[tree.SpecificationFile], definitions: Definitions) -> list[Diagnostic]:

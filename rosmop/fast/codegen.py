@@ -842,6 +842,7 @@ STATEMENTS: Mapping[type[nodes.FormNode], Callable[[_FunctionCodegen, Any], byte
             nodes.AfterElements: _FunctionCodegen._after_elements,
             nodes.Skip: _FunctionCodegen._skip,
             nodes.NotPast: _FunctionCodegen._not_past,
+            nodes.Ends: _FunctionCodegen._ends,
             nodes.ReadNumbers: _FunctionCodegen._read_numbers,
             nodes.ReadValue: _FunctionCodegen._read_value,
             nodes.Require: _FunctionCodegen._require,

@@ -25,6 +25,7 @@ from rosmop.fast.wasm import (
     I64_LT_U,
     I64_MUL,
     I64_SUB,
+    compare,
     constant,
     f32_load,
     f64_load,
@@ -90,6 +91,10 @@ class MessageAccess(ArithmeticCodegen):
         count = constant(I64, node.count) if isinstance(node.count, int) else self._get(node.count, I64)
         end = self._position(node.at) + count + constant(I64, node.size) + I64_MUL + I64_ADD
         return end + self._set(node.name, I64)
+
+    def _ends(self, node: nodes.Ends) -> bytes:
+        differs = self._position(node.at) + self._length() + compare(I64, "!=")
+        return self._when(differs, self._elsewhere)
 
     def _read_numbers(self, node: nodes.ReadNumbers) -> bytes:
         end = max(offset + struct_size(struct_code(kind) or "") for _, kind, offset in node.fields)

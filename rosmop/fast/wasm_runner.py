@@ -297,7 +297,9 @@ class WasmLane:
 
     def ready(self) -> bool:
         for monitor in self._monitors:
-            if monitor.enabled and (monitor.held or not monitor.seen or self._topic in monitor.starting):
+            if monitor.enabled and (not monitor.seen or self._topic in monitor.starting or monitor.held):
+                if monitor.seen and self._topic not in (*monitor.starting, *monitor.held_channels):
+                    continue  # it only observes this topic, and goes on to
                 return False
         return True
 

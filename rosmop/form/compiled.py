@@ -186,6 +186,11 @@ class SpecificationCode:
     given_topics: tuple[GivenTopic, ...] = ()
     ordered: bool = False
     withholdings: tuple[Withholding, ...] = ()
+    acts_on: tuple[str, ...] = ()
+    """The channels of its events whose messages it may drop, change, replace, withhold or publish.
+
+    It only observes the others. While it cannot judge, it holds these channels.
+    """
 
 
 @dataclass(eq=False)

@@ -514,6 +514,13 @@ class NotPast(FormNode, frozen=True):
     index: int
 
 
+class Ends(FormNode, frozen=True):
+    """Fault unless the message ends at this position."""
+
+    site: int
+    at: Spot
+
+
 class ReadNumbers(FormNode, frozen=True):
     """Assign numbers and times to variables; fields have offsets from `at`, in ascending order."""
 
@@ -574,8 +581,8 @@ class WriteBack(FormNode, frozen=True):
 
 Statement = (
     Evaluate | If | Loop | ForEach | Break | Continue | Select | Return | Leave | Charge | Allocate | LimitDepth | Drop
-    | StopMessage | Reset | Publish | AfterText | Count | AfterElements | Skip | NotPast | ReadNumbers | ReadValue
-    | Require | Pending | WriteBack
+    | StopMessage | Reset | Publish | AfterText | Count | AfterElements | Skip | NotPast | Ends | ReadNumbers
+    | ReadValue | Require | Pending | WriteBack
 )  # fmt: skip
 
 

@@ -376,6 +376,10 @@ class FormTerms:
         )
         state.slots[self._frame, node.name] = self._position(node.at, state) + count * node.size
 
+    def _ends(self, node: nodes.Ends, state: State) -> None:
+        end = self._position(node.at, state)
+        self._leave_to_python(state, end != z3.ZeroExt(32, self._beginning.size))
+
     def _read_numbers(self, node: nodes.ReadNumbers, state: State) -> None:
         self._within(node.at, max(offset + self._size(kind) for _, kind, offset in node.fields), state)
         for name, kind, offset in node.fields:
@@ -946,6 +950,7 @@ STATEMENTS: Mapping[type[nodes.FormNode], Callable[[FormTerms, Any, State], None
             nodes.AfterElements: FormTerms._after_elements,
             nodes.Skip: FormTerms._repeat,
             nodes.NotPast: FormTerms._not_past,
+            nodes.Ends: FormTerms._ends,
             nodes.ReadNumbers: FormTerms._read_numbers,
             nodes.ReadValue: FormTerms._read_value,
             nodes.Require: FormTerms._require,

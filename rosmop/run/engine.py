@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 
+from rosmop.form import nodes
 from rosmop.form.compiled import Compiled, EventCode, SpecificationCode, Withholding
 from rosmop.form.connected_groups import channel_of
 from rosmop.form.findings import Diagnostic
@@ -175,6 +176,7 @@ class MonitorSet:
         begin_margins(self._monitors, self.interpreter.variables)
         self.groups = tuple(_groups(compiled, self._monitors))
         self._guards = guards_of(compiled)
+        self._stopping = frozenset(_stopping(compiled))
         self._holds = True
         self._types = types_of(compiled)
         self._beginnings: dict[str, bytes] = {}
@@ -184,7 +186,7 @@ class MonitorSet:
         self._contexts: dict[str, tuple[Context, ...]] = {}
         self._withheld: dict[str, list[tuple[MonitorInstance, Withholding]]] = {}
         self._silent: dict[str, BatchOptions] = {}
-        self._execution = MonitorExecution(self.interpreter, on_fault, self._guards.judging)
+        self._execution = MonitorExecution(self.interpreter, on_fault, self._guards)
         self._agenda = Agenda(self._monitors, self._execution, patience, deadlines)
         self.began: tuple[str, ...] = ()
         self._broken = False
@@ -507,6 +509,17 @@ class MonitorSet:
         senders = [one.safes[topic] for one in self._monitors if one.enabled and topic in one.safes]
         return any(safe_messages.is_safe(sender.safe, data) for sender in senders)
 
+    def sends_safe(self, name: str, topic: str, data: bytes | bytearray | memoryview) -> bool:
+        """Whether these bytes are the safe message of this monitor for the topic."""
+        return any(
+            one.name == name and topic in one.safes and safe_messages.is_safe(one.safes[topic].safe, data)
+            for one in self._monitors
+        )
+
+    def only_stops(self, event: str) -> bool:
+        """Whether the event, named `specification.event`, changes messages only to the safe message."""
+        return event in self._stopping
+
     def stop(self, topic: str) -> None:
         """Send the safe messages until a message comes on the topic."""
         for monitor in self._monitors:
@@ -515,7 +528,7 @@ class MonitorSet:
         self._agenda.schedule()
 
     def holds_if_lost(self, code: SpecificationCode) -> bool:
-        return code.hold or (code.name in self._guards.names and not code.begins)
+        return code.hold or (bool(code.acts_on) and code.name in self._guards.names and not code.begins)
 
     def identity(self, code: SpecificationCode) -> bytes:
         return code.identity + self._types[code.name]
@@ -745,22 +758,23 @@ class MonitorSet:
         """Note monitors that cannot judge, because an event that keeps their state up to date has faulted.
 
         A monitor declared `begin` starts again; any other keeps its state and holds its topics (not in shadow mode).
+        Bytes that are not a message belong to no slice, so they end none: its deadlines go on.
         """
         for fault in outcome.faults[first:] if self.on_fault == "drop" else ():
             monitors = [
                 self.monitor(name) for name in self._guards.depending[fault.monitor] if fault.outdates
             ]
-            holding = [one for one in monitors if self._holds and not one.held and not one.code.begins]
+            holding = [
+                one for one in monitors if self._holds and not one.held and self.holds_if_lost(one.code)
+            ]
             for monitor in holding:
                 self.hold(monitor, f"an event that it depends on had a fault: {fault.position}: {fault.text}")
             outcome.began_holding = (*outcome.began_holding, *(one.name for one in holding))
             if any(one.code.begins for one in monitors):
                 began = self.began
                 again = dict.fromkeys([fault.monitor, *(one.name for one in monitors if one.code.begins)])
-                outcome.before = [
-                    *outcome.before,
-                    self._start([*map(self.monitor, again)], outcome.time, None),
-                ]
+                fresh = [one for one in map(self.monitor, again) if one.slices is None or not fault.malformed]
+                outcome.before = [*outcome.before, self._start(fresh, outcome.time, None)]
                 for name in again if self._holds else ():
                     self.monitor(name).start_anew()
                 self.began = began
@@ -836,6 +850,15 @@ class MonitorSet:
             return False
 
         return tap
+
+
+def _stopping(compiled: Compiled) -> Iterator[str]:
+    for code in compiled.specifications:
+        for event in code.events:
+            parts = [*nodes.walk(compiled.functions[event.function])]
+            writes = any(isinstance(one, nodes.WriteBack) and one.writes for one in parts)
+            if not writes and any(isinstance(one, nodes.StopMessage) for one in parts):
+                yield f"{code.name}.{event.name}"
 
 
 def _slice_parts(group: MonitorGroup) -> list[tuple[str, SliceParts]]:

@@ -7,7 +7,7 @@ steps, and the events after this one process the safe message.
 """
 
 import struct
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import replace
 from functools import partial
@@ -20,6 +20,7 @@ from rosmop.form.sites import Site, showing
 from rosmop.logics.interface import Categories, RunFaultError
 from rosmop.logics.pattern import TimedPattern
 from rosmop.run.explain import Bound, of_slice
+from rosmop.run.guards import Guards
 from rosmop.run.interpreter import Interpreter, LastFailure
 from rosmop.run.monitor import Handler, MonitorInstance, RunningProperty, SafeSender, Step
 from rosmop.run.outcomes import DROPPED, NOBODY, Fault, MessageSender, Outcome, Verdict
@@ -53,9 +54,9 @@ class Due(NamedTuple):
 class MonitorExecution:
     """Runs events, properties and handlers on the state of monitors."""
 
-    def __init__(self, interpreter: Interpreter, on_fault: OnFault, judging: Collection[str]) -> None:
-        """A fault of an event's function in `judging` only drops the message (`Guards.judging`)."""
-        self._judging = judging
+    def __init__(self, interpreter: Interpreter, on_fault: OnFault, guards: Guards) -> None:
+        """A fault of an event's function in `guards.judging` only drops the message."""
+        self._guards = guards
         self._function: str | None = None
         """The function of the event that runs, or None for a tick or deadline."""
         self.on_fault: OnFault = on_fault
@@ -559,12 +560,17 @@ class MonitorExecution:
     def _first(self, monitor: MonitorInstance, message: WireMessage, outcome: Outcome) -> bool:
         """Whether the monitor does not judge the message, because it holds its topics or failed to start.
 
-        It then drops all messages except the safe message.
+        It then drops all messages except the safe message, on the topics on which it acts. Messages that it only
+        observes pass, and keep its state up to date, unless it has none.
         """
-        if monitor.held:
+        broken = monitor.broken and self.on_fault == "drop"
+        if (message.channel or "") not in monitor.held_channels:
+            if broken:
+                return True
+        elif monitor.held:
             why = f" ({monitor.why_held})" if monitor.why_held else ""
             outcome.reason = f"{monitor.name} holds its topics until it is resumed{why}"
-        elif monitor.broken and self.on_fault == "drop":
+        elif broken:
             outcome.reason = f"{monitor.name} could not start: its initial values or `init` faulted"
         if outcome.reason is not None:
             sender = monitor.safes.get(message.channel or "")
@@ -574,10 +580,10 @@ class MonitorExecution:
             outcome.dropped_at = monitor.code.position
             message.dropped = True
             return True
-        monitor.seen = True
-        for timer in monitor.timers:
+        for timer in () if monitor.seen else monitor.timers:
             if not timer.ticked:
                 timer.due = message.time + timer.period
+        monitor.seen = True
         return False
 
     def _note(self, monitor: MonitorInstance) -> None:
@@ -703,11 +709,11 @@ class MonitorExecution:
         self, error: Exception, monitor: MonitorInstance, otherwise: Position, outcome: Outcome
     ) -> None:
         fault: Fault = _fault_of(error, self._interpreter, monitor.name, otherwise)
-        # Bytes that are not a message observe nothing: they are dropped, as if they had not been sent.
-        outdates = self._function not in self._judging and not isinstance(
-            error, MalformedError | struct.error
-        )
-        fault = replace(fault, outdates=outdates)
+        # Bytes on an observed topic that are not a message may stand for one that would have changed the state; on
+        # other topics nobody gets them.
+        malformed, function = isinstance(error, MalformedError | struct.error), self._function
+        outdates = function in self._guards.observing if malformed else function not in self._guards.judging
+        fault = replace(fault, outdates=outdates, malformed=malformed)
         monitor.faults += 1
         outcome.faults = (*outcome.faults, fault)
 

@@ -16,12 +16,14 @@ class Guards:
     """The guards; `depending` has, for each specification, the guards that depend on its state.
 
     A fault in the function of an event in `judging` only drops the event's own message, because the guards that
-    depend on the event act on its topic alone: no subscriber saw the events that the state lacks.
+    depend on the event act on its topic alone: no subscriber saw the events that the state lacks. `observing` has
+    the functions of the other events, if their specification only observes the topic.
     """
 
     names: frozenset[str]
     depending: Mapping[str, tuple[str, ...]]
     judging: frozenset[str]
+    observing: frozenset[str]
 
 
 def guards_of(compiled: Compiled) -> Guards:
@@ -49,7 +51,13 @@ def guards_of(compiled: Compiled) -> Guards:
         for event in code.events
         if all(places[guard] <= {event.channel} for guard in depending[code.name])
     }
-    return Guards(frozenset(names), depending, frozenset(judging))
+    observing = {
+        event.function
+        for name, code in codes.items()
+        for event in code.events
+        if depending[name] and event.channel not in (None, *code.acts_on)
+    }
+    return Guards(frozenset(names), depending, frozenset(judging), frozenset(observing - judging))
 
 
 def _used(codes: Mapping[str, SpecificationCode], name: str) -> Iterator[str]:

@@ -488,6 +488,14 @@ class _Maker:
 
         return run
 
+    def _ends(self, node: nodes.Ends) -> _Run:
+        at = self._position(node.at)
+
+        def run(v: Variables) -> None:
+            wire.require_end(v["b"], at(v))
+
+        return run
+
     def _read_numbers(self, node: nodes.ReadNumbers) -> _Run:
         codes, at, reads = "<", 0, []
         for name, kind, offset in node.fields:
@@ -943,6 +951,7 @@ STATEMENTS: Mapping[type[nodes.FormNode], Callable[[_Maker, Any], _Run]] = Mappi
         nodes.AfterElements: _Maker._after_elements,
         nodes.Skip: _Maker._skip,
         nodes.NotPast: _Maker._not_past,
+        nodes.Ends: _Maker._ends,
         nodes.ReadNumbers: _Maker._read_numbers,
         nodes.ReadValue: _Maker._read_value,
         nodes.Require: _Maker._require,

@@ -1,7 +1,7 @@
 """A running specification: events as functions, runs of properties, timers."""
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, NamedTuple, Protocol, cast
@@ -184,6 +184,13 @@ class MonitorInstance:
     @property
     def name(self) -> str:
         return self.code.name
+
+    @property
+    def held_channels(self) -> Collection[str]:
+        """Return the channels that it holds while it cannot judge; all, if it is declared `hold` and only observes."""
+        if self.code.acts_on or not self.code.hold:
+            return self.code.acts_on
+        return [event.channel for event in self.code.events if event.channel is not None]
 
     @property
     def failing(self) -> bool:

@@ -86,7 +86,7 @@ class Fault:
     """A runtime error that stopped an action, with the `values` of the variables involved.
 
     If it `outdates`, the monitor's state may be out of date, because an event that it observes did not take
-    effect.
+    effect. `malformed`: the bytes were not a message of the event's type.
     """
 
     monitor: str
@@ -94,6 +94,7 @@ class Fault:
     text: str
     values: Mapping[str, object]
     outdates: bool = False
+    malformed: bool = False
 
 
 def named(verdict: Verdict) -> str:

@@ -34,6 +34,11 @@ def text_end(buffer: Buffer, start: int) -> int:
     return int(start + 4 + _LENGTH.unpack_from(buffer, start)[0])
 
 
+def require_end(buffer: Buffer, end: int) -> None:
+    if end != len(buffer):
+        raise MalformedError(f"it has {len(buffer)} bytes, and its last field ends at byte {end}")
+
+
 def count(buffer: Buffer, start: int, least: int) -> int:
     number: int = _LENGTH.unpack_from(buffer, start)[0]
     if number * least > len(buffer) - start - 4 or (not least and number > MAX_EMPTY):

@@ -97,6 +97,13 @@ EVENTS: dict[str, str] = {
     " `monitor fault` follows.",
     "monitor published": "A monitor published a message; `at` is the location of the statement, `conditions` the"
     " conditions that led there; `handler` is the verdict whose handler ran, with its `why`.",
+    "stop begun": "A monitor stops a topic: it sends its safe message, or puts it in the place of messages. `detail`"
+    " has `monitor`, `cause` (the monitor's own line, a fault, or why it cannot judge), and what `message changed` or"
+    " `monitor published` has of this message; `host` and `caller_id` are those of the message that led to it, and"
+    " `publishers` has the nodes that publish the topic if a timer did.",
+    "stop ended": "A stop has ended; `detail` has `since` and `until` (its first and last action), `seconds`, the"
+    " number of `actions`, its `cause`, and the record of its begin in `begun_in`. With `unknown_end`, control ended"
+    " during the stop, so `until` is only what it knew.",
     "publication refused": "A publisher or service uses another type definition than the specifications; it is not"
     " relayed.",
     "door added": "An operator added a door; `detail` has who, the port and the address of an agent.",
@@ -186,7 +193,7 @@ EVENTS: dict[str, str] = {
     "log failed": "The log could not be written for some time and is written again; `reason` says why.",
 }
 
-MONITOR_ACTIONS = frozenset({"message dropped", "message changed", "monitor verdict", "monitor fault"})
+MONITOR_ACTIONS = frozenset({"message dropped", "message changed", "monitor verdict", "monitor fault", "stop begun"})
 """The events of monitors that start a recording if `recorder.triggers` lists them."""
 
 SEVERITIES: dict[str, Severity] = {
@@ -198,7 +205,7 @@ SEVERITIES: dict[str, Severity] = {
             "appliance started", "appliance stopped", "bundle in force", "clock not synchronised", "clock synchronised",
             "evidence exported", "forwarding resumed", "handed over", "host awaited", "host awaited no longer",
             "host enrolled", "host renewed", "hosts reloaded", "driver checked", "monitor resumed", "monitor set",
-            "policy loaded",
+            "policy loaded", "stop ended",
             "recording closed", "door added", "door removed", "door ticket made", "signed off", "signed on",
             "recording ordered", "recording fetched", "recording read", "recording removed", "specifications loaded",
             "switchover ordered", "token added", "token revoked", "token rotated", "took over", "topic looked into",

@@ -21,7 +21,10 @@ from appliance.base.varying_numbers import without_numbers
 FOLDED = frozenset({"denials folded", "repetitions folded"})
 _ABOUT_THE_LOG = frozenset({"records removed", "records lost", "forwarding gap"})
 """Events whose `detail.count` is a number of records, not of repetitions."""
-_MORE = re.compile(r"(in shadow mode(?:, not done)?: )?\d{1,18}+ more in the same second(?:: )?")
+_MORE = re.compile(
+    r"(in shadow mode(?:, not done)?: )?"
+    r"\d{1,18}+ more(?: in the same second| in \d{1,18}+ s|, \d{1,18}+ in \d{1,18}+ s, until it ended)(?:: )?"
+)
 _BETWEEN = 8
 
 

@@ -6,10 +6,10 @@ from appliance.channel.messages.message import Message
 
 
 class StateOwner(msgspec.Struct, frozen=True):
-    """A monitor, identified by the digest of its state. `holds`: it holds its topics if the state is lost."""
+    """A monitor, identified by the digest of its state. If the state is lost, it holds the topics `held`."""
 
     identity: str
-    holds: bool
+    held: frozenset[str]
     position: str
 
 

@@ -522,7 +522,8 @@ class MonitorEvent(msgspec.Struct, frozen=True, array_like=True):
 
     `before` and `after` are the first bytes of the message; `size` is its whole length. For a change, `monitor` is
     the last one; `changed_by` in the detail names the events of all. `host` and `caller_id` identify the message's
-    sender; they are empty for timed events, and `caller_id` for a count of several senders.
+    sender; they are empty for timed events, and `caller_id` for a count of several senders. `safe`: the monitor stops
+    the topic: it sent its safe message there, or put it in the place of the message.
     """
 
     kind: str
@@ -538,6 +539,7 @@ class MonitorEvent(msgspec.Struct, frozen=True, array_like=True):
     count: int = 0
     host: str = ""
     caller_id: str = ""
+    safe: bool = False
 
 
 class MonitorsReported(Message):

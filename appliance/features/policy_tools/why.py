@@ -60,6 +60,7 @@ def _own_lines(record: AuditRecord, host_in_words: Callable[[str], str]) -> Iter
         message = f"message {', '.join(sent)} of " if sent else ""
         when = f", {rfc3339(record.time)}" if author else ""
         yield f"by: {message}{' '.join(who) or 'unknown'}{when}"
+    yield from _of_stop(detail)
     if record.rule is not None:
         yield f"rule: {rule_text(record.rule)}"
     places = _list(detail.get("at"))
@@ -87,6 +88,13 @@ def _own_lines(record: AuditRecord, host_in_words: Callable[[str], str]) -> Iter
     is_verdict = record.event == "monitor verdict" or detail.get("would") == "verdict" or "handler" in detail
     if is_verdict and "why" not in detail and "count" not in detail:
         yield "because: the causing events are no longer known, or that second had too many verdicts to record them"
+
+
+def _of_stop(detail: Mapping[str, Any]) -> Iterator[str]:
+    if "cause" in detail:
+        yield f"cause: {detail['cause']}"
+    for publisher in map(_mapping, _list(detail.get("publishers"))):
+        yield f"published by: {publisher.get('node')} on {publisher.get('host')}"
 
 
 def _recorded(record: AuditRecord) -> Iterator[str]:

@@ -10,7 +10,7 @@ from appliance.channel.answers.field_docs import NanoMoment, doc
 OPERATORS = "operators"
 """The payer of recordings that operators order. Other recordings are charged as control's `charged_to` decides."""
 
-TriggerKind = Literal["drop", "change", "verdict", "denial", "alarm", "fault", "service", "order"]
+TriggerKind = Literal["drop", "change", "verdict", "stop", "denial", "alarm", "fault", "service", "order"]
 EventKind = Literal["drop", "change", "verdict", "denial", "alarm", "fault", "notice"]
 
 

@@ -49,6 +49,8 @@ _LONGEST_TEXT = 300
 
 def kinds_of(event: str, decision: str | None, severity: Severity) -> list[TriggerKind]:
     kinds: list[TriggerKind] = [_BY_EVENT[event]] if event in _BY_EVENT else []
+    if event == "stop begun":
+        kinds += ["stop", "change"]  # a message that becomes the safe one is changed
     if decision == "deny":
         kinds.append("denial")
     if severity is Severity.ALARM:

@@ -32,8 +32,8 @@ class RecorderRules(FeatureSection):
         ],
         description="names or types that are never recorded; default: cameras and microphones",
     )
-    triggers: list[Literal["drop", "change", "verdict", "fault", "denial", "alarm", "service"]] = key(
-        default=["drop", "verdict", "fault", "alarm", "service"],
+    triggers: list[Literal["drop", "change", "verdict", "fault", "stop", "denial", "alarm", "service"]] = key(
+        default=["drop", "verdict", "fault", "stop", "alarm", "service"],
         description="triggers of a recording, besides an operator; service: a node's call, if the policy lets it",
     )
     per_hour: Count = key(

@@ -21,7 +21,7 @@ def hold_begun(monitors: "MonitorSet", message: SpecificationsStated, switches: 
             monitors.hold_lost(
                 monitor, "it moved to another relay process, and its state remained in the previous one"
             )
-        if monitor.name in message.unbuilt and not monitor.code.begins:
+        if monitor.name in message.unbuilt and monitor.held_channels and not monitor.code.begins:
             monitors.hold(monitor, f"its file has an error: {message.unbuilt[monitor.name]}")
         if monitor.why_held and not switches.get(monitor.name, True):
             monitors.resume(monitor.name)

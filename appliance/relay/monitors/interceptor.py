@@ -9,7 +9,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from appliance.base import clock
@@ -53,8 +53,8 @@ class Interceptor:
 
     `changed(topics)` is called when monitors may want other topics; `topics` are those whose messages may now be
     judged differently (None: all). `holder(host)` is charged for the slices that a host's messages create,
-    `payer(host)` for their processor time. A message that takes more than `budget` seconds of processor time is cut
-    off, which is a fault.
+    `payer(host)` for their processor time. `publishers(topic)` returns the nodes that publish a topic now. A message
+    that takes more than `budget` seconds of processor time is cut off, which is a fault.
     """
 
     def __init__(
@@ -67,6 +67,7 @@ class Interceptor:
         changed: Callable[[frozenset[str] | None], None],
         holder: Callable[[str], str] = str,
         payer: Callable[[str], str] = str,
+        publishers: Callable[[str], Sequence[ObservationPoint]] = lambda _topic: (),
     ) -> None:
         self._loop = loop
         self.budget = budget
@@ -93,7 +94,9 @@ class Interceptor:
         self.senders = Senders()
         self._publish = publish
         self._keeper: StateKeeper | None = None
-        self.observer = Observer(self.observations, self._published, self.senders, held=self._tell_held)
+        self.observer = Observer(
+            self.observations, self._published, self.senders, held=self._tell_held, publishers=publishers
+        )
         self._shadow_observer = Observer(self.observations, lambda _published: None, self.senders, "shadow ")
         self.shadow = ShadowMonitors(loop, self.now, self._shadow_observer)
 
@@ -150,6 +153,7 @@ class Interceptor:
         hold_begun(result, message, self._switches)
         if self._keeper is not None:
             self._keeper.take(result)
+        self.observer.take(result)
         self.observer.keep([monitor.name for monitor in result.monitors], began, now)
         self.observer.report(outcome, NOWHERE)
         self.shadow.take(result, outcome)

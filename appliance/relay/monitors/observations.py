@@ -33,8 +33,11 @@ _INTEGERS = range(-(1 << 63), 1 << 64)
 
 _NOTHING: Mapping[str, Any] = MappingProxyType({})
 
-_Key = tuple[str, str, str, str, str, str]
-"""Kind, monitor, key of the incarnation, resource, host, distinction: clients of one host are counted together."""
+_Key = tuple[str, str, str, str, str, str, bool]
+"""Kind, monitor, key of the incarnation, resource, host, distinction, and whether the monitor stops the topic.
+
+Clients of one host are counted together.
+"""
 
 
 @dataclass(slots=True)
@@ -96,6 +99,7 @@ class Observations:
         text: str,
         *,
         distinction: str = "",
+        safe: bool = False,
         only_number: bool = False,
         shared: Mapping[str, Any] = _NOTHING,
         detail: Mapping[str, Any] | None = None,
@@ -106,14 +110,15 @@ class Observations:
     ) -> None:
         """Report an event about the `observed` message, or count it if its kind was already reported in this second.
 
-        `shared` is the detail of the count; with `only_number`, the count has no text.
+        `shared` is the detail of the count; with `only_number`, the count has no text. `safe`: the monitor sent its
+        safe message, or put it in the place of the message.
         """
         text = text[:LONGEST_TEXT]
-        repeated = self._repeated(kind, monitor, point, distinction)
+        repeated = self._repeated(kind, monitor, point, distinction, safe=safe)
         if repeated is not None:
             repeated.add(1, time, time, "" if only_number else text)
             return
-        self._begin(kind, monitor, point, distinction, shared)
+        self._begin(kind, monitor, point, distinction, shared, safe=safe)
         plain = _plain({**(detail or {}), **(observed.detail() if observed is not None else {})})
         self._add(
             MonitorEvent(
@@ -129,6 +134,7 @@ class Observations:
                 size,
                 host=point.host,
                 caller_id=point.caller_id,
+                safe=safe,
             )
         )
 
@@ -144,14 +150,15 @@ class Observations:
         first: int = 0,
         distinction: str = "",
         shared: Mapping[str, Any] = _NOTHING,
+        safe: bool = False,
     ) -> None:
-        repeated = self._repeated(kind, monitor, point, distinction)
+        repeated = self._repeated(kind, monitor, point, distinction, safe=safe)
         if repeated is None:
-            repeated = self._begin(kind, monitor, point, distinction, shared)
+            repeated = self._begin(kind, monitor, point, distinction, shared, safe=safe)
         repeated.add(count, first, time, text)
 
     def was_reported(self, kind: str, monitor: str, point: ObservationPoint, distinction: str = "") -> bool:
-        return self._key(kind, monitor, point, distinction) in self._told
+        return self._key(kind, monitor, point, distinction, safe=False) in self._told
 
     @property
     def some(self) -> bool:
@@ -169,26 +176,33 @@ class Observations:
         self._counted = []
         self.flush()
 
-    def _key(self, kind: str, monitor: str, point: ObservationPoint, distinction: str) -> _Key:
-        key = (kind, monitor, *point[:3], distinction[:LONGEST_TEXT])
+    def _key(self, kind: str, monitor: str, point: ObservationPoint, distinction: str, *, safe: bool) -> _Key:
+        key = (kind, monitor, *point[:3], distinction[:LONGEST_TEXT], safe)
         beyond = key not in self._told and self._distinct.get((kind, monitor), 0) >= _DISTINCT
-        return (kind, monitor, *point[:3], "") if beyond else key
+        return (kind, monitor, *point[:3], "", safe) if beyond else key
 
     def _repeated(
-        self, kind: str, monitor: str, point: ObservationPoint, distinction: str
+        self, kind: str, monitor: str, point: ObservationPoint, distinction: str, *, safe: bool
     ) -> _Repeated | None:
-        repeated = self._told.get(self._key(kind, monitor, point, distinction))
+        repeated = self._told.get(self._key(kind, monitor, point, distinction, safe=safe))
         if repeated is not None and repeated.caller_id != point.caller_id:
             repeated.caller_id = ""
         return repeated
 
     def _begin(
-        self, kind: str, monitor: str, point: ObservationPoint, distinction: str, shared: Mapping[str, Any]
+        self,
+        kind: str,
+        monitor: str,
+        point: ObservationPoint,
+        distinction: str,
+        shared: Mapping[str, Any],
+        *,
+        safe: bool,
     ) -> _Repeated:
-        key = self._key(kind, monitor, point, distinction)
-        if key[-1]:
+        key = self._key(kind, monitor, point, distinction, safe=safe)
+        if key[-2]:
             self._distinct[kind, monitor] = self._distinct.get((kind, monitor), 0) + 1
-        self._told[key] = _Repeated(point.caller_id, shared if key[-1] else _NOTHING)
+        self._told[key] = _Repeated(point.caller_id, shared if key[-2] else _NOTHING)
         return self._told[key]
 
     def _add(self, event: MonitorEvent) -> None:
@@ -217,7 +231,7 @@ class Observations:
 
 
 def _count_of(key: _Key, repeated: _Repeated) -> MonitorEvent:
-    kind, monitor, owner, resource, host, _distinction = key
+    kind, monitor, owner, resource, host, _distinction, safe = key
     return MonitorEvent(
         kind,
         monitor,
@@ -229,6 +243,7 @@ def _count_of(key: _Key, repeated: _Repeated) -> MonitorEvent:
         count=repeated.count,
         host=host,
         caller_id=repeated.caller_id,
+        safe=safe,
     )
 
 

@@ -5,7 +5,7 @@ A change by several monitors is one record under the last of them, but counts fo
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -30,6 +30,8 @@ if TYPE_CHECKING:
     from rosmop.run.outcomes import Published
 
 _EXPLAINED = 10
+_PUBLISHERS = 8
+"""The most publishers that the report of a stop names."""
 
 
 @dataclass(slots=True)
@@ -50,10 +52,17 @@ class Observer:
         publish: Callable[[Published], None],
         senders: Senders,
         prefix: str = "",
+        *,
         held: Callable[[], None] = lambda: None,
+        publishers: Callable[[str], Sequence[ObservationPoint]] = lambda _topic: (),
     ) -> None:
-        """`held()` is called when monitors have begun to hold their topics."""
+        """`held()` is called when monitors have begun to hold their topics.
+
+        `publishers(topic)` returns the nodes that publish a topic now.
+        """
         self._held = held
+        self._publishers = publishers
+        self._monitors: MonitorSet | None = None
         self.senders = senders
         self._explained = 0
         self._observations = observations
@@ -64,6 +73,9 @@ class Observer:
         self._again: dict[tuple[tuple[str, ...], ObservationPoint], int] = {}
         self._shown: set[ObservationPoint] = set()
         self._owed: list[FastPathCounts] = []
+
+    def take(self, monitors: MonitorSet) -> None:
+        self._monitors = monitors
 
     def keep(self, names: list[str], began: list[str], time: int) -> None:
         self._sum_up(time)
@@ -119,20 +131,66 @@ class Observer:
             self.report_line(
                 line.monitor, line.level, line.text, point=point, time=outcome.time, observed=observed
             )
-        for number, published in enumerate(() if outcome.repeated else outcome.published):
-            self._observations.note(
-                f"{self._prefix}{'call' if published.is_call else 'publish'}",
-                published.monitor,
-                _of_publication(point, published.topic),
-                outcome.time,
-                f"{published.type} on {published.topic}",
-                detail={"because_of": point.resource, **of_published(outcome, number, self._who)},
-                observed=observed,
-                after=published.data[:SHOWN],
-                size=len(published.data),
-            )
+        for number, published in enumerate(outcome.published):
+            self._published(outcome, number, point, observed)
             if (judged := outcome.judged.get(number)) is not None:
                 self._judged(judged, _of_publication(point, published.topic), published.data)
+
+    def _published(
+        self, outcome: Outcome, number: int, point: ObservationPoint, observed: ObservedMessage | None
+    ) -> None:
+        published = outcome.published[number]
+        kind = f"{self._prefix}{'call' if published.is_call else 'publish'}"
+        target = _of_publication(point, published.topic)
+        safe = self._is_safe(published.monitor, published.topic, published.data)
+        if outcome.repeated:
+            self._observations.add(
+                kind, published.monitor, target, outcome.time, 1, first=outcome.time, safe=safe
+            )
+            return
+        self._observations.note(
+            kind,
+            published.monitor,
+            target,
+            outcome.time,
+            f"{published.type} on {published.topic}",
+            safe=safe,
+            detail={
+                "because_of": point.resource,
+                **of_published(outcome, number, self._who),
+                **(self._cause(outcome, published.monitor, published.topic) if safe else {}),
+            },
+            observed=observed,
+            after=published.data[:SHOWN],
+            size=len(published.data),
+        )
+
+    def _is_safe(self, monitor: str, topic: str, data: bytes | bytearray | memoryview) -> bool:
+        monitors = self._monitors
+        return not self._prefix and monitors is not None and monitors.sends_safe(monitor, topic, data)
+
+    def _cause(self, outcome: Outcome, monitor: str, topic: str) -> Mapping[str, object]:
+        """Return why a monitor stops a topic: its own last line, the fault, or why it cannot judge."""
+        assert self._monitors is not None  # noqa: S101  they have stopped it
+        lines = [line.text for line in outcome.log if line.monitor == monitor]
+        faults = [fault.text for fault in outcome.faults if fault.monitor == monitor]
+        instance = self._monitors.monitor(monitor)
+        cause = ""
+        if faults:
+            cause = f"a fault: {faults[-1]}"
+        elif lines:
+            cause = lines[-1]
+        elif instance.held:
+            cause = (
+                f"it holds its topics: {instance.why_held}" if instance.why_held else "it holds its topics"
+            )
+        elif instance.broken:
+            cause = "its initial values or `init` faulted"
+        elif topic in instance.starting:
+            cause = "no command has come since it began"
+        nodes = [] if outcome.timer is None else self._publishers(topic)
+        found = [{"node": one.caller_id, "host": one.host} for one in nodes[:_PUBLISHERS]]
+        return {**({"cause": cause} if cause else {}), **({"publishers": found} if found else {})}
 
     def _send(self, outcome: Outcome) -> None:
         for earlier in outcome.before:
@@ -186,6 +244,7 @@ class Observer:
         self._shown.add(point)
         monitors = self._count_change(outcome.changed_by, 1)
         together = _together(outcome.changed_by)
+        safe = self._is_safe(monitors[-1], point.resource, outcome.buffer)
         self._observations.note(
             f"{self._prefix}change",
             monitors[-1],
@@ -193,8 +252,12 @@ class Observer:
             outcome.time,
             _of_change(monitors),
             distinction=", ".join(together),
+            safe=safe,
             shared={"changed_by": together} if together else {},
-            detail=of_change(outcome, self._who),
+            detail={
+                **of_change(outcome, self._who),
+                **(self._cause(outcome, monitors[-1], point.resource) if safe else {}),
+            },
             before=before,
             after=bytes(outcome.buffer[:SHOWN]),
             size=size,
@@ -276,6 +339,7 @@ class Observer:
                 text=_of_change(monitors),
                 distinction=", ".join(together),
                 shared={"changed_by": together} if together else {},
+                safe=bool(self._monitors and not self._prefix and self._monitors.only_stops(events[-1])),
             )
         self._again.clear()
 

@@ -8,7 +8,7 @@ from rosmop.tests.acting import message
 from tests.support.virtual_clock import VirtualClock
 from tests.unit.relay.monitors.quiet import QuietMonitors
 
-EVENT = "event e() /cmd_vel geometry_msgs/Twist '{}' { }"
+EVENT = "event e(double v) /cmd_vel geometry_msgs/Twist '{linear.x:v}' { if (v > 9) { return; } }"
 ERROR = "0.rv:1:5: error: unknown variable `missing`"
 
 

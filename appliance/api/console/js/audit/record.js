@@ -25,7 +25,7 @@ const [FIRST_TIME, LAST_TIME] = [1e17, 4.1e18]; // nanoseconds: the years 1973 t
 const ID = /^[0-9a-f]{20}$/;
 const GIVEN = new Set(["revoked", "connection refused"]);
 const SHOWN_APART = new Set(["before", "after", "before_fields", "after_fields", "at", "timer", "conditions", "values", "handler", "why"]);
-const MONITORS = new Set(["monitor verdict", "message dropped", "message changed", "monitor fault", "monitor called", "monitor published", "shadow observed"]);
+const MONITORS = new Set(["monitor verdict", "message dropped", "message changed", "monitor fault", "monitor called", "monitor published", "shadow observed", "stop begun", "stop ended"]);
 
 /** @param {{id: string, filter: Record<string, string>}} given */
 export function RecordPanel({ id, filter }) {

@@ -109,7 +109,7 @@ function History(/** @type {{path: string, row: any}} */ { path, row }) {
 }
 
 function tone(/** @type {any} */ one) {
-  return { "message dropped": "warn", "monitor fault": "deny", "message changed": "note", "monitor verdict": "note" }[/** @type {string} */ (one.event)] ?? "";
+  return { "message dropped": "warn", "monitor fault": "deny", "message changed": "note", "stop begun": "warn", "stop ended": "note", "monitor verdict": "note" }[/** @type {string} */ (one.event)] ?? "";
 }
 
 function Remove(/** @type {any} */ { name, row, path, monitors, close }) {

@@ -27,7 +27,7 @@ export function Doings() {
   const doings = useStore(notable, (one) => one.doings);
   return html`<section class="panel" aria-labelledby="doings"><div class="panel-head"><h2 id="doings">Recent actions of monitors</h2>
       <span class="end"><${Link} to="/console/audit?category=monitor&since=1d" class="small">All in the audit log</${Link}></span></div>
-    ${doings === null ? html`<${Loading} />` : !doings.length ? html`<${Empty} icon="monitors" title="No monitor acted in the last day">Verdicts, dropped and changed messages appear here.</${Empty}>`
+    ${doings === null ? html`<${Loading} />` : !doings.length ? html`<${Empty} icon="monitors" title="No monitor acted in the last day">Stops, verdicts, dropped and changed messages appear here.</${Empty}>`
       : html`<${List} records=${doings} what=${done} />`}</section>`;
 }
 
@@ -54,6 +54,6 @@ function done(/** @type {import("../audit/rows.js").Row} */ row, /** @type {any}
   const { value } = row;
   const one = shownOf(row);
   return html`<span class="event-badge"><${Badge} word=${one.event.replace(/^(monitor|message) /, "")} tone=${one.severity === "alarm" ? "deny" : one.severity === "warning" ? "warn" : "note"} /></span><div class="event-body">
-    <div><strong><${Given} value=${one.detail.monitor} most=${60} /></strong> <span class="muted">on</span> <${Given} value=${one.resource} most=${80} mono />${count}</div>
+    <div><strong><${Given} value=${one.detail.monitor} most=${60} /></strong> <span class="muted">on</span> <${Given} value=${one.resource} most=${80} mono />${one.caller_id && html` <span class="muted">by</span> <${Given} value=${one.caller_id} most=${60} mono /> <span class="muted">of</span> <${Host} value=${one.host} none="no address" />`}${count}</div>
     <div class="event-reason"><${Link} to=${`/console/audit/${one.id}`}><${Given} value=${value || one.reason || one.detail.category || one.event} most=${200} /></${Link}></div></div>`;
 }

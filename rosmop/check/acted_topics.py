@@ -1,0 +1,102 @@
+"""Find the topics, and parts of services, on which a specification acts: all others it only observes.
+
+It acts where it may drop or change a message, replace it by the safe message, withhold it, or publish one. While it
+cannot judge, it holds these topics and nothing else.
+"""
+
+from collections.abc import Iterator, Mapping
+
+from rosmop.form import nodes
+from rosmop.form.compiled import SpecificationCode
+from rosmop.form.connected_groups import channel_of
+from rosmop.text import tree
+
+_DROPS = (tree.DropStatement, tree.ReturnStatement, tree.StopStatement)
+_READING = frozenset({"size", "length", "empty", "at", "front", "back", "c_str", "find", "rfind", "substr",
+                      "compare", "toSec", "toNSec", "isZero"})  # fmt: skip
+"""Members that change nothing; any other may change a field of the message."""
+
+
+def acted_topics(code: SpecificationCode, functions: Mapping[str, nodes.Function]) -> tuple[str, ...]:
+    """Return the channels of the specification's own events on which it acts, in order."""
+    channels = {event.channel for event in code.events if event.channel is not None}
+    acted = {safe.topic for safe in code.safes} | {one.topic for one in code.withholdings}
+    acted |= {
+        node.topic
+        for function in functions.values()
+        if function.context == code.context
+        for node in nodes.walk(function)
+        if isinstance(node, nodes.Publish) and not node.service
+    }
+    acted |= {event.channel for event in code.events if _acts(functions[event.function])}
+    for declared in code.properties:
+        acting = {name for name, function in declared.handlers.items() if _acts(functions[function])}
+        acted |= {
+            code.events[number].channel
+            for number in range(len(declared.property.events))
+            if acting & declared.property.categories_after(number)
+        }
+    return tuple(sorted(channels.intersection(acted)))
+
+
+def written_topics(specification: tree.Specification) -> tuple[str, ...]:
+    """Return the channels on which the text of a specification that cannot be compiled may act, and perhaps more."""
+    helpers = {one.name for one in specification.functions if _takes_references(one)}
+    acting = any(
+        isinstance(node, _DROPS)
+        for declared in specification.properties
+        for node in tree.walk(declared.handlers)
+    )
+    acted = {safe.topic for safe in specification.safes} | {one.topic for one in specification.withholds}
+    acted |= {
+        node.topic for node in tree.walk(specification.events) if isinstance(node, tree.PublishStatement)
+    }
+    return tuple(
+        sorted({
+            channel
+            for event, channel in _channels(specification)
+            if acting or channel in acted or _may_act(event, helpers)
+        })
+    )  # fmt: skip
+
+
+def _acts(function: nodes.Function) -> bool:
+    return any(
+        isinstance(node, nodes.Drop) or (isinstance(node, nodes.WriteBack) and node.writes)
+        for node in nodes.walk(function)
+    )
+
+
+def _channels(specification: tree.Specification) -> Iterator[tuple[tree.EventDefinition, str]]:
+    for event in specification.events:
+        trigger = event.trigger
+        if isinstance(trigger, tree.MessageTrigger):
+            yield event, trigger.topic if trigger.part is None else channel_of(trigger.topic, trigger.part)
+
+
+def _takes_references(function: tree.FunctionDefinition) -> bool:
+    return any(one.type.reference and not one.type.constant for one in function.parameters)
+
+
+def _may_act(event: tree.EventDefinition, helpers: set[str]) -> bool:
+    own = {parameter.name for parameter in event.parameters}
+    for node in tree.walk((event.action, event.after)):
+        if isinstance(node, tree.DropStatement | tree.ReturnStatement):
+            return True
+        if isinstance(node, tree.Assignment | tree.IncrementExpression) and _root(node.target) in own:
+            return True
+        if isinstance(node, tree.CallExpression) and (
+            _root(node.callee) in helpers or _changes(node.callee, own)
+        ):
+            return True
+    return False
+
+
+def _changes(callee: tree.Expression, own: set[str]) -> bool:
+    return isinstance(callee, tree.MemberAccess) and callee.name not in _READING and _root(callee) in own
+
+
+def _root(expression: tree.Expression) -> str:
+    while isinstance(expression, tree.MemberAccess | tree.IndexExpression):
+        expression = expression.base
+    return expression.parts[-1] if isinstance(expression, tree.Name) else ""

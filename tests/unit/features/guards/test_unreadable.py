@@ -1,0 +1,128 @@
+"""Bytes that are not a message, on a topic that a guard observes, put it in doubt: it stops what it guards."""
+
+from collections.abc import Callable
+
+import pytest
+
+from appliance.features.guards.presets import PRESETS, Guard, text_of
+from rosmop.check.sources import compiled_from
+from rosmop.form.compiled import Compiled
+from rosmop.run.engine import MonitorSet
+from rosmop.tests.acting import message
+from rosmop.tests.on_module import on_module
+from tests.unit.features.guards.guarding import DEFINITIONS
+
+SECOND = 10**9
+DRIVE = message("geometry_msgs/Twist", linear__x=0.1)
+ODOMETRY = message("nav_msgs/Odometry", pose__pose__orientation__w=1.0, child_frame_id="base")
+SCAN = message("sensor_msgs/LaserScan", range_max=30.0, angle_min=-3.14, angle_increment=0.0174,
+               ranges=[9.0 + 0.01 * number for number in range(361)])  # fmt: skip
+BATTERY = message("sensor_msgs/BatteryState", percentage=0.9, location="front")
+GOOD = {
+    "separation": {"by": SCAN},
+    "fence": {"by": ODOMETRY},
+    "sensor": {"by": SCAN},
+    "agree": {"other": ODOMETRY, "by": ODOMETRY},
+    "arm": {"by": BATTERY, "fix": message("sensor_msgs/NavSatFix"), "check": message("std_msgs/Bool", data=True)},
+    "estop": {"stop": message("std_msgs/Bool"), "reset": message("std_msgs/Bool")},
+}  # fmt: skip
+"""For each preset with a safe message that observes topics: messages after which the base may move."""
+SEND_NOTHING = {
+    "answer": "its goals are cancelled at their deadlines",
+    "withhold": "it withholds until a message",
+}
+MADE = pytest.mark.parametrize("made", [MonitorSet.of, on_module], ids=["interpreter", "module"])
+DAMAGE: dict[str, Callable[[bytes], bytes]] = {
+    "empty": lambda _: b"",
+    "half": lambda data: data[: len(data) // 2],
+    "cut": lambda data: data[:-1],
+    "trailing": lambda data: data + b"\0",
+    "other": lambda data: bytes(len(data) + 40),
+}
+
+
+def started(name: str, made: Callable[[Compiled], MonitorSet]) -> MonitorSet:
+    monitors = made(compiled_from({"guard.rv": text_of(Guard(name, PRESETS[name]))}, DEFINITIONS))
+    monitors.start(0)
+    return monitors
+
+
+def test_the_table_has_each_preset_that_observes_a_topic() -> None:
+    observed = {name: set(preset.given_topics) - {"command", "cancel"} for name, preset in PRESETS.items()}
+    assert {name: set(messages) for name, messages in GOOD.items()} == {
+        name: topics for name, topics in observed.items() if topics and name not in SEND_NOTHING
+    }
+
+
+@MADE
+@pytest.mark.parametrize("damage", DAMAGE)
+@pytest.mark.parametrize(
+    ("name", "damaged"), [(name, topic) for name, given in GOOD.items() for topic in given]
+)
+def test_a_moving_base_is_stopped_by_an_unreadable_observation(
+    name: str, damaged: str, damage: str, made: Callable[[Compiled], MonitorSet]
+) -> None:
+    monitors, topics, now = started(name, made), PRESETS[name].given_topics, SECOND
+    for _ in range(8):
+        for topic, data in GOOD[name].items():
+            now += SECOND // 100
+            monitors.judge(topics[topic], bytearray(data), now)
+    assert monitors.judge("/cmd_vel", bytearray(DRIVE), now).result == "passed"
+    outcome = monitors.judge(topics[damaged], bytearray(DAMAGE[damage](GOOD[name][damaged])), now + 1)
+    assert [one.malformed for one in outcome.faults] == [True]
+    sent = [one.data for each in monitors.advance(now + 2) for one in each.sent()]
+    assert sent == [bytes(48)]
+    driven = monitors.judge("/cmd_vel", bytearray(DRIVE), now + 3)
+    assert driven.result == ("dropped" if name == "estop" else "changed")
+    assert bytes(driven.buffer) != DRIVE or driven.result == "dropped"
+    for topic, data in GOOD[name].items():
+        if topic != damaged:
+            assert monitors.judge(topics[topic], bytearray(data), now + 4).result == "passed"
+    monitors.judge("/cmd_vel", bytearray(DRIVE), now + 5)
+    if name == "estop":
+        assert monitors.judge("/cmd_vel", bytearray(bytes(48)), now + 6).result == "passed"
+        monitors.resume("estop")
+        assert monitors.judge("/cmd_vel", bytearray(DRIVE), now + 7).result == "passed"
+
+
+def test_a_goal_is_cancelled_in_time_despite_an_unreadable_result() -> None:
+    """The message belongs to no goal, so it ends none."""
+    monitors = started("answer", MonitorSet.of)
+    goal = bytearray(bytes(DEFINITIONS.layout("move_base_msgs/MoveBaseActionGoal").minimum))
+    head = bytes(16)  # header, and the stamp of the goal's id
+    goal = bytearray(head[:16] + bytes(8) + b"\1\0\0\0a" + goal[28:])
+    assert monitors.judge("/move_base/goal", goal, SECOND).result == "passed"
+    outcome = monitors.judge("/move_base/result", bytearray(b"\1"), 2 * SECOND)
+    assert [one.malformed for one in outcome.faults] == [True]
+    sent = [one.topic for each in monitors.advance(200 * SECOND) for one in each.sent()]
+    assert sent == ["/move_base/cancel"]
+
+
+@MADE
+def test_the_topic_is_withheld_after_an_unreadable_switch(made: Callable[[Compiled], MonitorSet]) -> None:
+    monitors = started("withhold", made)
+    monitors.judge("/privacy", bytearray(b"\0"), 1)
+    assert monitors.withheld_from("/camera/image_raw") == ()
+    monitors.judge("/privacy", bytearray(b"\0\0"), 2)
+    assert monitors.withheld_from("/camera/image_raw") == ("0.0.0.0/0", "::/0")
+
+
+@MADE
+@pytest.mark.parametrize("part", ["request", "response"])
+@pytest.mark.parametrize("damage", ["cut", "trailing"])
+def test_an_unreadable_observation_of_a_service(
+    part: str, damage: str, made: Callable[[Compiled], MonitorSet]
+) -> None:
+    field, data = ("data", b"\1") if part == "request" else ("success", b"\1\0\0\0\0")
+    text = f"""guard() {{ safe geometry_msgs/Twist {{ }} on /cmd_vel every 100ms; bool off = false;
+        event arm(bool on) service /arm std_srvs/SetBool {part} '{{{field}:on}}' {{ off = !on; }}
+        event drive() /cmd_vel geometry_msgs/Twist '{{}}' {{ if (off) {{ STOP; }} }} }}"""
+    monitors = made(compiled_from({"guard.rv": text}, DEFINITIONS))
+    monitors.start(0)
+    channel = monitors.channel_of("/arm", part)
+    assert monitors.judge(channel, bytearray(data), 1).result == "passed"
+    assert monitors.judge("/cmd_vel", bytearray(DRIVE), 2).result == "passed"
+    outcome = monitors.judge(channel, bytearray(DAMAGE[damage](data)), 3)
+    assert (outcome.result, outcome.began_holding) == ("dropped", ("guard",))
+    assert monitors.judge("/cmd_vel", bytearray(DRIVE), 4).result == "dropped"
+    assert monitors.judge(channel, bytearray(data), 5).result == "passed"
