@@ -20,7 +20,7 @@ _READING = frozenset({"size", "length", "empty", "at", "front", "back", "c_str",
 def acted_topics(code: SpecificationCode, functions: Mapping[str, nodes.Function]) -> tuple[str, ...]:
     """Return the channels of the specification's own events on which it acts, in order."""
     channels = {event.channel for event in code.events if event.channel is not None}
-    acted = {safe.topic for safe in code.safes} | {one.topic for one in code.withholdings}
+    acted: set[str | None] = {safe.topic for safe in code.safes} | {one.topic for one in code.withholdings}
     acted |= {
         node.topic
         for function in functions.values()
@@ -36,7 +36,7 @@ def acted_topics(code: SpecificationCode, functions: Mapping[str, nodes.Function
             for number in range(len(declared.property.events))
             if acting & declared.property.categories_after(number)
         }
-    return tuple(sorted(channels.intersection(acted)))
+    return tuple(sorted(channel for channel in channels if channel in acted))
 
 
 def written_topics(specification: tree.Specification) -> tuple[str, ...]:

@@ -16,12 +16,20 @@ from rosmop.form.sites import Site, Symbols
 from rosmop.run.guards import guards_of
 
 
-def with_observed_topics(compiled: Compiled, symbols: Symbols) -> Compiled:
+class _EndSymbols(Symbols):
+    """Names that no other part of the compiler makes."""
+
+    def fresh(self, prefix: str) -> str:
+        return super().fresh(f"{prefix}end")
+
+
+def with_observed_topics(compiled: Compiled) -> Compiled:
     """Return the set with `acts_on` of each specification; functions that read an observed message first find its end.
 
     Only events on which the actions of a specification depend need this.
     """
-    functions = dict(compiled.functions)
+    functions, symbols = dict(compiled.functions), _EndSymbols()
+    symbols.sites = [*compiled.sites]
     codes = tuple(replace(one, acts_on=acted_topics(one, functions)) for one in compiled.specifications)
     compiled = replace(compiled, specifications=codes)
     observing = guards_of(compiled).observing
@@ -31,7 +39,7 @@ def with_observed_topics(compiled: Compiled, symbols: Symbols) -> Compiled:
             if event.function in observing:
                 name = event.key or event.function
                 functions[name] = _checked(functions[name], event, compiled, symbols)
-    return replace(compiled, functions=functions)
+    return replace(compiled, functions=functions, sites=symbols.sites)
 
 
 def _checked(

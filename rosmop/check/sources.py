@@ -6,6 +6,7 @@ from types import MappingProxyType
 
 from rosmop.check.acted_topics import written_topics
 from rosmop.check.givens import Topics, with_topics
+from rosmop.check.observed_topics import with_observed_topics
 from rosmop.check.specification import compile_files, findings_of
 from rosmop.form.compiled import Compiled
 from rosmop.form.findings import Diagnostic, SpecificationError
@@ -44,7 +45,7 @@ def compiled_from(
             findings += error.findings
     if findings:
         raise SpecificationError([*findings, *findings_of(files, definitions)])
-    compiled = compile_files(files, definitions, margins=margins, topics=topics)
+    compiled = with_observed_topics(compile_files(files, definitions, margins=margins, topics=topics))
     if not written:
         return compiled
     codes = tuple(replace(one, acts_on=written.get(one.name, one.acts_on)) for one in compiled.specifications)

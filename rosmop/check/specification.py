@@ -42,7 +42,6 @@ from rosmop.check.specification_lint import (
     unused_events,
 )
 from rosmop.check.traps import rival_changes, traps
-from rosmop.check.observed_topics import with_observed_topics
 from rosmop.check.withholdings import withholdings
 from rosmop.form import nodes
 from rosmop.form.compiled import Compiled, PropertyCode, SpecificationCode
@@ -86,7 +85,7 @@ def compile_files(
     findings = list(dict.fromkeys(shared.findings))
     if any(finding.severity == "error" for finding in findings):
         raise SpecificationError(findings)
-    whole = Compiled(
+    return Compiled(
         tuple(compiled),
         tuple(sorted(findings, key=lambda finding: finding.position)),
         shared.functions,
@@ -96,7 +95,6 @@ def compile_files(
         tuple(shared.publications),
         tuple(shared.calls),
     )
-    return with_observed_topics(whole, shared.symbols)
 
 
 def findings_of(files: Sequence[tree.SpecificationFile], definitions: Definitions) -> list[Diagnostic]:

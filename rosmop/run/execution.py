@@ -710,7 +710,7 @@ class MonitorExecution:
     ) -> None:
         fault: Fault = _fault_of(error, self._interpreter, monitor.name, otherwise)
         # Bytes on an observed topic that are not a message may stand for one that would have changed the state; on
-        # other topics nobody gets them.
+        # other topics they reach no subscriber.
         malformed, function = isinstance(error, MalformedError | struct.error), self._function
         outdates = function in self._guards.observing if malformed else function not in self._guards.judging
         fault = replace(fault, outdates=outdates, malformed=malformed)

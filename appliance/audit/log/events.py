@@ -193,7 +193,9 @@ EVENTS: dict[str, str] = {
     "log failed": "The log could not be written for some time and is written again; `reason` says why.",
 }
 
-MONITOR_ACTIONS = frozenset({"message dropped", "message changed", "monitor verdict", "monitor fault", "stop begun"})
+MONITOR_ACTIONS = frozenset(
+    {"message dropped", "message changed", "monitor verdict", "monitor fault", "stop begun"}
+)
 """The events of monitors that start a recording if `recorder.triggers` lists them."""
 
 SEVERITIES: dict[str, Severity] = {
