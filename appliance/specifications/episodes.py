@@ -10,8 +10,9 @@
 Times of actions are those of the monitors' clock (nanoseconds), which runs evenly; `now` is monotonic (seconds).
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import msgspec
 
@@ -199,8 +200,10 @@ class Stops:
         return stops
 
 
-def _counted(event: MonitorEvent, known: _GoingOn, more: dict[str, object] | None = None) -> MonitorEvent:
-    detail = {**event.detail, "first_time": known.first, "last_time": known.last, **(more or {})}
+def _counted(
+    event: MonitorEvent, known: _GoingOn, more: Mapping[str, object] = MappingProxyType({})
+) -> MonitorEvent:
+    detail = {**event.detail, "first_time": known.first, "last_time": known.last, **more}
     counted = msgspec.structs.replace(event, count=known.count, detail=detail)
     known.count = 0
     return counted

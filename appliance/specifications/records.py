@@ -86,8 +86,7 @@ class MonitorRecords:
             until=moment(stop.until),
             actions=stop.count,
             begun_in=stop.record,
-            **({"cause": stop.cause} if stop.cause else {}),
-            **more,
+            more={"cause": stop.cause, **more} if stop.cause else more,
         )
 
     def reported(self, events: list[MonitorEvent], lost: int) -> None:

@@ -20,7 +20,8 @@ _READING = frozenset({"size", "length", "empty", "at", "front", "back", "c_str",
 def acted_topics(code: SpecificationCode, functions: Mapping[str, nodes.Function]) -> tuple[str, ...]:
     """Return the channels of the specification's own events on which it acts, in order."""
     channels = {event.channel for event in code.events if event.channel is not None}
-    acted: set[str | None] = {safe.topic for safe in code.safes} | {one.topic for one in code.withholdings}
+    acted: set[str | None] = {None}
+    acted |= {one.topic for one in code.safes} | {one.topic for one in code.withholdings}
     acted |= {
         node.topic
         for function in functions.values()

@@ -38,19 +38,18 @@ _HOUR = 3600 * _SECOND
 _MOST_HOSTS = 4096  # hosts whose last recording's end is remembered
 
 
-_BY_EVENT: dict[str, TriggerKind] = {
-    "message dropped": "drop",
-    "message changed": "change",
-    "monitor verdict": "verdict",
-    "monitor fault": "fault",
+_BY_EVENT: dict[str, tuple[TriggerKind, ...]] = {
+    "message dropped": ("drop",),
+    "message changed": ("change",),
+    "monitor verdict": ("verdict",),
+    "monitor fault": ("fault",),
+    "stop begun": ("stop", "change"),  # the message becomes the safe one
 }
 _LONGEST_TEXT = 300
 
 
 def kinds_of(event: str, decision: str | None, severity: Severity) -> list[TriggerKind]:
-    kinds: list[TriggerKind] = [_BY_EVENT[event]] if event in _BY_EVENT else []
-    if event == "stop begun":
-        kinds += ["stop", "change"]  # a message that becomes the safe one is changed
+    kinds = [*_BY_EVENT.get(event, ())]
     if decision == "deny":
         kinds.append("denial")
     if severity is Severity.ALARM:

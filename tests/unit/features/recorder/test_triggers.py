@@ -18,6 +18,7 @@ KINDS: tuple[TriggerKind, ...] = get_args(TriggerKind)
         (AuditRecord(id="1", time=5, event="message changed"), "change"),
         (AuditRecord(id="1", time=5, event="monitor verdict"), "verdict"),
         (AuditRecord(id="1", time=5, event="monitor fault", severity=Severity.ALARM), "fault"),
+        (AuditRecord(id="1", time=5, event="stop begun", severity=Severity.WARNING), "stop"),
         (AuditRecord(id="1", time=5, event="decision", decision="deny"), "denial"),
         (AuditRecord(id="1", time=5, event="signature refused", severity=Severity.ALARM), "alarm"),
         (AuditRecord(id="1", time=5, event="decision", decision="allow"), None),
@@ -30,7 +31,8 @@ def test_records_are_triggers_of_the_kind_that_is_wanted(record: AuditRecord, wh
     if trigger is not None:
         assert (trigger.time, trigger.record) == (5, "1")
         assert trigger.text.startswith(record.event)
-    assert trigger_of(record, [kind for kind in KINDS if kind not in {what, "alarm"}]) is None
+    own = {what, "alarm", *_BY_EVENT.get(record.event, ())}
+    assert trigger_of(record, [kind for kind in KINDS if kind not in own]) is None
 
 
 def test_a_trigger_has_no_content_of_messages() -> None:
