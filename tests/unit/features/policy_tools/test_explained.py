@@ -256,8 +256,8 @@ OUTCOMES = {
         f"hold m() {{ {B} {{ }} }}", given("b1"), "drop", STICK, "hold", [], {}, restarted=True
     ),
     "what could not begin": Row(
-        f"m() {{ int zero = 0; init() {{ zero = 1 / zero; }} {B} {{ if (b > 9) {{ return; }} }} }}", given("b1"), "drop", STICK,
-        "m()", [], {}
+        f"m() {{ int zero = 0; init() {{ zero = 1 / zero; }} {B} {{ if (b > 9) {{ return; }} }} }}", given("b1"), "drop",
+        STICK, "m()", [], {}
     ),
     "a change": Row(
         f"m() {{ {B} {WHEN} {{ if (b == 7) {{ b = 1; }} }} }}", given("b7"), "change", STICK, "b = 1", [],
