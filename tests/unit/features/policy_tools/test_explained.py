@@ -256,7 +256,7 @@ OUTCOMES = {
         f"hold m() {{ {B} {{ }} }}", given("b1"), "drop", STICK, "hold", [], {}, restarted=True
     ),
     "what could not begin": Row(
-        f"m() {{ int zero = 0; init() {{ zero = 1 / zero; }} {B} {{ if (b > 9) {{ return; }} }} }}", given("b1"), "drop",
+        f"m() {{ int zero = 0; init() {{ zero = 1 / zero; }} {B} {{ if (b) {{ return; }} }} }}", given("b1"), "drop",
         STICK, "m()", [], {}
     ),
     "a change": Row(
