@@ -19,6 +19,9 @@ class PresetParameter(msgspec.Struct, frozen=True):
     most: Annotated[str, doc("the greatest value, or empty if it is not a number")]
     what: Annotated[str, doc("its meaning, for a person")]
     loads: Annotated[bool, doc("it is in the text: a change loads the guard again, and for admins only")]
+    safe: Annotated[
+        str, doc("the values that the standard asks for, such as `>= 1.6`, or empty if it asks for none")
+    ] = ""
 
 
 class PresetRow(msgspec.Struct, frozen=True):
@@ -68,6 +71,9 @@ class GuardRow(msgspec.Struct, frozen=True):
             " `rosrv guard upgrade` replaces; `changed`: any other text"
         ),
     ] = "current"
+    below: Annotated[
+        list[str], doc("its values that are less safe than the standard asks for, each with the safe ones")
+    ] = []
 
 
 class GuardList(msgspec.Struct, frozen=True):

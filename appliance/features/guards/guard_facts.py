@@ -1,6 +1,9 @@
 """Convert between the graph, presets and the rows of answers, for control and for `rosrv guard`."""
 
+from collections.abc import Iterable
+
 from appliance.channel.answers.graph_answers import Graph
+from appliance.channel.answers.monitor_answers import GivenState
 from appliance.features.guards.guard_answers import PresetParameter, PresetRow
 from appliance.features.guards.presets import Preset
 from appliance.features.guards.robot_graph import TopicFacts
@@ -23,6 +26,16 @@ def preset_row(preset: Preset) -> PresetRow:
         preset.what,
         preset.given_topics,
         {given: list(rows) for given, rows in preset.topics.items()},
-        [PresetParameter(one.name, one.kind, one.default, one.unit, one.least, one.most, one.what, one.loads)
+        [PresetParameter(one.name, one.kind, one.default, one.unit, one.least, one.most, one.what, one.loads,
+                         one.safe)
          for one in preset.parameters],
     )  # fmt: skip
+
+
+def values_of(given: Iterable[GivenState]) -> dict[str, str]:
+    """Return the constants that a monitor has, as text."""
+    return {
+        one.name: str(one.value).lower() if isinstance(one.value, bool) else f"{one.value!r}"
+        for one in given
+        if one.kind != "topic"
+    }

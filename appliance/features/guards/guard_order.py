@@ -22,7 +22,11 @@ PRECEDENCES = (
         ("speed",),
         "after a stop the base jumps to its full velocity, as if it had driven on",
     ),
-    Precedence(("sane",), ("separation", "speed"), "an infinite velocity is limited instead of stopped"),
+    Precedence(
+        ("sane",),
+        ("separation", "speed"),
+        "of a command with an infinite velocity, the other velocities pass",
+    ),
     Precedence(
         ("rate",),
         ("fence", "separation", "speed"),

@@ -20,13 +20,14 @@ from appliance.features.guards.guard_answers import (
     Suggestion,
     Suggestions,
 )
-from appliance.features.guards.guard_facts import facts_of, preset_row
+from appliance.features.guards.guard_facts import facts_of, preset_row, values_of
 from appliance.features.guards.guard_order import Placed, faults, statements
 from appliance.features.guards.plans import planned
 from appliance.features.guards.presets import (
     PRESETS,
     GuardError,
     Preset,
+    below_the_standard,
     described,
     loaded_values,
     preset_named,
@@ -289,4 +290,5 @@ class GuardOrders:
             off_until=monitors.returns.until(name),
             version=preset.version,
             origin=origin_of(text),
+            below=below_the_standard(preset, values_of(given)),
         )

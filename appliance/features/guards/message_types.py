@@ -1,7 +1,7 @@
 """Adapt the text of a preset to the message types of a robot's topics.
 
 A preset is a valid text for one type. For another type, the type and the pattern of the events are replaced. A value
-that the type lacks becomes a local variable.
+that the type lacks becomes a local variable. Values that only other types have are zero in the first line of an event.
 """
 
 import re
@@ -34,21 +34,37 @@ def _twist(before: str = "") -> TypeRow:
     return TypeRow({axis: before + leg for axis, leg in zip(AXES, _LEGS, strict=True)})
 
 
-def _listed(*paths: str) -> TypeRow:
+_UNLIMITED = "double low = -INFINITY, high = INFINITY;"
+
+
+def _listed(*paths: str, low: str = "", high: str = "") -> TypeRow:
+    """Make `values` of the fields at `paths`. `low` and `high` are the fields of their range, if the type has them."""
     names = [f"v{place}" for place in range(len(paths))]
+    limits = {"low": low, "high": high} if low else {}
     return TypeRow(
-        dict(zip(names, paths, strict=True)),
-        parameters=", ".join(f"double {name}" for name in names),
-        local=f"std::vector<double> values = {{{', '.join(names)}}};",
+        {**dict(zip(names, paths, strict=True)), **limits},
+        parameters=", ".join(f"double {name}" for name in (*names, *limits)),
+        local=f"std::vector<double> values = {{{', '.join(names)}}};"
+        + ("" if limits else f"\n        {_UNLIMITED}"),
         element="double",
+    )
+
+
+def _ackermann(before: str = "") -> TypeRow:
+    fields = {"x": "speed", "steer": "steering_angle", "steerRate": "steering_angle_velocity"}
+    return TypeRow(
+        {
+            name: before + path
+            for name, path in {**fields, "acceleration": "acceleration", "jerk": "jerk"}.items()
+        }
     )
 
 
 VELOCITIES = {
     "geometry_msgs/Twist": _twist(),
     "geometry_msgs/TwistStamped": _twist("twist."),
-    "ackermann_msgs/AckermannDrive": TypeRow({"x": "speed"}),
-    "ackermann_msgs/AckermannDriveStamped": TypeRow({"x": "drive.speed"}),
+    "ackermann_msgs/AckermannDrive": _ackermann(),
+    "ackermann_msgs/AckermannDriveStamped": _ackermann("drive."),
 }
 TRAJECTORY = {"names": "joint_names", "points": "points"}
 GOAL = "control_msgs/FollowJointTrajectoryActionGoal"
@@ -82,13 +98,10 @@ POSES = {
     "geometry_msgs/PoseWithCovarianceStamped": _pose("pose.pose."),
 }
 POSITIONS = POSES | {"sensor_msgs/NavSatFix": _FIX}
-SPEEDS = {
-    "nav_msgs/Odometry": TypeRow({"v": "twist.twist.linear.x"}),
-    "geometry_msgs/TwistStamped": TypeRow({"v": "twist.linear.x"}),
-    "geometry_msgs/TwistWithCovarianceStamped": TypeRow({"v": "twist.twist.linear.x"}),
-}
+_TURNS = {"vx": "linear.x", "vy": "linear.y", "vz": "linear.z", "turn": "angular.z",
+          "wx": "angular.x", "wy": "angular.y", "wz": "angular.z"}  # fmt: skip
 MOTIONS = {
-    kind: TypeRow({"vx": f"{before}linear.x", "vy": f"{before}linear.y", "turn": f"{before}angular.z"})
+    kind: TypeRow({name: before + path for name, path in _TURNS.items()})
     for kind, before in (
         ("nav_msgs/Odometry", "twist.twist."),
         ("geometry_msgs/TwistStamped", "twist."),
@@ -96,14 +109,15 @@ MOTIONS = {
     )
 }
 _ARRIVAL = TypeRow(
-    local="std::vector<double> values = {ros::Time::now().toSec()};       // only its silence is judged",
+    local="std::vector<double> values = {ros::Time::now().toSec()};       // only its silence is judged\n"
+    f"        {_UNLIMITED}",
     element="double",
 )
 ANY_TYPE = "*"
 """The key of the row for every type that has none of its own."""
 SENSORS = {
-    "sensor_msgs/LaserScan": TypeRow({"values": "ranges"}),
-    "sensor_msgs/Range": _listed("range"),
+    "sensor_msgs/LaserScan": TypeRow({"values": "ranges", "low": "range_min", "high": "range_max"}),
+    "sensor_msgs/Range": _listed("range", low="min_range", high="max_range"),
     "sensor_msgs/NavSatFix": _listed("latitude", "longitude", "altitude"),
     "sensor_msgs/Imu": _listed(
         *(f"{what}.{axis}" for what in ("angular_velocity", "linear_acceleration") for axis in "xyz")
@@ -112,17 +126,20 @@ SENSORS = {
         *(f"pose.pose.position.{axis}" for axis in "xyz"),
         *(f"pose.pose.orientation.{axis}" for axis in "xyzw"),
     ),
-    "sensor_msgs/JointState": TypeRow({"values": "position"}, parameters="double[] values", element="double"),
+    "sensor_msgs/JointState": TypeRow(
+        {"values": "position"}, parameters="double[] values", local=_UNLIMITED, element="double"
+    ),
     "sensor_msgs/Joy": _ARRIVAL,
     ANY_TYPE: _ARRIVAL,
 }
 _SCAN = {
-    "start": "angle_min", "step": "angle_increment", "low": "range_min", "high": "range_max", "ranges": "ranges",
+    "first": "angle_min", "increment": "angle_increment", "least": "range_min", "most": "range_max", "ranges": "ranges",
 }  # fmt: skip
 SCANS = {"sensor_msgs/LaserScan": TypeRow(_SCAN)}
+JOINTS = {"sensor_msgs/JointState": TypeRow({"names": "name", "found": "position"})}
 BATTERIES = {"sensor_msgs/BatteryState": TypeRow({"percentage": "percentage"})}
 
-SWITCHES = {"std_msgs/Bool": TypeRow({"on": "data"})}
+SWITCHES = {"std_msgs/Bool": TypeRow({"withheld": "data"})}
 PRIVATE = {
     kind: TypeRow()
     for kind in (
@@ -134,7 +151,8 @@ PRIVATE = {
 }  # fmt: skip
 
 _EVENT = re.compile(
-    r"event (?P<name>\w+)\((?P<parameters>[^)]*)\) (?P<topic>\w+)\s+(?P<type>\w+/\w+)\s+'\{(?P<pattern>[^}]*)\}' \{"
+    r"event (?P<name>\w+)\((?P<parameters>[^)]*)\) (?P<topic>\w+)\s+(?P<type>\w+/\w+)\s+'\{(?P<pattern>[^}]*)\}'"
+    r"(?P<when>\s++when \([^{]*\))? \{(?:\n +double (?P<zeros>\w++ = 0(?:, \w++ = 0)*+);[^\n]*+)?"
 )
 _SAFE = re.compile(r"safe (?P<type>\w+/\w+) \{ \} on command every 100ms;")
 _COMMAND = re.compile(r"topic command = ([^;]+);")
@@ -174,6 +192,7 @@ def judges_arrival(row: TypeRow) -> bool:
 
 def _header(found: "re.Match[str]", kind: str, row: TypeRow) -> str:
     wanted = [one.rsplit(" ", 1) for one in found["parameters"].split(", ") if one]
+    wanted += [["double", one.removesuffix(" = 0")] for one in (found["zeros"] or "").split(", ") if one]
     bound = {name: row.paths[name] for _type, name in wanted if name in row.paths}
     parameters = ", ".join(f"{of} {name}" for of, name in wanted if name in bound)
     lacking = [name for _type, name in wanted if name not in bound]
@@ -182,9 +201,10 @@ def _header(found: "re.Match[str]", kind: str, row: TypeRow) -> str:
         parameters, bound, local = row.parameters, dict(row.paths), row.local
     pattern = ", ".join(f"{path}:{name}" for name, path in bound.items())
     head = f"event {found['name']}({parameters}) {found['topic']} {kind}"
-    one_line = f"{head} '{{{pattern}}}' {{"
+    when = found["when"] or ""
+    one_line = f"{head} '{{{pattern}}}'{when} {{"
     if len(one_line) > _WIDTH:
-        one_line = f"{head}\n            '{{{pattern}}}' {{"
+        one_line = f"{head}\n            '{{{pattern}}}'{when} {{"
     return one_line + (f"\n        {local}" if local else "")
 
 

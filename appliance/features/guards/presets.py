@@ -4,6 +4,7 @@ The first line of a guard names the preset, its version, the topics and their ty
 """
 
 import functools
+import operator
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -20,7 +21,8 @@ FOLDER = SHIPPED / "monitors" / "guards"
 
 _GIVEN = re.compile(
     r"^    (?P<kind>double|int|bool|topic) (?P<name>\w+) = (?P<default>[^ ;]+)"
-    r"(?: (?P<unit>[\w/]+))?(?: in (?P<least>[-\d.]+?)\.\.(?P<most>[-\d.]+))?;[ ]*(?:// (?P<remark>.*))?$",
+    r"(?: (?P<unit>[\w/]+))?(?: in (?P<least>[-\d.]+?)\.\.(?P<most>[-\d.]+))?;[ ]*"
+    r"(?:// (?P<remark>.*?)(?:; safe: (?P<safe>(?:[<>]=?|==) \S+))?)?$",
     re.MULTILINE,
 )
 _HEAD = re.compile(r"^((?:begin |hold )?)(\w+)\(", re.MULTILINE)
@@ -58,6 +60,17 @@ class Parameter:
     what: str = ""
     loads: bool = False
     """Whether it is part of the text, so that a new value loads the guard again."""
+    safe: str = ""
+    """The values that the standard or good practice asks for, such as `>= 1.6`, or empty if any value is as safe."""
+
+    def falls_below(self, value: str) -> bool:
+        """Return whether a value is less safe than `safe`."""
+        if not self.safe:
+            return False
+        sign, bound = self.safe.split(" ")
+        if self.kind == "bool":
+            return value != bound
+        return not _COMPARISONS[sign](float(value), float(bound))
 
     def checked(self, value: str) -> str:
         if self.kind == "bool":
@@ -98,6 +111,7 @@ def _network(name: str, value: str) -> str:
         ) from error
 
 
+_COMPARISONS = {"<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge, "==": operator.eq}
 _TABLES = {"corners": _CORNERS, "joints": _JOINTS, "time": _SPAN}
 _POLYGON = Parameter(
     "polygon", "corners", "-2,-2 2,-2 2,2 -2,2", "m", what="x and y of each corner", loads=True
@@ -151,7 +165,7 @@ class Preset:
     def parameters(self) -> tuple[Parameter, ...]:
         given = (
             Parameter(one["name"], one["kind"], one["default"], one["unit"] or "", one["least"] or "",
-                      one["most"] or "", one["remark"] or "")
+                      one["most"] or "", one["remark"] or "", safe=one["safe"] or "")
             for one in self._given if one["kind"] != "topic"
         )  # fmt: skip
         return (*given, *(one for one in self.further if _in_text(self.text, one) is not None))
@@ -182,9 +196,9 @@ PRESETS = {
         Preset("estop", _ANY),
         Preset("arm", {**_ANY, "by": types.BATTERIES}),
         Preset("answer", {"command": types.GOALS, "by": types.RESULTS}, (_DEADLINE,)),
-        Preset("joints", {"command": types.TRAJECTORIES}, (_LIMITS,)),
+        Preset("joints", {"command": types.TRAJECTORIES, "state": types.JOINTS}, (_LIMITS,)),
         Preset("rate", _MOVES),
-        Preset("agree", {**_MOVES, "by": types.SPEEDS, "other": types.SPEEDS}),
+        Preset("agree", {**_MOVES, "by": types.MOTIONS, "other": types.MOTIONS}),
         Preset("sane", _MOVES),
         Preset("withhold", {"command": types.PRIVATE, "by": types.SWITCHES}, (_FROM,)),
     )
@@ -233,6 +247,18 @@ def text_of(guard: Guard) -> str:
         text = _with_value(text, parameter, parameter.checked(value))
     text = _HEAD.sub(rf"\g<1>{guard.name}(", text, count=1)
     return _FIRST_LINE.sub(_first_line(guard), text, count=1)
+
+
+def below_the_standard(preset: Preset, values: Mapping[str, str]) -> list[str]:
+    """Return a sentence for each of the values, by parameter, that is less safe than the preset's standard asks for.
+
+    Parameters without a value have their default, which is safe.
+    """
+    return [
+        f"{one.name}={values[one.name]} is below the standard: {one.safe.removeprefix('== ')}"
+        for one in preset.parameters
+        if one.name in values and one.falls_below(values[one.name])
+    ]
 
 
 def preset_of(text: str) -> Preset | None:

@@ -165,11 +165,22 @@ class _Writer:
         )
 
     def add_arm(self, arm: TopicFacts) -> None:
-        self._add("joints", arm)
-        self._add_stops(arm)
         states = self.graph.sources(arm, {"sensor_msgs/JointState"})
         drivers = self.graph.robot_of(arm).drivers
         best = [state for state in states if not drivers.isdisjoint(state.publishers)] or states
+        if len(best) == 1:
+            self._add("joints", arm, topics={"state": best[0].name})
+        else:
+            why = (
+                f"choose one of {', '.join(state.name for state in best)}"
+                if best
+                else "no topic has its joints"
+            )
+            self._say(
+                f"joints of {arm.name} is left out: {why}:"
+                f" rosrv guard new joints {arm.name} --topic state=TOPIC --shadow"
+            )
+        self._add_stops(arm)
         # A resting arm repeats its positions.
         if len(best) == 1:
             self._add("sensor", arm, _silence(best[0], 3, 0.1, 1), {"frozen": "0"}, topics={"by": best[0].name},

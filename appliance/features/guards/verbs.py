@@ -17,7 +17,7 @@ from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.monitor_changes import say_replaced, say_shadow_deadline
 from appliance.cli.output import moment, say_json
 from appliance.features.guards.guard_answers import GuardRow, Suggestion
-from appliance.features.guards.guard_facts import preset_row
+from appliance.features.guards.guard_facts import preset_row, values_of
 from appliance.features.guards.guard_requests import (
     GuardNew,
     GuardSuggestionsWanted,
@@ -82,9 +82,11 @@ def list_guards(appliance: Appliance) -> None:
             say_json({"guard": row.name, "preset": row.preset, "state": row.state, "shadow": shadow,
                       "enabled": not shadow and not on, "held": held, "topics": [*row.topics.values()],
                       "stops": row.stops, "confirm_by": row.confirm_by, "version": row.version,
-                      "origin": row.origin})  # fmt: skip
+                      "origin": row.origin, "below": row.below})  # fmt: skip
         else:
             say(f"guard {row.name}: {_origin(row)} on {', '.join(row.topics.values())}, {_state(row)}")
+            for value in row.below:
+                say(f"    {value}", "yellow")
     for warning in body.warnings:
         if appliance.as_json:
             say_json({"warning": warning})
@@ -362,11 +364,7 @@ def _guard(appliance: Appliance, name: str) -> tuple[Monitors, MonitorState, str
 
 def _in_force(row: MonitorState, preset: Preset) -> dict[str, str]:
     names = {each.name for each in preset.parameters}
-    return {
-        one.name: str(one.value).lower() if isinstance(one.value, bool) else f"{one.value!r}"
-        for one in row.given
-        if one.name in names
-    }
+    return {name: value for name, value in values_of(row.given).items() if name in names}
 
 
 def _say_changed(appliance: Appliance, body: Replacement) -> None:
@@ -477,7 +475,8 @@ def _say_preset(preset: Preset) -> None:
         table = table_of("    parameter", "default", "range", "meaning")
         for one in preset.parameters:
             span = f"{one.least}..{one.most}" if one.least else ""
-            table.add_row(f"    {one.name}", f"{one.default} {one.unit}".strip(), span, one.what)
+            safe = f"; safe: {one.safe.removeprefix('== ')}" if one.safe else ""
+            table.add_row(f"    {one.name}", f"{one.default} {one.unit}".strip(), span, one.what + safe)
         say_table(table)
 
 

@@ -16,7 +16,7 @@ from roswire.standard import standard_definitions
 MS = 10**6
 BEGIN = 1_700_000_000 * 10**9
 TWIST = "geometry_msgs/Twist"
-NODES = ("", "/a", "/b", "/c")
+NODES = ("", *(f"/{letter}" for letter in "abcdefghijk"))
 DEFINITIONS = standard_definitions()
 SPEEDS = (0.0, -0.0, 0.2, -0.2, 0.5, -0.5, 0.5000001, 1.0, -3.0, 1e300, math.inf, -math.inf, math.nan)
 

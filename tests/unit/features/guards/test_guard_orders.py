@@ -222,7 +222,7 @@ async def test_a_new_guard_is_in_shadow_mode_or_in_force(
     [load] = manager.orders
     assert manager.enabling == [not shadow]
     assert "double vMax = 0.3 m/s" in load.files["speed.rv"]
-    assert (load.shadow, load.confirm_within, load.note[:14]) == (shadow, 300.0, "preset speed 1")
+    assert (load.shadow, load.confirm_within, load.note[:14]) == (shadow, 300.0, "preset speed 2")
 
 
 async def test_suggestions_name_the_guards_that_are_loaded(manager: Manager) -> None:

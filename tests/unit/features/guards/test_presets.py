@@ -11,6 +11,7 @@ from appliance.features.guards.presets import (
     Guard,
     GuardError,
     Preset,
+    below_the_standard,
     preset_of,
     text_of,
     with_values,
@@ -56,13 +57,38 @@ def test_a_preset_is_valid_as_it_is_and_for_each_of_its_types(preset: Preset) ->
         )
 
 
+@pytest.mark.parametrize("preset", PRESETS.values(), ids=PRESETS)
+def test_the_text_of_a_preset_is_that_of_its_first_types(preset: Preset) -> None:
+    """A parameter of an event that no row of its type has would silently be zero."""
+    types = {topic: next(iter(rows)) for topic, rows in preset.topics.items()}
+    made = text_of(Guard(preset.name, preset, types=types)).split("\n", 1)[1]
+    bare = [re.sub(r"//.*|\s", "", text.split("\n", 1)[1]) for text in (preset.text, f"\n{made}")]
+    assert bare[0] == bare[1]
+    for topic, rows in preset.topics.items():
+        used = {name for row in rows.values() for name in row.paths}
+        assert not used or rows[types[topic]].paths, topic
+
+
+@pytest.mark.parametrize("preset", PRESETS.values(), ids=PRESETS)
+def test_a_default_is_safe_by_the_standard_and_a_value_below_it_is_named(preset: Preset) -> None:
+    for parameter in preset.parameters:
+        assert not parameter.falls_below(parameter.default), parameter.name
+        values = {"true", "false"} if parameter.kind == "bool" else {parameter.least, parameter.most}
+        assert not parameter.safe or any(map(parameter.falls_below, values)), (
+            f"{parameter.name} is always safe"
+        )
+    assert below_the_standard(PRESETS["estop"], {"silent": "0", "zeroFirst": "true"}) == [
+        "silent=0 is below the standard: > 0"
+    ]
+
+
 def test_a_guard_is_an_ordinary_text_with_its_topics_types_and_values() -> None:
     types = {"command": "geometry_msgs/TwistStamped", "by": "geometry_msgs/PoseStamped"}
     text = text_of(
         Guard("yard", PRESETS["fence"], {"command": "/base/cmd", "by": "/pose"}, types,
               {"margin": "0.5", "polygon": "0,0 4,0  0,3.5", "worldFrame": "true"})
     )  # fmt: skip
-    assert text.startswith("// preset fence 2: command=/base/cmd geometry_msgs/TwistStamped, by=/pose")
+    assert text.startswith("// preset fence 3: command=/base/cmd geometry_msgs/TwistStamped, by=/pose")
     for part in (
         "topic command = /base/cmd;",
         "double margin = 0.5 m in 0..20;",

@@ -58,7 +58,7 @@ class Robot:
             case GuardsWanted():
                 rows = [
                     GuardRow(name, "fence", "", "stopping", {"command": "/cmd_vel"}, {}, [], {}, 3, version=1,
-                             origin=origin)
+                             origin=origin, below=["silent=0 is below the standard"] * (name == "old"))
                     for name, origin in (("fence", "current"), ("old", "older"), ("mine", "changed"))
                 ]  # fmt: skip
                 return SimpleNamespace(guards=rows, warnings=["fence acts before rate"])
@@ -256,6 +256,7 @@ def test_lists_and_proposals_are_printed(tmp_path: Path, capsys: pytest.CaptureF
     assert shown.endswith(
         "guard fence: fence on /cmd_vel, in force, stopping, 3 stops\n"
         "guard old: fence 1, older: rosrv guard upgrade old; on /cmd_vel, in force, stopping, 3 stops\n"
+        "    silent=0 is below the standard\n"
         "guard mine: fence 1, changed: not the text of the preset; on /cmd_vel, in force, stopping, 3 stops\n"
         "fence acts before rate\n"
     )
@@ -265,7 +266,8 @@ def test_lists_and_proposals_are_printed(tmp_path: Path, capsys: pytest.CaptureF
         "rosrv guard new fence\n"
         "    Keeps the base inside.\n"
         "    from the present rate: silent; defaults, which you should check: "
-        "margin=0.2, ahead=0.5, worldFrame=false, lat0=0, lon0=0, polygon=-2,-2 2,-2 2,2 -2,2; "
+        "margin=0.2, ahead=0.5, inward=0.3, worldFrame=false, wheelbase=0.25, lat0=0, lon0=0, "
+        "polygon=-2,-2 2,-2 2,2 -2,2; "
         "instead of /odom: /wheels\n"
         "/estop_enabled: its name does not say whether true stops\n"
     )

@@ -8,7 +8,7 @@ from appliance.features.guards.message_types import ANY_TYPE, GOAL
 from appliance.features.guards.presets import PRESETS, loaded_values
 from rosmop.tests.acting import STORE, fields, message
 from rosmop.tests.examples import examples
-from tests.unit.features.guards.guarding import Guarded, legs_of, seeded, twist
+from tests.unit.features.guards.guarding import NODES, Guarded, legs_of, seeded, twist
 
 TRACES = range(examples(1000))
 GO = twist(0.5)
@@ -28,52 +28,190 @@ def button(on: bool) -> bytes:
     return message("std_msgs/Bool", data=on)
 
 
+class Buttons:
+    """The rules of the page, for buttons and hands of any number."""
+
+    def __init__(self, hands: bool, silent: int) -> None:
+        self.two_hands, self.silent = hands, silent
+        self.buttons: dict[str, tuple[bool, int]] = {}
+        self.hands: dict[str, tuple[bool, int]] = {}
+        self.latched, self.idle, self.heard = False, False, -math.inf
+        self.stood = list[str]()
+
+    def judge(self, at: int) -> None:
+        """Judge all buttons, as the guard does when it hears of one, and every 100 ms."""
+        fresh = all(
+            not on and (not self.silent or at - when <= self.silent) for on, when in self.buttons.values()
+        )
+        self.idle = bool(self.buttons) and fresh
+        if self.latched or not self.idle:
+            self.stood = []
+
+    def press(self, on: bool, at: int, node: str) -> None:
+        self.buttons[node] = (on, at)
+        if on:
+            self.latched, self.stood = True, []
+            self.hands = {each: (down, 0) for each, (down, _when) in self.hands.items()}
+        self.heard = at
+        self.judge(at)
+
+    def reset(self, on: bool, at: int, node: str) -> None:
+        self.judge(at)
+        was, when = self.hands.get(node, (True, 0))
+        if not on:
+            self.hands[node] = (False, at if was else when)
+        elif not was:
+            counts = self.latched and self.idle and when > 0 and at - when >= 100
+            others = [each for each, (down, since) in self.hands.items()
+                      if each != node and down and since and at - since <= 500]  # fmt: skip
+            self.hands[node] = (True, at if counts else 0)
+            if counts and (not self.two_hands or others):
+                self.latched = False
+                self.hands = {each: (down, 0) for each, (down, _when) in self.hands.items()}
+        else:
+            self.hands[node] = (True, when)
+
+    def passes(self, moves: bool, at: int, node: str) -> bool:
+        if self.latched or not self.idle or (self.silent and at - self.heard > self.silent):
+            return False
+        if not moves and node not in self.stood:
+            self.stood = [*self.stood, node][:2]
+        return not moves or node in self.stood
+
+
 @pytest.mark.parametrize("hands", [False, True])
-def test_an_emergency_stop_stays_until_a_reset(hands: bool) -> None:
+@pytest.mark.parametrize("silent", [0, 2000])
+def test_an_emergency_stop_stays_until_a_reset(hands: bool, silent: int) -> None:
     random = seeded(7)
-    for _trace in TRACES:
-        guard, at = Guarded("estop", twoHands=hands), 0
-        latched = pressed = released = False
-        hand, hand_at = "", 0
-        for _message in range(30):
-            at += random.choice((1, 30, 500, 1999, 2001))
-            given = random.choice(("stop", "reset", "reset", "reset", "command", "command"))
-            on = random.random() < (0.3 if given == "stop" else 0.5)
-            if given == "command":
-                assert runs(guard, at) != latched
-                continue
+    passed, traces = 0, range(examples(300))
+    for _trace in traces:
+        guard, at, rules = Guarded("estop", twoHands=hands, silent=silent / 1000), 0, Buttons(hands, silent)
+        for _message in range(40):
+            before, at = at, at + random.choice((1, 30, 99, 100, 400, 501))
+            for tick in range(before // 100 * 100 + 100, at + 1, 100):
+                rules.judge(tick)
+            given = random.choice(
+                ("stop", "stop", "reset", "reset", "reset", "command", "command", "command")
+            )
+            on = random.random() < (0.1 if given == "stop" else 0.5)
             node = random.choice(("/a", "/b"))
-            guard.tell(given, button(on), at, node)
             if given == "stop":
-                pressed, latched = on, latched or on
-                hand = "" if on else hand
-            elif not on:
-                released = True
-            elif released and latched and not pressed:
-                released = False
-                if not hands or (hand not in {"", node} and at - hand_at <= 2000):
-                    latched, hand = False, ""
-                else:
-                    hand, hand_at = node, at
+                guard.tell("stop", button(on), at, node)
+                rules.press(on, at, node)
+            elif given == "reset":
+                guard.tell("reset", button(on), at, node)
+                rules.reset(on, at, node)
             else:
-                released = False
+                assert (guard.drive(GO if on else twist(), at, node)[0] == 0.5) == (
+                    rules.passes(on, at, node) and on
+                )
+                passed += guard.got[-1][1] == GO
+    assert passed > len(traces) / 10
+
+
+def go(guard: Guarded, at: int) -> None:
+    """Release the button `/a`, and let the node `/a` stand."""
+    guard.tell("stop", button(False), at)
+    guard.drive(twist(), at)
+
+
+def reset(guard: Guarded, at: int, node: str = "/a") -> None:
+    for on, when in ((False, at), (True, at + 100)):
+        guard.tell("stop", button(False), when)
+        guard.tell("reset", button(on), when, node)
 
 
 def test_an_emergency_stop_is_sent_at_once_and_repeated() -> None:
     guard = Guarded("estop")
+    go(guard, 1)
     assert runs(guard, 1)
     stops(guard)
     guard.tell("stop", button(True), 5)
     guard.advance(200)
     assert stops(guard) == [5, 100, 200]
-    guard = Guarded("estop", silent=1)
+    guard = Guarded("estop")
     assert not runs(guard, 1)
-    guard.tell("stop", button(False), 2)
+    go(guard, 2)
     assert runs(guard, 1002) and not runs(guard, 1003)
 
 
+def test_after_a_reset_each_node_stands_before_it_moves() -> None:
+    """A running autopilot does not move a base that a person has only just freed."""
+    guard = Guarded("estop")
+    go(guard, 1)
+    guard.tell("stop", button(True), 50)
+    reset(guard, 100)
+    assert not runs(guard, 210)
+    guard.drive(twist(), 220, "/b")
+    assert not runs(guard, 230) and guard.drive(GO, 235, "/b")[0] == 0.5
+    guard.drive(twist(), 240)
+    assert runs(guard, 250)
+
+
+def test_no_button_hides_another() -> None:
+    """A pressed button whose node is gone stays pressed, and a silent one is not hidden by one that sends."""
+    guard = Guarded("estop", silent=0)
+    go(guard, 1)
+    guard.tell("stop", button(True), 50, "/b")
+    reset(guard, 100)
+    guard.drive(twist(), 300)
+    assert not runs(guard, 310)
+    guard.monitors.give({"guard": {"forget": 1, "silent": 0}})
+    guard.advance(500)
+    assert not runs(guard, 510)
+    reset(guard, 600)
+    guard.drive(twist(), 800)
+    assert runs(guard, 810)
+    guard = Guarded("estop")
+    for node in ("/a", "/b"):
+        guard.tell("stop", button(False), 1, node)
+    guard.drive(twist(), 2)
+    for at in range(100, 1000, 100):
+        guard.tell("stop", button(False), at)
+    assert runs(guard, 1001) and not runs(guard, 1101)
+
+
+def test_a_ninth_button_stops() -> None:
+    guard = Guarded("estop", silent=0)
+    for place in range(8):
+        guard.tell("stop", button(False), 1, NODES[place + 1])
+    guard.drive(twist(), 2)
+    assert runs(guard, 3)
+    guard.tell("stop", button(False), 4, NODES[9])
+    assert not runs(guard, 5)
+
+
+@pytest.mark.parametrize(
+    ("acts", "freed"),
+    [
+        ([("/a", False, 0), ("/b", False, 0), ("/a", True, 200), ("/b", True, 700)], True),
+        ([("/a", False, 0), ("/b", False, 0), ("/a", True, 200), ("/b", True, 701)], False),
+        (
+            [("/a", True, 0), ("/b", False, 0), ("/b", True, 200), ("/b", False, 300), ("/b", True, 450)],
+            False,
+        ),
+        (
+            [("/a", False, 0), ("/b", False, 0), ("/a", True, 200), ("/a", False, 300), ("/b", True, 400)],
+            False,
+        ),
+        ([("/a", False, 0), ("/b", False, 0), ("/a", True, 1), ("/b", True, 1)], False),
+        ([("/a", False, 0), ("/a", True, 200), ("/a", False, 300), ("/a", True, 500)], False),
+    ],
+)
+def test_two_hands_act_together_and_are_released_between(
+    acts: list[tuple[str, bool, int]], freed: bool
+) -> None:
+    guard = Guarded("estop", twoHands=True, silent=0)
+    guard.tell("stop", button(True), 1)
+    guard.tell("stop", button(False), 10)
+    for node, on, at in acts:
+        guard.tell("reset", button(on), 1000 + at, node)
+    guard.drive(twist(), 2000)
+    assert runs(guard, 2001) == freed
+
+
 def scan(ranges: list[float]) -> bytes:
-    return message("sensor_msgs/LaserScan", ranges=ranges)
+    return message("sensor_msgs/LaserScan", ranges=ranges, range_min=0.1, range_max=5.0)
 
 
 def test_a_sensor_is_silent_frozen_or_blind() -> None:
@@ -89,19 +227,22 @@ def test_a_sensor_is_silent_frozen_or_blind() -> None:
                 continue
             ranges = before or [1.0] * 4
             if random.random() < 0.4:
-                ranges = [random.choice((1.0, 1.0000001, math.nan, math.inf)) for _ in range(4)]
+                ranges = [random.choice((1.0, 1.0000001, math.nan, math.inf, 5.1, 0.0)) for _ in range(4)]
             if random.random() < 0.05:
                 ranges = []
             repeated = repeated + 1 if np.array_equal(ranges, before, equal_nan=True) and heard > 0 else 0
-            finite = sum(map(math.isfinite, ranges))
+            finite = sum(0.1 <= one <= 5 for one in ranges)
             before, heard, seeing = ranges, at, finite > 0 and finite >= len(ranges) / 2
             guard.tell("by", scan(ranges), at)
+
+
+FREE = {"ranges": [9.0] * 72, "range_max": 30.0, "angle_min": -math.pi, "angle_increment": math.pi / 36}
 
 
 @pytest.mark.parametrize("preset", ["sensor", "separation"])
 def test_a_scan_that_is_too_large_to_judge_stops_the_base(preset: str) -> None:
     guard = Guarded(preset)
-    near = message("sensor_msgs/LaserScan", ranges=[4.0], range_max=30.0)
+    near = message("sensor_msgs/LaserScan", **FREE)
     guard.tell("by", near, 1)
     assert runs(guard, 2)
     huge = message("sensor_msgs/LaserScan", ranges=np.full(400_000, 4.0, dtype=np.float32), range_max=30.0)
@@ -118,9 +259,9 @@ BLIND = {
         message(ODOM, pose__pose__position__x=x, pose__pose__orientation__w=1.0) for x in (0.0, math.nan)
     ),
     "arm": tuple(message("sensor_msgs/BatteryState", percentage=charge) for charge in (1.0, math.nan)),
-    "sensor": tuple(message("sensor_msgs/LaserScan", ranges=[r]) for r in (4.0, math.nan)),
+    "sensor": tuple(message("sensor_msgs/LaserScan", **FREE | {"ranges": [r] * 72}) for r in (9.0, math.nan)),
     "separation": tuple(
-        message("sensor_msgs/LaserScan", ranges=[r], range_max=30.0) for r in (4.0, math.nan)
+        message("sensor_msgs/LaserScan", **FREE | {"ranges": [r] * 72}) for r in (9.0, math.nan)
     ),
 }
 
@@ -155,7 +296,7 @@ def test_a_moving_base_is_stopped_when_its_sensor_falls_silent() -> None:
 
 
 SENSED: dict[str, dict[str, Any]] = {
-    "sensor_msgs/Range": {"range": 1.0},
+    "sensor_msgs/Range": {"range": 1.0, "max_range": 2.0},
     "sensor_msgs/NavSatFix": {"latitude": 40.0},
     "sensor_msgs/Imu": {"angular_velocity__x": 0.1},
     "nav_msgs/Odometry": {"pose__pose__position__x": 1.0},
@@ -190,35 +331,45 @@ def test_only_the_silence_of_any_other_type_is_judged(kind: str) -> None:
     assert stops(guard) == [1420]
 
 
-def speed(v: float) -> bytes:
-    return message("nav_msgs/Odometry", twist__twist__linear__x=v)
+def speed(*v: float) -> bytes:
+    names = [f"twist__twist__{part}__{axis}" for part in ("linear", "angular") for axis in "xyz"]
+    return message("nav_msgs/Odometry", **dict(zip(names, v, strict=False)))
 
 
 def test_two_sources_agree_for_a_number_of_messages() -> None:
     random = seeded(9)
     for _trace in TRACES:
-        guard, at, others, other_at, mine_at = Guarded("agree", samples=3), 0, math.nan, -math.inf, -math.inf
+        guard, at, other_at, mine_at = Guarded("agree", samples=3, turning=0.1), 0, -math.inf, -math.inf
+        others: tuple[float, ...] = (math.nan,) * 6
         row, good = 0, False
         for _message in range(25):
             at += random.choice((1, 50, 50, 501))
             given = random.choice(("by", "by", "other", "command"))
-            v = random.choice((0.0, 0.1, 0.1, 0.30001, math.nan))
+            v = [0.0] * 6
+            v[random.choice((0, 0, 1, 2, 3, 4, 5))] = random.choice((0.0, 0.09, 0.1, 0.30001))
+            v[0] = math.nan if random.random() < 0.05 else v[0]
             if given == "command":
                 assert runs(guard, at) == (good and at - mine_at <= 500 and at - other_at <= 500)
                 continue
-            guard.tell(given, speed(v), at)
+            guard.tell(given, speed(*v), at)
             if given == "other":
-                others, other_at = v, at
+                others, other_at = tuple(v), at
                 continue
             mine_at = at
-            agrees = abs(v - others) <= 0.1 and at - other_at <= 500
-            row = (max(row, 0) + 1) if agrees else (min(row, 0) - 1)
+            apart = [
+                math.hypot(*(a - b for a, b in zip(v[k : k + 3], others[k : k + 3], strict=True)))
+                for k in (0, 3)
+            ]
+            agrees = all(one <= 0.1 + 1e-12 for one in apart) and at - other_at <= 500
+            row = (max(row, 0) + 1) if agrees else -3 if any(map(math.isnan, apart)) else (min(row, 0) - 1)
             good = (good or row >= 3) and row > -3
 
 
 @pytest.mark.parametrize(
     ("charge", "fixed", "checked", "passes"),
-    [(0.5, 0, True, True), (0.25, 0, True, True), (0.2499, 0, True, False), (math.nan, 0, True, False),
+    [(0.5, 0, True, True), (1.01, 0, True, False), (15.0, 0, True, False), (math.inf, 0, True, False),
+     (0.5, 3, True, False), (-0.5, 0, True, False), (0.25, 0, True, True), (0.2499, 0, True, False),
+     (math.nan, 0, True, False),
      (0.5, -1, True, False), (0.5, 0, False, False), (None, 0, True, False), (0.5, None, True, False),
      (0.5, 0, None, False)],
 )  # fmt: skip
@@ -236,6 +387,19 @@ def test_an_interlock_needs_battery_position_and_check(
     assert not runs(guard, 1002)
     guard.tell("by", message("sensor_msgs/BatteryState", percentage=1.0), 1003)
     assert not runs(guard, 1003)
+
+
+def test_a_base_in_motion_is_stopped_when_its_battery_is_empty() -> None:
+    guard = Guarded("arm", hundred=True)
+    for at, percentage in ((1, 21.0), (500, 19.0)):
+        guard.tell("by", message("sensor_msgs/BatteryState", percentage=percentage), at)
+        assert runs(guard, at) == (at == 1)
+    guard.tell("by", message("sensor_msgs/BatteryState", percentage=21.0), 600)
+    assert runs(guard, 600)
+    guard.tell("by", message("sensor_msgs/BatteryState", percentage=19.0), 610)
+    stops(guard)
+    guard.advance(1000)
+    assert stops(guard) == [700]
 
 
 def trajectory(names: list[str], *points: tuple[float, list[float]]) -> bytes:
@@ -258,15 +422,27 @@ def trajectory(names: list[str], *points: tuple[float, list[float]]) -> bytes:
 JOINTS = ["elbow", "wrist"]
 
 
+def state(*positions: float, names: list[str] = JOINTS) -> bytes:
+    return message("sensor_msgs/JointState", name=names, position=[*positions])
+
+
 @pytest.mark.parametrize(
     ("points", "passes"),
     [
         ([], True),
+        ([(0, [0, 0])], True),
+        ([(0, [0.1, 0])], True),
+        ([(0, [0.2, 0])], False),
+        ([(-1, [0, 0])], False),
+        ([(0, [0, 0]), (0, [0, 0])], False),
+        ([(0.4, [1.3, 0])], True),
+        ([(0.4, [1.49, 0])], False),
         ([(1, [0, 0]), (2, [1, 1])], True),
         ([(1, [1.5, 2.0]), (2, [-1.5, 0])], True),
         ([(1, [1.51, 0])], False),
         ([(1, [math.nan, 0])], False),
         ([(1, [0])], False),
+        ([(1, [])], False),
         ([(1, [0, 0]), (1, [0, 0])], False),
         ([(2, [0, 0]), (1, [0, 0])], False),
         ([(1, [0, 0]), (1.1, [1, 0])], False),
@@ -274,10 +450,37 @@ JOINTS = ["elbow", "wrist"]
 )
 def test_a_trajectory_keeps_the_limits_of_its_joints(points: Any, passes: bool) -> None:
     guard = Guarded("joints", limits="elbow:-1.5..1.5 wrist:-2..2")
-    for names, good in ((JOINTS, passes), (["elbow", "unknown"], passes and not points)):
-        outcome = guard.tell("command", trajectory(names, *points), 1)
+    guard.tell("state", state(0, 0), 1)
+    for names, good in ((JOINTS, passes), (["elbow", "unknown"], not points), (["elbow"] * 2, not points),
+                        ([], not points)):  # fmt: skip
+        outcome = guard.tell("command", trajectory(names, *points), 2)
         assert (outcome.result == "passed") == good
         assert good or not fields("trajectory_msgs/JointTrajectory", bytes(outcome.buffer)).points
+
+
+def test_a_trajectory_needs_the_present_position_of_each_joint() -> None:
+    near = trajectory(JOINTS, (0, [0.1, 0]))
+
+    def passes(guard: Guarded, at: int) -> bool:
+        return guard.tell("command", near, at).result == "passed"
+
+    guard = Guarded("joints")
+    assert not passes(guard, 1)
+    guard.tell("state", state(0.1, 0), 10)
+    assert passes(guard, 11) and passes(guard, 50) and not passes(guard, 100)
+    guard.tell("state", state(0.1, math.nan), 110)
+    assert not passes(guard, 110)
+    guard = Guarded("joints")
+    guard.tell("state", state(0.1, names=["elbow"]), 1)
+    assert not passes(guard, 2)
+    guard.tell("state", state(0, names=["wrist"]), 3, "/b")
+    assert passes(guard, 4)
+    guard.tell("state", state(1.0, names=["elbow"]), 5, "/b")
+    assert not passes(guard, 6)
+    guard.tell("state", state(0, names=["wrist"]), 7, "/b")
+    assert passes(guard, 8)
+    guard.tell("state", state(0, names=["gripper"]), 9, "/c")
+    assert not passes(guard, 10)
 
 
 def with_id(name: str, before: int, behind: int) -> bytes:
@@ -291,26 +494,37 @@ def test_a_goal_without_a_result_is_cancelled() -> None:
     ]
     assert [one.result for one in goals] == ["passed", "passed", "dropped"]
     guard.tell("by", with_id("b", 24, 5), 900)
+    guard.tell("by", with_id("a", 24, 5), 950, "/b")
     guard.got.clear()
     guard.advance(10_000)
     assert [(at, fields("actionlib_msgs/GoalID", data).id) for at, data in guard.got] == [(2001, "a")]
 
 
-def test_a_topic_is_withheld_until_the_switch_is_off_and_speaks() -> None:
+def test_a_topic_is_withheld_until_all_switches_are_off_and_speak() -> None:
     types, hosts = {"command": "std_msgs/String", "by": "std_msgs/Bool"}, ("10.0.0.7/32", "10.8.0.0/16")
     guard = Guarded("withhold", types, hosts="10.0.0.7 10.8.0.0/16", silent=1)
     assert guard.monitors.withheld_from("/camera/image_raw") == hosts
-    for at, on, withheld in ((1, False, ()), (900, True, hosts), (1000, False, ())):
-        guard.tell("by", button(on), at)
+    for at, on, node, withheld in (
+        (1, False, "/a", ()), (900, True, "/a", hosts), (1000, False, "/a", ()),
+        (1010, True, "/b", hosts), (1020, False, "/a", hosts), (1030, False, "/b", ()), (1500, False, "/a", ()),
+    ):  # fmt: skip
+        guard.tell("by", button(on), at, node)
         assert guard.monitors.withheld_from("/camera/image_raw") == withheld
+    guard.advance(2000)
+    assert guard.monitors.withheld_from("/camera/image_raw") == ()
     guard.advance(2100)
     assert guard.monitors.withheld_from("/camera/image_raw") == hosts
     assert loaded_values(guard.text) == {"hosts": " ".join(hosts)}
+    guard = Guarded("withhold", types, silent=0)
+    for place in range(9):
+        guard.tell("by", button(False), 1, NODES[place + 1])
+        assert bool(guard.monitors.withheld_from("/camera/image_raw")) == (place == 8)
 
 
 def test_for_an_action_a_stop_drops_goals_and_cancels_all() -> None:
     """An empty goal would not stop an arm."""
     guard = Guarded("estop", {"command": GOAL})
+    guard.tell("stop", button(False), 0)
     assert guard.tell("command", with_id("a", 24, 40), 1).result == "passed"
     guard.got.clear()
     guard.tell("stop", button(True), 2)
