@@ -39,6 +39,8 @@ _LOGS_OWN = {
     "log failed": ("since", "until"),
     "records lost": ("count", "first_time", "last_time"),
     "checkpoint": ("number", "sequence", "hash"),
+    "log replaced": ("log", "number", "hash"),
+    "log set aside": ("log", "number", "hash"),
     "signature refused": ("number",),
     "disk nearly full": ("left",),
     "disk has room": ("left",),

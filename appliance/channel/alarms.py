@@ -84,6 +84,8 @@ def _system(status: Status) -> Iterator[_Condition]:
     audit = status.audit
     if audit.failed is not None:
         yield "alarm", "audit-failed", "audit", f"the audit log cannot be written: {audit.failed}"
+    if audit.replaced is not None:
+        yield "alarm", "audit-replaced", "audit", audit.replaced
     if probe_failed(status):
         text = f"the ROS master is not hidden: {status.probe}; nodes are not served"
         yield "alarm", "probe", "system", text

@@ -127,5 +127,6 @@ def _audit_state(base: Foundation, states: dict[str, Any]) -> AuditState:
         failed=base.audit.failed,
         on_failure=base.settings.audit.on_audit_failure,
         degraded=base.audit.degraded,
+        replaced=base.audit.replaced,
         **states,
     )

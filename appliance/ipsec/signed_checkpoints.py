@@ -6,7 +6,8 @@
    the answer). An unknown log may begin with any number.
 3. The signer must have approved the removal that a checkpoint contains (`<log>.removed`). The first checkpoint
    with this field in a log from an older version is trusted.
-4. At most `MOST_LOGS` logs are remembered, so control cannot fill the signer's disk.
+4. At most `MOST_LOGS` logs are remembered that no operator set aside, so control cannot fill the signer's disk.
+5. Every answer names the other logs that were signed: a log that took the place of another one cannot hide it.
 """
 
 import hashlib
@@ -16,6 +17,7 @@ from pathlib import Path
 
 from appliance.base.atomic_files import write_whole
 from appliance.signing.log_proof import Checkpoint, parse_checkpoint
+from appliance.signing.signed_logs import OtherLog, others, remembered_logs, sync_index
 
 MOST_LOGS = 64
 _HASH = 32
@@ -59,6 +61,7 @@ class CheckpointMemory:
             number, now = wanted.number.to_bytes(_NUMBER, "big"), self._clock().to_bytes(_NUMBER, "big")
             write_whole(self._path(wanted.log, "times"), number + now, 0o600)
             write_whole(path, number + _digest(wanted), 0o600)
+            sync_index(self._directory)
             return
         descriptor = os.open(path, os.O_RDWR | os.O_CLOEXEC)
         try:
@@ -70,6 +73,10 @@ class CheckpointMemory:
                 os.fsync(descriptor)
         finally:
             os.close(descriptor)
+
+    def others(self, text: bytes) -> list[OtherLog]:
+        """Return the logs that were signed besides that of a checkpoint. Raises `OSError`, `ValueError`."""
+        return others(remembered_logs(self._directory), read_checkpoint(text).log)
 
     def signed_at(self, checkpoint: Checkpoint) -> int | None:
         path = self._path(checkpoint.log, "signed")
@@ -128,9 +135,10 @@ class CheckpointMemory:
             os.close(descriptor)
 
     def _room_for_another(self) -> None:
-        if len(list(self._directory.glob("*.signed"))) >= MOST_LOGS:
+        kept = [one for one in remembered_logs(self._directory) if not one.is_set_aside]
+        if len(kept) >= MOST_LOGS:
             raise CheckpointRefusedError(
-                f"{MOST_LOGS} logs were signed before; remove .signed files of old ones in {self._directory}"
+                f"{MOST_LOGS} logs were signed before; set old ones aside: rosrv audit acknowledge"
             )
 
     def _path(self, log: str, what: str) -> Path:

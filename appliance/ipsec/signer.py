@@ -35,6 +35,7 @@ from appliance.ipsec.key_files import SignerKeyError, require_private
 from appliance.ipsec.proof_of_possession import RequestRefusedError
 from appliance.ipsec.removals import RemovalApprover, RemovalRefusedError, RetentionLimits
 from appliance.ipsec.signed_checkpoints import CheckpointMemory, CheckpointRefusedError, newest_signing
+from appliance.signing.signed_logs import sync_index
 
 KEY_FILE = "audit.key"
 PUBLIC_KEY_FILE = "audit.pub"
@@ -101,6 +102,7 @@ class Signer:
         self._authority = authority
         self._trouble = trouble
         clock = AgeClock(directory / "age", lambda: newest_signing(directory))
+        sync_index(directory)
         self._signed = CheckpointMemory(directory, clock)
         self._removals = RemovalApprover(self._signed, kept, clock)
         self._key = key
@@ -135,9 +137,10 @@ class Signer:
     def _sign(self, number: int, text: bytes) -> messages.Message:
         try:
             self._signed.approve(text)
-        except (CheckpointRefusedError, OSError) as error:
+            others = tuple(self._signed.others(text))
+        except (CheckpointRefusedError, OSError, ValueError) as error:
             return messages.SignatureRefused(number, str(error))
-        return messages.SignatureMade(number, self._key.sign(text), self._public_key)
+        return messages.SignatureMade(number, self._key.sign(text), self._public_key, others)
 
     def _approve_removal(self, number: int, checkpoint: bytes, newest: bytes) -> messages.Message:
         try:

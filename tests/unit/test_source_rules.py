@@ -272,7 +272,7 @@ WALL_CLOCK = {
         "api/front/history.py", "audit/log/ids.py", "audit/log/log.py", "telemetry/audit_trail.py", "backup/create.py",
         "features/fleet/poller.py", "features/fleet/bundle_gate.py",
         "features/standby/second_join.py", "cli/status_watch.py", "features/fleet/connection.py",
-        "control/assembly/host_blocks.py", "features/standby/passive.py",
+        "control/assembly/host_blocks.py", "features/standby/passive.py", "cli/connection/audit_file.py",
         "control/assembly/policies.py", "control/operators/queries.py", "features/standby/replication.py",
         "features/recorder/recording_orders.py",
         "features/evidence/bundle.py",

@@ -170,6 +170,10 @@ EVENTS: dict[str, str] = {
     "records removed": "Retention removed old records; `detail` has which, why, and the hash of the last one.",
     "records lost": "The queue was full while the log could not be written; `detail` has the number of lost records.",
     "checkpoint": "The state of the chain up to the preceding record was sealed for signing.",
+    "log replaced": "The signer also signed another log, which no operator has set aside: the log was replaced or moved"
+    " away. `detail` has that log's id, and the number and hash of its last signed checkpoint. Repeated at each start.",
+    "log set aside": "An operator on the machine acknowledged that another log is no longer the present one"
+    " (`rosrv audit acknowledge`); `detail` has its id, and the number and hash of its last signed checkpoint.",
     "signature refused": "The signer rejected a checkpoint, or its signature is invalid or by another key.",
     "bundle in force": "A bundle of the fleet passed its commit-confirm and is in force; `detail.bundle` names it.",
     "bundle refused": "A bundle of the fleet was refused, or rolled back during commit-confirm; `detail.findings` has"

@@ -11,7 +11,7 @@ import os
 import sqlite3
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -26,6 +26,7 @@ from appliance.audit.log.housekeeping import WRITE_ERRORS, Housekeeping, Waiter,
 from appliance.audit.log.ids import IdSource
 from appliance.audit.log.lock_holders import holders
 from appliance.audit.log.log_writer import ChainWriter
+from appliance.audit.log.other_logs import OtherLogs
 from appliance.audit.log.record import AuditRecord, Severity
 from appliance.audit.log.removal import Remover
 from appliance.audit.log.repetition import summary
@@ -35,6 +36,7 @@ from appliance.base.clock import now, wall_ns
 from appliance.base.engine_thread import Drive, EngineThread
 from appliance.quotas.pool import QuotaClass
 from appliance.quotas.table import AUDIT_RESERVE
+from appliance.signing.signed_logs import OtherLog
 
 Durability = Literal["strict", "batched"]
 _GATHER_SECONDS = 0.02
@@ -109,6 +111,7 @@ class AuditLog:
             make=self._own,
             hold=self._held.append,
         )
+        self._other_logs = OtherLogs(self._own, self._held.append)
         self._waiting: list[Waiter] = []
         self._writer: ChainWriter | None = None
         self._failed: str | None = "the log is being opened"
@@ -172,6 +175,15 @@ class AuditLog:
         """Store a signature of the signer, if it is valid and made with the pinned key."""
         keep = self.housekeeping.keep_signature
         self._soon(lambda writer: keep(writer, number, signature, public_key))
+
+    def other_logs(self, others: Sequence[OtherLog]) -> None:
+        """Record the logs that the signer signed besides this one."""
+        self._put(partial(self._other_logs.named, others))
+
+    @property
+    def replaced(self) -> str | None:
+        """Return which other logs the signer signed that no operator set aside, in words."""
+        return self._other_logs.missing
 
     def refused(self, number: int, reason: str) -> None:
         self._put(partial(self.housekeeping.refused, number, reason))

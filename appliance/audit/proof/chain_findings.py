@@ -5,6 +5,8 @@ from typing import Annotated
 
 import msgspec
 
+from appliance.signing.signed_logs import OtherLog
+
 
 class FindingKind(enum.StrEnum):
     """The kind of a finding."""
@@ -24,6 +26,7 @@ class FindingKind(enum.StrEnum):
     NO_KEY = "no key"
     REWRITTEN = "rewritten"
     LOG_REPLACED = "log replaced"
+    MEMORY_MISSING = "memory missing"
     REMOVAL_UNFOUNDED = "removal unfounded"
     PROVES_NOTHING = "proves nothing"
 
@@ -58,7 +61,8 @@ class Verification(msgspec.Struct, frozen=True, kw_only=True):
     was used. `elsewhere` is the comparison with checkpoints of another machine, if they were given. `removal` is ""
     (no records were removed), "signed", or "unsigned": nothing proves that the settings required the removal, for
     example because a version that did not sign removals made it. `remembered` is the number of the last checkpoint in
-    the signer's memory of this log, 0 without one; None if the log was not compared with that memory.
+    the signer's memory of this log, 0 without one; None if the log was not compared with that memory. `other_logs` are
+    those that the signer signed besides this one; each that no operator set aside is a finding.
     """
 
     ok: bool
@@ -76,3 +80,4 @@ class Verification(msgspec.Struct, frozen=True, kw_only=True):
     elsewhere: Elsewhere | None = None
     removal: str = ""
     remembered: int | None = None
+    other_logs: list[OtherLog] = []

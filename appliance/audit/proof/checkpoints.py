@@ -46,6 +46,7 @@ class CheckpointVerifier:
         self.remembered = None if remembered is None else remembered.last
         """The last checkpoint in the signer's memory; None if that was not read."""
         self._remembered = remembered = remembered or SignerMemory()
+        self.other_logs = remembered.others
         self.signed = 0
         self.signed_through = 0
         self.rows: list[StoredCheckpoint] = []
@@ -93,6 +94,24 @@ class CheckpointVerifier:
         for missing in sorted(one for one in reported if one > number):
             message = "the chain has its record, but it was removed"
             yield _finding(FindingKind.CHECKPOINT_MISSING, missing, message)
+        yield from self._beside(last_signed)
+
+    def _beside(self, last_signed: int) -> Iterator[LogFinding]:
+        for other in self._remembered.others:
+            if other.set_aside is None:
+                message = (
+                    f"the signer signed log {other.log} up to checkpoint {other.last}, and this is log {self._log}: the"
+                    " log was replaced or moved away. If you know why, run as root on the machine 'rosrv audit"
+                    f" acknowledge {other.log}'"
+                )
+                yield LogFinding(FindingKind.LOG_REPLACED, 0, 0, message)
+        if self._remembered.lost and last_signed:
+            message = (
+                "the signer's memory of this log, or its beginning, was removed: what it does not have is proven by"
+                " signatures only. If you know why, run as root on the machine 'rosrv audit acknowledge"
+                f" {self._log}'"
+            )
+            yield LogFinding(FindingKind.MEMORY_MISSING, 0, 0, message)
 
     def _check_row(
         self, row: StoredCheckpoint, previous: str, chain: dict[int, bytes], last_sequence: int

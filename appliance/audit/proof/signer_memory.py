@@ -1,4 +1,4 @@
-"""Read what the signer remembers of a log, with which a log is compared that someone may have rewritten."""
+"""Read what the signer remembers of a log, with which a log is compared that someone may have rewritten or replaced."""
 
 import os
 from pathlib import Path
@@ -6,37 +6,61 @@ from pathlib import Path
 import msgspec
 
 from appliance.base.owner_access import open_named
+from appliance.signing.signed_logs import (
+    HASH_BYTES,
+    HEADER_BYTES,
+    OtherLog,
+    RememberedLog,
+    others,
+    remembered_logs,
+)
 
-_HASH = 32
-_HEADER = 8
+_PUBLIC_KEY = "audit.pub"  # beside the key of a signer that has run
 
 
 class SignerMemory(msgspec.Struct, frozen=True):
-    """The hashes of the checkpoints that the signer signed, from number `first` on, and the last approved removal."""
+    """The hashes of the checkpoints that the signer signed, from number `first` on, and the last approved removal.
+
+    `others` are the logs that it signed besides this one. `lost`: the memory, or its beginning, was removed.
+    """
 
     first: int = 1
     hashes: bytes = b""
     removed: int | None = None
+    others: list[OtherLog] = []
+    lost: bool = False
 
     @property
     def last(self) -> int:
-        return self.first + len(self.hashes) // _HASH - 1
+        return self.first + len(self.hashes) // HASH_BYTES - 1
 
     def hash(self, number: int) -> str | None:
-        at = (number - self.first) * _HASH
-        return self.hashes[at : at + _HASH].hex() if self.first <= number <= self.last else None
+        at = (number - self.first) * HASH_BYTES
+        return self.hashes[at : at + HASH_BYTES].hex() if self.first <= number <= self.last else None
 
 
 def read_signer_memory(directory: Path, log: str) -> SignerMemory | None:
-    """Return what the signer remembers of the log; None without the folder, or the right to read it."""
+    """Return what the signer remembers of the log; None without the folder, or the right to read it.
+
+    Raises `OSError`, and `ValueError` for a damaged file.
+    """
     try:
+        logs = remembered_logs(directory, open_named)
         signed, removed = (_remembered(directory / f"{log}.{what}") for what in ("signed", "removed"))
-    except PermissionError:
+        has_run = _remembered(directory / _PUBLIC_KEY) is not None
+    except (FileNotFoundError, PermissionError):
         return None
+    own = next((one for one in logs if one.log == log), None)
+    beside = others(logs, log)
     if signed is None:
-        return SignerMemory() if directory.is_dir() else None
+        return SignerMemory(others=beside, lost=has_run and (own is None or own.lacks_memory))
     approved = None if removed is None else int.from_bytes(removed, "big")
-    return SignerMemory(int.from_bytes(signed[:_HEADER], "big"), signed[_HEADER:], approved)
+    first = int.from_bytes(signed[:HEADER_BYTES], "big")
+    return SignerMemory(first, signed[HEADER_BYTES:], approved, beside, _is_cut(own))
+
+
+def _is_cut(own: RememberedLog | None) -> bool:
+    return own is not None and own.lacks_memory
 
 
 def _remembered(path: Path) -> bytes | None:

@@ -15,7 +15,7 @@ import msgspec
 
 from appliance.audit.log import log_database
 from appliance.audit.log.columns import StoredColumns, follows
-from appliance.audit.log.log_database import reading
+from appliance.audit.log.log_database import LogUnreadableError, reading
 from appliance.audit.log.retention import RemovedRange
 from appliance.audit.log.signatures import pinned_key_path, read_public_key, signature_is_valid
 from appliance.audit.proof.chain_findings import FindingKind, LogFinding, Verification
@@ -64,13 +64,20 @@ def verify(
         connection.text_factory = lambda text: text.decode("utf-8", "surrogateescape")
         log = _log_id(connection)
         # Read the memory before the log, so that a checkpoint signed in between is at most in the log.
-        remembered = None if signer is None else read_signer_memory(signer, log)
+        remembered = None if signer is None else _memory(signer, log)
         connection.execute("BEGIN").execute("SELECT count(*) FROM sqlite_schema")  # the log as it is now
         # A key is pinned before its first signature is stored: read it after that.
         if public_key is None and pinned_key_path(path).exists():
             public_key = read_public_key(pinned_key_path(path))
         verifier = _Verifier(connection, log, public_key, remembered, copies=copies, progress=progress)
         return verifier.run()
+
+
+def _memory(signer: Path, log: str) -> SignerMemory | None:
+    try:
+        return read_signer_memory(signer, log)
+    except (OSError, ValueError) as error:
+        raise LogUnreadableError(f"{signer}: the signer's memory cannot be read: {error}") from error
 
 
 class _Row(NamedTuple):
@@ -159,7 +166,7 @@ class _Verifier:
             signed_checkpoints=audit.signed, signed_through=audit.signed_through,
             unsealed=max(0, self.last - audit.signed_through), key=self._key.hex() if self._key else None,
             findings=self._findings, elsewhere=copies.result() if copies else None, removal=removal,
-            remembered=audit.remembered,
+            remembered=audit.remembered, other_logs=audit.other_logs,
         )  # fmt: skip
 
     def _check_removal(self, removed: RemovedRange) -> str:

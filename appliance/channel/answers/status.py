@@ -157,6 +157,9 @@ class AuditState(msgspec.Struct, frozen=True):
     failed: str | None
     on_failure: Literal["deny", "allow"]
     degraded: str | None
+    replaced: Annotated[
+        str | None, doc("which other logs the signer signed and no operator set aside, in words, or null")
+    ]
 
 
 if not TYPE_CHECKING:

@@ -5,6 +5,7 @@ from typing import Annotated
 import msgspec
 
 from appliance.channel.messages.message import Message
+from appliance.signing.signed_logs import OtherLog
 
 
 class SignatureWanted(Message):
@@ -15,11 +16,15 @@ class SignatureWanted(Message):
 
 
 class SignatureMade(Message):
-    """An Ed25519 signature (64 bytes), and the public key (32 bytes)."""
+    """An Ed25519 signature (64 bytes), and the public key (32 bytes).
+
+    `others` are the logs that were signed besides the one of this checkpoint.
+    """
 
     number: int
     signature: bytes
     public_key: bytes
+    others: tuple[OtherLog, ...] = ()
 
 
 class SignatureRefused(Message):

@@ -6,6 +6,9 @@ from collections.abc import Iterator
 from appliance.audit.log.record_format import printable, rfc3339
 from appliance.audit.proof.chain_findings import Elsewhere, FindingKind, Verification
 from appliance.base.counted import counted
+from appliance.signing.signed_logs import RememberedLog
+
+_BESIDE = (FindingKind.LOG_REPLACED, FindingKind.MEMORY_MISSING)
 
 
 def print_verification(result: Verification) -> None:
@@ -25,6 +28,12 @@ def print_verification(result: Verification) -> None:
         for text in _elsewhere(result.elsewhere):
             write(text)
     write(_memory(result.remembered))
+    for other in result.other_logs:
+        if other.set_aside is not None:
+            write(
+                f"log {other.log} was signed before, up to checkpoint {other.last}: it is not part of this one, and was"
+                f" set aside at {rfc3339(other.set_aside)}"
+            )
     write(f"key: {result.key or 'none (nothing was signed yet)'}")
     write(_verdict(result))
 
@@ -36,15 +45,23 @@ def _vouched(result: Verification) -> str:
 
 
 def _verdict(result: Verification) -> str:
-    if result.ok and not result.signed_through:
-        return "The log is consistent, but nothing is signed yet: its completeness is not proven. Verify again later."
-    if result.ok and not (result.remembered or result.elsewhere):
-        return "The log is consistent and its signatures are valid, but records may have been cut off at its end."
     if result.ok:
-        return "The log is complete and unchanged."
+        return _sound(result)
+    if all(finding.kind in _BESIDE for finding in result.findings):
+        return "The log itself is consistent, but it is not the whole log that was signed."
     if all(finding.kind is FindingKind.PROVES_NOTHING for finding in result.findings):
         return "The log itself is consistent, but the checkpoints kept elsewhere do not confirm it."
     return "The log was tampered with or is damaged."
+
+
+def _sound(result: Verification) -> str:
+    if not result.signed_through:
+        return "The log is consistent, but nothing is signed yet: its completeness is not proven. Verify again later."
+    if not (result.remembered or result.elsewhere):
+        return "The log is consistent and its signatures are valid, but records may have been cut off at its end."
+    if result.other_logs or (result.elsewhere is not None and result.elsewhere.other_logs):
+        return "This log is complete and unchanged; the other logs named above are not part of it."
+    return "The log is complete and unchanged."
 
 
 def _memory(remembered: int | None) -> str:
@@ -65,6 +82,13 @@ def _elsewhere(found: Elsewhere) -> Iterator[str]:
         yield "no checkpoint kept elsewhere belongs to this log"
     if found.other_logs:
         yield f"checkpoints of other logs: {', '.join(found.other_logs)}"
+
+
+def signed_log_text(one: RememberedLog, present: str) -> str:
+    state, known = one.state(present), one.acknowledgement
+    since = f" at {rfc3339(known.time)}" if state == "set aside" and known is not None else ""
+    lost = ", its beginning is not remembered" if one.lacks_memory else ""
+    return f"{one.log}  {state}{since}, checkpoints {one.first} to {one.last}{lost}"
 
 
 def write(text: str) -> None:

@@ -1,10 +1,12 @@
 """Read the audit log from its file in a state directory; `RestLog` has the same methods over REST."""
 
+import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
-from appliance.audit.log.log_database import LogUnreadableError
+from appliance.audit.log.log_database import LogUnreadableError, reading
 from appliance.audit.log.record_format import LogEntry
 from appliance.audit.proof.chain_findings import Verification
 from appliance.audit.proof.chain_proofs import evidence, evidence_line
@@ -21,6 +23,9 @@ from appliance.audit.search.search import (
     search,
     show,
 )
+from appliance.base import clock
+from appliance.base.owner_access import acting_as, open_named
+from appliance.signing.signed_logs import RememberedLog, acknowledge, remembered_logs
 
 _POLL_SECONDS = 0.2
 Progress = Callable[[int], None]
@@ -75,6 +80,31 @@ class FileLog:
     ) -> Verification:
         path = self.path
         return verify(path, key, path.parent.parent / "signer", copies, progress)
+
+    def present(self) -> str:
+        """Return the id of the log."""
+        with reading(self.path) as connection:
+            (found,) = connection.execute("SELECT id FROM log").fetchone()
+        return str(found)
+
+    def signed_logs(self) -> list[RememberedLog]:
+        """Return the logs that the signer of this machine signed."""
+        with self._signer() as folder:
+            return remembered_logs(folder, open_named)
+
+    def acknowledge(self, one: RememberedLog) -> None:
+        """Acknowledge, as root, that a log is no longer the present one, or that its memory is not whole."""
+        with self._signer() as folder, acting_as(folder.stat().st_uid):  # in a container, root as the signer
+            acknowledge(folder, one, clock.wall_ns(), os.getuid())
+
+    @contextmanager
+    def _signer(self) -> Iterator[Path]:
+        folder = self._state / "signer"
+        try:
+            yield folder
+        except (OSError, ValueError) as error:
+            why = f"{folder}: {error}; run this as root, with the appliance's --state"
+            raise LogUnreadableError(why) from error
 
     def checkpoints(self, after: int) -> list[SignedCheckpoint]:
         return signed_checkpoints(self.path, after)

@@ -68,7 +68,8 @@ class SignerRequests:
 
     def _heard(self, message: object) -> None:
         match message:
-            case messages.SignatureMade(number, signature, public_key):
+            case messages.SignatureMade(number, signature, public_key, others):
+                self._audit().other_logs(others)
                 self._audit().signed(number, signature, public_key)
                 self.signed.set()
             case messages.SignatureRefused(number, reason):

@@ -18,6 +18,7 @@ AUDIT_TOOLS = Feature(
                 "tail": Verb(f"{_VERBS}:tail"),
                 "show": Verb(f"{_VERBS}:show"),
                 "verify": Verb(f"{_VERBS}:verify"),
+                "acknowledge": Verb(f"{_PLACE}acknowledge_verb:acknowledge_log"),
                 "checkpoints": Verb(f"{_VERBS}:checkpoints"),
                 "export": Verb(f"{_VERBS}:export"),
             },

@@ -8,7 +8,7 @@ from appliance.features.view import StateView
 from appliance.features.views import STATES, states_in, states_of
 from tests.support.answers import example
 
-AUDIT = "lag_records lag_seconds failed on_failure degraded forwarding collector"
+AUDIT = "lag_records lag_seconds failed on_failure degraded replaced forwarding collector"
 STATUS = (
     "version since master processes isolation relaying mediation firewall probe policy ipsec monitors rosmaster relay"
     " nodes shadows topics services connections messages dropped audit clock recorder switched_off blocks last_minute"
