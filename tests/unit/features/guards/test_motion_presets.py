@@ -170,7 +170,7 @@ def test_only_finite_commands_are_sane(place: int, leg: float) -> None:
     assert Guarded("sane").drive(twist(*legs), 1) == (tuple(legs) if math.isfinite(leg) else (0,) * 6)
 
 
-def test_a_rate_drops_motions_and_never_a_stop_or_a_slower_one() -> None:
+def test_a_rate_drops_motions_and_never_a_stop() -> None:
     random = seeded(3)
     for _trace in TRACES:
         guard, left, before, at = Guarded("rate", interval=0.1, burst=3), 0.0, -math.inf, 0
