@@ -33,7 +33,7 @@ class _Reader:
     def __init__(self, definitions: Definitions, data: bytes) -> None:
         self._definitions = definitions
         self._data = data
-        self._position = 0
+        self.position = 0
         self._left = MOST_FIELDS  # the number of values that may still be shown
         self._steps = _MOST_STEPS  # the number of values that may still be read, whether shown or not
         self._sizes: dict[str, int | None] = {}
@@ -118,10 +118,10 @@ class _Reader:
         return str(value) if isinstance(value, float) and not math.isfinite(value) else value
 
     def _take(self, size: int) -> bytes:
-        data = self._data[self._position : self._position + size]
+        data = self._data[self.position : self.position + size]
         if len(data) < size:
             raise _EndError
-        self._position += size
+        self.position += size
         return data
 
 
@@ -150,6 +150,17 @@ def read_fields(definitions: Definitions, name: str, data: bytes) -> dict[str, A
         return fields
     except DefinitionError:
         return None
+
+
+def rest_of(definitions: Definitions, name: str, data: bytes) -> bytes:
+    """Return the bytes behind the last field of a message; none if the message is cut or cannot be read."""
+    reader = _Reader(definitions, data)
+    try:
+        definitions.md5sum(name)
+        reader.message(name)
+    except (_CutError, DefinitionError):
+        return b""
+    return data[reader.position :]
 
 
 class PublisherReader:

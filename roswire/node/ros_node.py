@@ -166,6 +166,14 @@ class RosNode:
     def follow(self, subscriber: NodeSubscription, uris: Sequence[Value]) -> None:
         subscriber.update([uri for uri in uris if isinstance(uri, str) and uri != self._uri])
 
+    async def subscribe_again(self, topic: str) -> None:
+        """Register a subscription again, to learn whether the master still grants it. Raise `RosError` if not."""
+        subscriber = self.subscribers[topic]
+        updates = subscriber.updates
+        uris = await self.master("registerSubscriber", topic, subscriber.wanted.name, self._uri)
+        if subscriber.updates == updates:  # else an update, which is newer, overtook the answer
+            self.follow(subscriber, uris if isinstance(uris, list) else [])
+
     async def unsubscribe(self, topic: str) -> None:
         async with self._lock("subscriber", topic):
             if topic in self.subscribers:
@@ -225,6 +233,10 @@ class RosNode:
             except BaseException:
                 del self.parameters[key]
                 raise
+
+    async def subscribe_parameter_again(self, key: str) -> None:
+        """Register a subscription again, to learn whether the master still grants it. Raise `RosError` if not."""
+        await self.master("subscribeParam", self._uri, key)
 
     async def unsubscribe_parameter(self, key: str) -> None:
         async with self._lock("parameter", key):

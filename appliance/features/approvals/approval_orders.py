@@ -185,7 +185,7 @@ class ApprovalOrders:
             self._enforce()
             await self._stop_motion(entry)
             return _shown(replace(entry, state=ApprovalState.REFUSED, until=clock.now(), who=who))
-        entry = self._table.refuse(entry, who)
+        entry = self._table.refuse(entry, who, clock.now())
         self._record("approval refused", entry, f"{who} refused approval {entry.number}", who=who)
         return _shown(entry)
 
@@ -193,6 +193,7 @@ class ApprovalOrders:
 
     def policy_changed(self) -> None:
         """End all entries about which the policy no longer asks. The next check stops their motions."""
+        self._table.forget_unanswered(lambda call: self._asks_about(call, ""))
         for entry in self._table.entries():
             if not self._asks(entry):
                 self._end(entry, "the policy no longer asks")
@@ -245,8 +246,10 @@ class ApprovalOrders:
         return "" if self._asks(entry) else "the policy no longer asks"
 
     def _asks(self, entry: ApprovalEntry) -> bool:
-        call = entry.call
-        request = Request(call.host, entry.caller_id, call.category, call.resource)
+        return self._asks_about(entry.call, entry.caller_id)
+
+    def _asks_about(self, call: HeldCall, caller_id: str) -> bool:
+        request = Request(call.host, caller_id, call.category, call.resource)
         asking = (decide_right(self._policy(), Right(request, below)).asks for below in (False, True))
         return any(asking)  # a parameter may be held because of a rule for what is below it
 
@@ -277,6 +280,7 @@ class ApprovalOrders:
     def _end(self, entry: ApprovalEntry, reason: str, who: str = "") -> None:
         if entry.state is ApprovalState.WAITS and entry.until <= clock.now():
             self._unanswered.append(clock.now())
+            self._table.end_unanswered(entry)
         self._table.end(entry)
         self._moved.pop(entry.number, None)
         self._still.pop(entry.number, None)

@@ -1,10 +1,14 @@
 """Keep the calls that wait for an approval, and the approvals. Times are monotonic seconds.
 
-1. A call has one number while it waits, however often its host repeats it.
+1. A call has one number while it waits, however often its host repeats it. If nobody answered, its repetition keeps
+   the number: the operator may have it from the agent. A call with other arguments is another call.
 2. An approval of one call is used once, by the same host, for the same service and arguments.
-3. An entry keeps the charged host of its call, even if another one would be charged now.
+3. A refusal pauses for `WAIT_SECONDS`, and no repetition shortens that.
+4. An entry keeps the charged host of its call, even if another one would be charged now.
 """
 
+from collections import OrderedDict
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import NamedTuple
@@ -14,6 +18,7 @@ from appliance.policy.model import Address, Category
 from appliance.policy.policy import Approval, Policy
 from appliance.quotas.pool import Pool, QuotaClass
 
+_MOST_UNANSWERED = 256
 WAIT_SECONDS = 120.0
 """How long a call waits for an answer, and how long an approval of one call can be used."""
 
@@ -86,6 +91,7 @@ class ApprovalTable:
         self._next = first
         self._entries: dict[int, ApprovalEntry] = {}
         self._by_call: dict[HeldCall, int] = {}
+        self._unanswered: OrderedDict[HeldCall, int] = OrderedDict()  # their numbers, oldest first
         self.pool: Pool[ChargedHost] = Pool(
             "waiting calls and approvals",
             APPROVALS.bounds,
@@ -117,12 +123,12 @@ class ApprovalTable:
     ) -> ApprovalEntry | str:
         if refusal := self.pool.take(charged):
             return refusal
+        number = self._unanswered.pop(call, 0) or self._next
         entry = ApprovalEntry(
-            self._next, call, charged, caller_id, type_, arguments, size, now, now + WAIT_SECONDS
+            number, call, charged, caller_id, type_, arguments, size, now, now + WAIT_SECONDS
         )
-        self._next += 1
-        self._put(entry)
-        return entry
+        self._next = max(self._next, number + 1)
+        return self._put(entry)
 
     def approve(
         self,
@@ -153,8 +159,20 @@ class ApprovalTable:
             )
         )
 
-    def refuse(self, entry: ApprovalEntry, who: str) -> ApprovalEntry:
-        return self._put(replace(entry, state=ApprovalState.REFUSED, who=who))
+    def refuse(self, entry: ApprovalEntry, who: str, now: float) -> ApprovalEntry:
+        return self._put(replace(entry, until=now + WAIT_SECONDS, state=ApprovalState.REFUSED, who=who))
+
+    def end_unanswered(self, entry: ApprovalEntry) -> None:
+        """End a call that nobody answered, and keep its number for a repetition."""
+        self.end(entry)
+        self._unanswered[entry.call] = entry.number
+        while len(self._unanswered) > _MOST_UNANSWERED:
+            self._unanswered.popitem(last=False)
+
+    def forget_unanswered(self, asks: Callable[[HeldCall], bool]) -> None:
+        """Forget the numbers of calls about which the policy no longer asks."""
+        for call in [call for call in self._unanswered if not asks(call)]:
+            del self._unanswered[call]
 
     def end(self, entry: ApprovalEntry) -> None:
         if self._entries.pop(entry.number, None) is not None:

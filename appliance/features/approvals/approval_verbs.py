@@ -5,6 +5,7 @@ from typing import Annotated, Any
 import msgspec
 import typer
 
+from appliance.base.counted import counted
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.durations import span_given
 from appliance.cli.output import say_json, usage_error
@@ -15,6 +16,7 @@ from appliance.features.approvals.approval_requests import (
     RefuseCall,
 )
 from rosmop.tool.terminal import say
+from roswire.message_view import read_bytes, read_fields, rest_of
 
 
 @speaks
@@ -70,19 +72,22 @@ def _arguments(one: Approval) -> str:
     if not one.sha256:
         return " with any arguments" if one.category == "call" else ""
     data = bytes.fromhex(one.arguments)
-    fields = _fields(one.type, data) if data else {}
+    fields, rest = _fields(one.type, data)
     shown = f"{data!r} ({one.type}, sha256 {one.sha256[:12]})" if fields is None else str(fields)
+    if rest:  # the service may read them, and the approval is for all bytes
+        shown = f"{shown}, and {counted(len(rest), 'byte')} behind the last field: {read_bytes(rest)}"
     hidden = one.size - len(data)
     return f" {shown}{f', and {hidden} more bytes, which are not shown' if hidden else ''}"
 
 
-def _fields(service: str, data: bytes) -> dict[str, Any] | None:
+def _fields(service: str, data: bytes) -> tuple[dict[str, Any] | None, bytes]:
+    """Return the fields of a request, and the bytes behind the last one; None for a type that is not known."""
     from roswire.errors import DefinitionError  # noqa: PLC0415  few calls need the definitions
-    from roswire.message_view import read_fields  # noqa: PLC0415  as above
     from roswire.standard import standard_definitions  # noqa: PLC0415  as above
 
     try:
         definitions = standard_definitions()
-        return read_fields(definitions, definitions.service(service).request.name, data)
+        name = definitions.service(service).request.name
     except DefinitionError:
-        return None
+        return (None if data else {}), b""
+    return read_fields(definitions, name, data), rest_of(definitions, name, data)

@@ -60,7 +60,10 @@ _LINGER_SECONDS = 10.0
 _REPLAY_SECONDS = 1.0  # not longer: an old command must not reach a robot
 _LEARN_SECONDS = 1.0
 _ASK_SECONDS, _ASK_AGAIN_SECONDS = 1.0, 10.0
-_ANSWER_SECONDS = 60.0  # for a client that answers a call of its service
+_ANSWER_SECONDS = (
+    60.0  # of a call, unless the client asks for another time; also of a call to a client's service
+)
+_LEFT_SECONDS = 10.0  # in which calls of a client end that has left
 
 BuiltIn = Callable[[CallOfService], "Awaitable[Raw] | None"]
 """Answers a call of a service that the door itself has; returns None for other services."""
@@ -145,6 +148,8 @@ class DoorNode:
         self._publications: dict[str, _Publication] = {}
         self._heard: dict[str, HeardTopic[_Subscriber]] = {}
         self._offers: dict[str, _Offer] = {}
+        self._refused: dict[str, tuple[float, str | None, str]] = {}  # when, type and reason, by topic
+        self._calls_of: dict[DoorClient, set[asyncio.Timeout]] = {}
         self._parameters = DoorParameters(node, calls)
         self._frames = SharedFrames()
         self._locks: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()
@@ -190,13 +195,15 @@ class DoorNode:
             case SubscribeParameter() | UnsubscribeParameter():
                 await self._parameters.carry_out(request, client)
 
-    async def forget(self, client: DoorClient) -> None:
-        """Release all that a connection used, and publish its wills."""
+    async def forget(self, client: DoorClient, *, wills: bool) -> None:
+        """Release all that a connection used, and publish its wills, unless its right has ended."""
         for topic, known in [
             (topic, one) for topic, one in self._publications.items() if client in one.clients
         ]:
-            if client in known.wills:
-                with contextlib.suppress(LimitExceededError):  # its subscribers would not get it either
+            if client in known.wills and wills:
+                # Its subscribers would not get it if there is no memory, or if the right to publish has ended.
+                with contextlib.suppress(LimitExceededError, RosError):
+                    await self._check_granted(known)
                     known.publish(known.wills[client], client.memory)
             self._unadvertise(topic, client)
         for topic in [topic for topic, heard in self._heard.items() if client in heard.clients]:
@@ -204,10 +211,32 @@ class DoorNode:
         for service in [service for service, offer in self._offers.items() if offer.client is client]:
             await self._withdraw(service)
         self._parameters.forget(client)
+        now = asyncio.get_running_loop().time()
+        for limit in self._calls_of.pop(client, ()):
+            limit.reschedule(now + _LEFT_SECONDS)
+
+    def policy_changed(self) -> None:
+        """Ask the master again before another client shares a subscription: the door's right may have ended."""
+        for heard in self._heard.values():
+            heard.doubtful = True
+        self._parameters.policy_changed()
 
     # --- publications ---
 
     async def _advertise(self, request: AdvertiseTopic, client: DoorClient) -> None:
+        refused = self._refused.get(request.topic)
+        if refused is not None and clock.now() - refused[0] < _ASK_SECONDS and refused[1] == request.type:
+            raise MasterDenialError(refused[2])
+        try:
+            await self._register(request, client)
+        except MasterDenialError as denial:
+            if len(self._refused) >= self._topics.whole:
+                self._refused.clear()
+            self._refused[request.topic] = clock.now(), request.type, str(denial)
+            raise
+        self._refused.pop(request.topic, None)
+
+    async def _register(self, request: AdvertiseTopic, client: DoorClient) -> None:
         async with self._lock(f"publisher {request.topic}"):
             known = self._publications.get(request.topic)
             if known is not None and not known.clients and not known.type.defined:
@@ -308,6 +337,7 @@ class DoorNode:
         topic = request.topic
         async with self._lock(f"subscriber {topic}"):
             if topic in self._heard:
+                await self._check_subscribed(topic)
                 self._heard[topic].clients[client] = request
                 self._subscribed.used(topic)
                 self.node.repeat(topic, lambda body, header: self._hear(topic, body, header, [client]))
@@ -324,6 +354,19 @@ class DoorNode:
             except BaseException:
                 del self._heard[topic]
                 raise
+
+    async def _check_subscribed(self, topic: str) -> None:
+        """Raise the master's refusal if the subscription, which another client shares, is no longer granted."""
+        heard = self._heard[topic]
+        if not heard.doubtful:
+            return
+        try:
+            await self.node.subscribe_again(topic)
+        except MasterDenialError as denial:
+            for client in heard.clients:
+                client.warned(str(denial))
+            raise
+        heard.doubtful = False
 
     def _hear(
         self,
@@ -396,18 +439,28 @@ class DoorNode:
         self._tasks.start(self._call(replace(request, values=values), client, size))
 
     async def _call(self, request: CallOfService, client: DoorClient, size: int) -> None:
+        seconds = request.seconds or _ANSWER_SECONDS
+        limit = asyncio.timeout(seconds)
+        self._calls_of.setdefault(client, set()).add(limit)
         try:
-            own = self._built_in(request)
-            client.answered(request.call, await (self._call_node(request) if own is None else own))
+            async with limit:
+                own = self._built_in(request)
+                answer = await (self._call_node(request, seconds) if own is None else own)
+            client.answered(request.call, answer)
+        except TimeoutError:
+            client.failed(request, f"{request.service} did not answer within {seconds:g} s")
         except RosError as error:
             client.failed(request, str(error))
         finally:
+            if client in self._calls_of:
+                self._calls_of[client].discard(limit)
+                if not self._calls_of[client]:
+                    del self._calls_of[client]
             self._calls.add(-size)
             self._waiting_calls.give_back(client.memory.host)
 
-    async def _call_node(self, request: CallOfService) -> Raw | bytes:
+    async def _call_node(self, request: CallOfService, seconds: float) -> Raw | bytes:
         header = await self.node.probe_service(request.service)
-        seconds = request.seconds or _ANSWER_SECONDS
         name, md5sum = header.get("type", ""), header.get("md5sum", "*")
         if request.type not in (None, name):
             raise ProtocolError(f"{request.service} has the type {name[:200]}, not {request.type}")

@@ -60,6 +60,7 @@ class DoorParameters:
         self._node = node
         self._calls = calls  # charged with the names in waiting reads
         self._clients: dict[str, set[ParameterClient]] = {}
+        self._doubtful: set[str] = set()  # subscribed before the policy changed
         self._lock = asyncio.Lock()  # for registrations
         self._reads: Counter[ParameterClient] = Counter()  # that wait
         self._reading = asyncio.Lock()
@@ -68,6 +69,9 @@ class DoorParameters:
 
     async def close(self) -> None:
         await self._tasks.close()
+
+    def policy_changed(self) -> None:
+        self._doubtful = {*self._clients}
 
     def begin_read(self, request: ReadParameters, client: ParameterClient) -> None:
         if self._reads[client] >= _MOST_READS:
@@ -135,6 +139,9 @@ class DoorParameters:
     async def _subscribe(self, name: str, client: ParameterClient) -> None:
         async with self._lock:
             if name in self._clients:
+                if name in self._doubtful:
+                    await self._node.subscribe_parameter_again(name)
+                    self._doubtful.discard(name)
                 self._clients[name].add(client)
                 return
             check_share("subscribed parameters", DOOR_PARAMETERS.bounds, [*self._clients.values()], client)

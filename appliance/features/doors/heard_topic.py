@@ -28,6 +28,8 @@ class HeardTopic(Generic[Client]):
     clients: dict[Client, SubscribeTopic] = field(default_factory=dict)
     header: Mapping[str, str] | None = None
     told: set[TypeKey] = field(default_factory=set)
+    doubtful: bool = False
+    """Whether the policy has changed since the master last granted the subscription."""
     _known: KnownType | None = None
     _unusable: tuple[Mapping[str, str], DefinitionError] | None = None
 

@@ -153,7 +153,7 @@ class DoorProcess:
                     self._network = GivenNetwork(message.address, self._child.tell)
                     self._tasks.start(self._start(message, self._network))
                 elif self._given.added != message.added:  # the slot has another door now
-                    self._over.set()
+                    self._end_door()
                 self._given = message
                 self._end_tickets(lambda ticket: ticket not in message.tickets)
                 self._block(message.blocked)
@@ -162,10 +162,11 @@ class DoorProcess:
             case door_link.PolicyChanged():
                 if self._door is not None:
                     self._door.lookout.policy_changed()
+                    self._door.node.policy_changed()
             case door_link.BlocksGiven(hosts):
                 self._block(hosts)
             case door_link.DoorEnded():
-                self._over.set()
+                self._end_door()
             case door_link.TicketEnded(ticket):
                 self._end_tickets(lambda one: one == ticket)
             case _:
@@ -179,15 +180,22 @@ class DoorProcess:
                 if self._network is not None:
                     self._network.refused(number, reason)
 
+    def _end_door(self) -> None:
+        for client in self._clients:
+            client.session.revoke("the door was removed")
+        self._over.set()
+
     def _block(self, hosts: list[str]) -> None:
         self._blocked = frozenset(hosts)
+        if self._door is not None:
+            self._door.node.policy_changed()  # the door itself may be blocked
         for client in [one for one in self._clients if one.peer in self._blocked]:
-            client.session.disconnect(_BLOCKED)
+            client.session.revoke(_BLOCKED)
 
     def _end_tickets(self, ended: Callable[[str], bool]) -> None:
         self._tickets = Counter({one: count for one, count in self._tickets.items() if not ended(one)})
         for client in [one for one in self._clients if one.ticket and ended(one.ticket)]:
-            client.session.disconnect("the ticket is over; ask the operator for a new one")
+            client.session.revoke("the ticket is over; ask the operator for a new one")
 
     def _took(self, message: Any, descriptors: tuple[int, ...]) -> None:
         match message:

@@ -1,14 +1,15 @@
 """Speak the rosbridge protocol, version 2, on one connection, without I/O.
 
-1. Every refusal has its reason: a `status` of level error with the id of the operation, or a failed
-   `service_response`. Nothing else is sent without a request.
+1. Every refusal has its reason: a `status` of level error with the id of the operation, also one without an id when
+   the reason is new, or a failed `service_response`. Nothing else is sent without a request.
 2. Frames repeat the client's own spelling of a name; requests have the canonical name.
 3. Everything that a client can make grow has a limit.
 4. No fragments are sent: no client library reads them.
 """
 
+import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from msgspec import Raw
@@ -59,6 +60,8 @@ from roswire.errors import PeerError, quoted
 from roswire.names import resolve
 from roswire.xmlrpc import Value
 
+_MOST_TOLD = 100
+_NUMBERS = re.compile(r"[0-9]+")
 _LEVELS = ("none", "error", "warning", "info")
 _STRENGTH: tuple[Compression, ...] = ("none", "png", "cbor", "cbor-raw")
 
@@ -73,7 +76,8 @@ class RosbridgeLimits:
     will_bytes: int = 4096
     calls: int = 100  # without an answer, in each direction
     fragment_bytes: int = 8 << 20  # of all frames that are not complete
-    call_seconds: float = 60.0
+    call_seconds: float = 60.0  # unless the client asks for another time
+    longest_call_seconds: float = 3600.0
 
 
 @dataclass(slots=True)
@@ -88,6 +92,8 @@ class _Subscription:
 class _Advertisement:
     type: str | None
     clients: set[ClientId] = field(default_factory=set)
+    refused: AdvertiseTopic | None = None
+    """The last advertisement if the door refused it. A message repeats it: most clients advertise only once."""
 
 
 @dataclass(slots=True)
@@ -112,6 +118,7 @@ class Rosbridge:
         self._services: dict[str, str] = {}  # the client's spelling, by canonical name
         self._calls: dict[int, _Call] = {}
         self._asked: dict[str, str] = {}  # calls to the client: their service, by id
+        self._told: set[str] = set()
         self._number = 0
         self._fragments = FragmentStore(limits.fragment_bytes, queue.memory)
         self._carry_out: dict[type[Any], Callable[[Any], list[DoorRequest]]] = {
@@ -155,6 +162,8 @@ class Rosbridge:
     def _add_advertisement(self, topic: str, kind: str | None, client: ClientId) -> None:
         _check_room(self._advertised, topic, self._limits.topics, "topics are advertised")
         known = self._advertised.setdefault(topic, _Advertisement(kind))
+        if known.refused is not None:
+            known = self._advertised[topic] = _Advertisement(kind)
         known.type = _one_type(topic, "advertised", known.type, kind)
         if client not in known.clients and len(known.clients) >= self._limits.ids:
             raise OperationError(
@@ -176,8 +185,12 @@ class Rosbridge:
     def _publish(self, operation: PublishOp) -> list[DoorRequest]:
         topic = self._resolved(operation.topic)
         publish = PublishMessage(topic, operation.msg, operation.id)
-        if topic in self._advertised:
+        known = self._advertised.get(topic)
+        if known is not None and known.refused is None:
             return [publish]
+        if known is not None and known.refused is not None:
+            again, known.refused = replace(known.refused, reply_to=operation.id), None
+            return [again, publish]
         self._add_advertisement(topic, None, None)
         queue = operation.queue_size or 1
         return [AdvertiseTopic(topic, None, operation.latch, queue, operation.id), publish]
@@ -239,10 +252,10 @@ class Rosbridge:
             self._fail_call(call, str(error))
             return []
         self._calls[self._number] = call
-        longest = self._limits.call_seconds
-        seconds = longest if operation.timeout is None else min(max(operation.timeout, 0.0), longest)
+        wished = max(operation.timeout or 0.0, 0.0) or self._limits.call_seconds
+        seconds = min(wished, self._limits.longest_call_seconds)
         values = Raw(b"{}") if bytes(operation.args) == b"null" else operation.args
-        return [CallOfService(service, self._number, values, seconds or longest, reply_to)]
+        return [CallOfService(service, self._number, values, seconds, reply_to)]
 
     def _offer(self, operation: AdvertiseServiceOp) -> list[DoorRequest]:
         service, kind = self._resolved(operation.service), type_name(operation.type)
@@ -290,7 +303,8 @@ class Rosbridge:
                     self._fail_call(call, reason)
                 return
             case AdvertiseTopic():
-                self._advertised.pop(request.topic, None)
+                if request.topic in self._advertised:
+                    self._advertised[request.topic].refused = request
             case SubscribeTopic():
                 for spelling in [
                     key for key, one in self._subscriptions.items() if one.topic == request.topic
@@ -299,6 +313,17 @@ class Rosbridge:
             case OfferService():
                 self._services.pop(request.service, None)
         self.status("error", reason, request.reply_to)
+        # roslib shows a program only statuses without an id. Once for each topic and reason, it gets this one too.
+        told = f"{getattr(request, 'topic', '')} {_NUMBERS.sub('', reason)}"
+        topics = isinstance(request, AdvertiseTopic | PublishMessage | SubscribeTopic)
+        if (
+            topics
+            and request.reply_to is not None
+            and told not in self._told
+            and len(self._told) < _MOST_TOLD
+        ):
+            self._told.add(told)
+            self.status("error", reason)
 
     def _fail_call(self, call: _Call, reason: str) -> None:
         # ros-mcp takes values without `successful` for a success.

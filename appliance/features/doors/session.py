@@ -42,8 +42,10 @@ from appliance.features.doors.known_types import DoorMessage
 from appliance.features.doors.lookout import Lookout
 from appliance.features.doors.origins import rejection
 from appliance.features.doors.png_frames import DoorFrame, PngFrame
+from appliance.features.doors.refusal_counts import MOST_REFUSALS, REFUSAL_SECONDS, RefusalCounts
 from appliance.features.doors.requests import (
     AdvertiseTopic,
+    CallOfService,
     DoorRequest,
     PublishMessage,
     UnadvertiseTopic,
@@ -62,6 +64,7 @@ _TURN = 64  # frames after which frames for clients are sent, although more have
 _TAKING_SECONDS = 5.0
 _LEAST_TAKEN = 1 << 19
 _CLOSING_SECONDS = 2.0
+_CLOSE_BYTES = 120  # of the reason in a closing frame
 _LAST_SECONDS = 1.0  # in which the client may take the last frames
 _LAST_TURN_SECONDS = 0.05
 _WATCH_SECONDS = 2.0  # between two looks at the surroundings
@@ -140,6 +143,8 @@ class DoorSession:
         opened: Callable[[], None] = lambda: None,  # called after the handshake
     ) -> None:
         self.end = ""
+        self._revoked = False
+        self._refusals = RefusalCounts()
         self.began = False
         self._opened = opened
         self.received = self.sent = 0  # frames
@@ -193,7 +198,7 @@ class DoorSession:
             self.end = self.end or f"the connection broke: {error}"
         finally:
             await self._end_connection()
-            await self._door.forget(self)
+            await self._door.forget(self, wills=not self._revoked)
             self.memory.close()
 
     async def _handshake(self) -> bool:
@@ -381,7 +386,14 @@ class DoorSession:
                 if isinstance(request, AdvertiseTopic):
                     refused.add(request.topic)
                 self._protocol.failed(request, str(error))
+                self._note_refusal(request, str(error))
                 self._wake.set()
+
+    def _note_refusal(self, request: DoorRequest, reason: str) -> None:
+        if isinstance(request, AdvertiseTopic | PublishMessage | CallOfService):
+            topic = "" if isinstance(request, CallOfService) else request.topic
+            if self._refusals.exceeded(topic, reason, asyncio.get_running_loop().time()):
+                self.disconnect(f"{MOST_REFUSALS} refusals in {REFUSAL_SECONDS:g} s: {reason}")
 
     def _note_will(self, request: DoorRequest) -> None:
         match request:
@@ -490,6 +502,11 @@ class DoorSession:
                     f"the client took {taken} bytes in {_TAKING_SECONDS:g} s, and holds memory that others need"
                 )
 
+    def revoke(self, reason: str) -> None:
+        """Disconnect the client because its right has ended. Its wills end with the right."""
+        self._revoked = True
+        self.disconnect(reason)
+
     def disconnect(self, reason: str) -> None:
         self._disconnect(CloseCode.POLICY_VIOLATION, reason)
 
@@ -497,7 +514,7 @@ class DoorSession:
         self.end = self.end or reason
         if self._socket.state is State.OPEN:
             with contextlib.suppress(WebSocketError):
-                self._socket.send_close(code, reason[:120])
+                self._socket.send_close(code, reason.encode()[:_CLOSE_BYTES].decode(errors="ignore"))
         self._over.set()
         self._wake.set()
 
@@ -518,6 +535,7 @@ class DoorSession:
 
     def failed(self, request: DoorRequest, reason: str) -> None:
         self.refusals += 1
+        self._note_refusal(request, reason)
         self._tell(lambda: self._protocol.failed(request, reason))
 
     def warned(self, reason: str) -> None:

@@ -17,6 +17,7 @@ from appliance.features.approvals.approval_orders import CHECK_SECONDS, LEASE_SE
 from appliance.features.approvals.approval_requests import Approval, ApprovalsWanted, ApproveCall, RefuseCall
 from appliance.features.approvals.approval_table import WAIT_SECONDS
 from appliance.features.approvals.view import APPROVALS_VIEW
+from appliance.features.doors.refusal_counts import HELD
 from appliance.master.endpoints.host_signs import HostSigns
 from appliance.policy.model import Address, Category, Request, address_of
 from appliance.policy.policy import Policy
@@ -305,7 +306,7 @@ async def test_a_call_without_an_answer_ends_with_an_alarm(site: Site) -> None:
     await site.pass_time(WAIT_SECONDS)
     [alarm] = view.alarms(site.orders.state())
     assert alarm.kind == "approval-unanswered"
-    assert number_in(await site.call()) != number
+    assert number_in(await site.call()) == number  # the operator may have it from the agent
     await site.pass_time(1)
     site.time.advance(600)
     assert not [*view.alarms(site.orders.state())]
@@ -448,3 +449,43 @@ async def test_no_call_passes_without_an_approval_of_its_own(site: Site) -> None
                 leased = leases.get(host, 0.0) > clock.now()
                 if not await site.call(body, host) and not leased:
                     once.remove((host, body))
+
+
+async def test_a_repeated_call_keeps_its_number_only_with_equal_arguments(site: Site) -> None:
+    number = number_in(await site.call(b"a"))
+    await site.pass_time(WAIT_SECONDS)
+    assert number_in(await site.call(b"b")) != number
+    assert number_in(await site.call(b"a")) == number
+    await site.orders.approve(ApproveCall(number, None), "ann")
+    assert not await site.call(b"a")
+    assert number_in(await site.call(b"a")) != number  # an approval that was used is not renewed
+
+
+async def test_the_number_of_a_call_ends_with_the_right_of_its_host(site: Site) -> None:
+    """A door that is removed and added again has the same name and address."""
+    number = number_in(site.publish("/x"))
+    await site.pass_time(WAIT_SECONDS)
+    before = site.text
+    site.text = compile_policy("[Publishers]\n", file="site.ini")
+    site.decide_again()
+    site.text = before
+    site.decide_again()
+    assert number_in(site.publish("/x")) != number
+
+
+@pytest.mark.parametrize("waited", [0.0, 60.0, 119.0])
+async def test_a_refusal_pauses_for_two_minutes_however_often_the_call_is_repeated(
+    site: Site, waited: float
+) -> None:
+    number = number_in(await site.call())
+    await site.pass_time(waited)
+    await site.orders.refuse(RefuseCall(number), "ann")
+    for _second in range(int(WAIT_SECONDS) - 1):
+        assert "an operator refused" in await site.call()
+        await site.pass_time(1)
+    await site.pass_time(1)
+    assert number_in(await site.call()) != number
+
+
+def test_doors_know_the_words_of_a_held_call(site: Site) -> None:
+    assert HELD in site.publish("/x")

@@ -22,3 +22,29 @@ def test_an_operator_sees_that_arguments_are_cut(
     fake = SimpleNamespace(as_json=False, answer_or_exit=lambda _request: Approvals([row]))
     cast(Any, approval_verbs.approve).function(cast(Appliance, fake), None)
     assert shown in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("service", "data", "shown"),
+    [
+        ("std_srvs/SetBool", b"\x01", " {'data': True}: waits"),
+        (
+            "std_srvs/SetBool",
+            b"\x01\x00evil",
+            " {'data': True}, and 5 bytes behind the last field: 006576696c: waits",
+        ),
+        ("std_srvs/Empty", b"go", " {}, and 2 bytes behind the last field: 676f: waits"),
+        ("std_srvs/Empty", b"", " {}: waits"),
+        ("own/Unknown", b"\x01x", " b'\\x01x' (own/Unknown, sha256 4bf5): waits"),
+        ("own/Unknown", b"", " {}: waits"),
+        ("roscpp/SetLoggerLevel", b"\x09\0\0\0ab", "'logger': '…', 'level': '…'}: waits"),
+    ],
+)
+def test_an_operator_sees_every_byte_of_the_arguments(
+    capsys: pytest.CaptureFixture[str], service: str, data: bytes, shown: str
+) -> None:
+    call = ("10.0.0.7", "/agent", "call", "/set", service, "4bf5")
+    row = Approval(48213, "waits", *call, data.hex(), len(data), 60.0, "")  # type: ignore[arg-type]  # of a tuple
+    fake = SimpleNamespace(as_json=False, answer_or_exit=lambda _request: Approvals([row]))
+    cast(Any, approval_verbs.approve).function(cast(Appliance, fake), None)
+    assert shown in capsys.readouterr().out

@@ -3,6 +3,7 @@ import json
 import struct
 import zlib
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import cbor2
@@ -144,14 +145,50 @@ def test_a_name_that_no_topic_has_is_refused_in_words(client: Client, spelling: 
     assert client.refusal({"op": "publish", "topic": spelling, "msg": {}, "id": 5})["id"] == 5
 
 
-def test_a_refusal_has_the_id_and_forgets_the_advertisement(client: Client) -> None:
-    advertise, publish = client.sends({"op": "publish", "topic": "/t", "msg": {}, "id": "p1"})
-    client.rosbridge.failed(advertise, "denied by [Publishers] /t (site.ini:14)")
-    assert client.gets() == [
-        {"op": "status", "level": "error", "msg": "denied by [Publishers] /t (site.ini:14)", "id": "p1"}
-    ]
-    assert client.sends({"op": "publish", "topic": "/t", "msg": {}})[0] == AdvertiseTopic("/t", None)
-    assert isinstance(publish, PublishMessage) and publish.reply_to == "p1"
+def test_a_refusal_has_the_id_and_once_none_for_programs_that_see_only_such(client: Client) -> None:
+    reason = "denied by [Publishers] /t (site.ini:14)"
+    for number in ("p1", "p2"):
+        advertise, publish = client.sends({"op": "publish", "topic": "/t", "msg": {}, "id": number})
+        client.rosbridge.failed(advertise, reason)
+        with_id = {"op": "status", "level": "error", "msg": reason, "id": number}
+        plain = {"op": "status", "level": "error", "msg": reason}
+        assert client.gets() == ([with_id, plain] if number == "p1" else [with_id])
+        assert isinstance(publish, PublishMessage) and publish.reply_to == number
+    client.rosbridge.failed(advertise, reason.replace("14", "15"))  # a number is not another reason
+    assert [one.get("id") for one in client.gets()] == ["p2"]
+    client.rosbridge.failed(advertise, "an operator refused approval 17; ask again in 90 s")
+    assert [one.get("id") for one in client.gets()] == ["p2", None]
+
+
+def test_a_message_repeats_the_refused_advertisement_with_its_type_and_will(client: Client) -> None:
+    """roslib and roslibpy advertise once, and an operator may approve it later."""
+    fields = {"topic": "/t", "type": "std_msgs/String", "latch": True, "will": {"data": "stop"}}
+    [advertise] = client.sends({"op": "advertise", "id": "a", **fields})
+    for number in range(3):
+        client.rosbridge.failed(advertise, "held for approval 17; ask the operator, then repeat")
+        again, publish = client.sends({"op": "publish", "topic": "/t", "msg": {}, "id": number})
+        assert again == replace(advertise, reply_to=number)
+        assert isinstance(publish, PublishMessage)
+    [only] = client.sends({"op": "publish", "topic": "/t", "msg": {}})  # it was not refused
+    assert isinstance(only, PublishMessage)
+    client.rosbridge.failed(advertise, "denied")
+    [other] = client.sends({"op": "advertise", "topic": "/t", "type": "std_msgs/Int8"})
+    assert isinstance(other, AdvertiseTopic) and other.type == "std_msgs/Int8"
+    client.rosbridge.failed(other, "denied")
+    assert client.sends({"op": "unadvertise", "topic": "/t"})
+    [first, _publish] = client.sends({"op": "publish", "topic": "/t", "msg": {}})
+    assert first == AdvertiseTopic("/t", None)
+
+
+@pytest.mark.parametrize(
+    ("wish", "seconds"),
+    [(None, 60), (0, 60), (-5, 60), (2.5, 2.5), (600, 600), (3600, 3600), (86_400, 3600), (1e300, 3600)],
+)
+def test_a_call_takes_as_long_as_its_client_wishes_up_to_an_hour(
+    client: Client, wish: float | None, seconds: float
+) -> None:
+    [call] = client.sends({"op": "call_service", "service": "/s", "timeout": wish})
+    assert isinstance(call, CallOfService) and call.seconds == seconds
 
 
 def test_messages_have_the_spelling_and_the_compression_of_the_client(client: Client) -> None:

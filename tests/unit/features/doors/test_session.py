@@ -185,6 +185,7 @@ async def test_a_frame_of_few_bytes_that_takes_much_memory_is_refused_in_words()
         tracemalloc.stop()
         assert "the client would hold" in status["msg"] and status["id"] == 1
         assert peak < DOOR_BYTES.bounds.host
+        assert "id" not in await client.next()
         client.send({"op": "publish", "topic": "/markers", "msg": {"markers": [{}] * 20_000}})
         await asyncio.sleep(1)
         assert client.frames.empty() and client.is_open
@@ -302,7 +303,8 @@ async def test_a_denial_of_the_master_is_words_with_the_id(deflate: bool) -> Non
         client.send({"op": "subscribe", "topic": "/camera", "id": 2})
         client.send({"op": "advertise_service", "service": "/s", "type": "std_srvs/Empty", "id": "s"})
         for reply_to in ("a", 2, "s"):
-            status = await client.next()
+            while (status := await client.next()).get("id") is None:
+                pass
             assert status == {"op": "status", "level": "error", "msg": reason, "id": reply_to}
         client.send({"op": "call_service", "service": "/brake", "id": "c"})
         response = await client.next()
@@ -411,6 +413,7 @@ async def test_a_subscription_with_a_type_that_the_topic_has_not_is_refused_in_w
         assert (
             status["msg"] == "/state has the type std_msgs/String, not std_msgs/Int32" and status["id"] == "w"
         )
+        assert "id" not in await wrong.next()
         assert wrong.frames.empty() and right.frames.qsize() == 2
         wrong.send(subscribe)
         await asyncio.sleep(1)
@@ -828,7 +831,7 @@ async def test_a_client_that_goes_through_a_thousand_topics_a_second_takes_none_
 
 
 async def test_a_thousand_calls_that_get_no_answer_leave_calls_for_other_hosts() -> None:
-    """A call waits on although its client has left."""
+    """A call waits on for ten seconds although its client has left."""
     async with door_world() as world:
         robot = await world.robot("10.0.0.3", "/robot")
 
@@ -932,3 +935,131 @@ async def test_parameters_of_one_host_leave_some_for_others() -> None:
 
 def _taken(*clients: WebSocketClient) -> list[Any]:
     return [client.frames.get_nowait() for client in clients for _ in range(client.frames.qsize())]
+
+
+@pytest.mark.parametrize("end", ["revoked", "denied", "left"])
+async def test_a_will_ends_with_the_right(end: str) -> None:
+    async with door_world() as world:
+        robot, client = await world.robot("10.0.0.3", "/robot"), await world.client()
+        heard: list[Body] = []
+        await robot.subscribe("/cmd", lambda body, _header: heard.append(body))
+        client.send({"op": "advertise", "topic": "/cmd", "type": "std_msgs/String", "will": {"data": "stop"}})
+        await asyncio.sleep(1)
+        if end == "revoked":  # its ticket ended, its host is blocked, or the door is removed
+            world.sessions[0].revoke("the ticket is over")
+        elif end == "denied":
+            await robot.unsubscribe("/cmd")
+            world.master.denials["registerPublisher"] = "the approval is over"
+            await asyncio.sleep(12)
+            client.writer.close()
+            await asyncio.sleep(1)
+            await robot.subscribe("/cmd", lambda body, _header: heard.append(body))
+        else:
+            client.writer.close()
+        await asyncio.sleep(5)
+        assert heard == ([string("stop")] if end == "left" else [])
+        world.master.denials.clear()
+
+
+SHARED: tuple[tuple[dict[str, Any], str], ...] = (
+    ({"op": "subscribe", "topic": "/state"}, "registerSubscriber"),
+    ({"op": "advertise", "topic": "/cmd", "type": "std_msgs/String"}, "registerPublisher"),
+)
+
+
+@pytest.mark.parametrize(("sent", "method"), SHARED)
+async def test_a_revoked_right_is_refused_in_words_beside_a_client_that_stays(
+    sent: dict[str, Any], method: str
+) -> None:
+    async with door_world() as world:
+        stays, comes = await world.client(), await world.client()
+        stays.send(sent)
+        await asyncio.sleep(12)
+        world.master.denials[method] = "denied by the new policy (site.ini:7)"
+        world.door.policy_changed()
+        comes.send(sent | {"id": "new"})
+        comes.send({"op": "publish", "topic": "/cmd", "msg": {"data": "go"}, "id": "new"})
+        status = await comes.next()
+        assert "site.ini:7" in status["msg"] or sent["op"] == "subscribe"
+        if sent["op"] == "subscribe":
+            assert (status["msg"], status["id"]) == ("denied by the new policy (site.ini:7)", "new")
+            assert (await stays.next())["msg"] == "denied by the new policy (site.ini:7)"
+        world.master.denials.clear()
+        calls = world.master.calls.count(method)
+        comes.send(sent | {"id": "again"})
+        await asyncio.sleep(2)
+        if sent["op"] == "subscribe":
+            assert world.master.calls.count(method) == calls + 1
+            stays.send(sent | {"id": "more"})
+            await asyncio.sleep(2)
+            assert world.master.calls.count(method) == calls + 1  # it is asked once after a change
+
+
+async def test_a_held_publisher_gets_through_after_the_operators_yes() -> None:
+    """The client advertises once, as roslib does, and is asked about at most once a second."""
+    async with door_world() as world:
+        robot, client = await world.robot("10.0.0.3", "/robot"), await world.client()
+        heard: list[Body] = []
+        await robot.subscribe("/cmd", lambda body, _header: heard.append(body))
+        world.master.denials["registerPublisher"] = "held for approval 17; ask the operator, then repeat"
+        client.send({"op": "advertise", "topic": "/cmd", "type": "std_msgs/String", "id": "a"})
+        for number in range(1000):
+            client.send({"op": "publish", "topic": "/cmd", "msg": {"data": str(number)}, "id": number})
+            await asyncio.sleep(0.1)
+        assert world.master.calls.count("registerPublisher") <= 102
+        assert client.is_open and heard == []  # it waits for an approval, so it is not disconnected
+        del world.master.denials["registerPublisher"]
+        await asyncio.sleep(2)
+        client.send({"op": "publish", "topic": "/cmd", "msg": {"data": "go"}, "id": "go"})
+        await asyncio.sleep(1)
+        assert heard == [string("go")]
+
+
+@pytest.mark.parametrize(
+    ("hertz", "waits", "ends"), [(10, False, True), (3, False, False), (10, True, False)]
+)
+async def test_a_client_that_ignores_refusals_is_disconnected_with_the_words(
+    hertz: int, waits: bool, ends: bool
+) -> None:
+    async with door_world() as world:
+        client = await world.client()
+        world.master.denials["registerPublisher"] = "denied by [Publishers] /cmd (site.ini:14) " + "ü" * 100
+        world.master.denials["lookupService"] = "held for approval 17; ask the operator, then repeat"
+        client.send({"op": "advertise", "topic": "/cmd", "type": "std_msgs/String", "id": "a"})
+        for number in range(20 * hertz):
+            if waits and number % hertz == 0:
+                client.send({"op": "call_service", "service": "/arm/home", "id": "c"})
+            client.send({"op": "publish", "topic": "/cmd", "msg": {"data": "x"}, "id": number})
+            await asyncio.sleep(1 / hertz)
+            if not client.is_open:
+                break
+        assert client.is_open is not ends
+        if ends:
+            assert (await client.closed()).startswith(
+                "100 refusals in 30 s: denied by [Publishers] /cmd (site.ini:14)"
+            )
+        world.master.denials.clear()
+
+
+async def test_a_call_ends_soon_after_its_client_and_a_long_one_as_late_as_it_wishes() -> None:
+    async with door_world() as world:
+        robot = await world.robot("10.0.0.3", "/robot")
+
+        async def answer(_body: bytes) -> bytes:
+            await asyncio.sleep(600)
+            return b""
+
+        await robot.offer("/slow", ServiceType.defined(standard_definitions(), "std_srvs/Empty"), answer)
+        stays, leaves = await world.client(), await world.client()
+        for client, number in ((stays, 1), (leaves, 2)):
+            client.send({"op": "call_service", "service": "/slow", "id": number, "timeout": 3600})
+        stays.send({"op": "call_service", "service": "/slow", "id": 3})
+        await asyncio.sleep(1)
+        assert world.door._waiting_calls.total == 3
+        leaves.writer.close()
+        await asyncio.sleep(12)
+        assert world.door._waiting_calls.total == 2
+        async with asyncio.timeout(700):
+            first, second = await stays.frames.get(), await stays.frames.get()
+        assert (first["id"], first["values"]["message"]) == (3, "/slow did not answer within 60 s")
+        assert (second["id"], second["result"]) == (1, True)
