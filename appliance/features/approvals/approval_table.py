@@ -1,7 +1,7 @@
 """Keep the calls that wait for an approval, and the approvals. Times are monotonic seconds.
 
-1. A call has one number while it waits, however often its host repeats it. If nobody answered, its repetition keeps
-   the number: the operator may have it from the agent. A call with other arguments is another call.
+1. A call has one number while it waits, however often its host repeats it. If no operator answered, its repetition
+   keeps the number: the operator may have it from the agent. A call with other arguments is another call.
 2. An approval of one call is used once, by the same host, for the same service and arguments.
 3. A refusal pauses for `WAIT_SECONDS`, and no repetition shortens that.
 4. An entry keeps the charged host of its call, even if another one would be charged now.
@@ -163,7 +163,7 @@ class ApprovalTable:
         return self._put(replace(entry, until=now + WAIT_SECONDS, state=ApprovalState.REFUSED, who=who))
 
     def end_unanswered(self, entry: ApprovalEntry) -> None:
-        """End a call that nobody answered, and keep its number for a repetition."""
+        """End a call that no operator answered, and keep its number for a repetition."""
         self.end(entry)
         self._unanswered[entry.call] = entry.number
         while len(self._unanswered) > _MOST_UNANSWERED:

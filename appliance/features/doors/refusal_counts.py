@@ -10,7 +10,7 @@ from collections import deque
 MOST_REFUSALS = 100
 REFUSAL_SECONDS = 30.0
 HELD = "held for approval"
-"""A reason with these words is no refusal yet: the call waits for an operator."""
+"""A call with these words in its reason waits for an operator."""
 _HELD_SECONDS = 120.0  # as long as a held call waits
 _MOST_TOPICS = 100
 

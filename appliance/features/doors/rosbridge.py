@@ -7,7 +7,6 @@
 4. No fragments are sent: no client library reads them.
 """
 
-import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -61,7 +60,7 @@ from roswire.names import resolve
 from roswire.xmlrpc import Value
 
 _MOST_TOLD = 100
-_NUMBERS = re.compile(r"[0-9]+")
+_WITHOUT_DIGITS = str.maketrans("", "", "0123456789")  # such as the seconds that are left
 _LEVELS = ("none", "error", "warning", "info")
 _STRENGTH: tuple[Compression, ...] = ("none", "png", "cbor", "cbor-raw")
 
@@ -314,16 +313,11 @@ class Rosbridge:
                 self._services.pop(request.service, None)
         self.status("error", reason, request.reply_to)
         # roslib shows a program only statuses without an id. Once for each topic and reason, it gets this one too.
-        told = f"{getattr(request, 'topic', '')} {_NUMBERS.sub('', reason)}"
-        topics = isinstance(request, AdvertiseTopic | PublishMessage | SubscribeTopic)
-        if (
-            topics
-            and request.reply_to is not None
-            and told not in self._told
-            and len(self._told) < _MOST_TOLD
-        ):
-            self._told.add(told)
-            self.status("error", reason)
+        if isinstance(request, AdvertiseTopic | PublishMessage | SubscribeTopic):
+            told = f"{request.topic} {reason.translate(_WITHOUT_DIGITS)}"
+            if request.reply_to is not None and told not in self._told and len(self._told) < _MOST_TOLD:
+                self._told.add(told)
+                self.status("error", reason)
 
     def _fail_call(self, call: _Call, reason: str) -> None:
         # ros-mcp takes values without `successful` for a success.

@@ -164,6 +164,7 @@ def test_a_message_repeats_the_refused_advertisement_with_its_type_and_will(clie
     """roslib and roslibpy advertise once, and an operator may approve it later."""
     fields = {"topic": "/t", "type": "std_msgs/String", "latch": True, "will": {"data": "stop"}}
     [advertise] = client.sends({"op": "advertise", "id": "a", **fields})
+    assert isinstance(advertise, AdvertiseTopic)
     for number in range(3):
         client.rosbridge.failed(advertise, "held for approval 17; ask the operator, then repeat")
         again, publish = client.sends({"op": "publish", "topic": "/t", "msg": {}, "id": number})

@@ -25,6 +25,7 @@ from appliance.features.standby.standby_answers import StandbyState
 from appliance.features.standby.standby_orders import StandbyAdministration
 from appliance.signing.request_signing import TokenKeys
 from appliance.store.access_tokens import TokenRow, make_token
+from appliance.store.host_tables import HostBlockRow
 from appliance.store.state_file import StateStore
 from tests.support.answers import example
 from tests.support.engines import InlineDatabase
@@ -147,3 +148,14 @@ def test_keys_and_tokens_are_of_the_same_time(tmp_path: Path, monkeypatch: pytes
         seen.append(sorted(one.name for one in tokens.usable()))
         assert all(row.keys for row in map(tokens.usable_row, (first.id, second.id)) if row)
     assert seen == [["alice"], ["alice", "bob"]]
+
+
+def test_a_standby_knows_the_blocked_hosts(tmp_path: Path) -> None:
+    save(tmp_path, made("alice")[0])
+    tokens = ReplicatedTokens(tmp_path / "state.db")
+    assert tokens.read() and tokens.blocked == []
+    store = StateStore(tmp_path, failed=pytest.fail, kind=InlineDatabase)
+    store.hosts.save_block(HostBlockRow("10.0.0.7", 1.0, None, "ann", ""))
+    store.close()
+    assert tokens.read() and tokens.blocked == ["10.0.0.7"]
+    assert not tokens.read()

@@ -87,6 +87,7 @@ class Bench:
         self.answer = TunnelsEnclosed("kernel")
         self.asked: list[Message] = []
         self.order: list[str] = []
+        self.blocked: set[Address] = set()
         self.store = StateStore(directory, failed=pytest.fail, kind=InlineDatabase)
         self.log = open_log(directory / "audit.db")
         self.declared = directory / "hosts.yaml"
@@ -96,7 +97,13 @@ class Bench:
         self.shared = authority = kind(self.authority, self.store.hosts)
         self.appliances = appliances = table(self.store.hosts, self.table.revoked)
         self.tunnels = Tunnels(
-            self.table, self.trail, authority, appliances, listen=(listen, 11311), say=self._said
+            self.table,
+            self.trail,
+            authority,
+            appliances,
+            listen=(listen, 11311),
+            say=self._said,
+            blocked=lambda: self.blocked,
         )
         self.certification = certification = Certification(
             self.store,
@@ -677,6 +684,31 @@ async def test_only_configurations_of_this_control_count_as_taken(
     charon.send(TunnelsReported(number, []))
     monkeypatch.setattr("appliance.hosts.tunnel_state._TAKEN_SECONDS", 30.0)
     assert await bench.tunnels.until_taken()
+    running.cancel()
+    for one in (link, charon):
+        one.close()
+
+
+async def test_the_tunnel_of_a_blocked_host_is_closed_until_the_block_ends(bench: Bench) -> None:
+    ours, theirs = socket.socketpair()
+    link, charon = Channel(ours, TunnelLink), Channel(theirs, TunnelLink)
+    stated: asyncio.Queue[list[str]] = asyncio.Queue()
+
+    def heard(message: Message, _descriptors: tuple[int, ...]) -> None:
+        if isinstance(message, TunnelsStated):
+            stated.put_nowait([host.name for host in message.hosts])
+
+    charon.attach(asyncio.get_running_loop(), heard, lambda: None)
+    for name in ("a", "b"):
+        await bench.add(name)
+    bench.tunnels.attach(link)
+    running = asyncio.create_task(bench.tunnels.run(lambda: None))
+    charon.send(CertificateNeeded(signing_request(key := make_key(), "rosrv-appliance"), fingerprint(key)))
+    assert await stated.get() == ["a", "b"]
+    for blocked, left in ((True, ["b"]), (False, ["a", "b"])):
+        bench.blocked = {bench.tunnels.addresses["a"]} if blocked else set()
+        bench.tunnels.state_anew()
+        assert await stated.get() == left
     running.cancel()
     for one in (link, charon):
         one.close()

@@ -1,0 +1,114 @@
+"""No way into the appliance without its row, and no cell without a test or a reason."""
+
+import ast
+import dataclasses
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+
+import pytest
+
+from appliance.api.front.request_gate import PUBLIC
+from appliance.features.feature import FeaturePart
+from appliance.supervisor.roles import ROLES as PROCESSES
+from tests.support import entrances
+from tests.support.entrances import CELLS, RULES
+
+ROOT = Path(__file__).parents[2]
+_LISTENS = re.compile(
+    r"\blisten\(|start_server\(|create_server\(|start_unix_server\(|create_datagram_endpoint\(|\.bind\("
+)
+_SECRET = re.compile(r"secrets\.(token|randbelow)|make_token\(|new_ticket\(")
+_ROUTES = re.compile(r"APIRouter\(|Routes\(\)|Route\(")
+_NO_WAY_IN = frozenset(
+    {
+        "methods",
+        "longest",
+        "status_fields",
+        "limits",
+        "details",
+        "holders",
+        "approved",
+        "policy_changed",
+        "work",
+    }
+)
+
+
+def files(pattern: re.Pattern[str], *folders: str) -> set[str]:
+    return {
+        str(path.relative_to(ROOT))
+        for folder in folders
+        for path in (ROOT / folder).rglob("*.py")
+        if pattern.search(path.read_text(encoding="utf-8"))
+    }
+
+
+def named(rows: Mapping[str, str]) -> Iterator[str]:
+    for text in rows.values():
+        if not text.startswith("- "):
+            yield from (one.strip() for one in text.split(","))
+
+
+def _named_tests(cell: str) -> list[str]:
+    return [] if cell.startswith("- ") else cell.split()
+
+
+def test_every_cell_is_filled() -> None:
+    for entrance, row in CELLS.items():
+        assert row.keys() == RULES.keys(), entrance
+
+
+def test_every_process_is_the_row_of_an_entrance() -> None:
+    assert {role.name for role in PROCESSES} == entrances.ROLES.keys()
+
+
+def test_every_file_that_listens_is_the_row_of_an_entrance() -> None:
+    found = files(_LISTENS, "appliance", "roswire", "fleet/rosrv_fleet")
+    assert found == entrances.LISTENERS.keys()
+
+
+def test_every_secret_is_the_row_of_an_entrance() -> None:
+    assert files(_SECRET, "appliance", "fleet/rosrv_fleet") == entrances.SECRETS.keys()
+
+
+def test_every_path_without_a_token_is_the_row_of_an_entrance() -> None:
+    assert entrances.WITHOUT_TOKEN.keys() == PUBLIC
+
+
+def test_every_route_of_the_collector_is_known() -> None:
+    found = {one.removeprefix("fleet/rosrv_fleet/") for one in files(_ROUTES, "fleet/rosrv_fleet")}
+    assert found == {*entrances.COLLECTOR_ROUTES}
+
+
+def test_every_part_of_a_feature_is_an_entrance_or_none() -> None:
+    fields = {field.name for field in dataclasses.fields(FeaturePart)}
+    assert fields == entrances.HOOKS.keys() | _NO_WAY_IN
+
+
+def test_the_rows_name_entrances_of_the_table() -> None:
+    rows: Iterable[Mapping[str, str]] = (
+        entrances.ROLES,
+        entrances.LISTENERS,
+        entrances.SECRETS,
+        entrances.WITHOUT_TOKEN,
+        entrances.HOOKS,
+    )
+    assert {name for one in rows for name in named(one)} | {"collector"} <= CELLS.keys()
+    used = {name for one in rows for name in named(one)}
+    assert CELLS.keys() == used, "a row of the table is no entrance any longer"
+
+
+@pytest.mark.parametrize("entrance", CELLS)
+def test_the_tests_of_the_cells_exist(entrance: str) -> None:
+    for rule, cell in CELLS[entrance].items():
+        assert cell.startswith("- ") or _named_tests(cell), f"{entrance}, {rule}: no test and no reason"
+        for test in _named_tests(cell):
+            file, _colons, name = test.partition("::")
+            path = ROOT / "tests" / file
+            assert path.exists(), f"{entrance}, {rule}: {file} does not exist"
+            tree = ast.parse(path.read_text(encoding="utf-8"))
+            functions = (
+                one.name for one in ast.walk(tree) if isinstance(one, ast.FunctionDef | ast.AsyncFunctionDef)
+            )
+            assert name in functions, f"{entrance}, {rule}: {file} has no {name}"
