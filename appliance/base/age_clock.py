@@ -5,6 +5,7 @@
    one after the system clock has been ahead for `_STANDS` of running time: then the smallest gap seen in that
    time. A system clock that is behind adds nothing until someone corrects it.
 3. The state is saved every `_SAVE`; time since the last save counts as time off.
+4. Data that was dated while a long gap did not count yet is as old as it is: `dated` adds that gap to its date.
 """
 
 from collections.abc import Callable
@@ -24,6 +25,14 @@ _SAVE = 600_000_000_000
 _log = structlog.get_logger()
 
 
+class _Jump(msgspec.Struct, array_like=True):
+    """A gap that was counted: dates from `first` to `last` by this clock are `added` too early."""
+
+    first: int
+    last: int
+    added: int
+
+
 class _Kept(msgspec.Struct):
     """The state of the clock; times are in nanoseconds."""
 
@@ -33,6 +42,7 @@ class _Kept(msgspec.Struct):
     sets: int = 0  # the sum of ignored changes of the system clock while the process ran
     step: int = 0  # the gap at the start, until it is counted
     since: int = 0  # `lived` when the gap was first seen
+    jumps: list[_Jump] = []  # the gaps that were counted later than at once
 
 
 class AgeClock:
@@ -80,6 +90,13 @@ class AgeClock:
                 write_whole(self._path, msgspec.json.encode(kept), 0o600)
         return kept.lived + kept.credited
 
+    def dated(self, date: int) -> int:
+        """Return when data was made that got this date by the clock."""
+        for jump in self._kept.jumps:
+            if jump.first <= date <= jump.last:
+                return date + jump.added
+        return date
+
     def latest(self) -> int:
         """Return the latest time that it may be: with the time off that does not count yet."""
         return self() + max(0, self._kept.step)
@@ -96,5 +113,6 @@ class AgeClock:
             if kept.step > 0 and kept.lived - kept.since >= _STANDS:
                 kept.step, counts = 0, kept.step
                 kept.believed += ahead
+                kept.jumps.append(_Jump(kept.since + kept.credited, kept.lived + kept.credited, counts))
         kept.credited += counts
         self._open = bool(kept.step)

@@ -104,7 +104,7 @@ class Signer:
         clock = AgeClock(directory / "age", lambda: newest_signing(directory))
         sync_index(directory)
         self._signed = CheckpointMemory(directory, clock)
-        self._removals = RemovalApprover(self._signed, kept, clock)
+        self._removals = RemovalApprover(self._signed, kept, clock, clock.dated)
         self._key = key
         self._public_key = key.public_key().public_bytes_raw()
 

@@ -103,7 +103,7 @@ async def make_foundation(
     )
     age = AgeClock(settings.state / "control" / "age")
     role.inherit(store, age)
-    blocks = BlockTable(store, age)
+    blocks = BlockTable(store, age, age.dated)
     await features.keep(store, lifeline)
     # The policy names hosts by address. These addresses are reliable only once clear text from them is blocked, so
     # start the tunnels before the policy.

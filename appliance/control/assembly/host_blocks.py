@@ -35,11 +35,13 @@ class HostUses:
 
 
 class BlockTable:
-    """All blocks, by canonical address; `age()` is the age clock."""
+    """All blocks, by canonical address; `age()` is the age clock, and `dated` corrects its earlier dates."""
 
-    def __init__(self, store: StateStore, age: Callable[[], int]) -> None:
+    def __init__(self, store: StateStore, age: Callable[[], int], dated: Callable[[int], int] = int) -> None:
         self._store = store
         self._age = age
+        self._dated = dated
+        self._put: dict[Address, int] = {}  # the dates of blocks that this process has put
         self._rows = {address_of(row.address): row for row in store.hosts.blocks()}
         self._now, self._wall, self._seen = age() if self._rows else 0, clock.wall(), clock.since_boot_ns()
         self.reasons: Mapping[Address, str] = self._described()
@@ -59,6 +61,16 @@ class BlockTable:
         """Read the age clock, which may write a file. Only one thread at a time may call this."""
         self._now, self._wall, self._seen = self._age(), clock.wall(), clock.since_boot_ns()
 
+    def _move_ends(self) -> None:
+        """Move the ends of blocks that were put while a long gap of the age clock did not count yet."""
+        for address, date in list(self._put.items()):
+            moved = self._dated(date) - date
+            if moved:
+                row = self._rows[address]
+                self._put[address] = date + moved
+                self._rows[address] = row._replace(ends=None if row.ends is None else row.ends + moved)
+                self._store.hosts.save_block(self._rows[address])
+
     def state(self) -> BlocksState:
         ends = [self.until(row) for row in self._rows.values()]
         return BlocksState(len(ends), min((end for end in ends if end is not None), default=None))
@@ -75,6 +87,7 @@ class BlockTable:
         self._store.hosts.save_block(row)
         self._rows.pop(address, None)
         self._rows[address] = row
+        self._put[address] = self._now
         self._changed()
         return row
 
@@ -87,15 +100,18 @@ class BlockTable:
         if row is not None:
             self._store.hosts.forget_block(row.address)
             del self._rows[address]
+            self._put.pop(address, None)
             self._changed()
         return row
 
     def due(self) -> list[Address]:
+        self._move_ends()
         return [
             address for address, row in self._rows.items() if row.ends is not None and row.ends <= self._now
         ]
 
     def seconds_left(self) -> float | None:
+        self._move_ends()
         ends = [row.ends for row in self._rows.values() if row.ends is not None]
         return max(0.0, (min(ends) - self._now) / _SECOND) if ends else None
 

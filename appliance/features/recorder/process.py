@@ -65,6 +65,7 @@ class _Process:
             recorder.close()
 
     def _make_recorder(self) -> Recorder:
+        age = AgeClock(Path.cwd() / "age")
         settings, rules = self._settings, self._settings.of(RecorderRules)
         return Recorder(
             rules,
@@ -72,7 +73,8 @@ class _Process:
                 Path.cwd(),
                 disk=int(rules.disk),
                 seconds=None if rules.days is None else rules.days * _DAY,
-                clock=AgeClock(Path.cwd() / "age"),
+                clock=age,
+                dated=age.dated,
             ),
             settings.state / "control" / "audit.db",
             [ring for _index, ring in sorted(self._rings.items())],

@@ -43,13 +43,25 @@ _log = structlog.get_logger()
 
 
 class RecordingStore:
-    """The recordings in a folder, each kept for `seconds` of `clock`."""
+    """The recordings in a folder, each kept for `seconds` of `clock`.
 
-    def __init__(self, folder: Path, *, disk: int, seconds: float | None, clock: Callable[[], int]) -> None:
+    `dated` corrects a date of the clock from a time when a long gap did not count yet.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        *,
+        disk: int,
+        seconds: float | None,
+        clock: Callable[[], int],
+        dated: Callable[[int], int] = int,
+    ) -> None:
         self._folder = folder
         self._disk = disk
         self._seconds = seconds
         self._clock = clock
+        self._dated = dated
         for mark in folder.glob(f"*/{_TEMPORARY}"):
             self._discard(mark.parent)
         for rest in self._named(_REST):
@@ -70,10 +82,14 @@ class RecordingStore:
                     _log.error("a recording cannot be read", recording=path.name, error=str(error))
 
     def _kept_since(self, recording: Recording) -> int:
-        """Return the time by the age clock, or else the end of the recording."""
+        """Return the date by the age clock: now if the disk was full, or an earlier version kept none."""
+        file = self._folder / recording.id / _SINCE
         with suppress(OSError, ValueError):
-            return int((self._folder / recording.id / _SINCE).read_bytes())
-        return recording.ended
+            return int(file.read_bytes())
+        now = self._clock()
+        with suppress(OSError):
+            file.write_bytes(b"%d" % now)
+        return now
 
     def _length(self, recording: Recording) -> int:
         return (self._folder / recording.id / ABOUT).stat().st_size
@@ -107,7 +123,7 @@ class RecordingStore:
 
     def keep(self, recording: Recording) -> None:
         kept = self._folder / recording.id
-        with suppress(OSError):  # the disk is full: the recording's age then counts from its end
+        with suppress(OSError):  # the disk is full: the next start tries again
             (self.part(recording.id) / _SINCE).write_bytes(b"%d" % self._clock())
         self.part(recording.id).rename(kept)
         (kept / PROGRESS).unlink(missing_ok=True)
@@ -177,8 +193,9 @@ class RecordingStore:
         """Yield recordings that are too old, with the reason; the caller must remove each before continuing."""
         self._expire(now, 0, TEMPORARY_SECONDS)
         while self._seconds is not None and self.recordings:
-            oldest = self.recordings[0]
-            if self._since[oldest.id] + int(self._seconds * 1e9) > self._clock():
+            oldest = min(self.recordings, key=lambda found: self._dated(self._since[found.id]))
+            present = self._clock()  # first: it may count a gap
+            if self._dated(self._since[oldest.id]) + int(self._seconds * 1e9) > present:
                 break
             yield oldest, "it is older than recorder.days"
 

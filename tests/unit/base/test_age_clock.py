@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from appliance.base.age_clock import AgeClock
+from tests.support.sources import ROOT
 
 HOUR = 3600 * 1_000_000_000
 DAY = 24 * HOUR
@@ -107,6 +108,31 @@ def test_a_long_time_off_counts_after_a_day(machine: Machine) -> None:
     assert machine.run(20 * HOUR) < BEGIN + 2 * DAY
     machine.off(2 * HOUR)
     assert abs(machine.run(6 * HOUR) - machine.true) < DAY
+
+
+def test_data_of_the_first_day_is_as_old_as_it_is(machine: Machine) -> None:
+    before = machine.age()
+    machine.off(90 * DAY)
+    machine.run(8 * HOUR)
+    made, date = machine.true, machine.age()
+    machine.run(8 * HOUR)
+    machine.off(HOUR)
+    machine.run(20 * HOUR)
+    assert abs(machine.age.dated(date) - made) < DAY
+    assert machine.age.dated(before - HOUR) == before - HOUR
+    machine.off(80 * DAY)
+    machine.run(30 * HOUR)
+    assert abs(machine.age.dated(date) - made) < DAY
+
+
+def test_each_program_that_dates_data_dates_it_by_the_latest() -> None:
+    """With the clock alone, data of the first day after a long rest would seem to have rested as well."""
+    files = [path for folder in ("appliance", "fleet") for path in (ROOT / folder).rglob("*.py")]
+    users = {
+        str(path.relative_to(ROOT)): path.read_text() for path in files if "AgeClock(" in path.read_text()
+    }
+    assert len(users) == 4
+    assert [name for name, text in users.items() if ".dated" not in text and ".latest()" not in text] == []
 
 
 def test_the_latest_time_has_the_time_off_at_once(machine: Machine) -> None:

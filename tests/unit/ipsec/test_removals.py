@@ -3,8 +3,10 @@ from pathlib import Path
 
 import pytest
 
+from appliance.base.age_clock import AgeClock
 from appliance.ipsec.removals import LARGEST_RECORD, RemovalApprover, RemovalRefusedError, RetentionLimits
 from appliance.ipsec.signed_checkpoints import CheckpointMemory, CheckpointRefusedError, read_checkpoint
+from tests.support.aging import DAY, HISTORIES, KEPT, ages_of
 
 LOG = "a" * 32
 _DAY = 86_400_000_000_000
@@ -113,3 +115,28 @@ def test_a_new_log_has_nothing_removed(tmp_path: Path) -> None:
     with pytest.raises(CheckpointRefusedError, match="only removal up to 0 was approved"):
         desk.sign(removed=7)
     assert not list(tmp_path.iterdir())
+
+
+class SignedLog:
+    """A checkpoint that the signer signed, and whether it would approve the removal of the records up to it."""
+
+    def __init__(self, folder: Path, age: AgeClock) -> None:
+        self._signed = CheckpointMemory(folder, age)
+        self._removals = RemovalApprover(self._signed, RetentionLimits(days=KEPT / DAY), age, age.dated)
+        head = f"rosrv audit checkpoint 1\nlog {LOG}\nnumber 1\nsequence 9\nhash {'b' * 64}\n"
+        self._text = f"{head}time 1\nprevious {'0' * 64}\n".encode()
+
+    def make(self) -> None:
+        self._signed.approve(self._text)
+
+    def is_due(self) -> bool:
+        try:
+            self._removals.approve(self._text, self._text)
+        except RemovalRefusedError:
+            return False
+        return True
+
+
+@pytest.mark.parametrize("history", HISTORIES)
+def test_records_are_kept_for_their_time_whatever_the_clock_does(tmp_path: Path, history: str) -> None:
+    assert ages_of(tmp_path, SignedLog, history) == []
