@@ -39,6 +39,9 @@ class Buckets:
         self._keep(host, left - 1, now)
         return 0.0
 
+    def give_back(self, host: str, now: float) -> None:
+        self._keep(host, min(self._burst, self._left(host, now) + 1), now)
+
     def wait(self, host: str, now: float) -> float:
         """Return the seconds until `take` succeeds, without taking a token."""
         left = self._left(host, now)

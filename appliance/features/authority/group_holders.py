@@ -1,7 +1,8 @@
 """Keep the holder of each group, and the hosts that wait for it. No I/O; times are monotonic seconds.
 
 1. `free` and `hold` are separate steps, so that the caller can cut the earlier holder off in between.
-2. The first waiting host that may take the group is next. A host that may only ask never is.
+2. The first waiting host that may take the group is next. A host that may only ask never is, and gives its place to
+   one that may take it if all are taken.
 """
 
 from collections.abc import Callable, Mapping
@@ -69,7 +70,10 @@ class GroupHolders:
     def wait(self, group: AuthorityGroup, host: Address, now: float) -> bool:
         waiting = self.waiting(group, now)
         if host not in waiting and len(waiting) >= MOST_WAITING:
-            return False
+            asking = [one for one in waiting if self._claim_of(group, one) is Claim.ASK]
+            if not asking or self._claim_of(group, host) is Claim.ASK:
+                return False
+            del self._waiting[group.name][asking[-1]]
         self._waiting[group.name][host] = now
         return True
 

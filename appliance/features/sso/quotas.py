@@ -5,9 +5,11 @@ from appliance.quotas.table import HonestUse, QuotaRow
 
 SIGN_ONS = QuotaRow(
     thing="sign-ons at the provider that are not finished",
-    bounds=Bounds(whole=256, host=8, unknown=8, kept=0),
-    at_limit="the oldest one of the address ends; an address begins at most `api_limits.failures_per_minute` a minute",
-    between="if all are taken, the oldest one of the address with most ends",
+    bounds=Bounds(whole=256, host=256, unknown=256, kept=0),
+    at_limit="if all are taken, the oldest one of the address with most ends; an address begins at most"
+    " `api_limits.failures_per_minute` a minute that it does not complete",
+    between="the address with most loses one; of those that run at once (6), the next is of the address with fewest,"
+    " then of the one that has used least",
     counting="an IPv6 network (/64) is one address",
     alarm="none: the person signs in again",
     margin=HonestUse(

@@ -4,7 +4,7 @@
 2. The keys of the browser's session are bound to the sign-on when it begins. So a stolen code, state or URL gives no
    other browser a session.
 3. Beyond `_MOST` sign-ons, a new one replaces the oldest of the address that has most, so a flood from one address
-   ends only its own.
+   ends only its own. Before that, an address may have all: many people can have one.
 """
 
 import base64
@@ -27,7 +27,7 @@ from appliance.features.sso.quotas import SIGN_ONS
 from appliance.features.sso.settings import Sso
 
 PENDING_SECONDS = 600.0
-_MOST, _MOST_OF_ADDRESS = SIGN_ONS.bounds.whole, SIGN_ONS.bounds.host
+_MOST = SIGN_ONS.bounds.whole
 _LONGEST_CODE = 4096
 _OK = 200
 
@@ -144,11 +144,12 @@ class SignOns:
     def _make_room(self, address: str) -> None:
         now, peer = clock.now(), peer_key(address)
         self._pending = {state: one for state, one in self._pending.items() if one.until > now}
-        held = Counter(peer_key(one.address) for one in self._pending.values())
-        if held[peer] < _MOST_OF_ADDRESS:
-            if len(self._pending) < _MOST:
-                return
-            peer = held.most_common(1)[0][0]
+        if len(self._pending) < _MOST:
+            return
+        held = Counter({peer: 1})
+        held.update(peer_key(one.address) for one in self._pending.values())
+        most = max(held.values())
+        peer = peer if held[peer] == most > 1 else held.most_common(1)[0][0]
         del self._pending[
             next(state for state, one in self._pending.items() if peer_key(one.address) == peer)
         ]

@@ -231,7 +231,7 @@ async def test_a_flood_of_sign_ons_ends_only_its_own() -> None:
     mine = await provider.begin("10.0.0.9")
     asked = provider.asked
     first = await provider.begin("2001:db8::1")
-    for number in range(50):
+    for number in range(300):
         await provider.begin(f"2001:db8::{number:x}")  # one /64
     for number in range(400):
         await provider.begin(f"10.1.{number % 60}.7")
@@ -239,3 +239,13 @@ async def test_a_flood_of_sign_ons_ends_only_its_own() -> None:
     await provider.sign_ons.finish(mine, "code", "")
     with pytest.raises(SignOnRefusedError, match="not begun here"):
         await provider.sign_ons.finish(first, "code", "")
+
+
+async def test_people_behind_one_address_end_no_sign_on_of_one_another() -> None:
+    provider = ScriptedProvider()
+    states = []
+    for _ in range(100):
+        states.append((await provider.begin("10.0.0.9"), provider.asked))
+    for state, asked in states:
+        provider.asked = asked
+        await provider.sign_ons.finish(state, "code", "")

@@ -1,0 +1,34 @@
+from ipaddress import IPv4Address
+from types import SimpleNamespace
+from typing import Any
+
+from appliance.features.authority.group_holders import MOST_WAITING, GroupHolders
+from appliance.policy.authority import Claim
+
+GROUP: Any = SimpleNamespace(name="base", lease=2.0)
+DRIVERS = {IPv4Address("10.0.0.1"): Claim.TAKE, IPv4Address("10.0.0.2"): Claim.OVERRIDE}
+
+
+def guest(number: int) -> IPv4Address:
+    return IPv4Address("10.9.0.0") + number
+
+
+def test_hosts_that_may_only_ask_keep_no_driver_from_waiting() -> None:
+    groups = GroupHolders(lambda _group, host: DRIVERS.get(host, Claim.ASK))
+    for number in range(MOST_WAITING):
+        assert groups.wait(GROUP, guest(number), 0.0)
+    assert not groups.wait(GROUP, guest(99), 0.0)
+    for driver in DRIVERS:
+        assert groups.wait(GROUP, driver, 0.0)
+    waiting = groups.waiting(GROUP, 0.0)
+    assert len(waiting) == MOST_WAITING
+    assert waiting[:14] == [guest(number) for number in range(14)] and set(waiting[14:]) == set(DRIVERS)
+    assert groups.successor(GROUP, 0.0) == next(iter(DRIVERS))
+
+
+def test_drivers_wait_in_their_order_and_take_no_place_of_one_another() -> None:
+    groups = GroupHolders(lambda _group, _host: Claim.TAKE)
+    for number in range(MOST_WAITING):
+        assert groups.wait(GROUP, guest(number), 0.0)
+    assert not groups.wait(GROUP, guest(99), 0.0)
+    assert groups.waiting(GROUP, 0.0) == [guest(number) for number in range(MOST_WAITING)]
