@@ -11,7 +11,10 @@ LONGEST_REVISION = 10**15
 Text = Annotated[str, msgspec.Meta(min_length=1, max_length=1 << 20)]
 Signature = Annotated[
     str,
-    doc("the site's signature, where required: what `rosrv sign FILE` writes to FILE.sig", max_length=8192),
+    doc(
+        "the site's signature, where required: what `rosrv sign FILE --key KEY` writes to FILE.sig",
+        max_length=8192,
+    ),
 ]
 MonitorName = Annotated[str, msgspec.Meta(min_length=1, max_length=256)]
 FileName = Annotated[

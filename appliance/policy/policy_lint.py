@@ -114,7 +114,13 @@ def _unused_groups(groups: HostGroups, findings: Findings) -> None:
 
 def _missing_sections(present: set[Category], findings: Findings) -> None:
     for decider in sections.DECIDERS:
-        if not decider.extension and decider.categories[0] not in present:
-            findings.warn(
-                Place(), f"there is no [{decider.name}] section, so its requests are denied for all hosts"
+        if decider.categories[0] in present:
+            continue
+        effect = "denied for all hosts"
+        if decider.extension:
+            keys = (
+                f"{category} default" if len(decider.phrases) > 1 else "default"
+                for category in decider.phrases
             )
+            effect = f"allowed for all hosts: add it, with {' and '.join(f'{key} = HOSTS' for key in keys)}"
+        findings.warn(Place(), f"there is no [{decider.name}] section, so its requests are {effect}")

@@ -89,12 +89,13 @@ class BundlesConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
 class FleetConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The configuration of a collector.
 
-    `database` is a libpq connection string; libpq also reads PGPASSWORD and PGPASSFILE. A robot is silent after
-    `silent_seconds` without a sign of life.
+    `names` are further host names under which browsers may open the collector. `database` is a libpq connection
+    string; libpq also reads PGPASSWORD and PGPASSFILE. A robot is silent after `silent_seconds` without a sign of life.
     """
 
     data: Path = _DATA
     listen: str = "0.0.0.0:8444"
+    names: tuple[str, ...] = ()
     certificate: Path
     key: Path
     database: str = "dbname=rosrv_fleet"

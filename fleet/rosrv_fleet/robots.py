@@ -127,8 +127,8 @@ class Robots:
             known = self.all().get(name)
             if known is not None and appliance in ("", *known.appliances):
                 raise EnrolmentError(
-                    f"{name} is already enrolled; for a new certificate: rosrv-fleet robot renew {name}; for its"
-                    " standby: --appliance NAME"
+                    f"{name} is already enrolled; for a new certificate: rosrv-fleet robot renew {name} --certificate"
+                    " FILE; for its standby: --appliance NAME"
                 )
             robot, own = self._with(known, name, appliance, new_appliance(key, certificate), group)
             return self._keep(robot, "robot add", f"{group} {_detail(robot, own)}".strip())

@@ -20,8 +20,10 @@ from rosrv_fleet.connections import ClientConnections, listen
 from rosrv_fleet.door import Door
 from rosrv_fleet.enrolment import RobotAppliance
 from rosrv_fleet.failures import failure_of
+from rosrv_fleet.host_names import HostNames
 from rosrv_fleet.robots import Robots
 from rosrv_fleet.rollouts.service import BundleService
+from rosrv_fleet.server_certificate import names_of
 
 _RELOAD_SECONDS = 1.0
 _CLOSE_SECONDS = 1.0
@@ -145,7 +147,12 @@ def serve(collector: Collector) -> None:
     listener = listen(*config.address, table)
     options: dict[str, Any] = {"log_config": None, "access_log": False, "server_header": False}
     settings = uvicorn.Config(
-        Door(make_app(collector), table, collector.tokens),
+        Door(
+            make_app(collector),
+            table,
+            collector.tokens,
+            HostNames([*config.names, *names_of(config.certificate)]),
+        ),
         loop="asyncio",  # the connections are counted by its sockets
         http=_protocol(config.limits.header_seconds, table, tls),
         ws="none",

@@ -58,10 +58,20 @@ def url_of(config: FleetConfig) -> str:
     return f"https://{shown}:{config.address[1]}"
 
 
+def names_of(certificate: Path) -> list[str]:
+    """Return the host names in the certificate; one may begin with `*.`."""
+    names = _alternative_names(certificate)
+    return [] if names is None else names.get_values_for_type(x509.DNSName)
+
+
 def _addresses(certificate: Path) -> list[str]:
+    names = _alternative_names(certificate)
+    return [] if names is None else [str(address) for address in names.get_values_for_type(x509.IPAddress)]
+
+
+def _alternative_names(certificate: Path) -> x509.SubjectAlternativeName | None:
     first = x509.load_pem_x509_certificates(certificate.read_bytes())[0]
     try:
-        names = first.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+        return first.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
     except x509.ExtensionNotFound:
-        return []
-    return [str(address) for address in names.get_values_for_type(x509.IPAddress)]
+        return None

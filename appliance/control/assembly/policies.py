@@ -32,7 +32,7 @@ from appliance.control.errors import UnknownThingError
 from appliance.policy.host_names import HostNames, in_words
 from appliance.policy.host_sets import Network
 from appliance.policy.judgement import PolicyContext
-from appliance.policy.live_rights import LiveRight, deprived
+from appliance.policy.live_rights import LiveRight, deprived, may_keep
 from appliance.policy.model import Address
 from appliance.policy.policy import Approval, CurrentPolicy, Policy
 from appliance.signing.fingerprints import fingerprint
@@ -344,7 +344,7 @@ class Policies(Revisions[RevisionRow]):
         self._note_refused("")
         before = self.revision
         row = RevisionRow(before + 1, policy.text, policy.file, clock.wall(), who, note, signature)
-        lost = _losses(policy, self._live()) if self.policy else []
+        lost = _losses(self._completed(policy), self.policy(), self._live()) if self.policy else []
         self._put_in_force(row, within)
         revoked = self._enforce(policy)
         self._trail.happened(
@@ -361,16 +361,14 @@ class Policies(Revisions[RevisionRow]):
 
     def _enforce(self, policy: Policy) -> int:
         before = self.policy() if self.policy else None
-        self.policy.set(
-            replace(
-                policy,
-                blocks=dict(self._blocks()),
-                holders=dict(self._holders()),
-                approved=self._approved(),
-            )
-        )
+        self.policy.set(self._completed(policy))
         self._trail.revision = self.revision
         return 0 if before is None else self._changed(before, self.policy())
+
+    def _completed(self, policy: Policy) -> Policy:
+        return replace(
+            policy, blocks=dict(self._blocks()), holders=dict(self._holders()), approved=self._approved()
+        )
 
     def _loaded(self, before: int, revoked: int, lost: Sequence[str] = ()) -> Loaded:
         warnings = [*lost, *map(str, self.current.warnings)]
@@ -380,11 +378,12 @@ class Policies(Revisions[RevisionRow]):
         await self.rollback(revision, who=UNCONFIRMED)
 
 
-def _losses(policy: Policy, live: Iterable[LiveRight]) -> list[str]:
+def _losses(policy: Policy, before: Policy, live: Iterable[LiveRight]) -> list[str]:
+    had = [one for one in live if may_keep(before, one).allowed]
     return [
         f"warning: {host} has nodes ({_some(nodes)}) and loses all its rights: if that is a mistake, "
         "`rosrv policy rollback` and name the host in the policy"
-        for host, nodes in deprived(policy, live).items()
+        for host, nodes in deprived(policy, had).items()
     ]
 
 

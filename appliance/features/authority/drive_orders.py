@@ -234,11 +234,13 @@ class DriveOrders:
         claim = self._claim(group, host)
         if holding is not None and claim is Claim.TAKE:
             reason = (
-                f"{holding.host} holds {group.name}: `rosrv drive ask {group.name}`, or wait until it is free"
+                f"{holding.host} holds {group.name}: `rosrv drive ask {group.name} --host {host}`, or wait until it is"
+                " free"
             )
         elif claim is Claim.ASK:
             reason = (
-                f"{host} may only ask for {group.name}: `rosrv drive ask {group.name}`; an operator gives it"
+                f"{host} may only ask for {group.name}: `rosrv drive ask {group.name} --host {host}`; an operator gives"
+                " it"
             )
         else:
             reason = f"{host} has no claim to {group.name}: no line of [Authority] names it ({group.rule})"

@@ -205,6 +205,7 @@ class GuardOrders:
             if name in self._monitors.checked.monitors or file in self._monitors.sources.files:
                 raise GuardError(
                     f"a monitor {name} is loaded: give another name (--name), or change it: rosrv guard set {name}"
+                    " VALUE=…"
                 )
         except GuardError as error:
             raise SenselessError(str(error)) from error

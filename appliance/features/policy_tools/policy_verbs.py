@@ -18,6 +18,7 @@ from appliance.cli.output import Json, by_host, say_json
 from appliance.features.policy_tools.decision_reasons import DecisionExplanation, explain, render
 from appliance.features.policy_tools.grant import DecidedRequest, UngrantableError
 from appliance.features.policy_tools.grant import grant as grant_of
+from appliance.features.policy_tools.host_rights import rights_of_host
 from appliance.features.policy_tools.policy_impact import PolicyImpact, cases_beside, impact_of
 from appliance.features.policy_tools.policy_input import (
     Enrolled,
@@ -165,7 +166,8 @@ def explain_request(
 ) -> None:
     """Explain whether a request is allowed, by which rule, and the overridden rules. Exit status 1 unless allowed.
 
-    Without a file, explain the decision of the policy in force.
+    Without an action, list the rules that grant the host something; exit status 1 if none does. Without a file, the
+    policy in force is used.
 
     Example: rosrv policy explain --host 10.0.0.9 --node /joystick --publish /cmd_vel
     """
@@ -180,9 +182,11 @@ def explain_request(
         Category.NODE: use_node,
     }
     chosen = [(category, name) for category, name in asked.items() if name is not None]
-    if len(chosen) != 1:
+    if len(chosen) > 1 or (node and not chosen):
         raise usage_error("give exactly one action of the host: --publish TOPIC, --command CALL, …")
     policy = compiled(appliance, file, robot, enrolled)
+    if not chosen:
+        raise typer.Exit(_list_rights(appliance, policy, host))
     category, name = chosen[0]
     try:
         request = Request(asking_host(host, policy), node, category, check_resource(category, name))
@@ -200,6 +204,27 @@ def explain_request(
             for line in _allowing(policy, request):
                 say(line)
     raise typer.Exit(0 if explanation.allowed else 1)
+
+
+def _list_rights(appliance: Appliance, policy: Policy, host: str) -> int:
+    try:
+        address = asking_host(host, policy)
+    except BadWordError as error:
+        raise usage_error(str(error)) from error
+    rights = list(rights_of_host(policy, address))
+    for right in rights:
+        if appliance.as_json:
+            place = asdict(right.rule) if right.rule is not None else None
+            verdict = "ask" if right.asks else "allow"
+            say_json({"host": str(address), "section": right.section, "rule": place, "decision": verdict})
+        else:
+            say(right.text, "yellow" if right.asks else "")
+    if not appliance.as_json:
+        if not rights:
+            say(f"no rule grants {address} anything", "red")
+        if address in policy.blocks:
+            say(f"whatever the rules say: {address} is {policy.blocks[address]}", "yellow")
+    return 0 if rights else 1
 
 
 def _explanation_fields(explanation: DecisionExplanation) -> dict[str, object]:

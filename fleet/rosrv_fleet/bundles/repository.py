@@ -257,7 +257,7 @@ class BundleRepository:
     def _require_role(self, site: str, group: str) -> str:
         role = role_of(site, group)
         if role not in self.roles():
-            raise RepositoryError(f"{role} is not delegated: rosrv-fleet bundle delegate {site} {group}")
+            raise RepositoryError(f"{role} is not delegated: rosrv-fleet bundle delegate {site}/{group}")
         return role
 
     def _versions(self, listed: Targets) -> list[int]:

@@ -158,7 +158,9 @@ def _page_of(shown: Sequence[RobotRow], asked: Mapping[str, str]) -> str:
     first = number * ROWS + 1
     place = f"{first:,} to {first + len(part) - 1:,} of {len(shown):,}"
     pages = f'<nav class="pages" aria-label="Pages of robots"><span>{place}</span>{" ".join(steps)}</nav>'
-    empty = "No robot matches." if any(given.values()) else "No robot is enrolled: rosrv-fleet robot add NAME"
+    empty = (
+        "No robot matches." if any(given.values()) else "No robot is enrolled: rosrv-fleet robot invite NAME"
+    )
     return table("Robots", _COLUMNS, map(robot_row, part), empty) + (pages if last else "")
 
 

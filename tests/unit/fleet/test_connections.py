@@ -11,6 +11,7 @@ from rosrv_fleet.access import IS_ROBOT
 from rosrv_fleet.config import Limits
 from rosrv_fleet.connections import ClientConnections, CountedSocket
 from rosrv_fleet.door import Door
+from rosrv_fleet.host_names import HostNames
 from rosrv_fleet.tokens import FleetRole, OperatorTokens
 
 from tests.support.virtual_clock import let_time_pass
@@ -124,8 +125,11 @@ def test_handshakes_of_unproven_addresses_have_a_share(table: ClientConnections)
     _in_loop(story)
 
 
-async def _status(door: Door, address: str, token: str = "", *, robot: bool = False) -> int:
-    headers = [(b"authorization", f"Bearer {token}".encode())] if token else []
+async def _status(
+    door: Door, address: str, token: str = "", *, robot: bool = False, name: str = "10.0.0.5"
+) -> int:
+    headers = [(b"host", name.encode())]
+    headers += [(b"authorization", f"Bearer {token}".encode())] if token else []
     scope: Any = {
         "type": "http", "method": "POST", "path": "/login", "headers": headers, "client": (address, 1),
         "state": {IS_ROBOT: robot}, "query_string": b"",
@@ -146,7 +150,7 @@ def test_requests_without_a_token_have_a_share(table: ClientConnections, tmp_pat
 
     tokens = OperatorTokens(tmp_path / "tokens.json")
     token = tokens.add("alice", FleetRole.VIEWER)
-    door = Door(app, table, tokens)
+    door = Door(app, table, tokens, HostNames([]))
 
     async def story() -> None:
         for word in ("", "wrong"):
@@ -156,5 +160,7 @@ def test_requests_without_a_token_have_a_share(table: ClientConnections, tmp_pat
         assert {await _status(door, "203.0.113.0", robot=True) for _ in range(300)} == {200}
         behind_it = [await _status(door, "10.0.0.1", "wrong") for _ in range(300)]
         assert behind_it.count(429) > 0
+        assert await _status(door, "203.0.113.77", name="evil.example.org") == 421
+        assert await _status(door, "203.0.113.77", robot=True, name="evil.example.org") == 200
 
     asyncio.run(story())

@@ -23,7 +23,7 @@ from appliance.control.assembly.policy_gate import PolicyRefusedError
 from appliance.policy import judgement
 from appliance.policy.live_rights import LiveRight
 from appliance.policy.model import Address, Category, Request
-from appliance.policy.policy import CurrentPolicy, Policy
+from appliance.policy.policy import Approval, CurrentPolicy, Policy
 from appliance.store.state_file import StateStore
 from tests.support.control_parts import OPEN, Records
 from tests.support.engines import InlineDatabase
@@ -55,6 +55,8 @@ class Appliance:
         restarted: bool = False,
         hosts: Callable[[], Mapping[str, Address]] = dict,
         blocks: Callable[[], Mapping[Address, str]] = dict,
+        holders: Callable[[], Mapping[str, Address]] = dict,
+        approved: Callable[[], frozenset[Approval]] = frozenset,
         live: Callable[[], Iterable[LiveRight]] = list,
         changed: Callable[[Policy, Policy], int] = lambda _before, _policy: 0,
         site_keys: Sequence[str] = (),
@@ -63,7 +65,7 @@ class Appliance:
         self.records = Records()
         policies = Policies(
             self.file, store, cast(Any, self.records), CurrentPolicy(), robot=(), hosts=hosts, blocks=blocks,
-            holders=dict, approved=frozenset, live=live, changed=changed, carried_out=at_once, site_keys=site_keys,
+            holders=holders, approved=approved, live=live, changed=changed, carried_out=at_once, site_keys=site_keys,
         )  # fmt: skip
         policies.start(restarted=restarted)
         try:
@@ -106,13 +108,38 @@ async def test_a_reload_warns_of_hosts_that_lose_everything(tmp_path: Path) -> N
     live = [LiveRight(robot, f"/n{number}", "registerPublisher", "/scan") for number in range(5)]
     live += [LiveRight(other, "/ocu", "registerPublisher", topic) for topic in ("/scan", "/joy")]
     with appliance.started(live=lambda: live) as policies:
-        assert (await policies.reload(PolicyReload(), "operator")).warnings == []
+        loaded = await policies.reload(PolicyReload(), "operator")
+        assert [text for text in loaded.warnings if "loses" in text] == []
         appliance.file.write_text(OPEN.replace("[Publishers]\n", "[Publishers]\n/scan =\n"))
         loaded = await policies.reload(PolicyReload(), "operator")
         assert [text for text in loaded.warnings if "loses" in text] == [
             "warning: 192.168.1.10 has nodes (/n0, /n1, /n2 and 2 more) and loses all its rights: if that is a "
             "mistake, `rosrv policy rollback` and name the host in the policy"
         ]
+
+
+@pytest.mark.parametrize("kind", ["approval", "holder", "block", "none"])
+async def test_a_reload_of_an_unchanged_policy_deprives_no_host(tmp_path: Path, kind: str) -> None:
+    """Whatever beside the text of the policy gave or took the right: an approval, a group, a block."""
+    appliance, host = Appliance(tmp_path), ipaddress.ip_address("10.0.0.7")
+    text = OPEN.replace("[Publishers]\n", "[Groups]\nagent=10.0.0.7\n[Publishers]\n/cmd_vel = ask agent\n")
+    if kind == "holder":
+        text = OPEN + "[Authority]\nbase = /cmd_vel\ntake base = 10.0.0.7\n"
+    appliance.file.write_text(text)
+    approved = frozenset({(host, Category.PUBLISH, "/cmd_vel")}) if kind == "approval" else frozenset()
+    live = [LiveRight(host, "/agent", "registerPublisher", "/cmd_vel")]
+    given: Any = {
+        "approved": lambda: approved,
+        "holders": lambda: {"base": host} if kind == "holder" else {},
+        "blocks": lambda: {host: "blocked by ann"} if kind == "block" else {},
+    }
+    with appliance.started(live=lambda: live, **given) as policies:
+        loaded = await policies.reload(PolicyReload(), "operator")
+        assert [one for one in loaded.warnings if "loses" in one] == []
+        appliance.file.write_text(OPEN.replace("[Publishers]\n", "[Publishers]\n/cmd_vel =\n"))
+        loaded = await policies.reload(PolicyReload(), "operator")
+        had = kind in ("approval", "holder")
+        assert any("10.0.0.7 has nodes (/agent) and loses all" in one for one in loaded.warnings) is had
 
 
 async def test_a_reload_names_its_author(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
