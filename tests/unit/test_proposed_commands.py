@@ -16,7 +16,7 @@ from rosrv_fleet.cli import app as fleet_app
 from appliance.cli import main
 from rosmop.tool.command import app as rosmop_app
 
-_UsageError = typer.BadParameter.__mro__[1]  # which typer does not export
+_UsageError: Any = typer.BadParameter.__mro__[1]  # which typer does not export
 ROOT = Path(__file__).parents[2]
 GIVEN = "\x01"  # a value that the program fills in
 _WORD = r"(?:\\?\"[^\"\n]*\"|'[^'\n]*'|[^\s`\"';()<>|,&]|,(?=\S))+"
@@ -45,7 +45,7 @@ def texts(file: Path) -> Iterator[str]:
     inside = {id(part) for node in ast.walk(tree) if isinstance(node, ast.JoinedStr) for part in node.values}
     for node in ast.walk(tree):
         if isinstance(node, ast.JoinedStr):
-            yield "".join(one.value if isinstance(one, ast.Constant) else GIVEN for one in node.values)
+            yield "".join(str(one.value) if isinstance(one, ast.Constant) else GIVEN for one in node.values)
         elif isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in inside:
             yield node.value
 

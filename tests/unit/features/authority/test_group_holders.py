@@ -4,9 +4,10 @@ from typing import Any
 
 from appliance.features.authority.group_holders import MOST_WAITING, GroupHolders
 from appliance.policy.authority import Claim
+from appliance.policy.model import Address
 
 GROUP: Any = SimpleNamespace(name="base", lease=2.0)
-DRIVERS = {IPv4Address("10.0.0.1"): Claim.TAKE, IPv4Address("10.0.0.2"): Claim.OVERRIDE}
+DRIVERS: dict[Address, Claim] = {IPv4Address("10.0.0.1"): Claim.TAKE, IPv4Address("10.0.0.2"): Claim.OVERRIDE}
 
 
 def guest(number: int) -> IPv4Address:
