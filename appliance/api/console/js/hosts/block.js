@@ -32,8 +32,9 @@ function BlockDialog(/** @type {{host: string, close: () => void, after: () => v
     try {
       const json = { address: address.trim(), for_seconds: seconds ? Number(seconds) : null, note, force };
       const { body } = await ask("POST", "/v1/blocks", { match: "*", json });
+      const uses = body.ended.uses.length ? ` Ended: ${body.ended.uses.join("; ")}.` : "";
       const others = body.other_addresses.length ? ` Not blocked: its other address ${body.other_addresses.join(", ")}.` : "";
-      done(`${body.name || body.address} is blocked`, `It lost ${ended(body.ended)}.${others}`);
+      done(`${body.name || body.address} is blocked`, `It lost ${ended(body.ended)}.${uses}${others}`);
       after();
       close();
     } catch (failure) {
@@ -42,12 +43,12 @@ function BlockDialog(/** @type {{host: string, close: () => void, after: () => v
   };
   const foot = html`<button class="button" onClick=${close}>Not now</button><${Button} role="operator" tone="danger" disabled=${!address.trim()} why="Enter the host's address or name first" onClick=${block}>Block the host</${Button}>`;
   return html`<${Dialog} title="Block this host?" close=${close} foot=${foot}><${Failure} error=${error} />
-    <p>Every call of the host is denied now, whatever the policy says, and its registrations and connections through the relay end. When the block ends, the policy decides again.</p>
+    <p>The host is refused at every entrance, whatever the policy says: its registrations, connections, sessions and tunnel end. When the block ends, the policy decides again.</p>
     <${Field} label="Address, or name of an enrolled host" mono value=${address} set=${setAddress} placeholder="10.0.0.7" maxlength="64" />
     <${Present} host=${address.trim()} />
     <${Field} label="For" value=${seconds} set=${setSeconds} options=${TIMES} />
     <${Field} label="Note for other operators" value=${note} set=${setNote} placeholder="tablet lost" maxlength="200" />
-    ${error?.status === 422 && html`<${Check} label="Block it even if it is the robot's own host" on=${force} set=${setForce} />`}</${Dialog}>`;
+    ${error?.status === 422 && html`<${Check} label="Block it even if it is the robot's own host, or yours" on=${force} set=${setForce} />`}</${Dialog}>`;
 }
 
 /** What would end. @param {{host: string}} given */
