@@ -224,7 +224,7 @@ class DoorNode:
     # --- publications ---
 
     async def _advertise(self, request: AdvertiseTopic, client: DoorClient) -> None:
-        refused = self._refused.get(request.topic)
+        refused = self._refused.get(request.topic) if request.repeated else None
         if refused is not None and clock.now() - refused[0] < _ASK_SECONDS and refused[1] == request.type:
             raise MasterDenialError(refused[2])
         try:

@@ -24,6 +24,8 @@ class AdvertiseTopic:
     reply_to: ClientId = None
     will: msgspec.Raw | None = None
     """A message that is published if the connection ends while the topic is advertised."""
+    repeated: bool = False
+    """Whether a message repeats an advertisement that was refused, which the node may remember for a second."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -188,7 +188,7 @@ class Rosbridge:
         if known is not None and known.refused is None:
             return [publish]
         if known is not None and known.refused is not None:
-            again, known.refused = replace(known.refused, reply_to=operation.id), None
+            again, known.refused = replace(known.refused, reply_to=operation.id, repeated=True), None
             return [again, publish]
         self._add_advertisement(topic, None, None)
         queue = operation.queue_size or 1

@@ -168,7 +168,7 @@ def test_a_message_repeats_the_refused_advertisement_with_its_type_and_will(clie
     for number in range(3):
         client.rosbridge.failed(advertise, "held for approval 17; ask the operator, then repeat")
         again, publish = client.sends({"op": "publish", "topic": "/t", "msg": {}, "id": number})
-        assert again == replace(advertise, reply_to=number)
+        assert again == replace(advertise, reply_to=number, repeated=True)
         assert isinstance(publish, PublishMessage)
     [only] = client.sends({"op": "publish", "topic": "/t", "msg": {}})  # it was not refused
     assert isinstance(only, PublishMessage)
