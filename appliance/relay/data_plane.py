@@ -30,6 +30,7 @@ from appliance.relay.monitors.topic_pipeline import TopicPipeline
 from appliance.relay.relay_limits import RelayLimits
 from appliance.relay.report import Reporter
 from appliance.relay.topic_taps import TopicTaps
+from appliance.relay.transport.frames import Batch
 from appliance.relay.transport.loop_channel import LoopLink
 from appliance.relay.transport.rate_limit import RateAllowance, RateLimits
 
@@ -217,6 +218,7 @@ class DataPlane:
             ),
             refused=self._reporter.send,
             sink=self._sink,
+            replayed=self._may_pass_again,
             over=self._loop.over,
             servers=self._servers.of,
         )
@@ -252,6 +254,14 @@ class DataPlane:
         if node is not None and node.monitors:
             return None
         return self._flows.of(grant.limit, grant.topic, grant.host, grant.caller_id)
+
+    def _may_pass_again(self, relayed: RelayedTopic, first: Batch) -> bool:
+        body = first.view[4:]
+        if self.interceptor.is_stop(relayed.topic, bytes(body)):
+            return True
+        point = ObservationPoint(relayed.key, relayed.topic, relayed.host, relayed.name)
+        self.interceptor.refuse_replay(point, body)
+        return False
 
     def _publishers(self, topic: str) -> list[ObservationPoint]:
         return [

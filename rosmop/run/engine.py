@@ -189,6 +189,7 @@ class MonitorSet:
         self._execution = MonitorExecution(self.interpreter, on_fault, self._guards)
         self._agenda = Agenda(self._monitors, self._execution, patience, deadlines)
         self.began: tuple[str, ...] = ()
+        self._restarted: Outcome | None = None
         self._broken = False
         self._index()
         self._lanes = Lanes()
@@ -581,6 +582,9 @@ class MonitorSet:
         for monitor in (*self._monitors, *self.shadowed):
             if (monitor.name in was_tried) is not (monitor.name in is_tried):
                 monitor.faults = 0
+                if monitor.name in was_tried:
+                    monitor.start_anew()
+        self._agenda.schedule()
         return self._with_shadows(outcome, shadowed)
 
     def _follow(
@@ -602,9 +606,12 @@ class MonitorSet:
                 fresh.append(monitor)
         self._index()
         outcome = self._start(fresh, time_ns, None)
-        for monitor in fresh:  # only an operator may release the topics
-            if monitor.name in known and (earlier := known[monitor.name][0]).held:
-                self.hold_lost(monitor, earlier.why_held)
+        for monitor in fresh:
+            if monitor.name in known and self._holds:
+                earlier = known[monitor.name][0]
+                monitor.start_anew()
+                if earlier.held:  # only an operator may release the topics
+                    self.hold_lost(monitor, earlier.why_held)
         return outcome
 
     def has_departed(self, monitor: MonitorInstance) -> bool:
@@ -622,7 +629,10 @@ class MonitorSet:
         """Enable or disable monitors, ignoring unknown names; return the monitors that changed.
 
         The time while a monitor is disabled does not count: its timers, and its properties with time bounds, restart.
+        A monitor that is declared `begin` begins again (`take_restarted`), unless it has slices, because it has missed
+        messages. Enabled monitors send their safe messages until the next message on the topic.
         """
+        fresh = []
         changed = [monitor for shadow in self.shadows for monitor in shadow.switch(enabled, time_ns)]
         for monitor in self._monitors:
             wanted = enabled.get(monitor.name, monitor.enabled)
@@ -641,10 +651,24 @@ class MonitorSet:
                         running.begin(time_ns)
                 if monitor.slices is not None:
                     monitor.slices.restart(time_ns)
+                elif monitor.code.begins:
+                    fresh.append(monitor)
+        if fresh:
+            began = self.began
+            self._restarted = self._start(fresh, time_ns, None)
+            self.began = began
+        for monitor in self._monitors:
+            if self._holds and monitor.enabled and monitor in changed:
+                monitor.start_anew()
         if changed:
             self._index()
             self._agenda.schedule()
         return tuple(changed)
+
+    def take_restarted(self) -> Outcome | None:
+        """Return the outcome of monitors that have begun again because they were enabled."""
+        outcome, self._restarted = self._restarted, None
+        return outcome
 
     def give(self, values: GivenValues) -> None:
         """Set given constants, and all others to their defaults, without resetting the state.

@@ -8,6 +8,9 @@ A guard's stop comes over another connection, so it can overtake motions that wa
 the queue or in the kernel. Therefore subscribers also get the stop after these motions, and a later subscriber gets
 it instead of them (`supersede`).
 
+A latching publisher sends its last message again on each connection. On a topic of commands this message is not new, so
+it is not passed (`replayed`), except on the first connection of a new publisher.
+
 If the publisher's host has no memory left, a latched message is not kept. When memory is free again, a later
 subscriber makes the relay reconnect to the publisher; the other subscribers then get the message twice. A latched
 command (a message of a topic that had a guard, or a goal) is never requested again: it would begin a motion long after
@@ -23,6 +26,7 @@ from enum import Enum, auto
 
 from appliance.channel.messages import LatchRefused, TopicTraffic
 from appliance.relay.connections.headers import to_subscriber
+from appliance.relay.connections.latch_replay import LatchReplay
 from appliance.relay.connections.latched_message import LatchedMessage
 from appliance.relay.connections.message_sink import MessageSink, MessageStream
 from appliance.relay.connections.named_subscribers import seen_names
@@ -124,6 +128,7 @@ class RelayedTopic:
         make_room: Callable[[int], None],
         refused: Callable[[LatchRefused], None],
         sink: MessageSink | None,
+        replayed: Callable[["RelayedTopic", Batch], bool] = lambda _topic, _batch: True,
         over: Callable[[], bool] = lambda: False,
         servers: Callable[[str], Collection[str]] = lambda _topic: (),
     ) -> None:
@@ -148,7 +153,10 @@ class RelayedTopic:
         self._monitoring = _Monitoring()
         self._taps: tuple[Callable[[Batch], None], ...] = ()
         self._stream: MessageStream | None = None
-        self._startup_replay = StartupReplay(share, clock() + (APPEARED if fresh else -1))
+        self._replayed = replayed
+        new_until = clock() + (APPEARED if fresh else -1)
+        self._latch_replay = LatchReplay(new_until)
+        self._startup_replay = StartupReplay(share, new_until)
         self._reported = True
         self._superseded = False  # whether a guard's stop is the last message
         self._is_command = topic.endswith("/goal")  # no monitor can declare what stops an action
@@ -264,6 +272,7 @@ class RelayedTopic:
         before, self._header = self._header, header
         self.latch.is_latching = header.get("latching", "0") == "1"
         self._state = TopicState.OPEN
+        self._latch_replay.opened(self._clock(), is_latching=self.latch.is_latching)
         self.differs()
         self._end_stream()
         if self._sink is not None:
@@ -307,9 +316,19 @@ class RelayedTopic:
         self.counters.add(batch.messages, len(batch.view))
         self._reported = False
         passing = batch
-        if self.flow.limits:
-            passing = self.flow.passing(batch, self._clock(), latching=self.latch.is_latching)
+        if self._latch_replay.awaited:
+            passing = self._without_replay(batch)
+        if self.flow.limits and passing.messages:
+            passing = self.flow.passing(passing, self._clock(), latching=self.latch.is_latching)
         return self._take(batch, passing, since)
+
+    def _without_replay(self, batch: Batch) -> Batch:
+        """Leave out the first message of this connection, if it is a command that the publisher had latched before."""
+        latched = self._latch_replay.is_first(self._clock()) and self._is_command
+        if not latched or self._replayed(self, batch.head(1)):
+            return batch
+        self.latch.withheld = True
+        return batch.tail(batch.messages - 1)
 
     def sent(self, batch: Batch, since: float, number: int, sent: int) -> None:
         """Continue after the pump has passed a batch to the first `number` subscribers, and `sent` bytes to the next.

@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     from rosmop.run.outcomes import Outcome, Published
 
 _AFTER_DEFECT = 1.0
+_REPLAYED = "its publisher had latched this command before the relay connected to it; send it again"
 
 
 class Interceptor:
@@ -185,6 +186,8 @@ class Interceptor:
         switches = {monitor.name: self._switches.get(monitor.name, True) for monitor in both}
         switched = self.monitors.switch(switches, self.now())
         self.monitors.give(self._given)
+        if (restarted := self.monitors.take_restarted()) is not None:
+            self.observer.report(restarted, NOWHERE)
         self.keep_all()
         self.schedule()
         self.shadow.schedule()
@@ -231,6 +234,9 @@ class Interceptor:
 
     def is_stop(self, topic: str, data: bytes) -> bool:
         return self.monitors is not None and self.monitors.is_safe(topic, data)
+
+    def refuse_replay(self, point: ObservationPoint, body: memoryview) -> None:
+        self.observer.dropped(dropped(body, self.now(), _REPLAYED), point, body)
 
     def _guards(self, topic: str, *, begin: bool) -> list[str]:
         if self.monitors is None:

@@ -630,8 +630,32 @@ def test_a_command_that_a_guard_has_dropped_does_not_come_when_the_guard_is_off(
     world.told.clear()
     OFF[off](world, text)
     publisher.send(string("new"))
-    world.gets(base, string("new"))
+    world.until(lambda: data_of(base).endswith(string("new")))
+    assert base.data.replace(string("stop"), b"") == string("new")
     assert not [one for one in world.told if isinstance(one, UpstreamWanted)]
+
+
+@pytest.mark.parametrize(("topic", "safe"), [("/chatter", SAFE), ("/arm/goal", "int seen")])
+@pytest.mark.parametrize("replayed", ["one", "stop"])
+def test_a_latched_command_is_new_only_on_the_first_connection(
+    world: Monitored, topic: str, safe: str, replayed: str
+) -> None:
+    world.load(BEGINNING.strip().replace("int seen", safe).replace("/chatter", topic))
+    publisher, base = latching_client(world, topic)
+    publisher.send(string("before"))
+    world.until(lambda: string("before") in data_of(base))
+    base.data.clear()
+    publisher.sock.close()
+    world.hears(UpstreamWanted, key="k", topic=topic)
+    world.state(UpstreamFound("k", topic, LOOPBACK, world.publisher.getsockname()[1]))
+    again = world.accept(world.publisher)
+    world.gets_header(again)
+    again.send(encode_header(TYPED | {"topic": topic, "latching": "1"}) + string(replayed) + string("new"))
+    world.until(lambda: data_of(base).endswith(string("new")))
+    passes = replayed == "stop" and topic == "/chatter"
+    assert base.data == (string("stop") if passes else b"") + string("new")
+    if not passes:
+        assert "send it again" in world.event("drop").text
 
 
 def test_a_server_that_connects_again_does_not_get_a_cancelled_goal(world: Monitored) -> None:
