@@ -30,7 +30,6 @@ from appliance.relay.monitors.topic_pipeline import TopicPipeline
 from appliance.relay.relay_limits import RelayLimits
 from appliance.relay.report import Reporter
 from appliance.relay.topic_taps import TopicTaps
-from appliance.relay.transport.frames import Batch
 from appliance.relay.transport.loop_channel import LoopLink
 from appliance.relay.transport.rate_limit import RateAllowance, RateLimits
 
@@ -255,8 +254,7 @@ class DataPlane:
             return None
         return self._flows.of(grant.limit, grant.topic, grant.host, grant.caller_id)
 
-    def _may_pass_again(self, relayed: RelayedTopic, first: Batch) -> bool:
-        body = first.view[4:]
+    def _may_pass_again(self, relayed: RelayedTopic, body: memoryview) -> bool:
         if self.interceptor.is_stop(relayed.topic, bytes(body)):
             return True
         point = ObservationPoint(relayed.key, relayed.topic, relayed.host, relayed.name)

@@ -35,6 +35,18 @@ class PresetRow(msgspec.Struct, frozen=True):
     parameters: Annotated[list[PresetParameter], doc("the values that operators set")]
 
 
+class LastStop(msgspec.Struct, frozen=True):
+    """The last stop of a guard since control started: it sent its safe message, or put it in the place of commands."""
+
+    since: Annotated[Moment, doc("its first action")]
+    until: Annotated[Moment | None, doc("its last action, or null while it goes on")]
+    actions: Annotated[int, doc("the safe messages so far")]
+    cause: Annotated[str, doc("the guard's own line, a fault, or why it cannot judge")]
+    host: Annotated[str, doc("the host of the message that led to it, or empty if a timer did")]
+    node: Annotated[str, doc("the node of that message")]
+    record: Annotated[str, doc("the audit record `stop begun`")]
+
+
 class GuardRow(msgspec.Struct, frozen=True):
     """A loaded guard."""
 
@@ -63,6 +75,7 @@ class GuardRow(msgspec.Struct, frozen=True):
     off_until: Annotated[Moment | None, doc("when it is enabled again automatically, or null if never")] = (
         None
     )
+    last_stop: Annotated[LastStop | None, doc("its last stop, or null if there was none")] = None
     version: Annotated[int, doc("the version of the preset in its text")] = 0
     origin: Annotated[
         str,

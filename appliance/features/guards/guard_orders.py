@@ -16,6 +16,7 @@ from appliance.features.guards.guard_answers import (
     GuardList,
     GuardPlan,
     GuardRow,
+    LastStop,
     LoadedSuggestion,
     Suggestion,
     Suggestions,
@@ -257,6 +258,14 @@ class GuardOrders:
         before = "shadow " if self._monitors.switches.in_shadow(name) else ""
         return sum(self._monitors.records.counts[f"{before}{kind}", name] for kind in _ACTS)
 
+    def _last_stop(self, name: str) -> LastStop | None:
+        stops = self._monitors.records.stops
+        stop = stops.last.get(name)
+        if stop is None:
+            return None
+        until = None if stops.goes_on(name) else stop.until / 1e9
+        return LastStop(stop.since / 1e9, until, stop.count, stop.cause, stop.host, stop.node, stop.record)
+
     def _state(self, name: str) -> str:
         monitors = self._monitors
         if name in monitors.rollout.held:
@@ -289,6 +298,7 @@ class GuardOrders:
             why_held=monitors.rollout.why_held.get(name, ""),
             confirm_by=monitors.returns.confirm_by(name),
             off_until=monitors.returns.until(name),
+            last_stop=self._last_stop(name),
             version=preset.version,
             origin=origin_of(text),
             below=below_the_standard(preset, values_of(given)),

@@ -503,4 +503,13 @@ def _state(row: GuardRow) -> str:
         if row.confirm_by is None
         else f", until {moment(row.confirm_by)} unless you run: rosrv monitor confirm"
     )
-    return f"in force, {row.state}{'' if row.preset == 'withhold' else f', {acts}'}{end}"
+    return f"in force, {row.state}{'' if row.preset == 'withhold' else f', {acts}'}{_last_stop(row)}{end}"
+
+
+def _last_stop(row: GuardRow) -> str:
+    stop = row.last_stop
+    if stop is None:
+        return ""
+    when = f"since {moment(stop.since)}" if stop.until is None else f"last until {moment(stop.until)}"
+    who = f" ({stop.node} on {stop.host})" if stop.node else ""
+    return f", {when}{f': {stop.cause}' if stop.cause else ''}{who}"

@@ -26,12 +26,11 @@ from enum import Enum, auto
 
 from appliance.channel.messages import LatchRefused, TopicTraffic
 from appliance.relay.connections.headers import to_subscriber
-from appliance.relay.connections.latch_replay import LatchReplay
 from appliance.relay.connections.latched_message import LatchedMessage
 from appliance.relay.connections.message_sink import MessageSink, MessageStream
 from appliance.relay.connections.named_subscribers import seen_names
 from appliance.relay.connections.served_subscribers import ServedSubscribers, TopicSubscriber
-from appliance.relay.connections.startup_replay import APPEARED, StartupReplay
+from appliance.relay.connections.startup_replay import APPEARED, LatchReplay, StartupReplay
 from appliance.relay.transport.frames import Batch
 from appliance.relay.transport.memory import HostMemory
 from appliance.relay.transport.pump import SUBSCRIBERS, ModuleCall, Traffic, Version
@@ -128,7 +127,7 @@ class RelayedTopic:
         make_room: Callable[[int], None],
         refused: Callable[[LatchRefused], None],
         sink: MessageSink | None,
-        replayed: Callable[["RelayedTopic", Batch], bool] = lambda _topic, _batch: True,
+        replayed: Callable[["RelayedTopic", memoryview], bool] = lambda _topic, _body: True,
         over: Callable[[], bool] = lambda: False,
         servers: Callable[[str], Collection[str]] = lambda _topic: (),
     ) -> None:
@@ -325,7 +324,7 @@ class RelayedTopic:
     def _without_replay(self, batch: Batch) -> Batch:
         """Leave out the first message of this connection, if it is a command that the publisher had latched before."""
         latched = self._latch_replay.is_first(self._clock()) and self._is_command
-        if not latched or self._replayed(self, batch.head(1)):
+        if not latched or self._replayed(self, batch.head(1).view[4:]):
             return batch
         self.latch.withheld = True
         return batch.tail(batch.messages - 1)

@@ -2,17 +2,21 @@ from collections import Counter
 from types import SimpleNamespace
 from typing import Any
 
+import msgspec
 import pytest
 
 from appliance.base import clock
 from appliance.channel import admin
 from appliance.channel.answers.graph_answers import Graph, Publisher, Topic
+from appliance.channel.messages import MonitorEvent
 from appliance.control.errors import SenselessError, UnknownThingError
 from appliance.features.guards import guard_orders, guard_requests
+from appliance.features.guards.guard_answers import LastStop
 from appliance.features.guards.guard_orders import GuardOrders
 from appliance.features.guards.presets import PRESETS, Guard, text_of
 from appliance.features.guards.upgrades import Upgrade
 from appliance.features.guards.view import ActingGuard, GuardsState
+from appliance.specifications.episodes import Stops
 from appliance.specifications.specification_files import SpecificationsRefusedError
 from tests.support.virtual_clock import let_time_pass
 
@@ -38,7 +42,7 @@ class Manager:
         )
         self.givens = SimpleNamespace(states=lambda _checked, _name: [])
         self.returns = SimpleNamespace(until=lambda _name: None, confirm_by=lambda _name: None)
-        self.records = SimpleNamespace(counts=Counter())
+        self.records = SimpleNamespace(counts=Counter(), stops=Stops(lambda _stops: None))
 
     async def load(self, request: Any, _who: str, *, enable: bool = False) -> Any:
         self.orders.append(request)
@@ -105,6 +109,22 @@ async def test_a_guard_is_stopping_while_it_acts(manager: Manager, orders: Guard
     assert ((await row(orders)).state, (await row(orders)).stops) == ("shadow", 0)
     manager.rollout.held.add("fence")
     assert (await row(orders)).state == "holding"
+
+
+async def test_a_guard_has_its_last_stop(manager: Manager, orders: GuardOrders) -> None:
+    assert (await row(orders)).last_stop is None
+    stops, now = manager.records.stops, clock.now()
+    for second in (5, 7):
+        event = MonitorEvent(
+            "change", "fence", "k", "/cmd_vel", second * 10**9, "", {"cause": "at the edge"}, host="10.0.0.7",
+            caller_id="/teleop", safe=True,
+        )  # fmt: skip
+        if (begun := stops.take(event, now)) is not None:
+            stops.recorded(begun, "18e9")
+    going_on = LastStop(5, None, 2, "at the edge", "10.0.0.7", "/teleop", "18e9")
+    assert (await row(orders)).last_stop == going_on
+    stops.ended(now + 10)
+    assert (await row(orders)).last_stop == msgspec.structs.replace(going_on, until=7)
 
 
 async def test_a_guard_is_withholding_while_its_relay_says_so(manager: Manager, orders: GuardOrders) -> None:

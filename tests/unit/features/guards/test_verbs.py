@@ -15,6 +15,7 @@ from appliance.features.guards import verbs
 from appliance.features.guards.guard_answers import (
     GuardPlan,
     GuardRow,
+    LastStop,
     LoadedSuggestion,
     Suggestion,
     Suggestions,
@@ -58,8 +59,12 @@ class Robot:
             case GuardsWanted():
                 rows = [
                     GuardRow(name, "fence", "", "stopping", {"command": "/cmd_vel"}, {}, [], {}, 3, version=1,
-                             origin=origin, below=["silent=0 is below the standard"] * (name == "old"))
-                    for name, origin in (("fence", "current"), ("old", "older"), ("mine", "changed"))
+                             origin=origin, below=["silent=0 is below the standard"] * (name == "old"),
+                             last_stop=LastStop(5, until, 2, "at the edge", "10.0.0.7", "/teleop", "18e9")
+                             if until != 0 else None)
+                    for name, origin, until in (
+                        ("fence", "current", None), ("old", "older", 7), ("mine", "changed", 0)
+                    )
                 ]  # fmt: skip
                 return SimpleNamespace(guards=rows, warnings=["fence acts before rate"])
             case GuardTry():
@@ -254,8 +259,10 @@ def test_lists_and_proposals_are_printed(tmp_path: Path, capsys: pytest.CaptureF
     shown = capsys.readouterr().out
     assert all(f"{name}: {preset.what}" in shown for name, preset in PRESETS.items())
     assert shown.endswith(
-        "guard fence: fence on /cmd_vel, in force, stopping, 3 stops\n"
-        "guard old: fence 1, older: rosrv guard upgrade old; on /cmd_vel, in force, stopping, 3 stops\n"
+        "guard fence: fence on /cmd_vel, in force, stopping, 3 stops, since 1970-01-01 00:00Z: at the edge"
+        " (/teleop on 10.0.0.7)\n"
+        "guard old: fence 1, older: rosrv guard upgrade old; on /cmd_vel, in force, stopping, 3 stops,"
+        " last until 1970-01-01 00:00Z: at the edge (/teleop on 10.0.0.7)\n"
         "    silent=0 is below the standard\n"
         "guard mine: fence 1, changed: not the text of the preset; on /cmd_vel, in force, stopping, 3 stops\n"
         "fence acts before rate\n"

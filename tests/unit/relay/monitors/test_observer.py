@@ -272,3 +272,41 @@ def test_a_count_of_different_words_has_no_text() -> None:
     assert (len(full), more.count, more.text) == (101, 9, "")
     assert more.detail == {"first_time": 102, "last_time": 110}
     told.monitored.close()
+
+
+HALT = """halt() { safe geometry_msgs/Twist { } on /cmd every 100ms;
+    event drive(double v) /cmd geometry_msgs/Twist '{linear:{x:v}}' {
+        if (v > 1) { ROS_WARN("too fast: %.1f", v); STOP; } } }"""
+
+
+@pytest.mark.parametrize("together", [False, True])
+@pytest.mark.parametrize("kind", ["change", "publish"])
+def test_a_stop_is_marked_and_has_its_cause(kind: str, *, together: bool) -> None:
+    """Also the stops that are only counted, and those that the module makes."""
+    told = Told(together=together, texts=(HALT, TURN))
+    if kind == "publish":
+        monitors = told.monitored.interceptor.monitors
+        assert monitors is not None
+        monitors.hold(monitors.monitor("halt"), "its state is lost")
+        for time in range(3):
+            told.monitored.interceptor.observer.report(
+                monitors.advance(told.monitored.interceptor.now() + time * 10**8)[0], ObservationPoint("", "")
+            )
+    else:
+        told.send(*[(5, 0, 0)] * 30, (0.5, 0, 5))
+    first, *counts = [event for event in told.events(kind) if event.monitor == "halt"]
+    assert first.safe
+    assert all(event.safe for event in counts)
+    assert 1 + sum(event.count for event in counts) == (30 if kind == "change" else 3)
+    assert first.detail["cause"] == (
+        "too fast: 5.0" if kind == "change" else "it holds its topics: its state is lost"
+    )
+    told.monitored.close()
+
+
+def test_a_limit_is_not_a_stop() -> None:
+    told = Told(together=True, texts=(HALT, TURN))
+    told.send(*[(0.5, 0, 5)] * 30)
+    changes = told.events("change")
+    assert {(event.monitor, event.safe) for event in changes} == {("turn", False)}
+    told.monitored.close()
