@@ -40,7 +40,7 @@ class ServiceReport:
         if failed is not None and settings.audit.on_audit_failure == "deny":
             obstacle = f"nothing is granted, because the audit log cannot be written: {failed}"
         keeps_state = any(
-            owner.holds and monitors.switches.enabled(name) for name, owner in monitors.checked.states.items()
+            owner.held and monitors.switches.enabled(name) for name, owner in monitors.checked.states.items()
         )
         return lease_link.ControlServes(obstacle or self._lasting(), keeps_state)
 
