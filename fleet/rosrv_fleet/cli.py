@@ -220,6 +220,11 @@ def verify(
             _print_proof(proof, as_json=as_json)
         if not proofs:
             _note(f"{one.name}: nothing was collected yet")
+        if len(proofs) > 1:
+            _note(
+                f"{one.name}: {len(proofs)} logs, each proven for itself; see why a new one began:"
+                f" rosrv-fleet search --robot {one.name} --event 'log *'"
+            )
     raise typer.Exit(0 if complete else 1)
 
 

@@ -111,7 +111,7 @@ class SegmentStore:
         self._reserve = reserve
         self._locks: dict[str, threading.Lock] = {}
         self._aging = threading.Lock()
-        for name in ("segments", "newest", "removed", "incoming", *_KINDS):
+        for name in ("segments", "newest", "earlier", "removed", "incoming", *_KINDS):
             make_folder(folder / name)
 
     def _lock(self, robot: str) -> threading.Lock:
@@ -217,10 +217,29 @@ class SegmentStore:
         if newest is not None and newest[1].log == place.log and newest[1].number > place.number:
             os.utime(file, ns=(now, now))
             return
+        if newest is not None and newest[1].log != place.log:
+            self._note_earlier(newest[1])
         making = self._folder / "incoming" / f"{place.robot}.newest"
         making.write_text(place.mark, encoding="ascii")
         os.utime(making, ns=(now, now))
         making.rename(file)
+
+    def _note_earlier(self, last: SegmentPlace) -> None:
+        """Note the last segment of a log before the robot's newest segment is one of another log."""
+        earlier = self.earlier(last.robot)
+        if earlier.get(last.log, 0) < last.number:
+            content = msgspec.json.encode(earlier | {last.log: last.number})
+            write_whole(self._folder / "earlier" / last.robot, content, 0o600)
+
+    def earlier(self, robot: str) -> dict[str, int]:
+        """Return the logs that the robot pushed before its present one, with their last segments' numbers."""
+        file = self._folder / "earlier" / robot
+        try:
+            return msgspec.json.decode(file.read_bytes(), type=dict[str, int])
+        except FileNotFoundError:
+            return {}
+        except ValueError as error:
+            raise OSError(f"{file}: damaged: {error}; see what changed it, and remove it") from error
 
     def newest(self, robot: str) -> tuple[int, SegmentPlace] | None:
         try:

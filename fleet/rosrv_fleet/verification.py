@@ -1,8 +1,8 @@
 """Prove from the stored segments that no record of a robot is missing.
 
 The segments of a complete log form one chain. It starts at the log's beginning, after records whose removal the
-signer signed, or after segments whose removal the collector's own retention noted. The newest segment of a robot is
-also noted outside of the log, so its loss is found.
+signer signed, or after segments whose removal the collector's own retention noted. The newest segment of a robot, and
+the last one of each earlier log, are also noted outside of the log, so their loss is found.
 """
 
 import gzip
@@ -53,7 +53,18 @@ def prove(store: SegmentStore, robot: Robot, segment_bytes: int) -> list[LogProo
         if head is None or head.number < place.number:
             proof = proofs.setdefault(place.log, LogProof(robot=robot.name, log=place.log))
             proof.findings.append(f"segment {place.number}, the newest that arrived, is missing")
+    _check_earlier(store, robot, proofs)
     return list(proofs.values())
+
+
+def _check_earlier(store: SegmentStore, robot: Robot, proofs: dict[str, LogProof]) -> None:
+    """Report segments that are missing at the end of logs that the robot pushed before its present one."""
+    for log, number in store.earlier(robot.name).items():
+        head, (note, _damage) = store.head(robot.name, log), _removal(store, robot, log)
+        stored = max(0 if head is None else head.number, 0 if note is None else note.number)
+        if stored < number:
+            proof = proofs.setdefault(log, LogProof(robot=robot.name, log=log))
+            proof.findings.append(f"segment {number}, the last of this log that arrived, is missing")
 
 
 def _prove_log(store: SegmentStore, robot: Robot, log: str, segment_bytes: int) -> LogProof:

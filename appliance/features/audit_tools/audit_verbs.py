@@ -250,7 +250,10 @@ def _later(source: FileLog | RestLog, last: SignedCheckpoint) -> list[SignedChec
     found = source.checkpoints(last.number - 1)
     if found and (found[0].log, found[0].number) == (last.log, last.number):
         return found[1:]
-    return source.checkpoints(0)
+    anew = source.checkpoints(0)
+    if anew and anew[0].log != last.log:
+        note(f"log {anew[0].log} took the place of log {last.log}: see rosrv audit verify")
+    return anew
 
 
 @speaks_with(_ALWAYS_JSON_HELP, FILTER)

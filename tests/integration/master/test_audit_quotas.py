@@ -21,7 +21,9 @@ LONG = "k" * 900
 def siege(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Siege]:
     need_root()
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
-    with Lab("rosrv-test") as lab, Siege(lab, tmp_path_factory.mktemp("siege"), "relays: 2\n") as there:
+    # With this size, the part of the disk of a guest's network is less than the bound of one host.
+    settings = "relays: 2\naudit: {retention_bytes: 256MiB}\n"
+    with Lab("rosrv-test") as lab, Siege(lab, tmp_path_factory.mktemp("siege"), settings) as there:
         yield there
 
 

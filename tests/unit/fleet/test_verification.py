@@ -2,6 +2,7 @@ import asyncio
 import gzip
 import itertools
 import os
+import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -37,7 +38,13 @@ class _Store(SegmentStore):
 
 @pytest.fixture
 def store(make_log: MakeLog, path: Path, tmp_path: Path) -> _Store:
-    log, found = make_log(checkpoint_every=10), _Store(tmp_path / "data", 0)
+    found = _Store(tmp_path / "data", 0)
+    _push(found, make_log, path, tmp_path)
+    return found
+
+
+def _push(found: _Store, make_log: MakeLog, path: Path, tmp_path: Path) -> None:
+    log = make_log(checkpoint_every=10)
     for number in range(50):
         log.record(decision(log, number))
         if number % 10 == 9:
@@ -54,8 +61,7 @@ def store(make_log: MakeLog, path: Path, tmp_path: Path) -> _Store:
         upload.unlink()
         os.utime(found.path(place), (1e9, 1e9))
         found.indexed(place)
-    assert len(_places(found)) > 3
-    return found
+    assert log.close() is None
 
 
 def _places(store: SegmentStore) -> list[SegmentPlace]:
@@ -94,3 +100,27 @@ def test_a_removal_without_a_note_is_a_loss(listed: bool, store: _Store, key: Ed
     proof = _proof(store, key)
     assert (proof.segments, proof.missing) == (len(places) - 2, last - first + 1)
     assert f"records {first} to {last} are missing" in proof.findings
+
+
+def test_an_earlier_log_that_is_no_longer_stored_is_a_loss(
+    store: _Store, make_log: MakeLog, path: Path, tmp_path: Path, key: Ed25519PrivateKey
+) -> None:
+    """The robot began a new log; the collector has the last segment of each, or a note of its removal."""
+    (first,) = store.logs("arm1")
+    path.unlink()
+    _push(store, make_log, path, tmp_path)
+    robot = Robot(name="arm1", key=key.public_key().public_bytes_raw().hex(), certificate="", added=0)
+
+    def proven() -> dict[str, list[str]]:
+        return {proof.log: proof.findings for proof in prove(store, robot, 1 << 20)}
+
+    both = proven()
+    assert (len(both), list(both.values())) == (2, [[], []])
+    places = list(store.segments("arm1", first))
+    store.path(places[-1]).rename(tmp_path / "last")
+    assert proven()[first] == [f"segment {places[-1].number}, the last of this log that arrived, is missing"]
+    (tmp_path / "last").rename(store.path(places[-1]))
+    assert proven() == both
+    shutil.rmtree(store.path(places[0]).parent.parent)
+    assert first in proven()
+    assert len(proven()[first]) == 1
