@@ -11,6 +11,7 @@ from appliance.control.assembly.foundation import Foundation
 from appliance.control.operators.administration import Administration
 from appliance.control.operators.clock_check import ClockCheck
 from appliance.control.operators.handled_alarms import HandledAlarms
+from appliance.control.operators.node_connections import NodeConnections
 from appliance.control.operators.overview import graph_of
 from appliance.control.operators.queries import Queries
 from appliance.control.operators.request_methods import request_methods
@@ -60,6 +61,7 @@ def make_operators(base: Foundation, parts: Parts) -> Operators:
         tokens_changed=lambda: rest().state_tokens(),
         status=lambda: looks().present(),
         handled_alarms=handled,
+        connections=NodeConnections(core.registry, ends.subscribers.delivery, base.lifeline.surroundings),
     )
     queries = Queries(
         parts,

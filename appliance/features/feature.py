@@ -50,6 +50,16 @@ class KeptHosts(Protocol):
         """Return the hosts' addresses by their names in the policy, such as `door:alice`."""
 
 
+class ConnectedNodes(Protocol):
+    """See `NodeConnections` in `appliance/control/operators/node_connections.py`."""
+
+    def is_here(self, host: str) -> bool | None:
+        """Return whether a host is the appliance's machine, or null if the appliance cannot know."""
+
+    async def unknown_publishers(self, node: str, topic: str) -> list[str] | None:
+        """Return the URIs of a node's publishers that the appliance did not give it, or null without an answer."""
+
+
 @dataclass(frozen=True)
 class FeatureContext:
     """Objects of control that parts of features use. `robot` may be empty."""
@@ -82,6 +92,7 @@ class OperatorContext:
     tokens_changed: Callable[[], None]
     status: "Callable[[], Status]"
     handled_alarms: "HandledAlarms"
+    connections: "ConnectedNodes"
     kept: Mapping[str, KeptHosts]
 
 

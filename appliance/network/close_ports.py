@@ -4,6 +4,8 @@
    opens continue. A UDP packet is dropped if it is new to the tracker, so answers pass.
 2. A connection that this machine forwards to the appliance is dropped if it then has an address of this machine:
    the policy would treat it as the machine's own. With kernels before Linux 5.7 the rule never matches.
+3. With `LocalCallers`, a connection from this machine to itself is refused at its SYN unless the connecting socket
+   belongs to one of them. A packet without a socket has no owner, so it is refused.
 """
 
 import ipaddress
@@ -24,6 +26,8 @@ RANGE_FILE = Path("/proc/sys/net/ipv4/ip_local_port_range")
 # One match is for ESP in the kernel, the other for ESP in user space on strongSwan's TUN device. join.sh checks both.
 _THROUGH_IPSEC = ("meta ipsec exists ", 'iifname "ipsec*" ')
 _SYN = "tcp flags & (syn | ack) == syn"
+_USER = re.compile(r"[a-z_][a-z0-9_-]{0,31}|[0-9]{1,10}")
+_GROUP = re.compile(r"[\w.@:-]++(?:/[\w.@:-]++)*+", re.ASCII)
 _SERVICE = re.compile(r"(tcp|udp)/(\d{1,5})(?:-(\d{1,5}))?")
 
 
@@ -36,6 +40,37 @@ class OpenService:
 
     def __str__(self) -> str:
         return f"{self.protocol}/{self.ports}"
+
+
+@dataclass(frozen=True)
+class LocalCallers:
+    """The users (names or numbers) and control groups (paths below the root) that may reach the ports over loopback."""
+
+    users: tuple[str, ...] = ()
+    groups: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not self.users and not self.groups:
+            raise ValueError("--strict needs the user or the control group of the nodes: --user robot")
+        for user in self.users:
+            if not _USER.fullmatch(user):
+                raise ValueError(f"--user {user!r} is not the name or the number of a user")
+        for group in self.groups:
+            if not _GROUP.fullmatch(group):
+                raise ValueError(
+                    f"--cgroup {group!r} is not the path of a control group, such as system.slice/robot.service"
+                )
+
+    def __str__(self) -> str:
+        return ", ".join((*self.users, *self.groups))
+
+    def rules(self) -> list[str]:
+        """Return the rules of nftables that accept them."""
+        users = [f"meta skuid {{ {', '.join(dict.fromkeys(self.users))} }} accept"] if self.users else []
+        return users + [
+            f'socket cgroupv2 level {group.count("/") + 1} "{group}" accept'
+            for group in dict.fromkeys(self.groups)
+        ]
 
 
 def parse_services(texts: Sequence[str]) -> tuple[OpenService, ...]:
@@ -72,9 +107,16 @@ def local_port_range() -> PortRange:
 
 
 def protection(
-    appliances: Sequence[str], ports: PortRange, services: Sequence[OpenService], *, tunnelled: bool = False
+    appliances: Sequence[str],
+    ports: PortRange,
+    services: Sequence[OpenService],
+    *,
+    tunnelled: bool = False,
+    strict: LocalCallers | None = None,
 ) -> str:
-    """Return the nftables file. `tunnelled`: the appliances' addresses are accepted only through IPsec."""
+    """Return the nftables file. `tunnelled`: the appliances' addresses are accepted only through IPsec. `strict`: only
+    these programs of the machine itself reach the ports.
+    """
     if not appliances:
         raise ValueError("give the address of at least one appliance")
     rules, leaving = ['iifname "lo" accept'], []
@@ -85,14 +127,29 @@ def protection(
             source = f"{keyword} saddr {addresses} accept"
             rules += [f"{through}{source}" for through in (_THROUGH_IPSEC if tunnelled else ("",))]
             leaving.append(f"{keyword} daddr {addresses} {_SYN} iif != 0 fib saddr type local counter drop")
-    rules += [f"{service.protocol} dport {service.ports} accept" for service in dict.fromkeys(services)]
+    opened = [f"{service.protocol} dport {service.ports} accept" for service in dict.fromkeys(services)]
+    local = (
+        []
+        if strict is None
+        else [
+            'oifname != "lo" accept',
+            *opened,
+            *strict.rules(),
+            f"tcp dport {ports} {_SYN} counter reject with tcp reset",
+            f"udp dport {ports} ct state {{ new, invalid }} counter drop",
+        ]
+    )
+    rules += opened
     rules += [
         f"tcp dport {ports} {_SYN} counter reject with tcp reset",
         f"udp dport {ports} ct state {{ new, invalid }} counter drop",
     ]
+    inside = "loopback" if strict is None else f"{strict} of this machine"
+    head = "    chain local {\n        type filter hook output priority filter; policy accept;\n"
+    chain = f"{head}{_indented(local)}    }}\n" if local else ""
     return (
         "#!/usr/sbin/nft -f\n"
-        f"# Closes the ROS ports of this machine ({ports}) to all but loopback and the appliance\n"
+        f"# Closes the ROS ports of this machine ({ports}) to all but {inside} and the appliance\n"
         f"# ({', '.join(appliances)}), whose address no host behind this machine can use.\n"
         "# Made by `rosrv protect`; `rosrv protect --remove` removes it.\n"
         f"table inet {TABLE}\n"
@@ -106,6 +163,7 @@ def protection(
         "        type filter hook postrouting priority 300; policy accept;\n"
         f"{_indented(leaving)}"
         "    }\n"
+        f"{chain}"
         "}\n"
     )
 

@@ -53,6 +53,7 @@ ORDERS: tuple[admin.AdminRequest[Any], ...] = (
     *of_feature("door ticket", name="alice", seconds=60.0),
     *of_feature("guard new", preset="deadman", topics={"command": "/cmd_vel"}),
     *of_feature("guard set", name="silent", values={}),
+    *of_feature("guard upgrade", name="silent"),
     *of_feature("driver check", command="/cmd_vel", by="/odom"),
 )
 UNSTORED = {

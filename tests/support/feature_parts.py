@@ -6,6 +6,7 @@ from appliance.channel.answers.status import Status
 from appliance.configuration.sections import DEFAULTS
 from appliance.control.assembly.policies import Policies
 from appliance.control.operators.handled_alarms import HandledAlarms
+from appliance.control.operators.node_connections import NodeConnections
 from appliance.features.feature import Feature, FeatureContext
 from appliance.features.parts import FeatureParts
 from appliance.features.table import FEATURES
@@ -26,6 +27,7 @@ def idle_parts() -> FeatureParts:
         appliance="", store=store, policies=idle(Policies), monitors=monitors, processes=tuple,
         received=lambda _sequence: None, graph=lambda: Graph([], [], []), tokens_changed=lambda: None,
         status=lambda: idle(Status), handled_alarms=idle(HandledAlarms),
+        connections=idle(NodeConnections),
     )  # fmt: skip
     return parts
 

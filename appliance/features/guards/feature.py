@@ -21,12 +21,16 @@ def _operate(context: OperatorContext) -> FeaturePart:
     from appliance.features.guards.driver_check import DriverChecks  # noqa: PLC0415  only control needs it
     from appliance.features.guards.guard_orders import GuardOrders  # noqa: PLC0415  only control needs it
 
-    orders = GuardOrders(context.monitors, context.graph)
+    orders = GuardOrders(context.monitors, context.graph, context.connections)
     checks = DriverChecks(context.monitors, context.core.trail, context.graph, context.processes)
     return FeaturePart(
         methods=(*orders.methods(), *checks.methods()),
         status_fields=lambda: {"guards": orders.state()},
-        work={"the guards": orders.watch, "the check of a driver": checks.watch},
+        work={
+            "the guards": orders.watch,
+            "the place of guards": orders.placement.watch,
+            "the check of a driver": checks.watch,
+        },
     )
 
 

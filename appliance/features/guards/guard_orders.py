@@ -4,6 +4,8 @@ import asyncio
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import msgspec
+
 from appliance.base import clock
 from appliance.channel import admin
 from appliance.channel.answers.graph_answers import Graph
@@ -11,6 +13,7 @@ from appliance.channel.answers.monitor_answers import Replacement
 from appliance.channel.messages import GivenValue
 from appliance.control.errors import SenselessError, UnknownThingError
 from appliance.control.operators.request_method import RequestMethod
+from appliance.features.feature import ConnectedNodes
 from appliance.features.guards import guard_requests
 from appliance.features.guards.guard_answers import (
     GuardList,
@@ -23,6 +26,7 @@ from appliance.features.guards.guard_answers import (
 )
 from appliance.features.guards.guard_facts import facts_of, preset_row, values_of
 from appliance.features.guards.guard_order import Placed, faults, statements
+from appliance.features.guards.placement import Placement
 from appliance.features.guards.plans import planned
 from appliance.features.guards.presets import (
     PRESETS,
@@ -58,8 +62,11 @@ def _written(value: bool | int | float | str) -> str:
 class GuardOrders:
     """Answers requests about guards; `graph()` returns the present graph."""
 
-    def __init__(self, monitors: SpecificationManager, graph: Callable[[], Graph]) -> None:
+    def __init__(
+        self, monitors: SpecificationManager, graph: Callable[[], Graph], connections: ConnectedNodes
+    ) -> None:
         self._monitors, self._graph = monitors, graph
+        self.placement = Placement(self._guarded_commands, graph, connections)
         self._acts: dict[str, int] = {}
         self._acted_at: dict[str, float] = {}
         self._acting_since: dict[str, float] = {}
@@ -94,13 +101,16 @@ class GuardOrders:
     def state(self) -> GuardsState | None:
         loaded = len(self._guards())
         acting = [ActingGuard(name, since) for name, since in self._acting_since.items()]
-        return GuardsState(loaded, acting) if loaded else None
+        place = self.placement
+        return (
+            GuardsState(loaded, acting, place.elsewhere, place.bypassed, place.unanswered) if loaded else None
+        )
 
     async def guards(self, _request: guard_requests.GuardsWanted) -> GuardList:
         rows = [self._row(name, preset) for name, preset in self._guards().items()]
         return GuardList(
             self._monitors.revision, self._monitors.tag, [preset_row(one) for one in PRESETS.values()], rows,
-            [*faults(self._placed())],
+            [*faults(self._placed()), *self.placement.elsewhere],
         )  # fmt: skip
 
     async def suggestions(self, _request: guard_requests.GuardSuggestionsWanted) -> Suggestions:
@@ -123,7 +133,11 @@ class GuardOrders:
             {file: text}, note=described(text), expected=request.expected, confirm_within=request.confirm_within,
             shadow=request.shadow, hold=request.hold,
         )  # fmt: skip
-        return await self._monitors.load(order, who, enable=not request.shadow)
+        loaded = await self._monitors.load(order, who, enable=not request.shadow)
+        elsewhere = self.placement.sentences(request.topics["command"])
+        return (
+            msgspec.structs.replace(loaded, warnings=[*loaded.warnings, *elsewhere]) if elsewhere else loaded
+        )
 
     async def set(self, request: guard_requests.GuardSet, who: str) -> GuardList:
         monitors, name = self._monitors, request.name
@@ -157,6 +171,7 @@ class GuardOrders:
             shadow = request.shadow or monitors.switches.starts_in_shadow
             off, topics, stops = False, topics_in(text), 0
             changed = {each: ["", value] for each, value in request.values.items()}
+            kept = self.placement.sentences(request.topics["command"])
         else:
             present, text, _constants = self._changed(name, request.values)
             if request.upgrade:
@@ -246,6 +261,9 @@ class GuardOrders:
             Placed(name, preset.name, topics_in(files[file_of[name]]).get("command", ""), file_of[name])
             for name, preset in self._guards().items()
         ]
+
+    def _guarded_commands(self) -> frozenset[str]:
+        return frozenset(guard.command for guard in self._placed() if guard.preset != "withhold")
 
     def _guard(self, name: str) -> tuple[Preset, str]:
         guards = self._guards()

@@ -115,6 +115,10 @@ class RobotGraph:
             driving = frozenset(node for node in driving if not self._filters_positions(node))
         return driving
 
+    def ends(self, command: TopicFacts) -> frozenset[str]:
+        """Return the nodes that carry out a command of any type."""
+        return (self.drivers(command) if command.type in types.VELOCITIES else frozenset()) or _used(command)
+
     def robot_of(self, command: TopicFacts) -> GraphedRobot:
         return next(robot for robot in self.robots if command in robot.commands)
 
@@ -203,7 +207,7 @@ class RobotGraph:
         ours, theirs = _parts(one.name)[:-1], _parts(other.name)[:-1]
         if ours == theirs:
             return True
-        if self._ends(one).isdisjoint(self._ends(other)):
+        if self.ends(one).isdisjoint(self.ends(other)):
             return one not in self.bases and bool(theirs) and ours[: len(theirs)] == theirs
         apart = next((i for i, (a, b) in enumerate(zip(ours, theirs, strict=False)) if a != b), None)
         if apart is None:
@@ -214,9 +218,6 @@ class RobotGraph:
                 for topic in self.topics)
             for head in heads
         )  # fmt: skip
-
-    def _ends(self, command: TopicFacts) -> frozenset[str]:
-        return self.drivers(command) if command.type in types.VELOCITIES else _used(command)
 
     def _robot(self, group: list[TopicFacts], groups: list[list[TopicFacts]]) -> GraphedRobot:
         places = [_parts(command.name)[:-1] for command in group]
@@ -230,7 +231,7 @@ class RobotGraph:
             if others and not any(place[:length] == common[:length] for place in others):
                 namespace = common[:length]
                 break
-        drivers = frozenset(node for command in group for node in self._ends(command))
+        drivers = frozenset(node for command in group for node in self.ends(command))
         chain = drivers.union(*(command.publishers for command in group))
         for _step in range(_MOST_STEPS):
             inputs = (topic for topic in self.velocities if not chain.isdisjoint(topic.subscribers))

@@ -17,11 +17,30 @@ class ActingGuard(msgspec.Struct, frozen=True):
     since: Annotated[Moment, doc("it has done so since then, without a pause of 2 seconds")]
 
 
+class BypassedGuard(msgspec.Struct, frozen=True):
+    """A node that takes a guarded command from publishers that the appliance did not give it."""
+
+    topic: Annotated[str, doc("the guarded topic")]
+    node: Annotated[str, doc("the node that takes commands past the guard")]
+    host: Annotated[str, doc("its host")]
+    publishers: Annotated[list[str], doc("the URIs of the publishers, as the node names them")]
+
+
 class GuardsState(msgspec.Struct, frozen=True):
     """The loaded guards."""
 
     loaded: Annotated[int, doc("all guards, also disabled ones and those in shadow mode")]
     acting: Annotated[list[ActingGuard], doc("the guards that limit or stop the robot now")]
+    elsewhere: Annotated[
+        list[str], doc("guarded topics whose base is on another machine than the appliance, as sentences")
+    ] = []
+    bypassed: Annotated[
+        list[BypassedGuard],
+        doc("nodes that take a guarded command past the appliance; asked every few seconds"),
+    ] = []
+    unanswered: Annotated[
+        list[str], doc("nodes with a guarded command that do not say from whom they take it")
+    ] = []
 
 
 def _since(guard: ActingGuard) -> str:
@@ -33,6 +52,18 @@ def _alarms(state: GuardsState) -> Iterator[Trouble]:
     for guard in state.acting:
         text = f"the guard {_since(guard)}: rosrv audit search --category monitor --text {guard.name}"
         yield Trouble("notice", f"guard-acts:{guard.name}", text)
+    for one in state.bypassed:
+        text = (
+            f"{one.node} takes {one.topic} from {', '.join(one.publishers)}, past its guards: end that process, and"
+            f" run rosrv protect --strict on {one.host}"
+        )
+        yield Trouble("alarm", f"guard-bypassed:{one.topic}", text)
+    for sentence in state.elsewhere:
+        text = f"{sentence}: rosrv guard check-driver measures whether the driver stops the base then"
+        yield Trouble("warning", f"guard-elsewhere:{sentence.partition(':')[0]}", text)
+    for node in state.unanswered:
+        text = f"{node} does not answer getBusInfo: whether it takes commands past its guards is unknown"
+        yield Trouble("notice", f"guard-unanswered:{node}", text)
 
 
 def _line(state: GuardsState) -> tuple[str, str]:

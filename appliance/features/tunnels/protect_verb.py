@@ -52,6 +52,25 @@ def protect(
             help="The ports to close or check (default: the local port range here, of this machine or container).",
         ),
     ] = None,
+    strict: Annotated[
+        bool,
+        typer.Option(
+            "--strict",
+            help="Close the ports also to programs of this machine, except those of --user and --cgroup.",
+        ),
+    ] = False,
+    users: Annotated[
+        list[str] | None,
+        typer.Option("--user", metavar="USER", help="Strict: a user that runs nodes. Repeatable."),
+    ] = None,
+    groups: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--cgroup",
+            metavar="PATH",
+            help="Strict: a control group of nodes, such as system.slice/robot.service. Repeatable.",
+        ),
+    ] = None,
     apply: Annotated[
         bool, typer.Option("--apply", help="Apply the rules now, replacing earlier ones.")
     ] = False,
@@ -78,6 +97,8 @@ def protect(
     Close the ports, and open them again:
       sudo rosrv protect --appliance 192.168.1.20 --open tcp/40022 --apply
       sudo rosrv protect --remove
+    Close them also to other users of this machine:
+      sudo rosrv protect --appliance 192.168.1.20 --strict --user robot --apply
     Check another machine, and report to the appliance (role operator):
       rosrv protect --check 192.168.1.10
       rosrv protect --check 192.168.1.10 --api https://192.168.1.20:8443
@@ -92,12 +113,15 @@ def protect(
     try:
         services = protection.parse_services(open_services or ())
         chosen = protection.parse_ports(ports) if ports is not None else protection.local_port_range()
+        if (users or groups) and not strict:
+            _fail("--user and --cgroup are for --strict")
+        local = protection.LocalCallers(tuple(users or ()), tuple(groups or ())) if strict else None
         if check is not None:
             _check(_CheckTarget(check, name, chosen, services, seconds), running)
         elif remove:
             _remove(running.as_json)
         else:
-            _make(appliance or [_own(running)], chosen, services, apply, running.as_json)
+            _make(appliance or [_own(running)], chosen, services, local, apply=apply, as_json=running.as_json)
             if ports is None and not apply:
                 sys.stderr.write(
                     f"rosrv: note: {chosen} is the local port range here; for another machine, or the machine of this"
@@ -111,11 +135,13 @@ def _make(
     appliances: list[str],
     ports: PortRange,
     services: tuple[protection.OpenService, ...],
+    local: protection.LocalCallers | None,
+    *,
     apply: bool,
     as_json: bool,
 ) -> None:
     text = protection.protection(
-        [protection.parse_address(appliance) for appliance in appliances], ports, services
+        [protection.parse_address(appliance) for appliance in appliances], ports, services, strict=local
     )
     for service in services:
         if service.ports.last < ports.first or service.ports.first > ports.last:
@@ -127,10 +153,11 @@ def _make(
                 "rosrv: warning: net.ipv4.tcp_syncookies is 0 on this machine: forged SYN packets from the appliance's"
                 " address can lock the appliance out. Run: sysctl -w net.ipv4.tcp_syncookies=1\n"
             )
+        inside = "loopback" if local is None else f"{local} on this machine"
         _say(
             as_json,
-            {"event": "applied", "ports": str(ports), "appliances": appliances},
-            f"TCP and UDP {ports} are now closed to all but loopback and {', '.join(appliances)}.\n"
+            {"event": "applied", "ports": str(ports), "appliances": appliances, "strict": local is not None},
+            f"TCP and UDP {ports} are now closed to all but {inside} and {', '.join(appliances)}.\n"
             "Check it from another machine: rosrv protect --check ADDRESS-OF-THIS-MACHINE\n",
         )
     else:

@@ -40,6 +40,8 @@ _CALL_BYTES = 200  # an empty call in Python's memory
 _TEXT_BYTES = 60  # an empty text in Python's memory
 
 ANSWER = XmlRpcLimits(body=16 << 10, elements=256, depth=4, string=16 << 10, parts=0)
+LONG_ANSWER = XmlRpcLimits(body=256 << 10, elements=16_384, depth=4, string=16 << 10, parts=0)
+"""For one answer at a time: a thousand connections of a node."""
 
 _REUSES = frozenset({"requestTopic", "publisherUpdate", "paramUpdate"})  # a node may get each of these twice
 _KEPT_SECONDS = 1.0  # between two rounds that close connections
@@ -58,9 +60,11 @@ class NodeApiClient:
         self._unused: dict[NodeUri, XmlRpcClient] = {}  # in the round before, and not in this one
         self._round: asyncio.TimerHandle | None = None
 
-    def client(self, incarnation: Incarnation, *, pool: int = 0) -> XmlRpcClient:
+    def client(
+        self, incarnation: Incarnation, *, pool: int = 0, limits: XmlRpcLimits = ANSWER
+    ) -> XmlRpcClient:
         """Return a client for the node's address, which another process may use now."""
-        return XmlRpcClient(incarnation.call_uri, timeout=self._timeout, pool=pool, limits=ANSWER)
+        return XmlRpcClient(incarnation.call_uri, timeout=self._timeout, pool=pool, limits=limits)
 
     async def call(self, incarnation: Incarnation, method: str, *params: Value) -> Value:
         """Call a node. Raises `CallFailedError`; `RefusedError` for a shutdown if another node has the address."""
@@ -271,6 +275,14 @@ class Delivery:
     def remove_first(self, incarnation: Incarnation, topic: str, publishers: frozenset[str]) -> None:
         """Send the next list without these publishers first."""
         self._list(incarnation, topic).remove(publishers)
+
+    async def ask(self, incarnation: Incarnation, method: str) -> Value:
+        """Call a node once, in turn with the calls to other hosts, and return its answer. Raises `CallFailedError`."""
+        await self._turns.enter(incarnation.host)
+        try:
+            return await self._nodes.client(incarnation, limits=LONG_ANSWER).call(method, MASTER_NAME)
+        finally:
+            self._turns.leave(incarnation.host)
 
     def drop_list(self, incarnation: Incarnation, topic: str) -> None:
         one = self._lists.get(incarnation.key, {}).pop(topic, None)

@@ -88,6 +88,90 @@ def test_only_the_appliance_reaches_the_ports(robot: Host, gateway: Host, attack
         assert reaches(attacker, robot.address, INSIDE)
 
 
+@contextlib.contextmanager
+def as_user(number: int) -> Iterator[None]:
+    """Run as another user; the thread keeps its namespace."""
+    os.setresuid(number, number, 0)
+    try:
+        yield
+    finally:
+        os.setresuid(0, 0, 0)
+
+
+def reached_by(host: Host, user: int, address: str, port: int) -> bool:
+    with host.entered(), as_user(user):
+        try:
+            socket.create_connection((address, port), timeout=10).close()
+        except ConnectionRefusedError:
+            return False
+    return True
+
+
+def test_strict_rules_keep_other_users_of_the_machine_out(robot: Host, gateway: Host, attacker: Host) -> None:
+    """Only the node's own user and the appliance reach its ports: also over the machine's own addresses."""
+    node, other = 61_001, 61_002
+    with listening(robot, INSIDE, KEPT, OUTSIDE):
+        assert reached_by(robot, other, "127.0.0.1", INSIDE)
+        close(robot, gateway, "--open", f"tcp/{KEPT}", "--strict", "--user", str(node))
+        for address in ("127.0.0.1", "::1", robot.address, robot.address6):
+            assert reached_by(robot, node, address, INSIDE), address
+            for user in (other, 0):  # root is another user: its rosnode does not reach the nodes
+                assert not reached_by(robot, user, address, INSIDE), (address, user)
+                assert reached_by(robot, user, address, KEPT)
+                assert reached_by(robot, user, address, OUTSIDE)
+        assert reaches(gateway, robot.address, INSIDE)
+        assert not reaches(attacker, robot.address, INSIDE)
+        with robot.entered(), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
+            receiver.bind(("127.0.0.1", INSIDE))
+            receiver.settimeout(1)
+            for user, arrives in ((other, False), (node, True)):
+                refused = contextlib.suppress(PermissionError)  # a dropped datagram is an error of the sender
+                with as_user(user), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender, refused:
+                    sender.sendto(b"x", ("127.0.0.1", INSIDE))
+                if arrives:
+                    assert receiver.recv(9) == b"x"
+                else:
+                    with pytest.raises(TimeoutError):
+                        receiver.recv(9)
+        close(robot, gateway)  # without --strict, the chain is gone again
+        assert reached_by(robot, other, "127.0.0.1", INSIDE)
+
+
+IN_A_GROUP = """
+set -e
+mount -t cgroup2 none /sys/fs/cgroup
+mkdir /sys/fs/cgroup/$3
+trap 'rmdir /sys/fs/cgroup/$3' EXIT
+"$1" -c "$2" --appliance 10.77.0.2 --ports 40000-40099 --apply --strict --cgroup "$3" >&2
+reach="import socket; socket.create_connection(('127.0.0.1', 40007), timeout=10)"
+"$1" -c "open('/sys/fs/cgroup/$3/cgroup.procs', 'w').write('0'); $reach; print('the group connects')"
+"$1" -c "$reach" 2>/dev/null || echo "another process does not"
+"""
+
+
+def test_strict_rules_know_the_control_group_of_the_nodes(robot: Host) -> None:
+    """In a mount namespace of its own: nft looks for the group below /sys/fs/cgroup."""
+    need_program("unshare", "util-linux")
+    script = [
+        "unshare",
+        "-m",
+        "bash",
+        "-c",
+        IN_A_GROUP,
+        "bash",
+        sys.executable,
+        COMMAND,
+        f"rosrv_{os.getpid()}",
+    ]
+    with listening(robot, INSIDE):
+        process = robot.popen(
+            script, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+            env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])},
+        )  # fmt: skip
+        out, err = process.communicate(timeout=120)
+    assert (out, process.returncode) == ("the group connects\nanother process does not\n", 0), err
+
+
 def test_a_container_behind_the_machine_is_not_taken_for_it(
     lab: Lab, robot: Host, gateway: Host, attacker: Host
 ) -> None:

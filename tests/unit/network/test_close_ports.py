@@ -4,6 +4,7 @@ from pathlib import Path
 import pytest
 
 from appliance.network.close_ports import (
+    LocalCallers,
     local_port_range,
     parse_address,
     parse_ports,
@@ -35,6 +36,42 @@ def test_the_file_closes_the_range_after_all_that_stays_open() -> None:
         "ip6 daddr { fd00::20 } tcp flags & (syn | ack) == syn iif != 0 fib saddr type local counter drop",
     ]
     assert text.count("delete table inet rosrv_protect") == 1
+
+
+def test_strict_rules_refuse_all_other_programs_of_the_machine() -> None:
+    """A packet without an owner is refused also, and answers and connections that are there are not concerned."""
+    callers = LocalCallers(("robot", "1001", "robot"), ("system.slice/robot.service",))
+    services = parse_services(["tcp/40022"])
+    plain = protection(["192.168.1.20"], RANGE, services)
+    text = protection(["192.168.1.20"], RANGE, services, strict=callers)
+    chain = text.partition("    chain local {\n")[2]
+    assert [line.strip() for line in chain.splitlines()] == [
+        "type filter hook output priority filter; policy accept;",
+        'oifname != "lo" accept',
+        "tcp dport 40022 accept",
+        "meta skuid { robot, 1001 } accept",
+        'socket cgroupv2 level 2 "system.slice/robot.service" accept',
+        "tcp dport 32768-60999 tcp flags & (syn | ack) == syn counter reject with tcp reset",
+        "udp dport 32768-60999 ct state { new, invalid } counter drop",
+        "}",
+        "}",
+    ]
+    assert text.partition("    chain local {\n")[0] + "}\n" == plain.replace(
+        "loopback and", "robot, 1001, robot, system.slice/robot.service of this machine and"
+    )
+
+
+@pytest.mark.parametrize(
+    ("users", "groups", "why"),
+    [
+        ((), (), "needs the user"), (("a b",), (), "--user 'a b'"), (("Robot",), (), "--user"), (("x}",), (), "--user"),
+        ((), ("/system.slice",), "--cgroup"), ((), ('a"; drop',), "--cgroup"), ((), ("a//b",), "--cgroup"),
+        ((), ("../a/",), "--cgroup"), (("",), (), "--user"),
+    ],
+)  # fmt: skip
+def test_a_wrong_caller_is_named(users: tuple[str, ...], groups: tuple[str, ...], why: str) -> None:
+    with pytest.raises(ValueError, match=why):
+        LocalCallers(users, groups)
 
 
 def test_no_appliance_is_an_error() -> None:

@@ -7,7 +7,8 @@ import pytest
 
 from appliance.base import clock
 from appliance.channel import admin
-from appliance.channel.answers.graph_answers import Graph, Publisher, Topic
+from appliance.channel.answers.graph_answers import Graph, Node, Publisher, Topic
+from appliance.channel.answers.monitor_answers import Replacement
 from appliance.channel.messages import MonitorEvent
 from appliance.control.errors import SenselessError, UnknownThingError
 from appliance.features.guards import guard_orders, guard_requests
@@ -19,6 +20,7 @@ from appliance.features.guards.view import ActingGuard, GuardsState
 from appliance.specifications.episodes import Stops
 from appliance.specifications.specification_files import SpecificationsRefusedError
 from tests.support.virtual_clock import let_time_pass
+from tests.unit.features.guards.test_placement import Connections
 
 pytestmark = pytest.mark.anyio
 TYPES = {"command": "geometry_msgs/Twist", "by": "nav_msgs/Odometry"}
@@ -67,7 +69,7 @@ def manager() -> Manager:
 
 @pytest.fixture
 def orders(manager: Manager) -> GuardOrders:
-    return GuardOrders(manager, lambda: Graph([], [], []))  # type: ignore[arg-type]  # as much of it as guards need
+    return GuardOrders(manager, lambda: Graph([], [], []), Connections())  # type: ignore[arg-type]  # as much as guards need
 
 
 async def row(orders: GuardOrders) -> Any:
@@ -265,7 +267,7 @@ async def test_suggestions_name_the_guards_that_are_loaded(manager: Manager) -> 
     given = [SimpleNamespace(name=name, kind="topic", value=topic) for name, topic in
              (("command", "/cmd_vel"), ("by", "/odom"))]  # fmt: skip
     manager.givens = SimpleNamespace(states=lambda _checked, _name: given)
-    orders = GuardOrders(manager, lambda: Graph([], topics, []))  # type: ignore[arg-type]  # as much as guards need
+    orders = GuardOrders(manager, lambda: Graph([], topics, []), Connections())  # type: ignore[arg-type]  # as much as guards need
     found = await orders.suggestions(guard_requests.GuardSuggestionsWanted())
     assert [one.name for one in found.loaded] == ["fence"]
     assert [one.preset for one in found.suggestions] == ["deadman", "speed"]
@@ -296,3 +298,26 @@ async def test_a_guard_shows_its_version_and_is_upgraded_once(
     await orders.upgrade(guard_requests.GuardUpgrade("fence", confirm_within=60.0), "eve")
     [load] = manager.orders
     assert (load.files, load.shadow, load.confirm_within) == ({"fence.rv": new.text}, True, 60.0)
+
+
+async def test_a_new_guard_and_the_list_say_that_the_base_is_on_another_machine(manager: Manager) -> None:
+    nodes = [Node("/base", "10.0.0.5", "live", [], ["/c"], [])]
+    graph = Graph(nodes, [Topic("/c", TYPES["command"], True, [], ["/base"], [])], [])
+    orders = GuardOrders(manager, lambda: graph, Connections())  # type: ignore[arg-type]  # as much as guards need
+    warning = "/c: the base is on 10.0.0.5: a cut between here and there is not guarded"
+    loaded = Replacement(2, "2.0", 1, [], [], [], [], ["another"], [], [], None)
+    manager.load = lambda *_given, **_options: _answered(loaded)  # type: ignore[method-assign]  # with warnings
+    request = guard_requests.GuardNew("speed", {"command": "/c"}, types={"command": TYPES["command"]})
+    assert warning in (await orders.new(request, "eve")).warnings
+    plan = guard_requests.GuardTry("speed", {"command": "/c"}, {"command": TYPES["command"]})
+    assert warning in (await orders.plan(plan, "eve")).warnings
+    manager.givens = SimpleNamespace(states=lambda _checked, _name: [])
+    manager.sources.files["fence.rv"] = text_of(Guard("fence", PRESETS["fence"], {"command": "/c"}, TYPES))
+    orders.placement.look()
+    assert (await orders.guards(guard_requests.GuardsWanted())).warnings == [warning]
+    state = orders.state()
+    assert state is not None and state.elsewhere == [warning]
+
+
+async def _answered(answer: Any) -> Any:
+    return answer

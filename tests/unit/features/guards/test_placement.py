@@ -1,0 +1,124 @@
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from appliance.features.guards.placement import GuardedDriver, Placement
+from appliance.features.guards.view import GUARDS_VIEW, BypassedGuard, GuardsState
+from tests.unit.features.guards.test_suggestions import ROBOTS, graph_of
+
+pytestmark = pytest.mark.anyio
+THEIRS = "http://10.0.0.5:41234/"
+
+
+class Connections:
+    def __init__(self) -> None:
+        self.answers: list[list[str] | None] = []
+        self.asked: list[tuple[str, str]] = []
+
+    def is_here(self, host: str) -> bool | None:
+        return {"10.111.0.1": True, "172.29.77.10": None}.get(host, False)
+
+    async def unknown_publishers(self, node: str, topic: str) -> list[str] | None:
+        self.asked.append((node, topic))
+        return self.answers.pop(0)
+
+
+def placed(robot: str, host: str, *commands: str) -> tuple[Placement, Connections]:
+    topics = [
+        SimpleNamespace(
+            name=one.name, type=one.type, subscribers=list(one.subscribers),
+            publishers=[SimpleNamespace(node=node, messages_per_second=1.0) for node in one.publishers],
+        )
+        for one in graph_of(robot)
+    ]  # fmt: skip
+    names = {node for one in graph_of(robot) for node in (*one.publishers, *one.subscribers)}
+    graph: Any = SimpleNamespace(
+        topics=topics,
+        nodes=[SimpleNamespace(name=name, host=host if "mux" not in name else "10.0.0.77") for name in names],
+    )
+    connections = Connections()
+    return Placement(lambda: commands, lambda: graph, connections), connections
+
+
+@pytest.mark.parametrize(
+    ("host", "sentences"),
+    [
+        ("10.111.0.1", []),
+        ("10.0.0.5", ["/cmd_vel: the base is on 10.0.0.5: a cut between here and there is not guarded"]),
+        ("172.29.77.10", ["/cmd_vel: the base is on 172.29.77.10: if that is another machine than this container's, a"
+                          " cut between here and there is not guarded"]),
+    ],
+)  # fmt: skip
+def test_a_base_on_another_machine_is_named_and_a_multiplexer_is_not_a_base(
+    host: str, sentences: list[str]
+) -> None:
+    place, _ = placed("turtlebot3", host, "/cmd_vel")
+    assert place.look() == [GuardedDriver("/cmd_vel", "/turtlebot3_core", host)]
+    assert place.elsewhere == sentences == place.sentences("/cmd_vel")
+    assert not place.sentences("/nothing")
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_the_node_that_carries_a_command_out_is_asked_and_no_observer(robot: str) -> None:
+    commands = [
+        name for name, line in ROBOTS[robot]["topics"].items() if "cmd" in name or name.endswith("/goal")
+    ]
+    place, _ = placed(robot, "10.0.0.5", *commands)
+    for driver in place.look():
+        assert driver.topic in commands
+    placeless, _ = placed(robot, "10.0.0.5")
+    assert (placeless.look(), placeless.elsewhere) == ([], [])
+
+
+async def test_an_unknown_publisher_is_reported_when_it_is_there_twice_and_until_it_is_gone() -> None:
+    place, connections = placed("turtlebot3", "10.0.0.5", "/cmd_vel")
+    [driver] = place.look()
+    for answer, reported in (
+        ([THEIRS], False), ([], False), ([THEIRS], False), (["http://10.0.0.6:1/"], False), ([THEIRS], False),
+        ([THEIRS], True), (None, True), ([THEIRS], True), ([], False),
+    ):  # fmt: skip
+        connections.answers = [answer]
+        await place.ask(driver)
+        assert place.bypassed == (
+            [BypassedGuard("/cmd_vel", "/turtlebot3_core", "10.0.0.5", [THEIRS])] if reported else []
+        ), answer
+    assert {*connections.asked} == {("/turtlebot3_core", "/cmd_vel")}
+
+
+async def test_a_node_without_an_answer_is_named_after_some_questions() -> None:
+    place, connections = placed("turtlebot3", "10.0.0.5", "/cmd_vel")
+    [driver] = place.look()
+    connections.answers = [None, None, None, []]
+    for named in (False, False, True, False):
+        await place.ask(driver)
+        assert place.unanswered == (["/turtlebot3_core"] if named else [])
+
+
+async def test_a_topic_that_is_not_guarded_any_more_is_forgotten() -> None:
+    place, connections = placed("turtlebot3", "10.0.0.5", "/cmd_vel")
+    [driver] = place.look()
+    connections.answers = [[THEIRS], [THEIRS]]
+    await place.ask(driver)
+    await place.ask(driver)
+    assert place.bypassed
+    place._commands = lambda: ()
+    assert (place.look(), place.bypassed, place.elsewhere) == ([], [], [])
+
+
+def test_the_status_has_an_alarm_a_warning_and_a_notice() -> None:
+    state = GuardsState(
+        1, [], ["/cmd_vel: the base is on 10.0.0.5: a cut between here and there is not guarded"],
+        [BypassedGuard("/cmd_vel", "/base", "10.0.0.5", [THEIRS])], ["/base"],
+    )  # fmt: skip
+    [view] = GUARDS_VIEW.states
+    assert [(one.severity, one.kind, one.text) for one in view.alarms(state)] == [
+        ("alarm", "guard-bypassed:/cmd_vel",
+         f"/base takes /cmd_vel from {THEIRS}, past its guards: end that process, and run rosrv protect --strict on"
+         " 10.0.0.5"),
+        ("warning", "guard-elsewhere:/cmd_vel",
+         "/cmd_vel: the base is on 10.0.0.5: a cut between here and there is not guarded: rosrv guard check-driver"
+         " measures whether the driver stops the base then"),
+        ("notice", "guard-unanswered:/base",
+         "/base does not answer getBusInfo: whether it takes commands past its guards is unknown"),
+    ]  # fmt: skip
