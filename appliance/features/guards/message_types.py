@@ -87,8 +87,9 @@ def _pose(before: str) -> TypeRow:
 _FIX = TypeRow(
     {"fixed": "status.status", "lat": "latitude", "lon": "longitude"},
     parameters="int fixed, double lat, double lon",
-    local="""double px = fixed < 0 ? NAN : metres_east(lat, lon, lat0, lon0);
-        double py = fixed < 0 ? NAN : metres_north(lat, lon, lat0, lon0);
+    local="""bool known = fixed >= 0 && fixed <= 2;
+        double px = known ? metres_east(lat, lon, lat0, lon0) : NAN;
+        double py = known ? metres_north(lat, lon, lat0, lon0) : NAN;
         geometry_msgs::Quaternion q;
         q.w = NAN;                                             // a fix has no direction""",
 )

@@ -4,13 +4,15 @@ import random
 from collections.abc import Iterable
 from typing import Any
 
+from rosbags.typesys import get_types_from_msg
+
 from appliance.features.guards.presets import DRIVER_CHECK, PRESETS, Guard, text_of
 from rosmop.check.sources import compiled_from
 from rosmop.fast.build import certified, parts_of
 from rosmop.fast.load import loaded
 from rosmop.run.engine import MonitorSet
 from rosmop.run.outcomes import MessageSender, Outcome
-from rosmop.tests.acting import fields, message
+from rosmop.tests.acting import STORE, fields, message
 from roswire.standard import standard_definitions
 
 MS = 10**6
@@ -18,6 +20,10 @@ BEGIN = 1_700_000_000 * 10**9
 TWIST = "geometry_msgs/Twist"
 NODES = ("", *(f"/{letter}" for letter in "abcdefghijk"))
 DEFINITIONS = standard_definitions()
+for _kind in ("AckermannDrive", "AckermannDriveStamped"):
+    STORE.register(
+        get_types_from_msg(DEFINITIONS.message(f"ackermann_msgs/{_kind}").text, f"ackermann_msgs/msg/{_kind}")
+    )
 SPEEDS = (0.0, -0.0, 0.2, -0.2, 0.5, -0.5, 0.5000001, 1.0, -3.0, 1e300, math.inf, -math.inf, math.nan)
 
 

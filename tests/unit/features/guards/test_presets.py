@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+from appliance.features.guards.guard_order import PRECEDENCES
 from appliance.features.guards.message_types import ANY_TYPE
 from appliance.features.guards.presets import (
     FOLDER,
@@ -168,3 +169,15 @@ def test_the_page_names_an_existing_test_for_each_fault() -> None:
 
 def test_processes_see_the_presets_of_a_checkout_in_a_closed_home() -> None:
     assert any(FOLDER.is_relative_to(part) for part in program_folders())
+
+
+NOT_ORDERED = {"withhold": "it changes and drops no message"}
+
+
+def test_a_preset_has_its_place_in_the_order_and_on_the_page() -> None:
+    ordered = {name for row in PRECEDENCES for name in (*row.first, *row.then)}
+    assert ordered | NOT_ORDERED.keys() == PRESETS.keys() and not ordered & NOT_ORDERED.keys()
+    page = (ROOT / "docs" / "guards.md").read_text(encoding="utf-8")
+    section = page.partition("## Presets")[2].partition("\n## ")[0]
+    for name in PRESETS:
+        assert section.count(f"\n| `{name}` |") == 2, f"{name} has no row in one of the tables"

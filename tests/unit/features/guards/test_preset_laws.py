@@ -1,0 +1,446 @@
+"""The laws of a safe stop, on every field that a preset observes, in every state of it.
+
+The cells follow from `PRESETS`, the rows of message types and the patterns of the events. So a new preset needs a
+recipe, and each cell that its law does not cover needs a reason in `REASONS`.
+"""
+
+import math
+import re
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from itertools import product
+from typing import Any
+
+import pytest
+
+from appliance.features.guards.message_types import ANY_TYPE, GOAL, VELOCITIES
+from appliance.features.guards.presets import PRESETS, Guard, below_the_standard, text_of
+from rosmop.run.outcomes import MessageSender
+from rosmop.tests.acting import fields, message
+from tests.unit.features.guards.guarding import BEGIN, MS, NODES, Guarded
+from tests.unit.features.guards.test_watching_presets import trajectory, with_id
+
+STATES = (
+    "absent", "NaN", "out of range", "unreadable", "old", "another node", "another host", "after a reset",
+    "after a hold", "default",
+)  # fmt: skip
+Values = Mapping[str, Any]
+TRAJECTORY = "trajectory_msgs/JointTrajectory"
+
+
+def scan(k: int) -> Values:
+    limits = {"range_min": 0.1, "range_max": 30.0}
+    return {"angle_min": -math.pi, "angle_increment": math.pi / 36, **limits, "ranges": [9.0 + k * 1e-3] * 72}
+
+
+def odometry(k: int) -> Values:
+    return {"pose__pose__position__x": k * 1e-4, "pose__pose__orientation__w": 1.0}
+
+
+EVIDENCE: dict[str, Callable[[int], Values]] = {
+    "sensor_msgs/LaserScan": scan,
+    "sensor_msgs/Range": lambda k: {"range": 1.0 + k * 1e-3, "min_range": 0.1, "max_range": 5.0},
+    "sensor_msgs/NavSatFix": lambda k: {"latitude": k * 1e-9, "longitude": 0.0, "altitude": 1.0},
+    "sensor_msgs/Imu": lambda k: {"angular_velocity__x": k * 1e-3},
+    "nav_msgs/Odometry": odometry,
+    "geometry_msgs/PoseStamped": lambda _k: {"pose__orientation__w": 1.0},
+    "geometry_msgs/PoseWithCovarianceStamped": lambda _k: {"pose__pose__orientation__w": 1.0},
+    "geometry_msgs/TwistStamped": lambda _k: {},
+    "geometry_msgs/TwistWithCovarianceStamped": lambda _k: {},
+    "sensor_msgs/JointState": lambda k: {"name": ["elbow"], "position": [k * 1e-4]},
+    "sensor_msgs/BatteryState": lambda _k: {"percentage": 0.9},
+    "sensor_msgs/Joy": lambda _k: {},
+    "std_msgs/Bool": lambda _k: {"data": False},
+}
+"""Good evidence by type; `k` counts the messages."""
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """The needs of a preset beside its defaults, to let an honest robot move."""
+
+    values: Values = field(default_factory=dict)
+    fixed: Mapping[str, str] = field(default_factory=dict)
+    """The types of topics that have only one."""
+    by_type: Mapping[str, Values] = field(default_factory=dict)
+    """Further values for a type of a topic."""
+    evidence: Mapping[str, Values] = field(default_factory=dict)
+    """Evidence that differs from that of the type, by topic."""
+    velocities: str = "pass"
+    """The result of a velocity that is not a finite number: `stopped`, `bounded` or `pass`, as a motion."""
+
+
+RECIPES = {
+    "deadman": Recipe(),
+    "speed": Recipe(velocities="bounded"),
+    "separation": Recipe(velocities="bounded"),
+    "fence": Recipe(
+        {"silent": 0.5}, by_type={"sensor_msgs/NavSatFix": {"worldFrame": True}}, velocities="bounded"
+    ),
+    "sensor": Recipe({"least": 1}),
+    "estop": Recipe(fixed={"stop": "std_msgs/Bool"}),
+    "arm": Recipe(
+        {"needFix": True, "needCheck": True, "silent": 0.5, "checked": 1},
+        {"fix": "sensor_msgs/NavSatFix", "check": "std_msgs/Bool"},
+        evidence={"check": {"data": True}},
+    ),
+    "rate": Recipe(),
+    "agree": Recipe(),
+    "sane": Recipe(velocities="stopped"),
+    "joints": Recipe(),
+}
+
+APART = {
+    "answer": "it follows ids of goals, not values: `test_a_goal_without_a_result_is_cancelled`",
+    "withhold": "it commands no motion: `test_a_topic_is_withheld_until_all_switches_are_off_and_speak`",
+}
+"""Presets that no motion passes or not, each with the test that has its states."""
+
+REASONS: dict[tuple[str, str, str, str], str] = {
+    (
+        "*",
+        "*",
+        "*",
+        "another host",
+    ): "a node's name is unique at a master, so another host is another node: same cell",
+    ("deadman", "command", "*", "another node"): "`test_a_deadman_stops_for_each_node_that_falls_silent`",
+    ("*", "command", "*", "another node"): "a command counts for what it says, whichever node sends it",
+    ("deadman", "command", "*", "old"): "`test_a_deadman_stops_within_its_time_and_a_tick`",
+    ("*", "command", "*", "old"): "the age of commands is the law of `deadman`",
+    ("*", "command", "*", "absent"): "without a command a base does not move",
+    (
+        "*",
+        "command",
+        "",
+        "unreadable",
+    ): "the base cannot read it either: the motion in force stays, with its evidence",
+    ("*", "*", "", "NaN"): "only the arrival of a message counts, whatever it says",
+    ("*", "*", "", "out of range"): "only the arrival of a message counts, whatever it says",
+    ("separation", "command", "rz", "NaN"): "a turn is judged by the way that it bends, and finite by `sane`",
+    ("separation", "command", "rz", "out of range"): "as NaN",
+    ("fence", "command", "rz", "NaN"): "as `separation`",
+    ("fence", "command", "rz", "out of range"): "as `separation`",
+    ("separation", "command", "steer", "*"): "as its turn",
+    ("fence", "command", "steer", "*"): "as its turn",
+    ("separation", "by", "most", "out of range"): "a greater range is no danger: the readings are within it",
+    ("sensor", "by", "high", "out of range"): "as `separation`",
+    (
+        "sensor",
+        "by",
+        "*",
+        "out of range",
+    ): "these types declare no range: a wrong value that changes is not noticed",
+    ("joints", "command", "*", "NaN"): "`test_a_trajectory_keeps_the_limits_of_its_joints`",
+    ("joints", "command", "*", "out of range"): "`test_a_trajectory_keeps_the_limits_of_its_joints`",
+    (
+        "joints",
+        "state",
+        "names",
+        "*",
+    ): "a name is found or not: `test_a_trajectory_needs_the_present_position_of_each_joint`",
+    ("*", "*", "pressed", "NaN"): "a truth value has no NaN",
+    ("*", "*", "done", "NaN"): "a truth value has no NaN",
+    ("*", "*", "status", "NaN"): "a whole number has no NaN",
+    ("*", "*", "fixed", "NaN"): "a whole number has no NaN",
+    ("estop", "reset", "*", "absent"): "without a reset the stop stays",
+    ("estop", "reset", "*", "out of range"): "every number but 0 is true",
+    ("estop", "reset", "*", "old"): "a reset is an act, not a state; what it frees waits for a zero",
+    ("estop", "reset", "*", "unreadable"): "what is no message resets nothing: the guard holds",
+    ("estop", "reset", "*", "another node"): "`test_two_hands_act_together_and_are_released_between`",
+    ("estop", "reset", "*", "after a reset"): "`test_after_a_reset_each_node_stands_before_it_moves`",
+}
+"""Why a cell is not judged here. `*` stands for any; the first key that fits counts."""
+
+
+def reason(preset: str, topic: str, name: str, state: str) -> str:
+    for key, why in REASONS.items():
+        if all(
+            wanted in {"*", given} for wanted, given in zip(key, (preset, topic, name, state), strict=True)
+        ):
+            return why
+    return ""
+
+
+@dataclass(frozen=True)
+class Place:
+    """A field that a preset observes on a topic of some type."""
+
+    preset: str
+    topic: str
+    kind: str
+    name: str
+    """The parameter, or empty for a topic of which only the arrival counts."""
+    path: str = ""
+
+
+_PATTERN = re.compile(r"event \w+\([^)]*\) (\w+)\s+(\w+/\w+)\s+'\{([^}]*)\}'")
+
+
+def kinds_of(preset: str) -> Iterator[dict[str, str]]:
+    """Yield types for the topics of a preset, so that each row of each topic is in one."""
+    rows = {topic: [*rows] for topic, rows in PRESETS[preset].topics.items()}
+    first = {topic: kinds[0] for topic, kinds in rows.items()}
+    for topic, kinds in rows.items():
+        for kind in kinds:
+            yield first | {topic: "std_msgs/Bool" if kind == ANY_TYPE else kind}
+
+
+def places_of(preset: str) -> list[Place]:
+    found: dict[Place, None] = {}
+    for kinds in kinds_of(preset):
+        text = text_of(Guard("guard", PRESETS[preset], types=kinds))
+        for topic, kind, pattern in _PATTERN.findall(text):
+            parts = [one.split(":") for one in pattern.split(", ") if one]
+            for path, name in parts or [("", "")]:
+                found[Place(preset, topic, kind, name, path)] = None
+    bound = {(one.topic, one.kind) for one in found if one.name}
+    return [one for one in found if one.name or (one.topic, one.kind) not in bound]
+
+
+class Lab(Guarded):
+    """A guard among honest nodes: `/a` has the evidence, and commands."""
+
+    def __init__(self, preset: str, place: Place | None = None) -> None:
+        recipe = RECIPES[preset]
+        first = {topic: next(iter(rows)) for topic, rows in PRESETS[preset].topics.items()}
+        self.kinds = first | dict(recipe.fixed)
+        if place is not None:
+            self.kinds[place.topic] = place.kind
+        values = dict(recipe.values)
+        for kind in self.kinds.values():
+            values |= recipe.by_type.get(kind, {})
+        rows = {topic: kind for topic, kind in self.kinds.items() if topic in PRESETS[preset].topics}
+        super().__init__(preset, rows, **values)
+        self.preset, self.at, self.count = preset, 0, 0
+        self.monitors.name_senders(lambda source: (f"10.0.0.{source}", NODES[source]))
+
+    def send(
+        self, given: str, change: Values | None = None, node: str = "/a", data: bytes | None = None
+    ) -> None:
+        self.count += 1
+        kind = self.kinds[given]
+        if data is None:
+            good = {**EVIDENCE[kind](self.count), **RECIPES[self.preset].evidence.get(given, {})}
+            data = message(kind, **{**good, **(change or {})})
+        outcome = self.monitors.judge(
+            self.topics[given], bytearray(data), BEGIN + self.at * MS, MessageSender(NODES.index(node))
+        )
+        self.receive(outcome, self.at)
+
+    def command(self, change: Values | None = None, *, moves: bool = True) -> bytes:
+        kind = self.kinds["command"]
+        if kind in VELOCITIES:
+            x = VELOCITIES[kind].paths["x"].replace(".", "__")
+            return message(kind, **{x: 0.1 if moves else 0.0, **(change or {})})
+        if kind == TRAJECTORY:
+            return trajectory(["elbow"], (1.0, [0.0]), (2.0, [0.01]))
+        if self.preset == "joints":
+            return with_id("a", 24, 0) + trajectory(["elbow"], (1.0, [0.0])) + bytes(16)
+        return with_id("a", 24, 40 if kind == GOAL else 72)
+
+    def moved(self, data: bytes) -> bool:
+        """Return whether a command moves something."""
+        kind = self.kinds["command"]
+        if kind in VELOCITIES:
+            read = fields(kind, data)
+            return any(
+                _get(read, path) != 0 for name, path in VELOCITIES[kind].paths.items() if name in MOVING
+            )
+        return kind != TRAJECTORY or len(fields(kind, data).points) > 0
+
+    def passes(self, change: Values | None = None, *, moves: bool = True) -> bool:
+        outcome = self.monitors.judge(
+            self.topics["command"],
+            bytearray(self.command(change, moves=moves)),
+            BEGIN + self.at * MS,
+            MessageSender(1),
+        )
+        self.receive(outcome, self.at)
+        return outcome.result != "dropped" and self.moved(bytes(outcome.buffer))
+
+    def step(self, ms: int = 50) -> None:
+        self.at += ms
+        self.advance(self.at)
+
+    def run(
+        self, ms: int, *, without: str = "", bad: Callable[[], None] | None = None, drives: bool = True
+    ) -> bool:
+        """Let good evidence come every 50 ms, except on a topic; return whether the last command passed."""
+        passed = False
+        for step in range(ms // 50):
+            self.step()
+            for given in self.kinds:
+                if given not in {"command", without}:
+                    self.send(given)
+            if bad is not None:
+                bad()
+            if drives:
+                passed = self.passes(moves=self.at > 400 or step > 8)
+        return passed
+
+    def own_motions(self) -> int:
+        """Return the number of messages by the guard itself that move something."""
+        return sum(self.moved(data) for _at, data in self.got) if self.kinds["command"] in VELOCITIES else 0
+
+
+MOVING = {"x", "y", "z", "rx", "ry", "rz"}
+
+
+def _get(read: Any, path: str) -> float:
+    for part in path.split("."):
+        read = getattr(read, part)
+    return float(read)
+
+
+DOUBLES = {
+    "sensor_msgs/NavSatFix", "sensor_msgs/Imu", "sensor_msgs/JointState", "nav_msgs/Odometry", "geometry_msgs/Twist",
+    "geometry_msgs/PoseStamped", "geometry_msgs/PoseWithCovarianceStamped", "geometry_msgs/TwistStamped",
+    "geometry_msgs/TwistWithCovarianceStamped",
+}  # fmt: skip
+"""Types whose numbers are doubles; those of all others are floats, which have no 1e200, but 3e38."""
+
+
+def changed(place: Place, value: Any, good: Values) -> Values | None:
+    """Return the changes that set a field, or nothing if it cannot have the value."""
+    key = place.path.replace(".", "__")
+    if place.name == "q":
+        return {f"{key}__{axis}": value for axis in "xyzw"}
+    if place.kind not in DOUBLES and abs(value) > 3e38:
+        value = math.copysign(3e38, value)
+    if isinstance(good.get(key), list):
+        return None if isinstance(good[key][0], str) else {key: [value] * len(good[key])}
+    return {key: value}
+
+
+def judge(place: Place, state: str) -> str:
+    """Return what is wrong with a cell, or an empty text."""
+    lab = Lab(place.preset, place)
+    if state == "default":
+        default = Guarded(place.preset)
+        given = {one.name: one.default for one in PRESETS[place.preset].parameters}
+        assert default.text and not below_the_standard(PRESETS[place.preset], given)
+        return "" if lab.run(1500) else "an honest robot does not move"
+    return CELLS[state](lab, place)
+
+
+def _absent(lab: Lab, place: Place) -> str:
+    return "a motion passes without it" if lab.run(1500, without=place.topic) else ""
+
+
+def _wrong(value: float, whole: int) -> Callable[[Lab, Place], str]:
+    def cell(lab: Lab, place: Place) -> str:
+        assert lab.run(1500), "an honest robot does not move"
+        if place.topic == "command":
+            return _wrong_command(lab, place, value)
+        good = EVIDENCE[place.kind](1)
+        is_bool = place.kind == "std_msgs/Bool"
+        is_whole = place.path.startswith("status.")
+        assert not (math.isnan(value) and (is_bool or is_whole)), "give a reason"
+        change = changed(place, True if is_bool else whole if is_whole else value, good)
+        assert change is not None, "give a reason"
+        if place.preset == "arm" and is_bool:
+            change = {"data": False}
+        passed = lab.run(1000, without=place.topic, bad=lambda: lab.send(place.topic, change))
+        return "a motion passes with it" if passed else ""
+
+    return cell
+
+
+def _wrong_command(lab: Lab, place: Place, value: float) -> str:
+    value = value if place.kind in DOUBLES or not abs(value) > 3e38 else 3e38
+    change = {place.path.replace(".", "__"): value}
+    how = RECIPES[place.preset].velocities
+    outcome = lab.monitors.judge(
+        lab.topics["command"], bytearray(lab.command(change)), BEGIN + lab.at * MS, MessageSender(1)
+    )
+    read = fields(place.kind, bytes(outcome.buffer))
+    got = _get(read, place.path)
+    is_finite = math.isfinite(_get(fields(place.kind, lab.command(change)), place.path))
+    if how == "stopped":
+        return "" if lab.moved(bytes(outcome.buffer)) == is_finite else "it is not stopped"
+    if how == "bounded":
+        return "" if abs(got) <= 1000 or (is_finite and place.preset != "speed") else f"{got} passes"
+    return "" if math.isclose(got, value, rel_tol=1e-6) or not is_finite else "it is changed"
+
+
+def _unreadable(lab: Lab, place: Place) -> str:
+    assert lab.run(1500), "an honest robot does not move"
+    lab.got.clear()
+    if place.topic == "command":
+        data = lab.command()[:3]
+        outcome = lab.monitors.judge(
+            lab.topics["command"], bytearray(data), BEGIN + lab.at * MS, MessageSender(1)
+        )
+        return "it passes" if outcome.result != "dropped" and bytes(outcome.buffer) == data else ""
+    passed = lab.run(600, without=place.topic, bad=lambda: lab.send(place.topic, data=b""))
+    return "a motion passes" if passed else ""
+
+
+def _old(lab: Lab, place: Place) -> str:
+    assert lab.run(1500), "an honest robot does not move"
+    lab.got.clear()
+    lab.run(1500, without=place.topic, drives=False)
+    if place.preset != "joints" and not any(not lab.moved(data) for _at, data in lab.got):
+        return "the guard sends no stop"
+    return "a motion passes" if lab.passes() else ""
+
+
+def _another_node(lab: Lab, place: Place) -> str:
+    assert lab.run(1500), "an honest robot does not move"
+    passed = lab.run(2500, without=place.topic, bad=lambda: lab.send(place.topic, node="/b"))
+    return "another node hides that the first is silent" if passed else ""
+
+
+def _after_a_reset(lab: Lab, place: Place) -> str:
+    """After its evidence was missing, or a stop, nothing moves without a new command."""
+    assert lab.run(1500), "an honest robot does not move"
+    without = "" if place.topic == "command" else place.topic
+    lab.run(1500, without=without, drives=False)
+    lab.got.clear()
+    lab.run(1500, drives=False)
+    return "the guard moves the base" if lab.own_motions() else ""
+
+
+def _after_a_hold(lab: Lab, place: Place) -> str:
+    assert lab.run(1500), "an honest robot does not move"
+    lab.monitors.hold(lab.monitors.monitor("guard"), "an operator asks for it")
+    lab.got.clear()
+    if lab.run(500):
+        return "a motion passes while the guard holds"
+    lab.monitors.resume("guard")
+    lab.run(500, drives=False)
+    if lab.own_motions():
+        return "the guard moves the base"
+    lab.run(1000)
+    return "" if lab.run(1500) else "an honest robot does not move afterwards"
+
+
+CELLS = {
+    "absent": _absent, "NaN": _wrong(math.nan, 0), "out of range": _wrong(1e200, 99), "unreadable": _unreadable,
+    "old": _old, "another node": _another_node, "after a reset": _after_a_reset, "after a hold": _after_a_hold,
+}  # fmt: skip
+ROWS = [
+    (preset, topic, kind)
+    for preset in RECIPES
+    for topic, kind in dict.fromkeys((one.topic, one.kind) for one in places_of(preset))
+]
+
+
+@pytest.mark.parametrize(("preset", "topic", "kind"), ROWS)
+def test_each_state_of_each_observed_field_keeps_the_laws(preset: str, topic: str, kind: str) -> None:
+    places = [one for one in places_of(preset) if (one.topic, one.kind) == (topic, kind)]
+    wrong = []
+    for place, state in product(places, STATES):
+        if not reason(preset, topic, place.name, state) and (why := judge(place, state)):
+            wrong.append(f"{preset}, {topic} {kind} {place.path or 'arrival'}, {state}: {why}")
+    assert not wrong, "\n".join(wrong)
+
+
+def test_every_preset_has_a_recipe_or_a_test_of_its_own() -> None:
+    assert RECIPES.keys() | APART.keys() == PRESETS.keys() and not RECIPES.keys() & APART.keys()
+    places = [place for preset in RECIPES for place in places_of(preset)]
+    for *cell, state in REASONS:
+        there = ((one.preset, one.topic, one.name) for one in places)
+        assert state in {"*", *STATES} and any(
+            all(wanted in {"*", given} for wanted, given in zip(cell, one, strict=True)) for one in there
+        ), f"no cell has the reason {cell}"
