@@ -476,16 +476,21 @@ def isolation_for(
     return NetnsIsolation(ports, backend) if isolation == "netns" else NoIsolation()
 
 
-def _require_own_network() -> None:
-    """Refuse a container that shares the machine's network: the firewall would affect the whole machine."""
-    shared = lives_on_the_machines_network()
-    if is_contained() and (shared or bridges()):
-        raise StartError(
+def shared_network() -> str:
+    """Return why the firewall of a container would affect the whole machine, or an empty string."""
+    if is_contained() and (lives_on_the_machines_network() or bridges()):
+        return (
             "isolation container: this container shares the machine's network (network_mode: host, hostNetwork), so "
             "the firewall would apply to the whole machine. Give it its own network, as compose.host.yaml does for a "
             "robot whose nodes run on the machine itself; or run rosrv without a container, with isolation netns"
         )
-    if shared:
+    return ""
+
+
+def _require_own_network() -> None:
+    if reason := shared_network():
+        raise StartError(reason)
+    if lives_on_the_machines_network():
         log.warning(
             "isolation container, and no container: the firewall is this machine's. That is right where it is the "
             "appliance's alone (a virtual machine); else use --isolation netns"

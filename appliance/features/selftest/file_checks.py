@@ -16,6 +16,7 @@ from appliance.base.input_files import read_given, read_given_text
 from appliance.base.shipped import SHIPPED, before_program
 from appliance.configuration.settings import Settings
 from appliance.features.selftest.selftest_findings import SelftestFinding, fail, ok, run_check, skip, warn
+from appliance.features.table import pairing_in
 from appliance.hosts.hosts_file import DeclaredHostsError, read_declared
 from appliance.policy.cases import run_cases
 from appliance.policy.judgement import PolicyContext, judge
@@ -24,6 +25,8 @@ from appliance.policy.policy_findings import PolicyError
 from appliance.signing.site_keys import read_signature
 from appliance.specifications.checking import check
 from appliance.specifications.specification_files import SpecificationsRefusedError, read_folder
+from appliance.supervisor.errors import StartError
+from appliance.supervisor.restore_mark import refuse_half_restored
 from appliance.supervisor.state_directory import foreign
 
 _LITTLE_SPACE, _NO_SPACE = 1 << 30, 50 << 20
@@ -136,10 +139,30 @@ def _state(state: Path) -> Iterator[SelftestFinding]:
         yield warn("state", f"{state}: this user may not write", "run as the appliance's owner, or root")
     else:
         yield ok("state", f"{state}, mode {mode & 0o777:o}")
+    yield from run_check("restore", lambda: _restore(state))
+    yield from run_check("pair", lambda: _pair(state))
     yield from run_check("secrets", lambda: _secrets(state))
     yield from run_check("space", lambda: _space(state))
     yield from run_check("clock", lambda: _clock(state))
     yield from run_check("certificates", lambda: _certificates(state))
+
+
+def _restore(state: Path) -> Iterator[SelftestFinding]:
+    try:
+        refuse_half_restored(state)
+    except StartError as error:
+        yield fail("restore", str(error), "rosrv restore")
+
+
+def _pair(state: Path) -> Iterator[SelftestFinding]:
+    """One of two appliances does not start with a membership that it cannot read."""
+    try:
+        pairing = pairing_in(state)
+    except StartError as error:
+        yield fail("pair", str(error), "rosrv standby join, or rosrv standby leave")
+    else:
+        if pairing is not None:
+            yield ok("pair", f"one of two; the other one is {pairing.other}")
 
 
 def _secrets(state: Path) -> Iterator[SelftestFinding]:

@@ -20,14 +20,18 @@ from appliance.network.firewall.backend import BackendMissingError, FirewallErro
 from appliance.network.firewall.backend_check import prove
 from appliance.network.firewall.iptables import IptablesBackend
 from appliance.network.firewall.nft import NftBackend
+from appliance.network.isolation import read_only_settings
 from appliance.network.namespaces import Namespace, NetworkError
 from appliance.supervisor.errors import StartError
+from appliance.supervisor.isolation_lifecycle import shared_network
 from appliance.supervisor.port_check import require_free
-from appliance.supervisor.roles import ROSMASTER, ROSOUT
+from appliance.supervisor.roles import ROS_PROGRAMS
 from appliance.supervisor.users import NUMERIC_IDS
 
 _SECONDS = 10.0
 _CHARON = Path("/usr/sbin/charon-systemd")
+ROS_PACKAGES = {path.name: package for path, package in ROS_PROGRAMS.items()}
+"""The packages of the programs without which the appliance does not start."""
 
 
 def machine(settings: Settings, *, running: bool) -> Iterator[SelftestFinding]:
@@ -49,8 +53,7 @@ def _python() -> Iterator[SelftestFinding]:
 
 def _programs() -> Iterator[SelftestFinding]:
     for name, path, package, missing in (
-        ("rosmaster", ROSMASTER, "python3-rosmaster", fail),
-        ("rosout", ROSOUT, "rosout", warn),
+        *((path.name, path, package, fail) for path, package in ROS_PROGRAMS.items()),
         ("charon", _CHARON, "charon-systemd", warn),
         ("nft", None, "nftables", warn),
         ("ip", None, "iproute2", warn),
@@ -110,6 +113,8 @@ def _kernel(settings: Settings) -> Iterator[SelftestFinding]:
             "isolation none: no firewall hides the ROS master",
             "use netns or container on a robot",
         )
+    if settings.isolation == "container":
+        yield from run_check("network", _own_network)
     if os.geteuid() != 0:
         yield skip("kernel", "checks of namespaces and the firewall need root", "sudo rosrv selftest")
         return
@@ -124,12 +129,31 @@ def _kernel(settings: Settings) -> Iterator[SelftestFinding]:
         return
     try:
         yield ok("namespaces", "a network namespace can be created")
+        if settings.isolation == "netns":
+            yield from run_check("sysctl", lambda: _settings_of_the_kernel(read_only_settings()))
         yield from run_check("veth", lambda: _veth(namespace))
         interfaces.set_link(namespace, "lo", up=True)
         yield from run_check("firewall", lambda: _firewall(settings, namespace))
         yield from run_check("esp", lambda: _esp(namespace))
     finally:
         namespace.delete()
+
+
+def _settings_of_the_kernel(read_only: list[str]) -> Iterator[SelftestFinding]:
+    if read_only:
+        text = f"{', '.join(read_only)} cannot be written: /proc/sys is read-only"
+        yield fail(
+            "sysctl", text, "mount /proc/sys writable, or use isolation container in a container of its own"
+        )
+    else:
+        yield ok("sysctl", "the kernel's network settings can be written")
+
+
+def _own_network() -> Iterator[SelftestFinding]:
+    if reason := shared_network():
+        yield fail("network", reason, "give the container its own network")
+    else:
+        yield ok("network", "the firewall affects only the appliance's own network")
 
 
 def _veth(namespace: Namespace) -> Iterator[SelftestFinding]:
