@@ -10,7 +10,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 
 from rosrv_fleet.access import IS_ROBOT, token_of
 from rosrv_fleet.connections import ClientConnections, owner_of
-from rosrv_fleet.host_names import WRONG_HOST, HostNames
+from rosrv_fleet.host_names import WRONG_HOST, CollectorNames
 from rosrv_fleet.tokens import OperatorTokens
 
 
@@ -18,7 +18,7 @@ class Door:
     """An ASGI application that passes on the requests within the limits of `ClientConnections` to a name of its own."""
 
     def __init__(
-        self, app: ASGIApp, table: ClientConnections, tokens: OperatorTokens, names: HostNames
+        self, app: ASGIApp, table: ClientConnections, tokens: OperatorTokens, names: CollectorNames
     ) -> None:
         self._app, self._table, self._tokens, self._names = app, table, tokens, names
 

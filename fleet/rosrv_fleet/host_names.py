@@ -9,7 +9,7 @@ WRONG_HOST = (
 )
 
 
-class HostNames:
+class CollectorNames:
     """The names of the collector: its addresses, `localhost`, those of its certificate, and `names`."""
 
     def __init__(self, names: Iterable[str]) -> None:

@@ -20,7 +20,7 @@ from rosrv_fleet.connections import ClientConnections, listen
 from rosrv_fleet.door import Door
 from rosrv_fleet.enrolment import RobotAppliance
 from rosrv_fleet.failures import failure_of
-from rosrv_fleet.host_names import HostNames
+from rosrv_fleet.host_names import CollectorNames
 from rosrv_fleet.robots import Robots
 from rosrv_fleet.rollouts.service import BundleService
 from rosrv_fleet.server_certificate import names_of
@@ -151,7 +151,7 @@ def serve(collector: Collector) -> None:
             make_app(collector),
             table,
             collector.tokens,
-            HostNames([*config.names, *names_of(config.certificate)]),
+            CollectorNames([*config.names, *names_of(config.certificate)]),
         ),
         loop="asyncio",  # the connections are counted by its sockets
         http=_protocol(config.limits.header_seconds, table, tls),

@@ -33,7 +33,7 @@ PROSE = {
 }  # fmt: skip
 APPLICATIONS = {"rosrv": main.app, "rosrv-fleet": fleet_app, "rosmop": rosmop_app}
 LABELS = re.compile(r"(audit checkpoint|audit removal|order|evidence|fleet receipt|signing key)( .*)?$")
-"""The first lines of signed statements, which are no commands."""
+"""The first lines of signed statements, which are not commands."""
 
 
 def texts(file: Path) -> Iterator[str]:

@@ -11,7 +11,7 @@ from rosrv_fleet.access import IS_ROBOT
 from rosrv_fleet.config import Limits
 from rosrv_fleet.connections import ClientConnections, CountedSocket
 from rosrv_fleet.door import Door
-from rosrv_fleet.host_names import HostNames
+from rosrv_fleet.host_names import CollectorNames
 from rosrv_fleet.tokens import FleetRole, OperatorTokens
 
 from tests.support.virtual_clock import let_time_pass
@@ -150,7 +150,7 @@ def test_requests_without_a_token_have_a_share(table: ClientConnections, tmp_pat
 
     tokens = OperatorTokens(tmp_path / "tokens.json")
     token = tokens.add("alice", FleetRole.VIEWER)
-    door = Door(app, table, tokens, HostNames([]))
+    door = Door(app, table, tokens, CollectorNames([]))
 
     async def story() -> None:
         for word in ("", "wrong"):

@@ -1,7 +1,7 @@
 import pytest
-from rosrv_fleet.host_names import HostNames
+from rosrv_fleet.host_names import CollectorNames
 
-NAMES = HostNames(["fleet.example.com", "*.hall.example.com"])
+NAMES = CollectorNames(["fleet.example.com", "*.hall.example.com"])
 
 
 @pytest.mark.parametrize(

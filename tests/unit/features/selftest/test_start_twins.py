@@ -85,7 +85,7 @@ def test_a_setting_of_the_kernel_that_cannot_be_written_fails(
 def test_a_program_without_which_nothing_starts_is_a_failure(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(machine_checks.shutil, "which", lambda _name: None)
+    monkeypatch.setattr("shutil.which", lambda _name: None)
     monkeypatch.setattr(Path, "exists", lambda _path: False)
     found = {one.check: one.outcome for one in machine_checks._programs()}
     assert found[name] == "fail"
@@ -105,6 +105,6 @@ def test_a_membership_that_cannot_be_read_fails(tmp_path: Path) -> None:
 
 def test_a_container_that_shares_the_network_fails(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(machine_checks, "shared_network", lambda: "it shares the network")
-    monkeypatch.setattr(machine_checks.os, "geteuid", lambda: 1)
+    monkeypatch.setattr("os.geteuid", lambda: 1)
     settings: Any = Settings(isolation="container")
     assert "fail" in [one.outcome for one in machine_checks._kernel(settings) if one.check == "network"]
