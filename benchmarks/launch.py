@@ -239,9 +239,8 @@ def again(nodes: int, starts: int, *, rospy: bool) -> int:
             ratios.append(ours / theirs)
             table.add_row(str(number + 1), _seconds(theirs), _seconds(ours), f"{ratios[-1]:.2f}")
     median, greatest = statistics.median(ratios), max(ratios)
-    table.title = (
-        f"{nodes} {'rospy' if rospy else 'roscpp'} nodes, {starts} starts in a row, load average {load:.1f}"
-    )
+    kind = "rospy" if rospy else "roscpp"
+    print(f"{nodes} {kind} nodes, {starts} starts in a row, load average {load:.1f}")
     Console(width=110).print(table)
     print(f"median ratio {median:.2f} (at most {MEDIAN}), greatest {greatest:.2f} (at most {GREATEST})")
     return int(median > MEDIAN or greatest > GREATEST)
