@@ -309,8 +309,8 @@ class _Writer:
                     )
             if several and preset == "separation":
                 self._say(
-                    f"each separation counts angles from the front of its scanner: set sector of one that does not look"
-                    f" ahead ({', '.join(scan.name for scan in chosen)})"
+                    "each separation needs the direction and the view of its scanner: set mounted and sector"
+                    f" ({', '.join(scan.name for scan in chosen)})"
                 )
 
     def _comes_after_motion(self, topic: TopicFacts) -> bool:

@@ -65,7 +65,12 @@ def upgraded(text: str, in_force: Mapping[str, str], graph: Iterable[TopicFacts]
     for each, parameter in known.items():
         if each not in values and each not in changed:
             changed[each] = ["", parameter.default]
-    guard = planned(preset, name, topics_in(text), graph, values, types_in(text))
+    try:
+        guard = planned(preset, name, topics_in(text), graph, values, types_in(text))
+    except GuardError as error:
+        raise GuardError(
+            f"{name}: {error}; or remove it, and make it again with rosrv guard new {preset.name}"
+        ) from error
     return Upgrade(text_of(guard) + order_of(text), changed, warnings)
 
 
