@@ -1,4 +1,4 @@
-"""The cost of a message as users pay it: `python -m benchmarks.cold [--busy]` (under two minutes).
+"""The cost of a message as users pay it: `python -m benchmarks.cold [--busy] [--ordinary]` (under two minutes).
 
 The relay of `rosrv up`, without a monitor and with one (two fields read, one written, one FSM step), takes turns with
 a direct connection, `copying_relay.c` with epoll, and five lines of Python. Cells are medians of the rounds; in
@@ -6,6 +6,10 @@ parentheses are the median, the least and the greatest ratio to the C relay in t
 *paced1000* are messages a second, with real-time priority for the load if permitted; *window* keeps 64 messages on
 their way. `--busy` adds programs that use half of each core and walk through their memory. The processor time is that
 of the process in the middle. Needs g++, rosmaster and chrt.
+
+A robot's nodes have no real-time priority: with `--ordinary`, the load has none, so a change of the relay's priority
+shows. `--findings` then prints each median delay whose ratio to the C relay is beyond the table's in
+`benchmarks/RESULTS.md` by more than 20 % in every round, as `make nightly` does.
 """
 
 import argparse
@@ -14,13 +18,14 @@ import re
 import statistics
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from typing import Any
 
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks.launch import findings, table_ratios
 from benchmarks.monitors import CopyingRelay, MinimalRelay, specification
 from benchmarks.relay_throughput import HERE, TYPE, Direct, LoadApi, Result, System, run
 from tests.support.appliance import Appliance
@@ -38,6 +43,7 @@ POLICY = """
 default = 127.0.0.1
 """
 BASE = "C with epoll"
+LONE = "ordinary priority"  # the table's column in RESULTS.md
 SECONDS = {"paced": 2.0, "window": 0.4}
 SIZES = {"paced": (200,), "window": (200, 4096, 65536, 1048576, 4194304)}
 MODES = ("paced100", "paced1000", "window")
@@ -155,6 +161,19 @@ def modes(text: str) -> list[str]:
     return found
 
 
+def delays(results: Mapping[tuple[str, int], Mapping[str, Sequence[Result]]]) -> dict[str, list[float]]:
+    """Return the ratios of the median delay to the C relay's, by the names of rows in the table."""
+    return {
+        f"{mode.removeprefix('paced')} messages a second: {name}": [
+            run.p50 / base.p50 for run, base in zip(runs, found[BASE], strict=True)
+        ]
+        for (mode, _size), found in results.items()
+        if mode != "window"
+        for name, runs in found.items()
+        if name.startswith("deployed")
+    }
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--rounds", type=int, default=3)
@@ -164,9 +183,11 @@ def main() -> None:
         "--modes", type=modes, default=list(MODES), help=f"{','.join(MODES)}, or another pace"
     )
     parser.add_argument("--busy", action="store_true", help="with other programs on half of each core")
+    parser.add_argument("--ordinary", action="store_true", help="the load has no real-time priority")
+    parser.add_argument("--findings", action="store_true", help="compare with the table in RESULTS.md")
     options = parser.parse_args()
-    prefix, cores = realtime(), len(os.sched_getaffinity(0))
-    print(f"real-time priority of the load, if paced: {'yes' if prefix else 'not permitted'}")
+    prefix, cores = () if options.ordinary else realtime(), len(os.sched_getaffinity(0))
+    print(f"real-time priority of the load, if paced: {'yes' if prefix else 'no'}")
     print(f"other programs: {f'one on each of {cores} cores, half of the time' if options.busy else 'none'}")
     results: dict[tuple[str, int], dict[str, list[Result]]] = {}
     with ExitStack() as running:
@@ -185,6 +206,10 @@ def main() -> None:
                         results.setdefault((mode, size), {}).setdefault(system.name, []).append(result)
     for (mode, size), found in results.items():
         show(mode, size, found)
+    if options.findings:
+        column = f"{LONE}, `--busy`" if options.busy else LONE
+        known = table_ratios((HERE / "RESULTS.md").read_text(encoding="utf-8"), column)
+        print("\n".join(findings(delays(results), known, "C relay's")))
 
 
 if __name__ == "__main__":

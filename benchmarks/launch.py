@@ -306,14 +306,16 @@ def table_ratios(text: str, robot: str) -> dict[str, float]:
     }
 
 
-def findings(measured: Mapping[str, Sequence[float]], table: Mapping[str, float]) -> list[str]:
+def findings(
+    measured: Mapping[str, Sequence[float]], table: Mapping[str, float], peer: str = "plain master's"
+) -> list[str]:
     """Return the rows whose ratio is beyond the table's 20 % on the same side in every round."""
     found = []
     for what, ratios in measured.items():
         known = table[what]
         if min(ratios) > known * CHANGE or max(ratios) < known / CHANGE:
             now = f"{statistics.median(ratios):.2f} ({min(ratios):.2f} to {max(ratios):.2f})"
-            found.append(f"finding: {what}: {now} times the plain master's, {known:.2f} in the table")
+            found.append(f"finding: {what}: {now} times the {peer}, {known:.2f} in the table")
     return found
 
 

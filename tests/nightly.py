@@ -2,8 +2,9 @@
 
 It never stops at a failure. `build/nightly/results.json` has passes, failures and seconds of each test, and the
 commit, start, end and load average of each run. Runs of the same commit add up. If a robot's start
-(`benchmarks/launch.py`) differs by more than 20 % from the table in `benchmarks/RESULTS.md`, that is printed as a
-finding. The exit status is 1 if a test failed that `tests/unsteady.txt` does not list, or if the robot did not start.
+(`benchmarks/launch.py`) or the delay of a lone message (`benchmarks/cold.py`) differs by more than 20 % from the
+table in `benchmarks/RESULTS.md`, that is printed as a finding. The exit status is 1 if a test failed that
+`tests/unsteady.txt` does not list, or if one of these programs failed.
 """
 
 import argparse
@@ -23,7 +24,12 @@ from tests.support.sources import ROOT
 
 FOLDER = ROOT / "build" / "nightly"
 RESULTS = FOLDER / "results.json"
-START = FOLDER / "start.log"
+_LONE = ("benchmarks.cold", "--ordinary", "--findings", "--modes", "paced100,paced1000", "--rounds", "8")
+MEASUREMENTS = {
+    "start": ("benchmarks.launch",),
+    "lone message": _LONE,
+    "lone message, busy": (*_LONE, "--busy"),
+}
 UNSTEADY = ROOT / "tests" / "unsteady.txt"
 _STAGE_SECONDS = 90 * 60.0  # a stage that hangs ends, and counts as failed
 
@@ -162,17 +168,22 @@ def run_stage(stage: Stage, files: list[str]) -> tuple[list[tuple[str, str, floa
     return (list(outcomes_of(report)) if report.exists() else []), wrong
 
 
-def measure_start() -> tuple[list[str], str]:
-    command = [sys.executable, "-m", "benchmarks.launch"]
-    with START.open("wb") as log:
+def measure(name: str) -> tuple[list[str], str]:
+    """Run a program of `MEASUREMENTS`; return its findings, and why there are none."""
+    command, output = [sys.executable, "-m", *MEASUREMENTS[name]], _log_of(name)
+    with output.open("wb") as log:
         try:
             done = subprocess.run(
                 command, cwd=ROOT, stdout=log, stderr=log, timeout=_STAGE_SECONDS, check=False
             )
         except subprocess.TimeoutExpired:
             return [], f"not finished after {_STAGE_SECONDS / 60:.0f} minutes"
-    wrong = f"benchmarks.launch ended with status {done.returncode}" if done.returncode else ""
-    return findings_of(START.read_text(encoding="utf-8")), wrong
+    wrong = f"{MEASUREMENTS[name][0]} ended with status {done.returncode}" if done.returncode else ""
+    return findings_of(output.read_text(encoding="utf-8")), wrong
+
+
+def _log_of(name: str) -> Path:
+    return FOLDER / f"{name.replace(', ', '-').replace(' ', '-')}.log"
 
 
 def findings_of(output: str) -> list[str]:
@@ -213,12 +224,12 @@ def main() -> int:
             f"{stage.name}: {count['passed']} passed, {count['failed']} failed, {count['skipped']} skipped",
             flush=True,
         )
-    if lane in (None, "core"):
-        found, wrong = measure_start()
+    for name in MEASUREMENTS if lane in (None, "core") else ():
+        found, wrong = measure(name)
         results["findings"] += found
-        failed += [f"start: {wrong} (build/nightly/{START.name})"] if wrong else []
+        failed += [f"{name}: {wrong} (build/nightly/{_log_of(name).name})"] if wrong else []
         RESULTS.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
-        print("\n".join([*found, f"start: {len(found)} findings (build/nightly/{START.name})"]))
+        print("\n".join([*found, f"{name}: {len(found)} findings (build/nightly/{_log_of(name).name})"]))
     return _report(failed)
 
 

@@ -87,7 +87,8 @@ def _may_act(event: tree.EventDefinition, helpers: set[str]) -> bool:
         if isinstance(node, tree.Assignment | tree.IncrementExpression) and _root(node.target) in own:
             return True
         if isinstance(node, tree.CallExpression) and (
-            _root(node.callee) in helpers or _changes(node.callee, own)
+            (_root(node.callee) in helpers and not own.isdisjoint(map(_root, node.arguments)))
+            or _changes(node.callee, own)
         ):
             return True
     return False

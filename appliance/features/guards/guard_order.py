@@ -18,18 +18,31 @@ class Precedence(NamedTuple):
 
 PRECEDENCES = (
     Precedence(
-        ("agree", "arm", "deadman", "estop", "fence", "sensor", "separation"),
+        (
+            "agree",
+            "arm",
+            "deadman",
+            "enable",
+            "estop",
+            "fence",
+            "mode",
+            "overspeed",
+            "sensor",
+            "separation",
+            "standstill",
+            "zone",
+        ),
         ("speed",),
         "after a stop the base jumps to its full velocity, as if it had driven on",
     ),
     Precedence(
         ("sane",),
-        ("separation", "speed"),
+        ("mode", "separation", "speed", "zone"),
         "of a command with an infinite velocity, the other velocities pass",
     ),
     Precedence(
         ("rate",),
-        ("fence", "separation", "speed"),
+        ("fence", "mode", "separation", "speed", "standstill", "zone"),
         "a dropped command counts as the motion in force, so the real one is not stopped or limited",
     ),
     Precedence(("deadman",), ("rate",), "dropped commands count as silence and stop the base"),
@@ -37,7 +50,7 @@ PRECEDENCES = (
         ("arm", "sane"), ("rate",), "a command that has to be stopped may be dropped, and the base drives on"
     ),
     Precedence(
-        ("arm", "estop", "joints", "sensor"),
+        ("arm", "enable", "estop", "joints", "sensor"),
         ("answer",),
         "a goal that was dropped is reported as late, and cancelled, after the deadline",
     ),

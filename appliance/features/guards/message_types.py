@@ -140,6 +140,15 @@ SCANS = {"sensor_msgs/LaserScan": TypeRow(_SCAN)}
 JOINTS = {"sensor_msgs/JointState": TypeRow({"names": "name", "found": "position"})}
 BATTERIES = {"sensor_msgs/BatteryState": TypeRow({"percentage": "percentage"})}
 
+ENABLERS = {
+    "std_msgs/Bool": TypeRow({"held": "data"}),
+    "sensor_msgs/Joy": TypeRow(
+        {"buttons": "buttons"},
+        parameters="int[] buttons",
+        local="bool held = button < buttons.size() && buttons[button] == 1;",
+    ),
+}
+MODES = {"std_msgs/Bool": TypeRow({"byHand": "data"})}
 SWITCHES = {"std_msgs/Bool": TypeRow({"withheld": "data"})}
 PRIVATE = {
     kind: TypeRow()

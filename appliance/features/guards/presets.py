@@ -116,6 +116,14 @@ _TABLES = {"corners": _CORNERS, "joints": _JOINTS, "time": _SPAN}
 _POLYGON = Parameter(
     "polygon", "corners", "-2,-2 2,-2 2,2 -2,2", "m", what="x and y of each corner", loads=True
 )
+_ZONE = Parameter(
+    "polygon",
+    "corners",
+    "0.1,-0.4 1,-0.4 1,0.4 0.1,0.4",
+    "m",
+    what="x and y of each corner, before the scanner",
+    loads=True,
+)
 _LIMITS = Parameter(
     "limits",
     "joints",
@@ -200,6 +208,11 @@ PRESETS = {
         Preset("rate", _MOVES),
         Preset("agree", {**_MOVES, "by": types.MOTIONS, "other": types.MOTIONS}),
         Preset("sane", _MOVES),
+        Preset("enable", {**_ANY, "by": types.ENABLERS}),
+        Preset("mode", {**_MOVES, "by": types.MODES}),
+        Preset("overspeed", {**_MOVES, "by": types.MOTIONS}),
+        Preset("standstill", {**_MOVES, "by": types.MOTIONS}),
+        Preset("zone", {**_MOVES, "by": types.SCANS}, (_ZONE,)),
         Preset("withhold", {"command": types.PRIVATE, "by": types.SWITCHES}, (_FROM,)),
     )
 }

@@ -45,9 +45,14 @@ _READ = {
 
 NOT_SUGGESTED = {
     "agree": "no name says which two velocities should be equal",
+    "enable": "no name says that a person has to hold a switch",
+    "mode": "no name says that `true` means manual mode",
+    "overspeed": "its limits follow from the base, which the graph does not show",
     "rate": "a rate follows from the driver, which the graph does not show",
     "sane": "the other guards of a base stop it at values that are not finite",
+    "standstill": "its time follows from how the base brakes, which the graph does not show",
     "withhold": "no name says which picture is private, and from whom",
+    "zone": "its polygon follows from the outline of the base, which the graph does not show",
 }
 """The presets that are never proposed, and why."""
 

@@ -101,12 +101,13 @@ def test_observations_during_a_hold_count_after_it(made: Callable[[Compiled], Mo
     for pressed in (True, False):
         monitors = started(_text(PRESETS["estop"]), made)
         monitors.hold(monitors.monitor("estop"), "test")
-        drive = message("geometry_msgs/Twist", linear__x=1.0)
+        still, drive = message("geometry_msgs/Twist"), message("geometry_msgs/Twist", linear__x=1.0)
         press = message("std_msgs/Bool", data=pressed)
         assert monitors.judge("/emergency_stop", bytearray(press), 1).result == "passed"
         assert monitors.judge("/cmd_vel", bytearray(drive), 2).result == "dropped"
         monitors.resume("estop")
-        outcome = monitors.judge("/cmd_vel", bytearray(drive), 3)
+        monitors.judge("/cmd_vel", bytearray(still), 3)
+        outcome = monitors.judge("/cmd_vel", bytearray(drive), 4)
         assert outcome.result == ("changed" if pressed else "passed")
 
 

@@ -13,7 +13,7 @@ from rosmop.tests.on_module import on_module
 from tests.unit.features.guards.guarding import DEFINITIONS
 
 SECOND = 10**9
-DRIVE = message("geometry_msgs/Twist", linear__x=0.1)
+STILL, DRIVE = message("geometry_msgs/Twist"), message("geometry_msgs/Twist", linear__x=0.4)
 ODOMETRY = message("nav_msgs/Odometry", pose__pose__orientation__w=1.0, child_frame_id="base")
 SCAN = message("sensor_msgs/LaserScan", range_max=30.0, angle_min=-3.14, angle_increment=0.0174,
                ranges=[9.0 + 0.01 * number for number in range(361)])  # fmt: skip
@@ -25,11 +25,20 @@ GOOD = {
     "agree": {"other": ODOMETRY, "by": ODOMETRY},
     "arm": {"by": BATTERY, "fix": message("sensor_msgs/NavSatFix"), "check": message("std_msgs/Bool", data=True)},
     "estop": {"stop": message("std_msgs/Bool"), "reset": message("std_msgs/Bool")},
+    "enable": {"by": message("std_msgs/Bool", data=True)},
+    "mode": {"by": message("std_msgs/Bool")},
+    "overspeed": {"by": ODOMETRY},
+    "standstill": {"by": ODOMETRY},
+    "zone": {"by": SCAN, "mute": message("std_msgs/Bool")},
 }  # fmt: skip
-"""For each preset with a safe message that observes topics: messages after which the base may move."""
+"""For each preset with a safe velocity that observes topics: messages after which the base may move."""
+VALUES = {"zone": {"clear": "0"}}
+BEFORE = {"enable": {"by": message("std_msgs/Bool")}}
+"""Messages that come once before these."""
 SEND_NOTHING = {
     "answer": "its goals are cancelled at their deadlines",
     "withhold": "it withholds until a message",
+    "joints": "its safe message is a trajectory",
 }
 MADE = pytest.mark.parametrize("made", [MonitorSet.of, on_module], ids=["interpreter", "module"])
 DAMAGE: dict[str, Callable[[bytes], bytes]] = {
@@ -42,7 +51,11 @@ DAMAGE: dict[str, Callable[[bytes], bytes]] = {
 
 
 def started(name: str, made: Callable[[Compiled], MonitorSet]) -> MonitorSet:
-    monitors = made(compiled_from({"guard.rv": text_of(Guard(name, PRESETS[name]))}, DEFINITIONS))
+    monitors = made(
+        compiled_from(
+            {"guard.rv": text_of(Guard(name, PRESETS[name], values=VALUES.get(name, {})))}, DEFINITIONS
+        )
+    )
     monitors.start(0)
     return monitors
 
@@ -63,10 +76,13 @@ def test_a_moving_base_is_stopped_by_an_unreadable_observation(
     name: str, damaged: str, damage: str, made: Callable[[Compiled], MonitorSet]
 ) -> None:
     monitors, topics, now = started(name, made), PRESETS[name].given_topics, SECOND
+    for topic, data in BEFORE.get(name, {}).items():
+        monitors.judge(topics[topic], bytearray(data), now)
     for _ in range(8):
         for topic, data in GOOD[name].items():
             now += SECOND // 100
             monitors.judge(topics[topic], bytearray(data), now)
+    monitors.judge("/cmd_vel", bytearray(STILL), now)
     assert monitors.judge("/cmd_vel", bytearray(DRIVE), now).result == "passed"
     outcome = monitors.judge(topics[damaged], bytearray(DAMAGE[damage](GOOD[name][damaged])), now + 1)
     assert [one.malformed for one in outcome.faults] == [True]
@@ -80,9 +96,10 @@ def test_a_moving_base_is_stopped_by_an_unreadable_observation(
             assert monitors.judge(topics[topic], bytearray(data), now + 4).result == "passed"
     monitors.judge("/cmd_vel", bytearray(DRIVE), now + 5)
     if name == "estop":
-        assert monitors.judge("/cmd_vel", bytearray(bytes(48)), now + 6).result == "passed"
+        assert monitors.judge("/cmd_vel", bytearray(STILL), now + 6).result == "passed"
         monitors.resume("estop")
-        assert monitors.judge("/cmd_vel", bytearray(DRIVE), now + 7).result == "passed"
+        monitors.judge("/cmd_vel", bytearray(STILL), now + 7)
+        assert monitors.judge("/cmd_vel", bytearray(DRIVE), now + 8).result == "passed"
 
 
 def test_a_goal_is_cancelled_in_time_despite_an_unreadable_result() -> None:
@@ -96,6 +113,15 @@ def test_a_goal_is_cancelled_in_time_despite_an_unreadable_result() -> None:
     assert [one.malformed for one in outcome.faults] == [True]
     sent = [one.topic for each in monitors.advance(200 * SECOND) for one in each.sent()]
     assert sent == ["/move_base/cancel"]
+
+
+@MADE
+def test_an_unreadable_joint_state_ends_the_trajectory(made: Callable[[Compiled], MonitorSet]) -> None:
+    monitors = started("joints", made)
+    outcome = monitors.judge("/joint_states", bytearray(b"\1"), SECOND)
+    assert [one.malformed for one in outcome.faults] == [True]
+    sent = [one.topic for each in monitors.advance(SECOND + 1) for one in each.sent()]
+    assert sent == [PRESETS["joints"].given_topics["command"]]
 
 
 @MADE
