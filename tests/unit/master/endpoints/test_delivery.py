@@ -2,11 +2,12 @@ import asyncio
 import ipaddress
 from collections.abc import Callable
 from random import Random
+from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
 
-from appliance.master.endpoints.delivery import Delivery, NodeCall
+from appliance.master.endpoints.delivery import LONG_ANSWER, Delivery, NodeCall
 from appliance.master.graph.registry import Incarnation
 from appliance.quotas.pool import Bounds, QuotaClass
 from appliance.quotas.table import NODE_CALLS_UNDER_WAY
@@ -252,3 +253,28 @@ async def test_silent_nodes_delay_no_call_to_other_hosts() -> None:
     assert not post.node.heard
     post.node.answers.set()
     await post.world.settle()
+
+
+async def test_a_question_is_asked_once_in_turn_and_its_answer_may_be_long() -> None:
+    post, asked, used = Post(at_once=Bounds(1, 1, 0, 0)), list[tuple[str, str]](), list[Any]()
+    free = asyncio.Event()
+
+    async def call(method: str, caller: str) -> Value:
+        asked.append((method, caller))
+        await free.wait()
+        raise CallFailedError("it does not answer")
+
+    def client(_incarnation: Incarnation, *, limits: Any) -> Any:
+        used.append(limits)
+        return SimpleNamespace(call=call)
+
+    cast(Any, post.world.nodes).client = client
+    questions = [asyncio.create_task(post.delivery.ask(post.incarnation, "getBusInfo")) for _ in range(2)]
+    await asyncio.sleep(1.0)
+    assert asked == [("getBusInfo", "/master")]  # the other one waits for its turn
+    free.set()
+    for question in questions:
+        with pytest.raises(CallFailedError):
+            await question
+    assert len(asked) == 2 and used == [LONG_ANSWER] * 2
+    assert LONG_ANSWER.elements > 7 * 1000
