@@ -115,7 +115,7 @@ def values(kind: str, at: float, numbers: Sequence[float]) -> bytes:
     if kind == RANGE:
         return header(at) + struct.pack("<B4f", 0, 0.1, 0.1, 30, numbers[0])
     if kind == ODOMETRY:
-        return odometry(at, (*numbers[:3], 0, 0, 0, 1))
+        return odometry(at, numbers[:7])
     if kind == FIX:
         return header(at) + struct.pack("<bH3d9dB", 0, 1, *numbers[:3], *[0.0] * 9, 0)
     covariance = bytes(72)

@@ -352,7 +352,7 @@ class EvidenceWorld(World):
         self.unfit_from = (self.unfit_from if self.unfit_from != NEVER else self.now) if why else NEVER
         if self.switched_off or not why or self.now <= self.unfit_from + self.tick + SLACK:
             return
-        if self.fresh_from <= self.force[0] < self.now and self.moves(self.force[1]):
+        if self.fresh_from < self.force[0] < self.now and self.moves(self.force[1]):
             self.broken(self.law(), f"a motion stays in force: {why}")
 
     unfit_from = NEVER
@@ -362,7 +362,7 @@ class EvidenceWorld(World):
             self.broken("live", f"of {self.sent} commands with all evidence {self.got} pass")
 
 
-SENSOR_VALUES = {SCAN: 20, RANGE: 1, ODOMETRY: 3, FIX: 3, IMU: 6}
+SENSOR_VALUES = {SCAN: 20, RANGE: 1, ODOMETRY: 7, FIX: 3, IMU: 6}
 
 
 class SensorWorld(EvidenceWorld):
@@ -621,6 +621,8 @@ class EstopWorld(World):
         self.needs_reset = False
         self.latched_at = NEVER
         self.latched_by = "L6"
+        self.doubtful = ""
+        """The law that a motion breaks until the guard is resumed."""
         self.reset_at = NEVER
         self.waiting: set[int] = set()
         """Nodes whose next command must stand still."""
@@ -660,10 +662,10 @@ class EstopWorld(World):
         if on and not self.switched_off and self.moves(self.force[1]):
             self.broken("L3", "a press does not stop the base at once")
 
-    def _latch(self, law: str = "") -> None:
-        """Note a stop that only a reset ends; without one, this law is broken."""
+    def _latch(self) -> None:
+        """Note a stop that only a reset ends."""
         self.needs_reset, self.latched_at = True, self.now
-        self.latched_by = law or ("L4" if self.hands or len(self.resets) > 1 else "L6")
+        self.latched_by = "L4" if self.hands or len(self.resets) > 1 else "L6"
         self.edges.clear()
 
     def _button(self, node: int) -> None:
@@ -748,9 +750,16 @@ class EstopWorld(World):
         self._doubt("L2")
 
     def _doubt(self, law: str) -> None:
-        self._latch(law)
-        self.fresh_from = self.now
+        self.doubtful, self.fresh_from = law, self.now
         self.after(self.now + self.random.choice((50, 300, 1000)), self._resume)
+
+    def _resume(self) -> None:
+        """Resume the guard: the act of a person, after which each node stands still before it moves."""
+        super()._resume()
+        if self.doubtful == "L5":
+            self.needs_reset = self._pressed()
+        self.doubtful = ""
+        self.waiting = {1, 2}
 
     def passed(self, node: int, wanted: Legs, got: "Legs | None") -> None:
         if not self.moves(wanted) and not self.needs_reset:
@@ -759,6 +768,8 @@ class EstopWorld(World):
             self._may_move(node)
 
     def _may_move(self, node: int) -> None:
+        if self.doubtful:
+            self.broken(self.doubtful, "a motion passes before a person has resumed the guard")
         pressed = [one for one, button in self.stops.items() if button.on]
         if pressed:
             self.broken(
@@ -772,7 +783,7 @@ class EstopWorld(World):
         if node in self.waiting:
             self.broken(
                 "L6",
-                f"a motion of node {node} passes, which has not stood still after the reset at {self.reset_at} ms",
+                f"node {node} has not stood still since the reset at {self.reset_at} ms, or a resume",
             )
         if self.silent and not self.stops:
             self.broken("L2", "a motion passes before the first word of a button")

@@ -174,10 +174,11 @@ class World:
 
     def say(self, given: str, data: bytes, node: int = 6) -> bytes | None:
         """Publish a message on a topic of the guard that is not the command's."""
+        held = self.guard.holds
         passed, sent = self.guard.tell(self.guard.topics[given], data, self.now, node)
         for one in sent:
             self._receive(*one)
-        if passed is None and self.guard.holds and given != "command":
+        if passed is None and held and given != "command":
             self.broken(
                 "L5", f"a guard that holds drops a message on {self.guard.topics[given]}, which it observes"
             )
