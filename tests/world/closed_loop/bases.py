@@ -35,13 +35,16 @@ class Base:
     wanted: tuple[float, float, float] = (0.0, 0.0, 0.0)
     driven: float = 0.0
 
+    def __post_init__(self) -> None:
+        self.full_braking = self.braking
+
     def order(self, at: int, legs: Legs) -> None:
         self.orders.append((at + self.lag, legs))
 
     def move(self, until: int) -> None:
         while self.now < until:
             while self.orders and self.orders[0][0] <= self.now:
-                self.wanted = self._wanted(self.orders.popleft()[1])
+                self.wanted = self.wanted_by(self.orders.popleft()[1])
             end = min(until, self.now + 10, self.orders[0][0] if self.orders else until)
             self._step((end - self.now) / 1000)
             self.now = end
@@ -52,7 +55,8 @@ class Base:
         cos, sin = math.cos(self.heading), math.sin(self.heading)
         return self.vx * cos - self.vy * sin, self.vx * sin + self.vy * cos
 
-    def _wanted(self, legs: Legs) -> tuple[float, float, float]:
+    def wanted_by(self, legs: Legs) -> tuple[float, float, float]:
+        """Return the velocities x, y and turning that the base takes up for a command."""
         x, y, turning = (legs[place] for place in (0, 1, 5))
         x, y = (one if math.isfinite(one) else math.copysign(self.top, one) for one in (x, y))
         x, y = (max(-1e6, min(1e6, one)) for one in (x, y))

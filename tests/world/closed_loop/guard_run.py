@@ -52,6 +52,7 @@ class RunningGuard:
         self._part = _part(change(text_of(Guard("guard", chosen, types=types, values=in_text))))
         self.topics = chosen.given_topics
         self._monitors = self._set()
+        self.now = 0
         self._monitors.start(_ns(0))
 
     def _set(self) -> MonitorSet:
@@ -62,6 +63,7 @@ class RunningGuard:
 
     def advance(self, at: int) -> Iterator[tuple[int, str, bytes]]:
         """Yield the time, topic and bytes of each message that is due from the guard."""
+        self.now = at
         due = self._monitors.next_due
         if due is not None and due <= _ns(at):
             for one in self._monitors.advance(_ns(at)):
@@ -104,3 +106,7 @@ class RunningGuard:
         self._monitors.recover(
             [] if lost else kept, {"": "power cut"} if lost else {}, _ns(at), restarted=True
         )
+
+    def stand_by(self) -> None:
+        """Send no safe message before the first command, as no guard may do after a restart."""
+        self._monitors.monitor("guard").starting.clear()

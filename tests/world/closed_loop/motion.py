@@ -124,7 +124,8 @@ class DrivenWorld(World):
             self.broken(self.law(), "a motion is in force before the first measurement")
         if self.blind_from is not None and self.now > self.blind_from + self.tick + SLACK:
             self.broken(
-                "L2", f"a motion is in force, though all measurements since {self.blind_from} ms are invalid"
+                self.law(),
+                f"a motion is in force, though all measurements since {self.blind_from} ms are invalid",
             )
         if self.now > self.heard + silent * 1000 + self.tick + SLACK:
             self.broken(

@@ -80,6 +80,8 @@ class World:
         self.force: tuple[int, Legs] = (0, STILL)
         """The last command that the base got, and when."""
         self.switched_off = False
+        self.holding = False
+        """Whether the guard was told to hold, and not yet resumed."""
         self.fresh_from = 0
         """A motion is only allowed if its command came after this time."""
         self.made = 0
@@ -199,7 +201,7 @@ class World:
             self.received(self.now, got)
             if passed != data:
                 self._shortened(legs, got)
-            if self.moves(got) and self.guard.holds:
+            if self.moves(got) and (self.holding or self.guard.holds):
                 self.broken("L5", f"a motion passes a guard that holds: {_shown(got)}")
         if not self.switched_off:
             self.passed(node, legs, got)
@@ -228,11 +230,13 @@ class World:
 
     def hold(self) -> None:
         self.trace("the guard holds")
+        self.holding = True
         self.guard.hold()
         self.after(self.now + self.random.choice((50, 300, 1000)), self._resume)
 
     def _resume(self) -> None:
         self.trace("the guard is resumed")
+        self.holding = False
         self.guard.resume()
         self.fresh_from = self.now
 
