@@ -1,7 +1,7 @@
 """Worlds with a base that moves: among obstacles and persons (`separation`), and inside a fence (`fence`)."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -26,7 +26,7 @@ from tests.world.closed_loop.messages import (
     scan,
     travels,
 )
-from tests.world.closed_loop.world import SLACK, World, void
+from tests.world.closed_loop.world import BESIDE, FORGETS, SLACK, World, void
 
 PERSON_RADIUS = 0.2
 KINDS = {
@@ -41,8 +41,6 @@ class DrivenWorld(World):
 
     base: Base
     fault = ""
-    foreign = False
-    """Whether another node publishes good measurements of something else."""
     heard = -1
     """When the last valid measurement arrived, or -1."""
     blind_from: int | None = None
@@ -156,6 +154,7 @@ class SeparationWorld(DrivenWorld):
     """Walls and persons around a base with a scanner: ISO 13855 and ISO/TS 15066, speed and separation."""
 
     preset: ClassVar[str] = "separation"
+    not_yet: ClassVar[Mapping[str, str]] = {BESIDE: FORGETS}
 
     def plan(self) -> None:
         r = self.random
@@ -261,11 +260,11 @@ class SeparationWorld(DrivenWorld):
         self.every(lambda: period * r.uniform(0.7, 1.0), look, first=r.uniform(0, 200))
 
     def _arrive(self, data: bytes, valid: "bool | None") -> None:
-        self.say("by", data, 5)
+        self.say("by", data, 5, whole=self.fault != "cut")
         self.measured(valid=valid)
 
     def _fail(self) -> None:
-        self.fault = self.random.choice(SCAN_FAULTS)
+        self.fault = self.one_of(SCAN_FAULTS)
         self.trace(f"the scanner fails: {self.fault}")
         if self.fault != "dead" and self.random.random() < 0.5:
             self.after(self.now + self.random.uniform(500, 3000), self._repair)
@@ -389,6 +388,7 @@ class FenceWorld(DrivenWorld):
     """A base inside a polygon, or at first outside: not a centimetre is left outside."""
 
     preset: ClassVar[str] = "fence"
+    not_yet: ClassVar[Mapping[str, str]] = {BESIDE: FORGETS}
     tick = 50
 
     def plan(self) -> None:
@@ -470,11 +470,11 @@ class FenceWorld(DrivenWorld):
         self.every(lambda: period * r.uniform(0.7, 1.0), look, first=r.uniform(0, 200))
 
     def _arrive(self, data: bytes, valid: bool) -> None:
-        self.say("by", data, 5)
+        self.say("by", data, 5, whole=self.fault != "cut")
         self.measured(valid=valid)
 
     def _fail(self) -> None:
-        self.fault = self.random.choice(POSITION_FAULTS)
+        self.fault = self.one_of(POSITION_FAULTS)
         self.trace(f"the position fails: {self.fault}")
         if self.fault == "gap" or (self.fault != "dead" and self.random.random() < 0.5):
             self.after(self.now + self.random.uniform(500, 3000), self._repair)

@@ -39,20 +39,6 @@ NOT_MODELLED = {
 }
 """Presets without a world, each with the reason."""
 
-WAITING = {
-    "deadman": "commands that a cut link delivers late move the base",
-    "speed": "each axis is limited on its own, and the rest of a steered command is not",
-    "separation": "each axis is limited on its own, and a scan without evidence is permission",
-    "fence": "the age of a position costs no distance",
-    "sensor": "an operator's hold drops the sensor for everybody",
-    "estop": "the buttons of several nodes are one state",
-    "arm": "a motion that has begun goes on without evidence",
-    "rate": "a slower command is dropped",
-    "agree": "sources are compared by one part of the velocity",
-    "sane": "a steered command is judged by its speed alone",
-}
-"""Presets that do not keep the laws yet, each with what is missing; no gate runs their worlds."""
-
 
 def run_one(
     preset: str, seed: int, change: Change = unchanged, trace: Callable[[str], None] | None = None
