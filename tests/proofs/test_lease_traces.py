@@ -127,3 +127,11 @@ def test_a_history_of_the_product_is_an_execution(seed: int, tmp_path: Path) -> 
     events: list[str] = []
     History(seed, on_event=events.append).run()
     assert lease_accepts(tmp_path, events)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_history_with_a_slow_firewall_is_an_execution(seed: int, tmp_path: Path) -> None:
+    events: list[str] = []
+    History(seed, on_event=events.append, slow=1.1).run()
+    assert any(event.startswith("granted") for event in events)
+    assert lease_accepts(tmp_path, events)

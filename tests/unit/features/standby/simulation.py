@@ -265,6 +265,8 @@ class SimulatedRobot(Host):
         self.save_fault = ""
         self.granted = self.disk.epoch
         self.gate: Any = None
+        self.answering = False
+        self.spent = 0.0  # seconds that programs of the firewall have taken in the present step
         self.firewall = witness.LeaseFirewall(SETTINGS, "nft", self._nft)
 
     def started(self) -> None:
@@ -317,12 +319,32 @@ class SimulatedRobot(Host):
         self.power_off()
         self.history.at(self.history.random.uniform(0.5, 5), self.start)
 
+    @property
+    def now(self) -> float:
+        return super().now + self.spent * self.speed
+
     def received(self, sender: str, message: Any) -> None:
+        """Answer. A slow program of the firewall delays its change, the answer, and what comes next."""
+        self.answering = True
         try:
             answer = self.gate.answer(message, SETTINGS.appliances[sender].address)
         except _PowerLost:
+            self.spent = 0.0
             self._lose_power()
             return
+        finally:
+            self.answering = False
+        spent, self.spent = self.spent, 0.0
+        if spent:
+            self.pause(spent)
+            life = self.life
+            self.history.at(
+                spent, lambda: self.up and life == self.life and self._answer(sender, message, answer)
+            )
+        else:
+            self._answer(sender, message, answer)
+
+    def _answer(self, sender: str, message: Any, answer: bytes | None) -> None:
         if answer is not None:
             self._trace(sender, message, answer)
             self.history.send("witness", sender, answer)
@@ -357,6 +379,18 @@ class SimulatedRobot(Host):
     def translated_to(self) -> set[str]:
         return set(re.findall(r"dnat to (\S+)", self.rules))
 
+    def _change(self, rules: str) -> None:
+        if not self.history.slow or not self.answering:  # before the network or the process is up
+            self.rules = rules
+            return
+        self.spent += self.history.slow * self.history.random.uniform(0.5, 1.5)
+        boot = self.boot
+        self.history.at(self.spent, lambda: self._changed(boot, rules))
+
+    def _changed(self, boot: int, rules: str) -> None:
+        if self.network_up and boot == self.boot:
+            self.rules = rules
+
     def _save(self, record: Any) -> None:
         fault, self.save_fault = self.save_fault, "broken" if self.save_fault == "broken" else ""
         if self.disk_full:
@@ -374,7 +408,7 @@ class SimulatedRobot(Host):
             if fails and self.history.random.random() < 0.5:
                 raise product.WitnessError("nft: cannot allocate memory")
             if not fails or self.history.random.random() < 0.5:
-                self.rules = text
+                self._change(text)
             if fails:
                 raise product.UncertainError("nft: timed out")
         return self.rules
@@ -386,6 +420,8 @@ class History:
     product: Product = field(default_factory=Product)
     on_event: Callable[[str], None] | None = None
     faults: tuple[str, ...] = ()
+    slow: float = 0.0
+    """Seconds that a change of the robot's firewall takes."""
 
     def __post_init__(self) -> None:
         self.random = random.Random(self.seed)  # noqa: S311  a seeded history, not a secret

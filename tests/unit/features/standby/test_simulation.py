@@ -12,6 +12,13 @@ def test_no_history_breaks_a_promise(first: int) -> None:
         History(seed).run()
 
 
+@pytest.mark.parametrize("slow", [0.3, 1.1])
+@pytest.mark.parametrize("first", range(0, 40, 10))
+def test_no_history_with_a_slow_firewall_breaks_a_promise(first: int, slow: float) -> None:
+    for seed in range(first, first + 10):
+        History(seed, slow=slow).run()
+
+
 @pytest.mark.parametrize("name", MUTANTS)
 def test_each_mutant_of_a_rule_is_found(name: str, tmp_path: Path) -> None:
     mutant = MUTANTS[name]
