@@ -21,6 +21,7 @@ import sys
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import partial
 from types import ModuleType
 from typing import Any
 
@@ -337,11 +338,12 @@ class SimulatedRobot(Host):
         spent, self.spent = self.spent, 0.0
         if spent:
             self.pause(spent)
-            life = self.life
-            self.history.at(
-                spent, lambda: self.up and life == self.life and self._answer(sender, message, answer)
-            )
+            self.history.at(spent, partial(self._answer_later, self.life, sender, message, answer))
         else:
+            self._answer(sender, message, answer)
+
+    def _answer_later(self, life: int, sender: str, message: Any, answer: bytes | None) -> None:
+        if self.up and life == self.life:
             self._answer(sender, message, answer)
 
     def _answer(self, sender: str, message: Any, answer: bytes | None) -> None:
