@@ -226,13 +226,13 @@ class DoorNode:
     async def _advertise(self, request: AdvertiseTopic, client: DoorClient) -> None:
         refused = self._refused.get(request.topic) if request.repeated else None
         if refused is not None and clock.now() - refused[0] < _ASK_SECONDS and refused[1] == request.type:
-            raise MasterDenialError(refused[2])
+            raise ProtocolError(refused[2])
         try:
             await self._register(request, client)
-        except MasterDenialError as denial:
+        except RosError as error:
             if len(self._refused) >= self._topics.whole:
                 self._refused.clear()
-            self._refused[request.topic] = clock.now(), request.type, str(denial)
+            self._refused[request.topic] = clock.now(), request.type, str(error)
             raise
         self._refused.pop(request.topic, None)
 

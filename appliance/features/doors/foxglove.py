@@ -6,7 +6,7 @@ is a status with the level error, or `serviceCallFailure`.
 
 import struct
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import msgspec
@@ -93,6 +93,8 @@ class Foxglove:
         self._subscriptions: dict[int, int] = {}  # the channel, by the client's number
         self._by_topic: dict[str, set[int]] = {}
         self._channels: dict[int, tuple[str, str]] = {}  # of the client: topic and encoding
+        # Channels whose advertisement was refused. A message repeats it, because viewers advertise only once.
+        self._refused: dict[int, AdvertiseTopic] = {}
         self._calls: dict[int, tuple[int, int]] = {}  # service and call of the client
         self._number = 0
         self._parameters: dict[str, None] = {}  # subscribed, by canonical name
@@ -199,6 +201,7 @@ class Foxglove:
 
     def _unadvertise(self, operation: FoxgloveUnadvertise) -> list[DoorRequest]:
         topics = {self._channels.pop(one)[0] for one in operation.channelIds if one in self._channels}
+        self._refused = {one: request for one, request in self._refused.items() if one in self._channels}
         used = {topic for topic, _encoding in self._channels.values()}
         return [UnadvertiseTopic(topic) for topic in sorted(topics - used)]
 
@@ -208,7 +211,9 @@ class Foxglove:
             if number not in self._channels:
                 raise _FoxgloveError(f"the channel {number} is not advertised by this client")
             topic, encoding = self._channels[number]
-            return [PublishMessage(topic, _values(encoding, frame[_CLIENT_DATA.size :]))]
+            publish = PublishMessage(topic, _values(encoding, frame[_CLIENT_DATA.size :]))
+            again = self._refused.pop(number, None)
+            return [publish] if again is None else [replace(again, repeated=True), publish]
         if frame[:1] == b"\x02" and len(frame) >= _SERVICE_CALL.size:
             return self._call(frame)
         raise _FoxgloveError(
@@ -306,7 +311,7 @@ class Foxglove:
                 self._fail_call(service, call, reason)
                 return
             case AdvertiseTopic(topic):
-                self._channels = {one: row for one, row in self._channels.items() if row[0] != topic}
+                self._refused |= {one: request for one, row in self._channels.items() if row[0] == topic}
             case SubscribeTopic(topic):
                 for number in [*self._by_topic.get(topic, ())]:
                     self._end_subscription(number)

@@ -438,3 +438,30 @@ async def test_a_read_of_many_parameters_gives_those_that_the_door_may_read() ->
         assert "site.ini:9" in (await next_op(client, "status"))["message"]
         await asyncio.sleep(1)
         assert all("parameterValues" not in str(frame) for frame in [*client.frames._queue])  # type: ignore[attr-defined]
+
+
+async def test_a_held_channel_gets_through_after_the_operators_yes() -> None:
+    """A viewer advertises once."""
+    async with door_world() as world:
+        robot = await world.robot("10.0.0.3", "/robot")
+        sees(world, topics={})
+        heard: list[Body] = []
+        await robot.subscribe("/text", lambda body, _header: heard.append(body))
+        client = await world.client(subprotocols=SUBPROTOCOLS)
+        world.master.denials["registerPublisher"] = "held for approval 17; ask the operator, then repeat"
+        channel = {"id": 1, "topic": "/text", "encoding": "json", "schemaName": "std_msgs/String"}
+        client.send({"op": "advertise", "channels": [channel]})
+        for _message in range(100):
+            client.send(struct.pack("<BI", 1, 1) + b'{"data":"no"}')
+            await asyncio.sleep(0.1)
+        assert "held for approval 17" in (await next_op(client, "status"))["message"]
+        assert world.master.calls.count("registerPublisher") <= 12
+        del world.master.denials["registerPublisher"]
+        await asyncio.sleep(2)
+        client.send(struct.pack("<BI", 1, 1) + b'{"data":"hi"}')
+        await asyncio.sleep(1)
+        assert heard == [b"\x02\0\0\0hi"]
+        client.send({"op": "unadvertise", "channelIds": [1]})
+        client.send(struct.pack("<BI", 1, 1) + b'{"data":"hi"}')
+        while "channel 1 is not advertised" not in (await next_op(client, "status"))["message"]:
+            pass

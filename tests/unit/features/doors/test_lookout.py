@@ -115,8 +115,10 @@ async def test_services_are_found_by_their_type_although_some_are_denied_or_sile
     """As in every answer that is put together from many, one of them does not make it fail."""
     robot = Robot("service", 1)
     rosapi = Rosapi(robot, robot.types, robot.lookout)
+    began = asyncio.get_running_loop().time()
     answer = await ask(rosapi, "/rosapi/services_for_type", '{"type":"std_srvs/Trigger"}')
     assert answer["services"] == [f"/robot/{number:02}" for number in range(60)]
+    assert asyncio.get_running_loop().time() - began < 15
     assert await ask(rosapi, "/rosapi/services_for_type", '{"type":"own/None"}') == {"services": []}
 
 

@@ -943,7 +943,8 @@ async def test_a_will_ends_with_the_right(end: str) -> None:
         robot, client = await world.robot("10.0.0.3", "/robot"), await world.client()
         heard: list[Body] = []
         await robot.subscribe("/cmd", lambda body, _header: heard.append(body))
-        client.send({"op": "advertise", "topic": "/cmd", "type": "std_msgs/String", "will": {"data": "stop"}})
+        will = {"op": "advertise", "topic": "/cmd", "type": "std_msgs/String", "will": {"data": "stop"}}
+        client.send(will | {"latch": end == "denied"})  # a later subscriber would get it
         await asyncio.sleep(1)
         if end == "revoked":  # its ticket ended, its host is blocked, or the door is removed
             world.sessions[0].revoke("the ticket is over")
