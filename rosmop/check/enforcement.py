@@ -43,7 +43,7 @@ def enforcement(
         return f"nothing to enforce: no trace leads to @{category}"
     refused = blocking_refused(compiled, specification, category)
     if refused is None:
-        brings = _bringing(compiled, graph, category) if graph is not None else compiled.events
+        brings = bringing(compiled, graph, category) if graph is not None else compiled.events
         named = ", ".join(event for event in compiled.events if event in brings)
         said = f"can be enforced: @{category} may drop the message that causes it ({named})"
         topics = {
@@ -84,7 +84,7 @@ _COUNTS = {
 }
 
 
-def _bringing(compiled: CompiledProperty, graph: VerdictGraph, category: str) -> set[str]:
+def bringing(compiled: CompiledProperty, graph: VerdictGraph, category: str) -> set[str]:
     """Return the events that lead to the category from a state without it.
 
     If dropped messages do not count, only states that other messages reach are considered.

@@ -45,6 +45,7 @@ def compile_event(
     scope.lines.site = scope.site(event)
     bound = _bind(scope, event, trigger, kind)
     happens, is_noted = _assemble(scope, event, bound, _body(scope, event, trigger))
+    shared.bound[function] = bound
     whole = scope.function(function, ("m",), happens=happens)
     shared.define(whole)
     service = trigger.type if trigger.part is not None else None

@@ -1,10 +1,10 @@
 """The context of a function during compilation: its variables by name, and the statements written so far."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Literal
+from typing import Any, Literal
 
 from rosmop.check.assignables import Value, Variable
 from rosmop.form import nodes
@@ -116,6 +116,8 @@ class CompilationContext:
         self.findings: list[Diagnostic] = []
         self.publications: list[Publication] = []
         self.calls: list[Publication] = []
+        self.bound: dict[str, Sequence[Any]] = {}
+        """The fields that the pattern of each event binds (`PatternField`), by the name of its function."""
         self.partial = False
         """Whether some files of the set could not be parsed. These files may declare names that seem unknown."""
 

@@ -10,6 +10,7 @@ from rosmop.check.enforcement import blocking_refused, enforcement, remedy_code,
 from rosmop.check.event_facts import declare_facts
 from rosmop.check.event_functions import compile_event
 from rosmop.check.expressions import value_of
+from rosmop.check.flow_lint import flow_findings
 from rosmop.check.function_bodies import (
     compile_function,
     compile_handler,
@@ -134,6 +135,8 @@ def _compile_all(
     _check_types(shared, compiled)
     if not any(finding.severity == "error" for finding in shared.findings):
         compiled = with_remedies_checked(shared, compiled)
+    if not any(finding.severity == "error" for finding in shared.findings):
+        shared.findings += flow_findings(shared, compiled)
     shared.findings += bypassing(compiled, shared.publications, shared.functions)
     shared.findings += rival_changes([specification for _, specification in pairs], phases)
     shared.findings += _same_names(shared.specifications)

@@ -9,26 +9,15 @@ from rosmop.form.findings import Diagnostic
 from rosmop.text import tree
 from rosmop.types.messages import shown
 
-_FLOATING = frozenset({("double",), ("float",)})
-_MIN_MAX = frozenset({("std", "min"), ("std", "max"), ("min",), ("max",)})
-_ABSOLUTE = frozenset({"abs", "fabs", "fabsf"})
-_TESTS_OF_NAN = frozenset({"isnan", "isfinite", "isinf"})
-_UNORDERED = frozenset({"<", "<=", ">", ">="})
-
 
 def traps(specification: tree.Specification) -> Iterator[Diagnostic]:
     yield from _unlike_a_sender(specification)
-    tests = {node.parts[-1] for node in tree.walk(specification) if isinstance(node, tree.Name)}
     for event in specification.events:
         if isinstance(event.trigger, tree.TimerTrigger) and not event.trigger.has_unit:
             period = f"{event.trigger.period_ns / 1e9:g}"
             text = f"`every` without a unit is {period} s; write `{period}s` or `{period}ms`"
             yield Diagnostic(event.trigger.position, "warning", text)
         yield from _called_again(event)
-        yield from _always_dropped(event)
-        yield from _lost_changes(event)
-        if not tests & _TESTS_OF_NAN:
-            yield from _passed_nan(event)
 
 
 def _called_again(event: tree.EventDefinition) -> Iterator[Diagnostic]:
@@ -72,55 +61,6 @@ def _wrong_sender(function: str, text: str) -> str:
     )
 
 
-def _always_dropped(event: tree.EventDefinition) -> Iterator[Diagnostic]:
-    decides = any(
-        isinstance(node, tree.IfStatement | tree.SwitchStatement) for node in tree.walk(event.action)
-    )
-    if isinstance(event.trigger, tree.MessageTrigger) and decides and _ends(event.action):
-        text = (
-            f"{shown(event.name)} drops every message, because each path ends with `return;`, which drops it"
-        )
-        yield Diagnostic(
-            event.position, "warning", f"{text}; leave out the `return;` of the path that passes"
-        )
-
-
-def _ends(statement: tree.Statement | None) -> bool:
-    match statement:
-        case tree.ReturnStatement():
-            return True
-        case tree.Block(statements=statements):
-            return any(isinstance(one, tree.DropStatement) or _ends(one) for one in statements)
-        case tree.IfStatement(yes=yes, no=no):
-            return _ends(yes) and _ends(no)
-    return False
-
-
-def _acts(statement: tree.Statement) -> bool:
-    return _ends(statement) or any(
-        isinstance(node, tree.DropStatement | tree.StopStatement) for node in tree.walk(statement)
-    )
-
-
-def _lost_changes(event: tree.EventDefinition) -> Iterator[Diagnostic]:
-    fields = {parameter.name for parameter in event.parameters}
-    for block in tree.walk(event.action):
-        if not isinstance(block, tree.Block):
-            continue
-        stops = any(isinstance(statement, tree.StopStatement) for statement in block.statements)
-        if not stops and not _ends(block):
-            continue
-        how, word = ("replaces", "STOP;") if stops else ("drops", "return;")
-        for statement in block.statements:
-            if isinstance(statement, tree.ExpressionStatement) and (name := _assigned(statement)) in fields:
-                text = f"the new value of {shown(name)} is lost, because this path {how} the message"
-                yield Diagnostic(
-                    statement.position,
-                    "warning",
-                    f"{text}; to send the changed message, leave out the `{word}`",
-                )
-
-
 def _assigned(statement: tree.ExpressionStatement) -> str:
     target = statement.expression
     if not isinstance(target, tree.Assignment):
@@ -131,70 +71,6 @@ def _assigned(statement: tree.ExpressionStatement) -> str:
             return ""
         place = tree.fields_of(place)[1]
     return place.parts[0]
-
-
-def _passed_nan(event: tree.EventDefinition) -> Iterator[Diagnostic]:
-    """Warn of bounds that NaN passes: each comparison with NaN is false, and `std::min` may return it."""
-    numbers = {one.name for one in event.parameters if one.type.name in _FLOATING}
-    if isinstance(event.trigger, tree.MessageTrigger) and event.trigger.when is not None:
-        yield from _bounds(event.trigger.when, event.action, numbers)
-    for node in tree.walk(event.action):
-        match node:
-            case tree.IfStatement(condition=condition, yes=yes, no=None):
-                yield from _bounds(condition, yes, numbers)
-            case tree.Assignment(
-                target=tree.Name(parts=(name,)),
-                value=tree.ConditionalExpression(condition=condition, no=tree.Name(parts=(other,))),
-            ) if name == other and name in numbers:
-                yield from (_nan_passes(name, bound) for bound in _unordered(condition, {name}))
-            case tree.CallExpression(callee=tree.Name(parts=parts)) if parts in _MIN_MAX:
-                for name in sorted(numbers & {_name(argument) for argument in node.arguments}):
-                    text = f"`{parts[-1]}` passes NaN in {shown(name)} on, or takes it for the other bound"
-                    yield Diagnostic(node.position, "warning", f"{text}; test it with `isnan` before")
-
-
-def _bounds(
-    condition: tree.Expression, yes: tree.Statement, numbers: frozenset[str] | set[str]
-) -> Iterator[Diagnostic]:
-    changed = numbers if _acts(yes) else numbers & _assigned_in(yes)
-    for bound in _unordered(condition, changed):
-        name = next(name for name in sorted(changed) if name in {_operand(bound.left), _operand(bound.right)})
-        yield _nan_passes(name, bound)
-
-
-def _unordered(
-    condition: tree.Expression, names: frozenset[str] | set[str]
-) -> Iterator[tree.BinaryExpression]:
-    parts = [node for node in tree.walk(condition) if isinstance(node, tree.Expression)]
-    if any(isinstance(node, tree.UnaryExpression) and node.operator == "!" for node in parts):
-        return
-    waiting = [condition]
-    while waiting:
-        match waiting.pop():
-            case tree.BinaryExpression(operator="||" | "&&", left=left, right=right):
-                waiting += [right, left]
-            case tree.BinaryExpression(operator=operator) as bound if operator in _UNORDERED:
-                if names & {_operand(bound.left), _operand(bound.right)}:
-                    yield bound
-
-
-def _nan_passes(name: str, bound: tree.BinaryExpression) -> Diagnostic:
-    text = f"NaN passes this bound of {shown(name)}, because each comparison with NaN is false; use `clamp`,"
-    text += " negate the opposite comparison (`!(x <= 1)`), or use `isnan`"
-    return Diagnostic(bound.position, "warning", text)
-
-
-def _operand(node: tree.Expression) -> str:
-    match node:
-        case tree.CallExpression(callee=tree.Name(parts=parts), arguments=(argument,)) if (
-            parts[-1] in _ABSOLUTE
-        ):
-            return _name(argument)
-    return _name(node)
-
-
-def _name(node: tree.Expression) -> str:
-    return node.parts[0] if isinstance(node, tree.Name) else ""
 
 
 def _assigned_in(statement: tree.Statement) -> set[str]:

@@ -1,0 +1,24 @@
+"""The lints find a kind of mistake however it is written, and leave honest code alone."""
+
+from pathlib import Path
+
+from rosmop.check.sources import compiled_from
+from rosmop.tests.acting import definitions
+from rosmop.tests.transcripts import Case, table
+
+KINDS = {
+    "NaN": ("NaN",),
+    "lost": ("is lost, because",),
+    "every": ("drops every message",),
+    "stale": ("as it was, so other topics",),
+    "ends": ("only ends",),
+    "jump": ("as if it had driven on", "as if the robot had driven on"),
+}
+
+
+@table(Path(__file__).parent / "flow.txt")
+def test_a_lint_finds_its_kind_and_no_other(case: Case) -> None:
+    warnings = compiled_from({"x.rv": case.text}, definitions()).warnings
+    texts = [one.text for one in warnings]
+    found = [kind for kind, words in KINDS.items() if any(word in text for text in texts for word in words)]
+    assert tuple(found or ["accepted"]) == case.expected, warnings
