@@ -66,6 +66,10 @@ class Recipe:
     """Further values for a type of a topic."""
     evidence: Mapping[str, Values] = field(default_factory=dict)
     """Evidence that differs from that of the type, by topic."""
+    typed: Mapping[str, Values] = field(default_factory=dict)
+    """Evidence that differs from that of the type, by type."""
+    first: Mapping[str, Values] = field(default_factory=dict)
+    """A message that comes once before the evidence, by type."""
     velocities: str = "pass"
     """The result of a velocity that is not a finite number: `stopped`, `bounded` or `pass`, as a motion."""
 
@@ -88,6 +92,14 @@ RECIPES = {
     "agree": Recipe(),
     "sane": Recipe(velocities="stopped"),
     "joints": Recipe(),
+    "enable": Recipe(
+        typed={"std_msgs/Bool": {"data": True}, "sensor_msgs/Joy": {"buttons": [1]}},
+        first={"std_msgs/Bool": {"data": False}, "sensor_msgs/Joy": {"buttons": [0]}},
+    ),
+    "mode": Recipe({"vMax": 0, "wMax": 0}, velocities="bounded"),
+    "overspeed": Recipe(),
+    "standstill": Recipe(),
+    "zone": Recipe({"clear": 0}, {"mute": "std_msgs/Bool"}),
 }
 
 APART = {
@@ -140,6 +152,17 @@ REASONS: dict[tuple[str, str, str, str], str] = {
     ): "a name is found or not: `test_a_trajectory_needs_the_present_position_of_each_joint`",
     ("*", "*", "pressed", "NaN"): "a truth value has no NaN",
     ("*", "*", "done", "NaN"): "a truth value has no NaN",
+    ("*", "*", "held", "NaN"): "a truth value has no NaN",
+    ("*", "*", "byHand", "NaN"): "a truth value has no NaN",
+    ("enable", "by", "buttons", "NaN"): "a whole number has no NaN",
+    ("enable", "by", "buttons", "out of range"): "`test_a_button_of_a_joystick_is_a_device`",
+    ("zone", "by", "most", "out of range"): "as `separation`",
+    (
+        "zone",
+        "mute",
+        "*",
+        "*",
+    ): "muting is off by default: `test_muting_is_off_by_default_bounded_and_needs_a_signal_that_changes`",
     ("*", "*", "status", "NaN"): "a whole number has no NaN",
     ("*", "*", "fixed", "NaN"): "a whole number has no NaN",
     ("estop", "reset", "*", "absent"): "without a reset the stop stays",
@@ -213,6 +236,9 @@ class Lab(Guarded):
         super().__init__(preset, rows, **values)
         self.preset, self.at, self.count = preset, 0, 0
         self.monitors.name_senders(lambda source: (f"10.0.0.{source}", NODES[source]))
+        for given, kind in self.kinds.items():
+            if kind in recipe.first:
+                self.send(given, recipe.first[kind])
 
     def send(
         self, given: str, change: Values | None = None, node: str = "/a", data: bytes | None = None
@@ -220,7 +246,12 @@ class Lab(Guarded):
         self.count += 1
         kind = self.kinds[given]
         if data is None:
-            good = {**EVIDENCE[kind](self.count), **RECIPES[self.preset].evidence.get(given, {})}
+            recipe = RECIPES[self.preset]
+            good = {
+                **EVIDENCE[kind](self.count),
+                **recipe.typed.get(kind, {}),
+                **recipe.evidence.get(given, {}),
+            }
             data = message(kind, **{**good, **(change or {})})
         outcome = self.monitors.judge(
             self.topics[given], bytearray(data), BEGIN + self.at * MS, MessageSender(NODES.index(node))
@@ -338,7 +369,7 @@ def _wrong(value: float, whole: int) -> Callable[[Lab, Place], str]:
         assert not (math.isnan(value) and (is_bool or is_whole)), "give a reason"
         change = changed(place, True if is_bool else whole if is_whole else value, good)
         assert change is not None, "give a reason"
-        if place.preset == "arm" and is_bool:
+        if place.preset in {"arm", "enable"} and is_bool:
             change = {"data": False}
         passed = lab.run(1000, without=place.topic, bad=lambda: lab.send(place.topic, change))
         return "a motion passes with it" if passed else ""
