@@ -503,6 +503,8 @@ def _limits_before_stops(flows: Sequence[SpecificationFlow]) -> Iterator[Diagnos
     for place, flow in enumerate(flows):
         seen = set[str]()
         for event, name in flow.limits():
+            if flow.may_suppress(event.code.topic or ""):
+                continue  # it knows of stops itself
             for later in flows[place + 1 :]:
                 stop = later.code.name
                 if stop in seen or not later.may_suppress(event.code.topic or ""):

@@ -7,14 +7,15 @@ from random import Random
 import pytest
 
 import rosmop.certify
-from rosmop.certify.check import MOST_STEPS, AutomatonTables, certify
+from rosmop.certify.check import _CHECKS, _NO_AUTOMATON, MOST_STEPS, AutomatonTables, certify
 from rosmop.certify.formula_reader import UnsupportedFormulaError, WordReader
 from rosmop.certify.properties import DEFECT, certificate_of, certificates_of
 from rosmop.check.sources import compiled_from
 from rosmop.form.findings import Position
-from rosmop.logics import catalogue
+from rosmop.logics import catalogue, ltl, mtl, ptltl
 from rosmop.logics.automaton import Automaton
 from rosmop.logics.catalogue import compile_property
+from rosmop.logics.formula import Syntax
 from rosmop.logics.interface import CompiledProperty, FiniteProperty, FormulaError, Logic, Source
 from rosmop.logics.tfsm import TimedStateMachine
 from rosmop.tests.examples import examples
@@ -312,3 +313,23 @@ def test_durations(text: str, nanoseconds: int) -> None:
 def test_other_words_are_not_durations(text: str) -> None:
     with pytest.raises(UnsupportedFormulaError, match="where a duration is expected"):
         WordReader(text, ["."]).duration()
+
+
+@pytest.mark.parametrize(
+    ("logic", "syntax"), [("ltl", ltl.SYNTAX), ("ptltl", ptltl.SYNTAX), ("mtl", mtl.SYNTAX)]
+)
+def test_every_operator_that_a_logic_reads_is_certified(logic: str, syntax: Syntax) -> None:
+    later = (
+        {*mtl.FUTURE} if logic == "mtl" else set[str]()
+    )  # they need bounds of time, which nothing certifies
+    formulas = [f"{sign} a" for sign in syntax.unary if sign not in later]
+    formulas += [f"a {sign} b" for level in syntax.levels for sign in level.operators if sign not in later]
+    assert len(formulas) > 8
+    for formula in formulas:
+        whole = f"o ({formula})" if logic == "ltl" else formula  # a formula of ltl is about the future
+        certificate = certificate_of(compile_property(logic, whole, EVENTS, ORIGIN))
+        assert certificate.proved, (formula, certificate.text)
+
+
+def test_every_logic_is_certified_or_named_as_not_certified() -> None:
+    assert {*catalogue.LOGICS} == {*_CHECKS} | {*_NO_AUTOMATON}
