@@ -463,13 +463,15 @@ class FenceWorld(DrivenWorld):
                     )
             data = position(self.by, self.now, x, y, self.base.heading, known)
             data = data[:20] if self.fault == "cut" else data
-            valid = not self.fault or (self.world_frame and self.fault.endswith("heading"))
+            valid = (
+                None if self.fault.endswith("heading") else not self.fault
+            )  # far from the edge it needs none
             arrived = max(arrived, self.now + r.uniform(delay * 0.3, delay))
             self.after(arrived, lambda: self._arrive(data, valid))
 
         self.every(lambda: period * r.uniform(0.7, 1.0), look, first=r.uniform(0, 200))
 
-    def _arrive(self, data: bytes, valid: bool) -> None:
+    def _arrive(self, data: bytes, valid: "bool | None") -> None:
         self.say("by", data, 5, whole=self.fault != "cut")
         self.measured(valid=valid)
 

@@ -174,7 +174,7 @@ class SpeedWorld(World):
             self.drive(legs)
 
         self.every(
-            lambda: period * r.uniform(0.9, 1.1) if r.random() > 0.02 else r.uniform(900, 1500),
+            lambda: period * r.uniform(0.9, 1.1) if self.live or r.random() > 0.02 else r.uniform(900, 1500),
             send,
             first=100,
         )
@@ -211,7 +211,9 @@ class SpeedWorld(World):
         self.only_fresh()
 
     def ended(self) -> None:
-        needed = self.most / self.growth
+        needed = (
+            self.most / self.growth * 1.5
+        )  # commands that come less often than every 0.2 s grow more slowly
         if self.live and needed < 2 and abs(self.force[1][0] - 0.9 * self.most) > 1e-5:
             self.broken(
                 "live", f"a permitted {0.9 * self.most:.2f} m/s is {self.force[1][0]:.2f} m/s in the end"
@@ -295,7 +297,10 @@ class RateWorld(World):
 
     def _slower(self, one: Legs, other: Legs) -> bool:
         turns = (0.0, 0.0) if self.kind.startswith("ackermann") else (abs(one[5]), abs(other[5]))
-        return abs(one[0]) < abs(other[0]) and turns[0] <= turns[1]
+        speeds = (abs(one[0]), abs(other[0]))
+        return (
+            speeds[0] <= speeds[1] and turns[0] <= turns[1] and (speeds[0] < speeds[1] or turns[0] < turns[1])
+        )
 
     before: Legs = STILL
 
@@ -395,6 +400,7 @@ class SensorWorld(EvidenceWorld):
         self.guarded({"silent": self.silent, "frozen": self.frozen, "least": self.least}, {"by": self.by})
         self.heard, self.repeated, self.seeing, self.fault = NEVER, 0, False, ""
         self.known: list[float] = []
+        self.shown: list[float] = []
         live = r.random() < 0.2
         self.fit_since = 1500 if live else NEVER
         if not live:
@@ -413,6 +419,10 @@ class SensorWorld(EvidenceWorld):
         self.trace(f"the sensor fails: {self.fault}")
         if self.fault != "dead" and self.random.random() < 0.5:
             self.after(self.now + self.random.uniform(300, 2000), lambda: setattr(self, "fault", ""))
+
+    def _enable(self) -> None:
+        super()._enable()
+        self.shown, self.repeated = [], 0  # the guard counts from its new beginning
 
     def _good(self) -> bytes:
         return values(
@@ -438,10 +448,10 @@ class SensorWorld(EvidenceWorld):
                 numbers = [one if r.random() < 0.4 else math.nan for one in numbers]
         if self.fault == "cut":
             self.say("by", values(self.by, self.now, numbers)[:14], whole=False)
-            self.seeing = False
+            self.seeing, self.shown = False, []
             return
         finite = sum(map(math.isfinite, numbers))
-        same = repr(numbers) == repr(getattr(self, "shown", None))
+        same = repr(numbers) == repr(self.shown)
         self.repeated = self.repeated + 1 if same else 0
         self.shown = numbers
         self.seeing, self.heard = finite > 0 and finite >= self.least * count, self.now
@@ -703,7 +713,7 @@ class EstopWorld(World):
             period = (self.silent or 0.5) * 400
 
             def repeat() -> None:
-                self._press(node, self.stops[node].on)
+                self._press(node, node in self.stops and self.stops[node].on)
 
             self.every(
                 lambda: -1 if self.now > dies else period * r.uniform(0.5, 1), repeat, first=begins + 2
@@ -774,8 +784,10 @@ class EstopWorld(World):
 
     def _resume(self) -> None:
         """Resume the guard: the act of a person, after which each node stands still before it moves."""
+        lost_at = self.fresh_from
         super()._resume()
-        if self.doubtful == "L5":
+        if self.doubtful == "L5":  # nothing is known of a button that has said nothing since
+            self.stops = {node: button for node, button in self.stops.items() if button.heard >= lost_at}
             self.needs_reset = self._pressed()
         self.doubtful = ""
         self.waiting = {1, 2}
