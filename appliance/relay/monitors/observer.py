@@ -30,6 +30,9 @@ if TYPE_CHECKING:
     from rosmop.run.outcomes import Published
 
 _EXPLAINED = 10
+_LINE_NS = 10_000_000_000
+"""How long a monitor's last line explains its stops: the line may be throttled."""
+_MOST_STOPPING = 1000
 _PUBLISHERS = 8
 """The most publishers that the report of a stop names."""
 
@@ -70,7 +73,10 @@ class Observer:
         self._prefix = prefix
         self._counters: dict[str, _Counters] = {}
         self._happened: dict[tuple[str, ...], int] = {}
-        self._again: dict[tuple[tuple[str, ...], ObservationPoint], int] = {}
+        self._again: dict[tuple[tuple[str, ...], ObservationPoint, bool], int] = {}
+        self._stopping: dict[tuple[tuple[str, ...], ObservationPoint], bool] = {}
+        """Whether the last change that was compared, by its events and point, was a stop: the module only counts."""
+        self._lines: dict[str, tuple[int, str]] = {}
         self._shown: set[ObservationPoint] = set()
         self._owed: list[FastPathCounts] = []
 
@@ -79,6 +85,7 @@ class Observer:
 
     def keep(self, names: list[str], began: list[str], time: int) -> None:
         self._sum_up(time)
+        self._lines = {name: line for name, line in self._lines.items() if name in names}
         self._counters = {
             name: _Counters() if name in began else self._counters.get(name, _Counters()) for name in names
         }
@@ -169,6 +176,9 @@ class Observer:
         monitors = self._monitors
         return not self._prefix and monitors is not None and monitors.sends_safe(monitor, topic, data)
 
+    def _only_stops(self, event: str) -> bool:
+        return bool(self._monitors and not self._prefix and self._monitors.only_stops(event))
+
     def _cause(self, outcome: Outcome, monitor: str, topic: str) -> Mapping[str, object]:
         """Return why a monitor stops a topic: its own last line, the fault, or why it cannot judge."""
         assert self._monitors is not None  # noqa: S101  they have stopped it
@@ -188,6 +198,9 @@ class Observer:
             cause = "its initial values or `init` faulted"
         elif topic in instance.starting:
             cause = "no command has come since it began"
+        else:
+            said, line = self._lines.get(monitor, (0, ""))
+            cause = line if said and outcome.time - said <= _LINE_NS else _compared(outcome)
         nodes = [] if outcome.timer is None else self._publishers(topic)
         found = [{"node": one.caller_id, "host": one.host} for one in nodes[:_PUBLISHERS]]
         return {**({"cause": cause} if cause else {}), **({"publishers": found} if found else {})}
@@ -217,6 +230,7 @@ class Observer:
         time: int,
         observed: ObservedMessage | None = None,
     ) -> None:
+        self._lines[monitor] = time, text
         self._observations.note(
             f"{self._prefix}log",
             monitor,
@@ -237,14 +251,17 @@ class Observer:
         size: int,
         observed: ObservedMessage | None = None,
     ) -> None:
+        events = tuple(outcome.changed_by)
+        safe = self._is_safe(_monitor(events[-1]), point.resource, outcome.buffer)
+        if len(self._stopping) >= _MOST_STOPPING:
+            self._stopping.clear()
+        self._stopping[events, point] = safe
         if point in self._shown:
-            key = (tuple(outcome.changed_by), point)
-            self._again[key] = self._again.get(key, 0) + 1
+            self._again[events, point, safe] = self._again.get((events, point, safe), 0) + 1
             return
         self._shown.add(point)
-        monitors = self._count_change(outcome.changed_by, 1)
-        together = _together(outcome.changed_by)
-        safe = self._is_safe(monitors[-1], point.resource, outcome.buffer)
+        monitors = self._count_change(events, 1)
+        together = _together(events)
         self._observations.note(
             f"{self._prefix}change",
             monitors[-1],
@@ -327,7 +344,7 @@ class Observer:
             for event in events:
                 self._counter(_monitor(event)).events += count
         self._happened.clear()
-        for (events, point), count in self._again.items():
+        for (events, point, safe), count in self._again.items():
             monitors = self._count_change(events, count)
             together = _together(events)
             self._observations.add(
@@ -339,7 +356,7 @@ class Observer:
                 text=_of_change(monitors),
                 distinction=", ".join(together),
                 shared={"changed_by": together} if together else {},
-                safe=bool(self._monitors and not self._prefix and self._monitors.only_stops(events[-1])),
+                safe=safe,
             )
         self._again.clear()
 
@@ -374,7 +391,8 @@ class Observer:
                         shared={"category": verdict.category},
                     )
             for writers, messages in changed.items():
-                self._again[writers, point] = self._again.get((writers, point), 0) + messages
+                key = writers, point, self._stopping.get((writers, point), self._only_stops(writers[-1]))
+                self._again[key] = self._again.get(key, 0) + messages
         self._owed = [owed for owed in self._owed if owed.begun]
 
     def rows(self, monitors: MonitorSet, time: int) -> list[MonitorRow]:
@@ -452,6 +470,11 @@ def refusal(outcome: Outcome, part: str) -> str:
         return outcome.reason
     said = f": {outcome.fatal.text}" if outcome.fatal is not None else _said(outcome)
     return f"the {part} is dropped by the monitor {outcome.dropped_by}{said}"
+
+
+def _compared(outcome: Outcome) -> str:
+    values = list(outcome.conditions.values())
+    return ", ".join(f"{name} = {value}" for name, value in values[-1].items()) if values else ""
 
 
 def _why(outcome: Outcome) -> str:
