@@ -4,7 +4,7 @@ It acts where it may drop or change a message, replace it by the safe message, w
 cannot judge, it holds these topics and nothing else.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 
 from rosmop.form import nodes
 from rosmop.form.compiled import SpecificationCode
@@ -17,18 +17,30 @@ _READING = frozenset({"size", "length", "empty", "at", "front", "back", "c_str",
 """Members that change nothing; any other may change a field of the message."""
 
 
-def acted_topics(code: SpecificationCode, functions: Mapping[str, nodes.Function]) -> tuple[str, ...]:
-    """Return the channels of the specification's own events on which it acts, in order."""
+def published_topics(functions: Iterable[nodes.Function]) -> Mapping[str, set[str]]:
+    """Return the topics on which functions publish, by their context."""
+    found: dict[str, set[str]] = {}
+    for function in functions:
+        topics = found.setdefault(function.context, set())
+        topics |= {
+            node.topic
+            for node in nodes.walk(function)
+            if isinstance(node, nodes.Publish) and not node.service
+        }
+    return found
+
+
+def acted_topics(
+    code: SpecificationCode, functions: Mapping[str, nodes.Function], published: Collection[str]
+) -> tuple[str, ...]:
+    """Return the channels of the specification's own events on which it acts, in order.
+
+    `published` has the topics on which its functions publish.
+    """
     channels = {event.channel for event in code.events if event.channel is not None}
     acted: set[str | None] = {None}
     acted |= {one.topic for one in code.safes} | {one.topic for one in code.withholdings}
-    acted |= {
-        node.topic
-        for function in functions.values()
-        if function.context == code.context
-        for node in nodes.walk(function)
-        if isinstance(node, nodes.Publish) and not node.service
-    }
+    acted |= {*published}
     acted |= {event.channel for event in code.events if _acts(functions[event.function])}
     for declared in code.properties:
         acting = {name for name, function in declared.handlers.items() if _acts(functions[function])}
@@ -90,6 +102,10 @@ def _may_act(event: tree.EventDefinition, helpers: set[str]) -> bool:
             (_root(node.callee) in helpers and not own.isdisjoint(map(_root, node.arguments)))
             or _changes(node.callee, own)
         ):
+            return True
+        if isinstance(node, tree.RangeForStatement) and node.type.reference and _root(node.values) in own:
+            return True
+        if isinstance(node, tree.Declaration) and node.type.reference:
             return True
     return False
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import msgspec
 
-from rosmop.check.acted_topics import acted_topics
+from rosmop.check.acted_topics import acted_topics, published_topics
 from rosmop.check.locate import FieldLocator, MessageCursor
 from rosmop.form import nodes
 from rosmop.form.compiled import Compiled, EventCode
@@ -30,7 +30,11 @@ def with_observed_topics(compiled: Compiled) -> Compiled:
     """
     functions, symbols = dict(compiled.functions), _EndSymbols()
     symbols.sites = [*compiled.sites]
-    codes = tuple(replace(one, acts_on=acted_topics(one, functions)) for one in compiled.specifications)
+    published = published_topics(functions.values())
+    codes = tuple(
+        replace(one, acts_on=acted_topics(one, functions, published.get(one.context, ())))
+        for one in compiled.specifications
+    )
     compiled = replace(compiled, specifications=codes)
     observing = guards_of(compiled).observing
     for code in codes:
