@@ -261,7 +261,7 @@ def test_a_scan_with_a_wrong_head_stops(data: bytes) -> None:
     assert stops(guard)[-1] == 700
 
 
-def test_a_few_rays_are_no_thing_and_things_beside_the_zone_do_not_count() -> None:
+def test_a_few_rays_and_things_beside_the_zone_do_not_count() -> None:
     guard = clear_zone()
     guard.tell("by", scan([*FREE[:14], 0.6, 0.6, *FREE[16:]]), 700, "/b")
     assert moves(guard, FAST, 710)
