@@ -268,8 +268,8 @@ COUNTS = (
     Count("spoken", f"core files with an identifier of {_NAMED}", 43, 10, core_files_that_name_features),
     Count("walkers", "modules with SQL of their own that reads the audit log", 10, 3, walkers_of_the_audit_log),
     Count("registration", "files of one registerPublisher", 50, 48, files_of_a_registration),
-    Count("wide", "classes with 15 attributes or more", 46, 36, classes_with_many_attributes),
-    Count("any", "uses of `Any` in product code", 1350, 900, uses_of_any),
+    Count("wide", "classes with 15 attributes or more", 48, 36, classes_with_many_attributes),
+    Count("any", "uses of `Any` in product code", 1360, 900, uses_of_any),
     Count("helpers", "helpers of more than 40 lines that a test's body calls", 7, 0, long_helpers_in_tests),
 )  # fmt: skip
 

@@ -27,7 +27,7 @@ RANGE_FILE = Path("/proc/sys/net/ipv4/ip_local_port_range")
 _THROUGH_IPSEC = ("meta ipsec exists ", 'iifname "ipsec*" ')
 _SYN = "tcp flags & (syn | ack) == syn"
 _USER = re.compile(r"[a-z_][a-z0-9_-]{0,31}|[0-9]{1,10}")
-_GROUP = re.compile(r"[\w.@:-]++(?:/[\w.@:-]++)*+", re.ASCII)
+_GROUP = re.compile(r"(?!/)[\w.@:/-]{1,512}(?<!/)", re.ASCII)
 _SERVICE = re.compile(r"(tcp|udp)/(\d{1,5})(?:-(\d{1,5}))?")
 
 

@@ -81,12 +81,6 @@ class LinkAddresses:
         return ipaddress.ip_network(self.network).prefixlen
 
 
-def read_only_settings(sysctl: Path = Path("/proc/sys")) -> list[str]:
-    """Return the kernel settings of the host that the isolation has to write, and cannot."""
-    keys = (_GLOBAL[4], "net/ipv4/conf/default/route_localnet")
-    return [key.replace("/", ".") for key in keys if not os.access(sysctl / key, os.W_OK)]
-
-
 class _IpForwarding:
     """Reads, enables and restores IP forwarding.
 

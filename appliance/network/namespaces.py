@@ -339,3 +339,20 @@ def _signal_and_wait(descriptors: dict[int, int], number: signal.Signals, limit:
         for descriptor, _ in poll.poll(left * 1000):
             poll.unregister(descriptor)
             waiting.discard(descriptor)
+
+
+def shared_network() -> str:
+    """Return why the firewall of a container would affect the whole machine, or an empty string."""
+    if is_contained() and (lives_on_the_machines_network() or bridges()):
+        return (
+            "isolation container: this container shares the machine's network (network_mode: host, hostNetwork), so "
+            "the firewall would apply to the whole machine. Give it its own network, as compose.host.yaml does for a "
+            "robot whose nodes run on the machine itself; or run rosrv without a container, with isolation netns"
+        )
+    return ""
+
+
+def read_only_settings(sysctl: Path = Path("/proc/sys")) -> list[str]:
+    """Return the kernel settings of the host that the isolation has to write, and cannot."""
+    keys = ("net/ipv4/ip_forward", "net/ipv4/conf/default/route_localnet")
+    return [key.replace("/", ".") for key in keys if not os.access(sysctl / key, os.W_OK)]

@@ -39,9 +39,9 @@ from appliance.network.isolation import Isolation, IsolationSettings
 from appliance.network.namespaces import (
     Namespace,
     NetworkError,
-    bridges,
     is_contained,
     lives_on_the_machines_network,
+    shared_network,
 )
 from appliance.network.probe import probe_port
 from appliance.network.public_address import PublicAddress, only_address
@@ -474,17 +474,6 @@ def isolation_for(
     if isolation == "container":
         return ContainerIsolation(ports, backend)
     return NetnsIsolation(ports, backend) if isolation == "netns" else NoIsolation()
-
-
-def shared_network() -> str:
-    """Return why the firewall of a container would affect the whole machine, or an empty string."""
-    if is_contained() and (lives_on_the_machines_network() or bridges()):
-        return (
-            "isolation container: this container shares the machine's network (network_mode: host, hostNetwork), so "
-            "the firewall would apply to the whole machine. Give it its own network, as compose.host.yaml does for a "
-            "robot whose nodes run on the machine itself; or run rosrv without a container, with isolation netns"
-        )
-    return ""
 
 
 def _require_own_network() -> None:

@@ -10,7 +10,6 @@ from rosmop.check.enforcement import blocking_refused, enforcement, remedy_code,
 from rosmop.check.event_facts import declare_facts
 from rosmop.check.event_functions import compile_event
 from rosmop.check.expressions import value_of
-from rosmop.check.flow_lint import flow_findings
 from rosmop.check.function_bodies import (
     compile_function,
     compile_handler,
@@ -29,11 +28,11 @@ from rosmop.check.givens import (
 )
 from rosmop.check.pattern_references import with_references, without_references
 from rosmop.check.phases import Phases, ordered, phases_of, unknown_phases
-from rosmop.check.publication_order import bypassing
 from rosmop.check.reachable_types import identity, reached
 from rosmop.check.remedies import with_remedies_checked
 from rosmop.check.safe_messages import declare_safes
 from rosmop.check.scope import CompilationContext, SpecificationNames
+from rosmop.check.set_lint import lint_set
 from rosmop.check.slicing import check_parameters, declare_parameters, slicing_of, unsliceable
 from rosmop.check.specification_lint import (
     kept_slices,
@@ -42,7 +41,7 @@ from rosmop.check.specification_lint import (
     lint_statements,
     unused_events,
 )
-from rosmop.check.traps import rival_changes, traps
+from rosmop.check.traps import traps
 from rosmop.check.withholdings import withholdings
 from rosmop.form import nodes
 from rosmop.form.compiled import Compiled, PropertyCode, SpecificationCode
@@ -135,10 +134,7 @@ def _compile_all(
     _check_types(shared, compiled)
     if not any(finding.severity == "error" for finding in shared.findings):
         compiled = with_remedies_checked(shared, compiled)
-    if not any(finding.severity == "error" for finding in shared.findings):
-        shared.findings += flow_findings(shared, compiled)
-    shared.findings += bypassing(compiled, shared.publications, shared.functions)
-    shared.findings += rival_changes([specification for _, specification in pairs], phases)
+    shared.findings += [*lint_set(shared, compiled, [specification for _, specification in pairs], phases)]
     shared.findings += _same_names(shared.specifications)
     return compiled
 

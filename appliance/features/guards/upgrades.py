@@ -38,7 +38,7 @@ def upgraded(text: str, in_force: Mapping[str, str], graph: Iterable[TopicFacts]
     if loaded is None or origin == "changed":
         raise GuardError(
             f"the text of {name} was changed after it was made, so its changes would be lost: compare it with the"
-            f" preset; to replace it: rosrv guard remove {name}, and rosrv guard new"
+            f" preset; to replace it, remove it, and make it again"
         )
     preset = PRESETS[loaded.name]
     if origin == "current":
@@ -69,7 +69,7 @@ def upgraded(text: str, in_force: Mapping[str, str], graph: Iterable[TopicFacts]
         guard = planned(preset, name, topics_in(text), graph, values, types_in(text))
     except GuardError as error:
         raise GuardError(
-            f"{name}: {error}; or remove it, and make it again with rosrv guard new {preset.name}"
+            f"{name}: {error}; or remove it, and make it again"
         ) from error
     return Upgrade(text_of(guard) + order_of(text), changed, warnings)
 

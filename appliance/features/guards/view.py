@@ -59,7 +59,7 @@ def _alarms(state: GuardsState) -> Iterator[Trouble]:
         )
         yield Trouble("alarm", f"guard-bypassed:{one.topic}", text)
     for sentence in state.elsewhere:
-        text = f"{sentence}: rosrv guard check-driver measures whether the driver stops the base then"
+        text = f"{sentence}: measure whether the driver then stops it, with rosrv guard check-driver TOPIC --by TOPIC"
         yield Trouble("warning", f"guard-elsewhere:{sentence.partition(':')[0]}", text)
     for node in state.unanswered:
         text = f"{node} does not answer getBusInfo: whether it takes commands past its guards is unknown"

@@ -20,10 +20,8 @@ from appliance.network.firewall.backend import BackendMissingError, FirewallErro
 from appliance.network.firewall.backend_check import prove
 from appliance.network.firewall.iptables import IptablesBackend
 from appliance.network.firewall.nft import NftBackend
-from appliance.network.isolation import read_only_settings
-from appliance.network.namespaces import Namespace, NetworkError
+from appliance.network.namespaces import Namespace, NetworkError, read_only_settings, shared_network
 from appliance.supervisor.errors import StartError
-from appliance.supervisor.isolation_lifecycle import shared_network
 from appliance.supervisor.port_check import require_free
 from appliance.supervisor.roles import ROS_PROGRAMS
 from appliance.supervisor.users import NUMERIC_IDS

@@ -117,8 +117,8 @@ def test_the_status_has_an_alarm_a_warning_and_a_notice() -> None:
          f"/base takes /cmd_vel from {THEIRS}, past its guards: end that process, and run rosrv protect --strict on"
          " 10.0.0.5"),
         ("warning", "guard-elsewhere:/cmd_vel",
-         "/cmd_vel: the base is on 10.0.0.5: a cut between here and there is not guarded: rosrv guard check-driver"
-         " measures whether the driver stops the base then"),
+         "/cmd_vel: the base is on 10.0.0.5: a cut between here and there is not guarded: measure whether the driver"
+         " then stops it, with rosrv guard check-driver TOPIC --by TOPIC"),
         ("notice", "guard-unanswered:/base",
          "/base does not answer getBusInfo: whether it takes commands past its guards is unknown"),
     ]  # fmt: skip

@@ -8,7 +8,7 @@ import pytest
 
 from appliance.configuration.settings import Settings
 from appliance.features.selftest import file_checks, machine_checks
-from appliance.network.isolation import read_only_settings
+from appliance.network.namespaces import read_only_settings
 from appliance.supervisor.restore_mark import set_mark
 
 ROOT = Path(__file__).parents[4] / "appliance"

@@ -4,7 +4,7 @@ from pathlib import Path
 from appliance.features.guards.presets import PRESETS
 from distribution.guards_evidence_page import EVIDENCE, page
 
-ROOT = Path(__file__).parents[3]
+ROOT = Path(__file__).parents[4]
 
 
 def test_the_page_is_up_to_date() -> None:
