@@ -68,9 +68,7 @@ def upgraded(text: str, in_force: Mapping[str, str], graph: Iterable[TopicFacts]
     try:
         guard = planned(preset, name, topics_in(text), graph, values, types_in(text))
     except GuardError as error:
-        raise GuardError(
-            f"{name}: {error}; or remove it, and make it again"
-        ) from error
+        raise GuardError(f"{name}: {error}; or remove it, and make it again") from error
     return Upgrade(text_of(guard) + order_of(text), changed, warnings)
 
 
