@@ -110,6 +110,9 @@ class TunnelSite:
             f"the tunnel of {name} is up",
         )
 
+    def is_down(self, name: str = "ocu-1") -> None:
+        eventually(lambda: self.state(name) != "up", f"the tunnel of {name} is closed")
+
     def recorded(self, since: int, timeout: float = LONG, **fields: Any) -> Event:
         return self.trail.wait_for(since=since, timeout=timeout, **fields)
 

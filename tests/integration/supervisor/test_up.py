@@ -25,6 +25,7 @@ from tests.support.waiting import allowed
 PLACE = ("--listen", "127.0.0.1:0", "--rosmaster-port", "0", "--isolation", "none")
 POLICY = (
     "[Nodes]\ndefault = *\n[Publishers]\ndefault = *\n[Subscribers]\ndefault = *\n[Commands]\ndefault = *\n"
+    "[Services]\ndefault = *\n[Clients]\ndefault = *\n[Parameters]\nread /** = *\nwrite /** = *\n"
 )
 ENVIRONMENT = {"PATH": os.environ["PATH"], "PYTHONUNBUFFERED": "1"}
 
