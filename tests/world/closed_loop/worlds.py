@@ -32,7 +32,7 @@ NOT_MODELLED = {
     "mode": "it limits a velocity while a switch is on; a base of the rig has no manual mode",
     "overspeed": "the bases of the rig never drive faster than their command",
     "standstill": "the bases of the rig never move without a command",
-    "zone": "its traces are in test_person_and_zone_presets.py; the worlds of `separation` have walls and persons",
+    "zone": "its traces are in test_person_and_zone_presets.py; the worlds of `separation` have obstacles and persons",
     "answer": "it cancels goals of an action, whose server moves the robot; there is no velocity to follow",
     "joints": "it judges a trajectory as a whole; the rig has no arm",
     "withhold": "it keeps a topic from hosts, and commands no motion",

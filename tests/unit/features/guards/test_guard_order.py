@@ -51,9 +51,9 @@ def jumps(ordered: bool) -> bool:
     return guards.drive(twist(0.5), 2200)[0] > 0.3
 
 
-def seen(metres: float) -> bytes:
-    """Return a scan of things at some distance, which differ from scan to scan."""
-    ranges = [4.0 + metres / 1e6] * 72
+def seen(metres: float, blind: int = 0) -> bytes:
+    """Return a scan of things at some distance, which differ from scan to scan; its first rays may be blind."""
+    ranges = [math.nan] * blind + [4.0 + metres / 1e6] * (72 - blind)
     return message("sensor_msgs/LaserScan", range_min=0.1, range_max=9.0, ranges=ranges,
                    angle_min=-math.pi, angle_increment=math.pi / 36)  # fmt: skip
 
@@ -106,6 +106,26 @@ def cancels_a_dropped_goal(ordered: bool) -> bool:
     return "a" in {fields("actionlib_msgs/GoalID", data).id for _at, data in guards.got}
 
 
+def moves_after_a_reset_without_a_zero(ordered: bool) -> bool:
+    """An autopilot begins after the reset: the deadman stops its first commands, until they have come for a while."""
+    guards = Together("estop", "deadman", ordered=ordered, estop={"silent": 0})
+    for at, topic, pressed in (
+        (1, "stop", False), (100, "stop", True), (200, "stop", False), (300, "reset", False), (500, "reset", True),
+    ):  # fmt: skip
+        guards.tell(topic, button(pressed), at)
+    return any(guards.drive(twist(0.5), at)[0] > 0 for at in range(600, 2000, 50))
+
+
+def moves_after_the_zone_without_a_zero(ordered: bool) -> bool:
+    """Only the sensor is blind at first, since it needs more valid values than the zone."""
+    guards = Together("zone", "sensor", ordered=ordered, sensor={"least": 1})
+    moved = False
+    for at in range(100, 3000, 50):
+        guards.tell("by", seen(at) if at > 1500 else seen(at, blind=1), at)
+        moved = moved or guards.drive(twist(0.5), at)[0] > 0
+    return moved
+
+
 def _pose(x: float) -> bytes:
     return message("nav_msgs/Odometry", pose__pose__position__x=x, pose__pose__orientation__w=1.0)
 
@@ -116,7 +136,7 @@ def twist_legs(x: float) -> tuple[float, ...]:
 
 CONSEQUENCES: list[Callable[[bool], bool]] = [
     jumps, passes_a_part, leaves_the_fence, stops_a_node_that_commands, ignores_a_command_that_is_not_a_number,
-    cancels_a_dropped_goal,
+    cancels_a_dropped_goal, moves_after_a_reset_without_a_zero, moves_after_the_zone_without_a_zero,
 ]  # fmt: skip
 
 
