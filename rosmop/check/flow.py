@@ -10,8 +10,8 @@ nothing changes, and helper functions are followed into. An unknown number may b
 
 import math
 import operator
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 from rosmop.form import nodes
@@ -109,7 +109,7 @@ class AbstractParts:
         return AbstractParts(parts, self.others)
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, slots=True)
 class PathState:
     """The state on a path: variables, the places where NaN skipped a restriction, and what is true of the message."""
 
@@ -127,7 +127,10 @@ class PathState:
     result: AbstractValue = _ANYTHING
 
     def branched(self) -> "PathState":
-        return replace(self, values=dict(self.values))
+        return PathState(
+            dict(self.values), self.skipped, self.control, self.inputs, self.fate, self.spoke, self.written,
+            self.result,
+        )  # fmt: skip
 
     def set(self, name: str, value: AbstractValue) -> None:
         if self.control and value.is_constant:
@@ -174,12 +177,12 @@ def merged(states: Iterable[PathState]) -> PathState:
     first, *rest = states
     made = first.branched()
     for state in rest:
-        for name in {*made.values, *state.values}:
-            ours, theirs = made.values.get(name), state.values.get(name)
-            if ours is theirs:
-                continue
-            missing = AbstractValue(inputs=frozenset({name}) if is_shared(name) else _NONE)
-            made.values[name] = joined(ours or missing, theirs or missing)
+        for name in made.values.keys() - state.values.keys():
+            made.values[name] = joined(made.values[name], _unset(name))
+        for name, theirs in state.values.items():
+            ours = made.values.get(name)
+            if ours is not theirs:
+                made.values[name] = joined(_unset(name) if ours is None else ours, theirs)
         made.skipped |= state.skipped
         made.control |= state.control
         made.inputs |= state.inputs
@@ -187,6 +190,23 @@ def merged(states: Iterable[PathState]) -> PathState:
         made.spoke = made.spoke or state.spoke
         made.result = joined(made.result, state.result)
     return made
+
+
+def _unset(name: str) -> AbstractValue:
+    return AbstractValue(inputs=frozenset({name})) if is_shared(name) else _ANYTHING
+
+
+def key_of(value: AbstractValue | None) -> Hashable:
+    """Return a key that distinguishes values also by the types of their numbers."""
+    if value is None:
+        return None
+    known = value.known
+    if isinstance(known, AbstractParts):
+        parts = frozenset((path, key_of(one)) for path, one in known.parts.items())
+        return (parts, key_of(known.others), *value[1:])
+    if isinstance(known, tuple):
+        known = tuple(map(key_of, known))
+    return (type(known), known, *value[1:])
 
 
 def is_tainted(value: AbstractValue) -> bool:
@@ -202,7 +222,7 @@ def why_of(values: Iterable[AbstractValue]) -> Places:
 
 def shared_of(inputs: frozenset[str]) -> frozenset[str]:
     """Return the shared variables among the inputs: a truth depends on them, and carries no number of a field."""
-    return frozenset(filter(is_shared, inputs))
+    return frozenset(filter(is_shared, inputs)) if inputs else inputs
 
 
 def is_shared(name: str) -> bool:
@@ -224,12 +244,24 @@ class FlowLimitError(Exception):
     """There is too much to follow."""
 
 
+class _PureCall(NamedTuple):
+    """The result of a call of a function without effects, and what the call adds to the analysis and its state."""
+
+    result: AbstractValue
+    skipped: Places
+    spoke: bool
+    compared: frozenset[str]
+    operations: frozenset[int]
+
+
 @dataclass
 class FlowWork:
-    """The rest of the work for a specification, and known results of functions of the library."""
+    """The rest of the work for a specification, and what is known of its functions, calls and blocks."""
 
     left: int = MOST_WORK
-    results: dict[tuple[str, str], AbstractValue] = field(default_factory=dict)
+    functions: dict[str, "_FunctionFacts"] = field(default_factory=dict)
+    own: dict[str, "_FunctionFacts"] = field(default_factory=dict)
+    calls: dict[Hashable, _PureCall] = field(default_factory=dict)
     facts: dict[int, "_BlockFacts"] = field(default_factory=dict)
     others: dict[tuple[int, bool], Sequence[nodes.Statement]] = field(default_factory=dict)
 
@@ -238,6 +270,28 @@ class FlowWork:
         found = self.facts.get(id(body))
         if found is None:
             found = self.facts[id(body)] = _facts_of(body)
+        return found
+
+    def facts_of_function(
+        self, function: nodes.Function, functions: Mapping[str, nodes.Function]
+    ) -> "_FunctionFacts":
+        """Return the facts of a function together with all functions that it calls."""
+        found = self.functions.get(function.name)
+        if found is None:
+            own, waiting = dict[str, _FunctionFacts](), [function.name]
+            while waiting:
+                name = waiting.pop()
+                if name in functions and name not in own:
+                    if name not in self.own:
+                        self.own[name] = _own_facts(functions[name])
+                    own[name] = self.own[name]
+                    waiting += own[name].calls
+            found = self.functions[function.name] = _FunctionFacts(
+                frozenset[str]().union(*(one.shared for one in own.values())),
+                frozenset[int]().union(*(one.sites for one in own.values())),
+                frozenset(own),
+                all(one.pure for one in own.values()),
+            )
         return found
 
     def spend(self) -> None:
@@ -527,11 +581,7 @@ class FlowAnalysis:
 
     def _read(self, name: str, state: PathState) -> AbstractValue:
         found = state.values.get(name)
-        return (
-            found
-            if found is not None
-            else AbstractValue(inputs=frozenset({name}) if is_shared(name) else _NONE)
-        )
+        return _unset(name) if found is None else found
 
     def _variable(self, node: nodes.Read, state: PathState) -> AbstractValue:
         return self._read(node.name, state)
@@ -829,13 +879,9 @@ class FlowAnalysis:
         if not any(map(is_tainted, arguments)):
             return AbstractValue(inputs=inputs)
         plain = tuple(one._replace(inputs=_NONE) for one in arguments)
-        key = (function.name, repr(plain))
-        results = self._work.results
-        if key not in results:
-            aside = FlowAnalysis(self._functions, {}, None, work=self._work)
-            aside._depth = self._depth
-            results[key] = aside._called(function, plain, _NONE, PathState())
-        found, why = results[key], why_of(arguments)
+        aside = FlowAnalysis(self._functions, {}, None, work=self._work)
+        aside._depth = self._depth
+        found, why = aside._called(function, plain, _NONE, PathState()), why_of(arguments)
         if found.is_number and not found.is_nan and found.why:
             return AbstractValue(found.known, frozenset({(CALL, self._site)}), inputs=inputs)
         true, false = (
@@ -847,6 +893,40 @@ class FlowAnalysis:
         )
 
     def _called(
+        self,
+        function: nodes.Function,
+        arguments: Sequence[AbstractValue],
+        inputs: frozenset[str],
+        state: PathState,
+    ) -> AbstractValue:
+        """Follow a call; a function without effects is followed once for each set of values that it reads."""
+        facts = self._work.facts_of_function(function, self._functions)
+        if not facts.pure:
+            return self._followed(function, arguments, inputs, state)
+        read = {name: state.values[name] for name in facts.shared if name in state.values}
+        source = self._source if self._source in facts.sites else None
+        key = (
+            function.name, self._depth, source, state.control, state.inputs, *map(key_of, arguments),
+            *((name, key_of(value)) for name, value in read.items()),
+        )  # fmt: skip
+        call = self._work.calls.get(key)
+        if call is None:
+            before = self.compared, self.operations
+            self.compared, self.operations = set(), set()
+            inner = PathState(read, control=state.control, inputs=state.inputs)
+            result = self._followed(function, arguments, inputs, inner)
+            call = _PureCall(
+                result, inner.skipped, inner.spoke, frozenset(self.compared), frozenset(self.operations)
+            )
+            self._work.calls[key] = call
+            self.compared, self.operations = before
+        self.compared |= call.compared
+        self.operations |= call.operations
+        state.skipped |= call.skipped
+        state.spoke = state.spoke or call.spoke
+        return call.result
+
+    def _followed(
         self,
         function: nodes.Function,
         arguments: Sequence[AbstractValue],
@@ -959,9 +1039,7 @@ def _assume(test: nodes.Expression, state: PathState, *, truth: bool) -> None:
                 if isinstance(side, nodes.Read) and known is not None and known.may_be_nan:
                     state.values[side.name] = known._replace(may_be_nan=False)  # the comparison is true
         case nodes.Read(type=value_types.BoolType(), name=name):
-            known = state.values.get(
-                name, AbstractValue(inputs=frozenset({name}) if is_shared(name) else _NONE)
-            )
+            known = state.values.get(name) or _unset(name)
             if known.known is UNKNOWN:
                 state.values[name] = known._replace(known=truth, less_true=_NONE, less_false=_NONE)
 
@@ -988,6 +1066,45 @@ class _BlockFacts:
 
     def acts(self, fields: Mapping[str, str]) -> bool:
         return self.drops or not self.flags.isdisjoint(fields)
+
+
+@dataclass(frozen=True)
+class _FunctionFacts:
+    """The shared variables that a function names, its sites and calls.
+
+    It is `pure` if it changes only variables of its own, and is not recursive.
+    """
+
+    shared: frozenset[str]
+    sites: frozenset[int]
+    calls: frozenset[str]
+    pure: bool
+
+
+_EFFECTS = (
+    nodes.Leave | nodes.Drop | nodes.StopMessage | nodes.Publish | nodes.Require | nodes.WriteBack
+    | nodes.ReadNumbers | nodes.ReadValue
+)  # fmt: skip
+
+
+def _own_facts(function: nodes.Function) -> _FunctionFacts:
+    changed, read, sites, calls, pure = {*function.parameters}, set[str](), set[int](), set[str](), True
+    for node in nodes.walk(function.body):
+        sites.add(getattr(node, "site", -1))
+        match node:
+            case nodes.Read(name=name):
+                read.add(name)
+            case nodes.Assign(name=name) | nodes.Select(name=name) | nodes.ForEach(name=name):
+                changed.add(name)
+            case nodes.Call(function="a_put" | "a_slot" | "l_append", arguments=(base, *_)):
+                changed |= {one.name for one in nodes.walk(base) if isinstance(one, nodes.Read)}
+            case nodes.Invoke(function=called, depth=depth):
+                pure = pure and depth is None
+                calls.add(called)
+        pure = pure and not isinstance(node, _EFFECTS)
+    pure = pure and not any(map(is_shared, changed)) and all(map(is_shared, read - changed))
+    shared = frozenset(filter(is_shared, changed | read))
+    return _FunctionFacts(shared, frozenset(sites), frozenset(calls), pure)
 
 
 def _facts_of(body: Sequence[nodes.Statement]) -> _BlockFacts:

@@ -7,9 +7,10 @@ updated that other topics are judged by.
 """
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import groupby, product
+from itertools import count, groupby, product
+from typing import NamedTuple
 
 from rosmop.check.enforcement import bringing
 from rosmop.check.flow import (
@@ -37,6 +38,7 @@ from rosmop.check.flow import (
     Places,
     is_shared,
     is_tainted,
+    key_of,
     merged,
 )
 from rosmop.check.message_fields import PatternField
@@ -94,6 +96,14 @@ class _Event:
         return [state for way, state in self.exits.items() if way.fate == SENT]
 
 
+class _Batch(NamedTuple):
+    """Events that run one after the other, and the shared variables that they name."""
+
+    number: int
+    events: Sequence[_Event]
+    shared: frozenset[str]
+
+
 class SpecificationFlow:
     """The flow of one specification."""
 
@@ -120,6 +130,8 @@ class SpecificationFlow:
             }
             event.exits = flow.event(event.function, PathState())
             event.compared, event.operations, event.drops = flow.compared, flow.operations, flow.drops
+        self._batches = [*map(self._batch, count(), _batches(self.events))]
+        self._followed: dict[Hashable, tuple[Places, dict[str, AbstractValue]]] = {}
 
     def findings(self) -> list[Diagnostic]:
         found = [*self._idle_returns()]
@@ -241,24 +253,33 @@ class SpecificationFlow:
             if source.site is not None:
                 found = frozenset(place for place in found if place[0] != TEST)
             delta = _tainted(after)
-        for _ in range(_ROUNDS if delta else 0):
+        fresh = {name for name, value in delta.items() if is_tainted(value)}
+        for _ in range(_ROUNDS):
             grown = dict(delta)
-            for batch in self._batches():
-                places, after = self._judged(batch, None, delta)
+            for batch in self._batches:
+                if fresh.isdisjoint(batch.shared):
+                    continue  # as without NaN, or as in the round before
+                places, after = self._follows(batch, delta)
                 found |= {place for place in places if place[0] != TEST}
                 grown |= {
                     name: value for name, value in after.items() if name not in grown and is_tainted(value)
                 }
-            if grown.keys() == delta.keys():
-                break
-            delta = grown
+            fresh, delta = {*grown} - {*delta}, grown
         return found
 
-    def _batches(self) -> Iterator[list[_Event]]:
-        """Yield the events of each channel, and each timer."""
-        for channel, group in groupby(sorted(self.events, key=_channel), _channel):
-            events = [*group]
-            yield from [events] if channel else [[one] for one in events]
+    def _follows(
+        self, batch: _Batch, delta: Mapping[str, AbstractValue]
+    ) -> tuple[Places, dict[str, AbstractValue]]:
+        """Judge a batch once for each set of values that it reads."""
+        read = {name: value for name, value in delta.items() if name in batch.shared}
+        key = (batch.number, frozenset((name, key_of(value)) for name, value in read.items()))
+        if key not in self._followed:
+            self._followed[key] = self._judged(batch.events, None, read)
+        return self._followed[key]
+
+    def _batch(self, number: int, events: Sequence[_Event]) -> _Batch:
+        facts = (self._work.facts_of_function(one.function, self._forms) for one in events)
+        return _Batch(number, events, frozenset[str]().union(*(one.shared for one in facts)))
 
     def _judged(
         self, events: Sequence[_Event], source: _Source | None, values: Mapping[str, AbstractValue]
@@ -526,6 +547,13 @@ def _tail_returns(body: Sequence[nodes.Statement]) -> Iterator[int]:
                 yield branch[-1].site
             else:
                 yield from _tail_returns(branch)
+
+
+def _batches(events: Sequence[_Event]) -> Iterator[Sequence[_Event]]:
+    """Yield the events of each channel, and each timer."""
+    for channel, group in groupby(sorted(events, key=_channel), _channel):
+        same = [*group]
+        yield from [same] if channel else [[one] for one in same]
 
 
 def _channel(event: _Event) -> str:
