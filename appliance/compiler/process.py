@@ -91,7 +91,9 @@ def answer(wanted: _Question) -> messages.ContentsFound | messages.PartsMade | m
         if isinstance(wanted, messages.PartsWanted):
             return messages.PartsMade(wanted.number, checking.parts(wanted.compiled, wanted.parts))
         if wanted.at_start:
-            found = checking.contents_at_start(wanted.files, wanted.definitions, wanted.topics)
+            found = checking.contents_at_start(
+                wanted.files, wanted.definitions, wanted.topics, lints=wanted.lints
+            )
         elif wanted.broken:
             found = checking.contents_beside(wanted.files, wanted.definitions, wanted.broken, wanted.topics)
         else:

@@ -38,14 +38,18 @@ def contents(
     load: bool = False,
     unbuilt: Mapping[str, str] = {},
     given_topics: Topics = NO_TOPICS,
+    lints: bool = True,
 ) -> Contents:
     """Compile specifications. Raises `SpecificationsRefusedError` with all errors.
 
-    `load`: also build and load the module. The monitors of the files in `unbuilt` do nothing.
+    `load`: also build and load the module. The monitors of the files in `unbuilt` do nothing. Without `lints`, there
+    are no warnings.
     """
     try:
         definitions = _standard().extended(Definitions.from_files(texts))
-        monitors = MonitorSet.of(compiled_from(files, definitions, without_code=unbuilt, topics=given_topics))
+        monitors = MonitorSet.of(
+            compiled_from(files, definitions, lints=lints, without_code=unbuilt, topics=given_topics)
+        )
         certificates, data = certified(monitors.compiled)
         if load:
             require_loadable(data)
@@ -112,11 +116,15 @@ def _givens(monitors: MonitorSet, name: str) -> Iterator[GivenDeclared]:
 
 
 def contents_at_start(
-    files: Mapping[str, str], texts: Mapping[str, str], given_topics: Topics = NO_TOPICS
+    files: Mapping[str, str],
+    texts: Mapping[str, str],
+    given_topics: Topics = NO_TOPICS,
+    *,
+    lints: bool = True,
 ) -> Contents:
     """Compile for a start: files with errors do nothing. Raises `SpecificationsRefusedError` beyond a limit."""
     try:
-        return contents(files, texts, load=True, given_topics=given_topics)
+        return contents(files, texts, load=True, given_topics=given_topics, lints=lints)
     except SpecificationsRefusedError as error:
         refusal = error
     good, errors = _good(files, texts, given_topics)
@@ -125,7 +133,10 @@ def contents_at_start(
     rest = {file: text for file, text in files.items() if file not in left_out}
     unbuilt = {file: error for file, error in bad.items() if file in rest}
     try:
-        found = contents(rest, texts if rest else {}, load=True, unbuilt=unbuilt, given_topics=given_topics)
+        definitions = texts if rest else {}
+        found = contents(
+            rest, definitions, load=True, unbuilt=unbuilt, given_topics=given_topics, lints=lints
+        )
     except SpecificationsRefusedError:
         raise refusal from None
     return msgspec.structs.replace(found, left_out=left_out)
@@ -160,7 +171,7 @@ def check(
 
 def _topics_known(text: str, file: str, texts: Mapping[str, str]) -> bool:
     try:
-        contents({file: text}, texts, unbuilt={file: ""})
+        contents({file: text}, texts, unbuilt={file: ""}, lints=False)
     except SpecificationsRefusedError:
         return False
     return True
@@ -174,7 +185,7 @@ def _good(
     def grown(good: set[str], more: Sequence[str]) -> set[str]:
         try:
             wanted = {file: files[file] for file in files if file in {*good, *more}}
-            contents(wanted, texts, load=True, given_topics=topics)
+            contents(wanted, texts, load=True, given_topics=topics, lints=False)
         except SpecificationsRefusedError as error:
             if len(more) == 1:
                 errors[more[0]] = next((one for one in error.findings if _ERROR in one), error.findings[0])

@@ -9,6 +9,8 @@ import contextlib
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
+import msgspec
+
 from appliance.base.withdrawal import require_awaited
 from appliance.channel import messages
 from appliance.channel.channel import Channel, ChannelClosedError
@@ -64,20 +66,32 @@ class SpecificationCompiler:
     async def check(
         self, sources: Sources, site_keys: Sequence[str], broken: Sequence[str] = ()
     ) -> CheckedSpecifications:
-        return await self._checked(sources, site_keys, broken, at_start=False)
+        return await self._checked(sources, site_keys, broken)
 
-    async def check_at_start(self, sources: Sources, site_keys: Sequence[str]) -> CheckedSpecifications:
-        """Compile for a start: files with errors do not keep the others from coming into force."""
-        return await self._checked(sources, site_keys, (), at_start=True)
+    async def check_at_start(
+        self, sources: Sources, site_keys: Sequence[str], known: Sequence[str] | None = None
+    ) -> CheckedSpecifications:
+        """Compile for a start: files with errors do not keep the others from coming into force.
+
+        `known` are the warnings that were found when these sources were loaded: nobody waits for them again.
+        """
+        checked = await self._checked(sources, site_keys, (), at_start=True, lints=known is None)
+        return checked if known is None else msgspec.structs.replace(checked, warnings=tuple(known))
 
     async def _checked(
-        self, sources: Sources, site_keys: Sequence[str], broken: Sequence[str], *, at_start: bool
+        self,
+        sources: Sources,
+        site_keys: Sequence[str],
+        broken: Sequence[str],
+        *,
+        at_start: bool = False,
+        lints: bool = True,
     ) -> CheckedSpecifications:
         if not sources.files:
             return CheckedSpecifications()
         require_bounded(sources)
         ask = self._asked_once if at_start else self._ordered
-        answer = await ask(_wanted(sources, broken, at_start=at_start))
+        answer = await ask(_wanted(sources, broken, at_start=at_start, lints=lints))
         return checked(answer.contents, sources, site_keys)
 
     async def try_out(
@@ -170,7 +184,12 @@ class SpecificationCompiler:
 
 
 def _wanted(
-    sources: Sources, broken: Sequence[str], *, at_start: bool = False, dry_run: bool = False
+    sources: Sources,
+    broken: Sequence[str],
+    *,
+    at_start: bool = False,
+    dry_run: bool = False,
+    lints: bool = True,
 ) -> Callable[[int], messages.ContentsWanted]:
     return lambda number: messages.ContentsWanted(
         number,
@@ -180,4 +199,5 @@ def _wanted(
         dry_run=dry_run,
         topics=sources.topics,
         broken=[*broken],
+        lints=lints,
     )

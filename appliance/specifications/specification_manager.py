@@ -43,6 +43,7 @@ from appliance.specifications.specification_files import (
     SpecificationsRefusedError,
 )
 from appliance.specifications.specification_revisions import (
+    MOST_WARNINGS,
     NOTHING,
     Check,
     CheckBeside,
@@ -51,6 +52,7 @@ from appliance.specifications.specification_revisions import (
     sources_of,
     specifications_at_start,
     text_of,
+    text_with_warnings,
     unknown_monitors,
 )
 from appliance.specifications.switches import SWITCHES, Switches, require_whole
@@ -197,6 +199,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         )
         if last is not None or (self.revision and sources_of(self.in_force) == sources):
             self._enforce(sources, checked)
+            self._keep_warnings()
             self._resume()
         else:
             self._end_limit()
@@ -397,10 +400,11 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
 
         The rollback of an unconfirmed change must succeed, so a file with an error does nothing, as after a start.
         """
-        check = self._as_at_start if who == UNCONFIRMED else self._strictly
         async with self._changing(request.expected):
             row = NOTHING if request.revision == 0 else await self._wanted(request.revision)
             note, last = f"rolled back to revision {row.revision}", kept_in(row)
+            as_before = partial(self._as_at_start, known=last.warnings)
+            check = as_before if who == UNCONFIRMED else self._strictly
             return await self._change(
                 sources_of(row),
                 who,
@@ -787,8 +791,8 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
     async def _strictly(self, sources: Sources) -> CheckedSpecifications:
         return await self._check(sources, self.site_keys, ())
 
-    async def _as_at_start(self, sources: Sources) -> CheckedSpecifications:
-        return await self._check_at_start(sources, self.site_keys)
+    async def _as_at_start(self, sources: Sources, known: Sequence[str] | None) -> CheckedSpecifications:
+        return await self._check_at_start(sources, self.site_keys, known)
 
     def _broken(self) -> dict[str, str]:
         unbuilt = {self.checked.monitors[name]: error for name, error in self.checked.unbuilt.items()}
@@ -909,9 +913,11 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
                 before.topics,
                 self.switches.said,
                 self.givens.said,
+                kept_in(last).warnings,
             )
             self.store.save_monitor_revision(last._replace(sources=text_of(ended)))
-        row = MonitorRevisionRow(last.revision + 1, text_of(sources), clock.wall(), who, note)
+        text = text_with_warnings(sources, checked)
+        row = MonitorRevisionRow(last.revision + 1, text, clock.wall(), who, note)
         self._put_in_force(row, within)
         self._enforce(sources, checked)
         added, changed, removed = sources.difference(before)
@@ -931,8 +937,15 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             began=list(began),
             signed_by=checked.signed_by,
             certificates=checked.certificates,
-            warnings=[*checked.warnings, *warnings][:100],
+            warnings=[*checked.warnings, *warnings][:MOST_WARNINGS],
         )
+
+    def _keep_warnings(self) -> None:
+        """Store warnings that this start had to look for, as after an update from a version that did not store them."""
+        text = text_with_warnings(self.sources, self.checked)
+        if self.revision and text != self.in_force.sources:
+            self.in_force = self.in_force._replace(sources=text)
+            self.store.save_monitor_revision(self.in_force)
 
     def _enforce(self, sources: Sources, checked: CheckedSpecifications) -> None:
         self.sources, self.checked = sources, checked

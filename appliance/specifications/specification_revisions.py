@@ -17,11 +17,14 @@ from appliance.specifications.specification_files import (
 )
 from appliance.store.state_file import MonitorRevisionRow, StateStore
 
-Check = Callable[[Sources, Sequence[str]], Awaitable[CheckedSpecifications]]
-"""Compiles sources. Raises `SpecificationsRefusedError`."""
+Check = Callable[[Sources, Sequence[str], Sequence[str] | None], Awaitable[CheckedSpecifications]]
+"""Compiles sources, whose warnings are known or None. Raises `SpecificationsRefusedError`."""
 
 CheckBeside = Callable[[Sources, Sequence[str], Sequence[str]], Awaitable[CheckedSpecifications]]
 """Compiles sources; the files named last may still have errors. Raises `SpecificationsRefusedError`."""
+
+MOST_WARNINGS = 100
+"""The most warnings that are stored with a revision, or in a record."""
 
 NOTHING = MonitorRevisionRow(0, "{}", 0.0, DISK, "")
 """The revision before the first one."""
@@ -36,10 +39,22 @@ class StartingSpecifications(NamedTuple):
 
 
 class StoredSpecifications(Sources, frozen=True):
-    """The sources of a revision; `switches` and `given` are of the time when the revision was replaced."""
+    """The sources of a revision; `switches` and `given` are of the time when the revision was replaced.
+
+    `warnings` are those of its load, or None if a start has to look for them.
+    """
 
     switches: dict[str, Switch] = {}  # noqa: RUF012  each struct gets one of its own
     given: dict[str, dict[str, GivenValue]] = {}  # noqa: RUF012  as above
+    warnings: tuple[str, ...] | None = None
+
+
+def text_with_warnings(sources: Sources, checked: CheckedSpecifications) -> str:
+    """Return the text of a revision, with its warnings if they are few and each file was compiled."""
+    whole = not (checked.unbuilt or checked.left_out) and len(checked.warnings) <= MOST_WARNINGS
+    return text_of(
+        StoredSpecifications(**msgspec.structs.asdict(sources), warnings=checked.warnings if whole else None)
+    )
 
 
 def text_of(sources: Sources) -> str:
@@ -88,19 +103,20 @@ async def _folder_or_kept(
         sources = folder.read()
         if kept is not None:
             sources = sources.with_topics(sources_of(kept).topics)
-        checked = await check(sources, site_keys)
+        known = kept_in(kept).warnings if kept is not None and sources_of(kept) == sources else None
+        checked = await check(sources, site_keys, known)
         findings = [*checked.unbuilt.values(), *checked.left_out.values()]
     except SpecificationsRefusedError as error:
         findings, checked = error.findings, None
     if findings and kept is not None and sources_of(kept) != sources:
         with contextlib.suppress(SpecificationsRefusedError):
-            before = await check(sources_of(kept), site_keys)
+            before = await _check_row(check, kept, site_keys)
             if not (before.unbuilt or before.left_out):
                 return StartingSpecifications(sources_of(kept), before, findings)
     if sources is None or checked is None:
         try:
             sources, _ = folder.read_usable(site_keys)
-            checked = await check(sources, site_keys)
+            checked = await check(sources, site_keys, None)
         except SpecificationsRefusedError:
             raise SpecificationsRefusedError(findings) from None
     return StartingSpecifications(sources, checked, [])
@@ -129,13 +145,19 @@ async def _check_kept(
 ) -> CheckedSpecifications:
     """Check a stored revision; if it is refused, the error names the command that discards it."""
     try:
-        return await check(sources_of(row), site_keys)
+        return await _check_row(check, row, site_keys)
     except SpecificationsRefusedError as error:
         advice = (
             f"this is revision {row.revision}, loaded by {row.who} while the appliance ran."
             " To discard it and start with the folder (--monitors): rosrv monitor reset --state DIR"
         )
         raise SpecificationsRefusedError([*error.findings, advice]) from error
+
+
+async def _check_row(
+    check: Check, row: MonitorRevisionRow, site_keys: Sequence[str]
+) -> CheckedSpecifications:
+    return await check(sources_of(row), site_keys, kept_in(row).warnings)
 
 
 def forget_revision(store: StateStore, now: float) -> int | None:

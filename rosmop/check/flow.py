@@ -1090,7 +1090,6 @@ _EFFECTS = (
 def _own_facts(function: nodes.Function) -> _FunctionFacts:
     changed, read, sites, calls, pure = {*function.parameters}, set[str](), set[int](), set[str](), True
     for node in nodes.walk(function.body):
-        sites.add(getattr(node, "site", -1))
         match node:
             case nodes.Read(name=name):
                 read.add(name)

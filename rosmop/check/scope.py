@@ -102,9 +102,12 @@ class StatementList:
 class CompilationContext:
     """The state that all functions share during compilation."""
 
-    def __init__(self, messages: MessageTypes, value_of: ValueOf, *, margins: bool = False) -> None:
+    def __init__(
+        self, messages: MessageTypes, value_of: ValueOf, *, margins: bool = False, lints: bool = True
+    ) -> None:
         self.symbols = Symbols()
         self.margins = margins
+        self.lints = lints
         self.messages = messages
         self.value_of = value_of
         self.values = ValueCodec(messages)

@@ -18,7 +18,7 @@ def lint_set(
     specifications: Sequence[tree.Specification],
     phases: Phases,
 ) -> Iterator[Diagnostic]:
-    if not any(finding.severity == "error" for finding in shared.findings):
+    if shared.lints and not any(finding.severity == "error" for finding in shared.findings):
         yield from flow_findings(shared, compiled)
     yield from bypassing(compiled, shared.publications, shared.functions)
     yield from rival_changes(specifications, phases)

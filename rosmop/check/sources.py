@@ -20,13 +20,14 @@ def compiled_from(
     definitions: Definitions,
     *,
     margins: bool = False,
+    lints: bool = True,
     without_code: Collection[str] = (),
     topics: Topics = MappingProxyType({}),
 ) -> Compiled:
     """Compile files (name to text) in this order. Raises `SpecificationError` with all errors.
 
     The specifications of files in `without_code` keep only their names, topics and services, and do nothing; they
-    act on the topics on which their text may act.
+    act on the topics on which their text may act. Without `lints`, there are no warnings.
     """
     files: list[tree.SpecificationFile] = []
     written: dict[str, tuple[str, ...]] = {}
@@ -45,7 +46,9 @@ def compiled_from(
             findings += error.findings
     if findings:
         raise SpecificationError([*findings, *findings_of(files, definitions)])
-    compiled = with_observed_topics(compile_files(files, definitions, margins=margins, topics=topics))
+    compiled = with_observed_topics(
+        compile_files(files, definitions, margins=margins, lints=lints, topics=topics)
+    )
     if not written:
         return compiled
     codes = tuple(replace(one, acts_on=written.get(one.name, one.acts_on)) for one in compiled.specifications)

@@ -65,13 +65,15 @@ def compile_files(
     definitions: Definitions,
     *,
     margins: bool = False,
+    lints: bool = True,
     topics: Topics = MappingProxyType({}),
 ) -> Compiled:
     """Compile parsed files. Raises `SpecificationError` with all errors.
 
-    With `margins`, comparisons of numbers are noted (`margins.py`). `topics` replace the topics in the files.
+    With `margins`, comparisons of numbers are noted (`margins.py`). Without `lints`, there are no warnings, and what
+    only finds warnings in files without errors is left out. `topics` replace the topics in the files.
     """
-    shared = CompilationContext(MessageTypes(definitions), value_of, margins=margins)
+    shared = CompilationContext(MessageTypes(definitions), value_of, margins=margins, lints=lints)
     pairs = [(file, specification) for file in files for specification in file.specifications]
     orders = [order for file in files for order in file.orders]
     compiled: Sequence[SpecificationCode] = ()
@@ -87,7 +89,7 @@ def compile_files(
         raise SpecificationError(findings)
     return Compiled(
         tuple(compiled),
-        tuple(sorted(findings, key=lambda finding: finding.position)),
+        tuple(sorted(findings, key=lambda finding: finding.position)) if lints else (),
         shared.functions,
         shared.symbols.sites,
         shared.types,

@@ -1,6 +1,7 @@
 """Build sets: certify, serialize, and translate to machine code."""
 
 from collections.abc import Collection, Iterable, Iterator
+from dataclasses import replace
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -25,14 +26,14 @@ class CertifiedSet(NamedTuple):
 
 
 def certified(compiled: Compiled) -> CertifiedSet:
-    """Certify and serialize a set; equal sets give equal bytes.
+    """Certify and serialize a set without its warnings; equal sets give equal bytes.
 
     Raises `SpecificationError` if an automaton differs from its formula, which is a defect.
     """
     certificates, wrong = certificates_of(compiled.specifications)
     if wrong:
         raise SpecificationError(wrong)
-    return CertifiedSet(certificates, encoded(compiled))
+    return CertifiedSet(certificates, encoded(replace(compiled, warnings=())))
 
 
 def require_loadable(data: bytes) -> None:

@@ -84,7 +84,7 @@ class Monitors(msgspec.Struct, frozen=True):
         str | None, doc("the folder that `reload` reads, or null if none was given at the start")
     ]
     differs_from_folder: bool
-    warnings: list[str]
+    warnings: Annotated[list[str], doc("found when they were loaded")]
     refused: Annotated[
         list[str], doc("why the relay rejects the specifications: all topics are blocked then")
     ]

@@ -66,7 +66,7 @@ class ContentsWanted(Message):
     """Control asks for the contents of specifications (name to text) with these message definitions.
 
     A `dry_run` gets less processor time than an order, and builds the module too. `at_start`: files with errors, such
-    as those in `broken`, do not keep the others from being compiled.
+    as those in `broken`, do not keep the others from being compiled; without `lints`, there are no warnings.
     """
 
     number: int
@@ -76,6 +76,7 @@ class ContentsWanted(Message):
     at_start: bool = False
     topics: dict[str, dict[str, str]] = msgspec.field(default_factory=dict)
     broken: list[str] = msgspec.field(default_factory=list)
+    lints: bool = True
 
 
 class ContentsFound(Message):

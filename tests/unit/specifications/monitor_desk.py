@@ -70,8 +70,12 @@ async def here(
     return await asyncio.to_thread(check, sources, site_keys, compiler=compiler)
 
 
-async def here_at_start(sources: Sources, site_keys: Sequence[str]) -> CheckedSpecifications:
-    return await asyncio.to_thread(check, sources, site_keys, compiler=contents_at_start)
+async def here_at_start(
+    sources: Sources, site_keys: Sequence[str], known: Sequence[str] | None = None
+) -> CheckedSpecifications:
+    compiler = partial(contents_at_start, lints=known is None)
+    checked = await asyncio.to_thread(check, sources, site_keys, compiler=compiler)
+    return checked if known is None else msgspec.structs.replace(checked, warnings=tuple(known))
 
 
 class Desk:

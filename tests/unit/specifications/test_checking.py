@@ -1,10 +1,12 @@
 from collections.abc import Callable
+from pathlib import Path
 
+import msgspec
 import pytest
 
 from appliance.channel.messages import PartNames
 from appliance.specifications.checking import contents, contents_at_start, parts
-from appliance.specifications.specification_files import SpecificationsRefusedError
+from appliance.specifications.specification_files import SpecificationsRefusedError, read_folder
 from rosmop.fast import batch_codegen, build
 from rosmop.fast.wasm_instance import WasmError
 from rosmop.form.compiled import Compiled
@@ -37,6 +39,25 @@ def test_a_file_is_left_out_with_the_file_whose_variables_it_uses() -> None:
 def test_nothing_is_left_out_without_an_error() -> None:
     files = {"a.rv": GOOD, "b.rv": USER}
     assert contents_at_start(files, {}) == contents(files, {})
+
+
+MONITORS = Path(__file__).parents[3] / "monitors"
+SHIPPED = sorted(MONITORS.rglob("*.rv"))
+WARNED = f"warned() {{ {TWIST} {{ if (v > 1) {{ v = 1; }} }} }}"
+
+
+@pytest.mark.parametrize("text", [WARNED, *map(Path.read_text, SHIPPED)])
+def test_without_lints_only_the_warnings_are_missing(text: str) -> None:
+    files, definitions = {"a.rv": text}, read_folder(MONITORS).definitions
+    found = contents(files, definitions)
+    assert contents_at_start(files, definitions, lints=False) == msgspec.structs.replace(found, warnings=())
+    assert any("NaN passes" in one for one in found.warnings) or text != WARNED
+
+
+def test_errors_are_found_without_lints() -> None:
+    with pytest.raises(SpecificationsRefusedError, match=r"a\.rv:1:.* error: .*missing"):
+        contents({"a.rv": WRONG}, {}, lints=False)
+    assert set(contents_at_start({"a.rv": WRONG}, {}, lints=False).unbuilt) == {"wrong"}
 
 
 @pytest.mark.parametrize("text", ["wrong() {", "wrong() { event e() /x nobody/Knows '{}' { } }"])

@@ -19,6 +19,7 @@ from appliance.specifications.specification_manager import (
     DryRunUnderWayError,
     MonitorsChangedError,
 )
+from appliance.specifications.specification_revisions import text_of
 from tests.support.site_key import LINE, NAME, OTHER_KEY, OTHER_LINE, signed
 from tests.unit.specifications.monitor_desk import A, B, C, Desk, Dialogue, here
 from tests.unit.transcripts import played, transcripts
@@ -381,6 +382,61 @@ async def test_a_load_or_removal_of_others_leaves_a_broken_file_as_the_start_lef
     assert monitors.names() == ["a", "code"]
     await monitors.load(admin.MonitorLoad({"text.rv": C, "code.rv": B}), "eve")
     assert idle() == ([], ["bytes.rv"])
+
+
+WARNED = "w() { event e(double v) /cmd geometry_msgs/Twist '{linear.x:v}' { if (v > 1) { v = 1; } } }"
+
+
+async def test_a_start_looks_for_warnings_only_in_what_was_not_loaded_before(desk: Desk) -> None:
+    looked: list[bool] = []
+    check = desk.check_at_start
+
+    async def noted(
+        sources: Sources, keys: Sequence[str], known: Sequence[str] | None
+    ) -> CheckedSpecifications:
+        looked.append(known is None)
+        return await check(sources, keys, known)
+
+    desk.check_at_start = noted
+    (desk.folder / "a.rv").write_text(WARNED)
+    warnings = (await desk.monitors()).checked.warnings
+    assert len(warnings) == 1
+    for restarted, taken_over in ((False, False), (True, False), (False, True)):
+        monitors = await desk.monitors(restarted=restarted, taken_over=taken_over)
+        assert monitors.checked.warnings == warnings
+    assert looked == [True, False, False, False]
+    row = monitors.in_force._replace(sources=text_of(monitors.sources))  # as an earlier version stored it
+    desk.store.save_monitor_revision(row)
+    for known in (False, True):
+        assert (await desk.monitors()).checked.warnings == warnings
+        assert looked.pop() is not known
+    (desk.folder / "a.rv").write_text(" " * 9 + WARNED)  # another text, which is not known
+    monitors = await desk.monitors()
+    assert (looked.pop(), monitors.revision, monitors.checked.warnings == warnings) == (True, 2, False)
+    await monitors.load(admin.MonitorLoad({"b.rv": WARNED.replace("w()", "x()")}), "eve")
+    both = monitors.checked.warnings
+    assert len(both) > 1
+    assert (await desk.monitors()).checked.warnings == both
+    assert looked.pop() is False
+
+
+async def test_a_start_looks_for_warnings_beside_a_file_that_did_nothing(desk: Desk) -> None:
+    (desk.folder / "a.rv").write_text(WARNED)
+    (desk.folder / "b.rv").write_text("nonsense")
+    monitors = await desk.monitors()
+    await monitors.load(admin.MonitorLoad({"c.rv": C}), "eve")
+    assert any("does nothing" in one for one in monitors.checked.warnings)
+    assert ["NaN passes" in one for one in (await desk.monitors()).checked.warnings] == [True]
+
+
+async def test_an_unconfirmed_change_goes_back_to_the_warnings_of_the_load(desk: Desk) -> None:
+    (desk.folder / "a.rv").write_text(WARNED)
+    monitors = await desk.monitors()
+    warnings = monitors.checked.warnings
+    await monitors.load(admin.MonitorLoad({"a.rv": A}, confirm_within=0), "eve")
+    async with asyncio.timeout(30):
+        await desk.rolled_back.wait()
+    assert (monitors.revision, monitors.checked.warnings) == (3, warnings)
 
 
 async def test_no_load_brings_a_further_error_beside_a_broken_file(desk: Desk) -> None:

@@ -2,7 +2,7 @@ import asyncio
 import contextlib
 import json
 import socket
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from appliance.features.standby.standby_summary import UNCHECKED
 from appliance.features.standby.takeover_check import TakeoverCheck
 from appliance.specifications.checking import contents_at_start
 from appliance.specifications.compiler_link import SpecificationCompiler
-from appliance.specifications.specification_files import Sources
+from appliance.specifications.specification_files import CheckedSpecifications, Sources
 from appliance.specifications.specification_revisions import text_of
 from appliance.specifications.switches import SWITCHES
 from appliance.store.state_file import IncarnationRow, MonitorRevisionRow, RevisionRow, StateStore
@@ -71,7 +71,7 @@ class Standby:
             "monitors": self.monitors,
         } | settings
         whole = Settings(state=self.home, policy=self.policy, **given)
-        compiling = (here, parts_here) if compiler is None else (compiler.check_at_start, compiler.parts)
+        compiling = (strictly, parts_here) if compiler is None else (compiler.check_at_start, compiler.parts)
         checked = Checked(
             TakeoverCheck(whole, membership or self.membership, *compiling, again=again), self.store
         )
@@ -82,6 +82,12 @@ class Standby:
         finally:
             task.cancel()
             await asyncio.wait([task])
+
+
+async def strictly(
+    sources: Sources, site_keys: Sequence[str], _known: Sequence[str] | None
+) -> CheckedSpecifications:
+    return await here(sources, site_keys)
 
 
 class Checked:
