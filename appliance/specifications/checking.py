@@ -42,8 +42,7 @@ def contents(
 ) -> Contents:
     """Compile specifications. Raises `SpecificationsRefusedError` with all errors.
 
-    `load`: also build and load the module. The monitors of the files in `unbuilt` do nothing. Without `lints`, there
-    are no warnings.
+    `load`: also build and load the module. The monitors of the files in `unbuilt` do nothing. Without `lints`, it finds only errors.
     """
     try:
         definitions = _standard().extended(Definitions.from_files(texts))

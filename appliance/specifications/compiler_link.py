@@ -73,7 +73,7 @@ class SpecificationCompiler:
     ) -> CheckedSpecifications:
         """Compile for a start: files with errors do not keep the others from coming into force.
 
-        `known` are the warnings that were found when these sources were loaded: nobody waits for them again.
+        `known` are the warnings that were found when these sources were loaded; they are not looked for again.
         """
         checked = await self._checked(sources, site_keys, (), at_start=True, lints=known is None)
         return checked if known is None else msgspec.structs.replace(checked, warnings=tuple(known))

@@ -1088,7 +1088,7 @@ _EFFECTS = (
 
 
 def _own_facts(function: nodes.Function) -> _FunctionFacts:
-    changed, read, sites, calls, pure = {*function.parameters}, set[str](), set[int](), set[str](), True
+    changed, read, calls, pure = {*function.parameters}, set[str](), set[str](), True
     for node in nodes.walk(function.body):
         match node:
             case nodes.Read(name=name):
@@ -1103,7 +1103,7 @@ def _own_facts(function: nodes.Function) -> _FunctionFacts:
         pure = pure and not isinstance(node, _EFFECTS)
     pure = pure and not any(map(is_shared, changed)) and all(map(is_shared, read - changed))
     shared = frozenset(filter(is_shared, changed | read))
-    return _FunctionFacts(shared, frozenset(sites), frozenset(calls), pure)
+    return _FunctionFacts(shared, frozenset(nodes.sites_of(function.body)), frozenset(calls), pure)
 
 
 def _facts_of(body: Sequence[nodes.Statement]) -> _BlockFacts:
