@@ -42,7 +42,8 @@ def contents(
 ) -> Contents:
     """Compile specifications. Raises `SpecificationsRefusedError` with all errors.
 
-    `load`: also build and load the module. The monitors of the files in `unbuilt` do nothing. Without `lints`, it finds only errors.
+    `load`: also build and load the module. The monitors of the files in `unbuilt` do nothing. Without `lints`, only
+    errors are found.
     """
     try:
         definitions = _standard().extended(Definitions.from_files(texts))
