@@ -51,7 +51,7 @@ class Buttons:
         self.buttons[node] = (on, at)
         if on:
             self.latched, self.stood = True, []
-            self.hands = {each: (down, 0) for each, (down, _when) in self.hands.items()}
+            self.hands = {each: (down, 0 if down else when) for each, (down, when) in self.hands.items()}
         self.heard = at
         self.judge(at)
 
@@ -67,7 +67,7 @@ class Buttons:
             self.hands[node] = (True, at if counts else 0)
             if counts and (not self.two_hands or others):
                 self.latched = False
-                self.hands = {each: (down, 0) for each, (down, _when) in self.hands.items()}
+                self.hands = {each: (down, 0 if down else when) for each, (down, when) in self.hands.items()}
         else:
             self.hands[node] = (True, when)
 
