@@ -269,6 +269,7 @@ class WasmLane:
         self._lines = [(line, home.named(line.context)) for line in module.lines] if feed.says else []
         self._said = module.said
         self._monitors = tuple(dict.fromkeys(monitors))
+        self._sources = [(one, one.sources[topic]) for one in self._monitors if topic in one.sources]
         self._memory = home.machine.memory  # it does not grow
         self._owner = self._memory.obj
         self._feed = feed
@@ -301,7 +302,7 @@ class WasmLane:
                 if monitor.seen and self._topic not in (*monitor.starting, *monitor.held_channels):
                     continue  # it only observes this topic, and goes on to
                 return False
-        return True
+        return not any(source.waits and monitor.enabled for monitor, source in self._sources)
 
     def prepare(
         self,

@@ -417,7 +417,8 @@ class Drop(FormNode, frozen=True):
 class SafeMessage(FormNode, frozen=True):
     """The only message that a monitor sends or passes on a topic while it cannot judge. Its declaration is at `site`.
 
-    If it is `stamped`, the `seq` and `stamp` of its header are not compared, and are set when it is sent.
+    If it is `stamped`, the `seq` and `stamp` of its header are not compared, and are set when it is sent; nor is the
+    frame, if the rest is zero.
     """
 
     topic: str

@@ -654,9 +654,7 @@ class MonitorSet:
                 elif monitor.code.begins:
                     fresh.append(monitor)
         if fresh:
-            began = self.began
-            self._restarted = self._start(fresh, time_ns, None)
-            self.began = began
+            self._restarted = self._start_again(fresh, time_ns)
         for monitor in self._monitors:
             if self._holds and monitor.enabled and monitor in changed:
                 monitor.start_anew()
@@ -691,6 +689,8 @@ class MonitorSet:
         monitor = self.monitor(name)
         monitor.resume()
         monitor.touch()
+        for topic in monitor.safes:
+            self._execution.forget_events(monitor, topic)
         self._agenda.schedule()
 
     # Events
@@ -749,6 +749,8 @@ class MonitorSet:
     def _follow_up(self, outcome: Outcome) -> None:
         if outcome.faults:
             self._after_faults(outcome)
+        if outcome.doubtful:
+            self._begin_again([self.monitor(name) for name in outcome.doubtful], outcome)
         if outcome.published:
             self._judge_published(outcome)
         published, faults = len(outcome.published), len(outcome.faults)
@@ -795,13 +797,25 @@ class MonitorSet:
                 self.hold(monitor, f"an event that it depends on had a fault: {fault.position}: {fault.text}")
             outcome.began_holding = (*outcome.began_holding, *(one.name for one in holding))
             if any(one.code.begins for one in monitors):
-                began = self.began
                 again = dict.fromkeys([fault.monitor, *(one.name for one in monitors if one.code.begins)])
                 fresh = [one for one in map(self.monitor, again) if one.slices is None or not fault.malformed]
-                outcome.before = [*outcome.before, self._start(fresh, outcome.time, None)]
+                self._begin_again(fresh, outcome)
                 for name in again if self._holds else ():
                     self.monitor(name).start_anew()
-                self.began = began
+
+    def _begin_again(self, monitors: Sequence[MonitorInstance], outcome: Outcome) -> None:
+        outcome.before = [*outcome.before, self._start_again(monitors, outcome.time)]
+        for monitor in monitors if self._holds else ():
+            monitor.start_anew()
+
+    def _start_again(self, monitors: Sequence[MonitorInstance], time_ns: int) -> Outcome:
+        """Start monitors again; each hears its topics first from the node from which it had them before."""
+        began = self.began
+        outcome = self._start(monitors, time_ns, None)
+        self.began = began
+        for monitor in monitors:
+            monitor.await_sources()
+        return outcome
 
     # The set
 
@@ -824,6 +838,8 @@ class MonitorSet:
         monitor.held, monitor.why_held, monitor.starting = before.held, before.why_held, before.starting
         for topic, sender in monitor.safes.items():
             sender.due = before.safes[topic].due
+        for topic, source in monitor.sources.items():
+            source.follow(before.sources[topic])
         monitor.broken = before.broken
         monitor.faults = before.faults
 

@@ -25,6 +25,7 @@ from rosmop.run.interpreter import Interpreter, LastFailure
 from rosmop.run.monitor import Handler, MonitorInstance, RunningProperty, SafeSender, Step
 from rosmop.run.outcomes import DROPPED, NOBODY, Fault, MessageSender, Outcome, Verdict
 from rosmop.run.slices import Key, Slice, Slices, of_nan
+from rosmop.run.topic_source import TopicSource
 from rosmop.runtime import safe_messages
 from rosmop.runtime.action_context import FOLDED_NS, FaultError, LogLine, MalformedError, Published
 from rosmop.runtime.wire import Buffer, WireMessage
@@ -114,11 +115,18 @@ class MonitorExecution:
         message = WireMessage(buffer, outcome.time, steps[0].event.channel)
         passing: MonitorInstance | None = None
         writers: tuple[tuple[Step, Sequence[int]], ...] = ()
+        heard: tuple[tuple[MonitorInstance, TopicSource], ...] = ()
         for step in steps:
             if step.first:
                 monitor = step.monitor
                 monitor.context.begin()
                 monitor.starting.discard(message.channel or "")
+                source = monitor.sources.get(message.channel or "")
+                if source is not None and source.waits:
+                    if not source.hears(self._node()):
+                        passing = monitor
+                        continue
+                    heard = (*heard, (monitor, source))
                 if (not monitor.seen or monitor.held) and self._first(monitor, message, outcome):
                     if not message.dropped:
                         passing = monitor
@@ -138,7 +146,26 @@ class MonitorExecution:
             if message.stopped is not None:
                 writers = (*writers, (step, [message.stopped]))
                 self._replaced(message)
+        if heard or outcome.faults:
+            self._note_nodes(steps, heard, message, outcome)
         self._finish(message, writers, outcome)
+
+    def _note_nodes(
+        self,
+        steps: Sequence[Step],
+        heard: Sequence[tuple[MonitorInstance, TopicSource]],
+        message: WireMessage,
+        outcome: Outcome,
+    ) -> None:
+        node, faulty = self._node(), {fault.monitor for fault in outcome.faults}
+        for monitor, awaited in heard:
+            if monitor.name not in faulty and not monitor.broken and not awaited.read(node):
+                outcome.doubtful = (*outcome.doubtful, monitor.name)
+        unreadable = {fault.monitor for fault in outcome.faults if fault.malformed and fault.outdates}
+        for step in steps if self.on_fault == "drop" else ():
+            source = step.monitor.sources.get(message.channel or "")
+            if step.first and source is not None and step.monitor.name in unreadable:
+                source.doubt(node)
 
     def tick(self, step: Step, time_ns: int) -> Outcome:
         self._sender, self._function = NOBODY, None
@@ -179,7 +206,22 @@ class MonitorExecution:
         sender.due = time_ns + safe.period_ns
         self._turn.now = time_ns
         self._turn.begin()
+        self.forget_events(monitor, safe.topic)
         return outcome
+
+    def forget_events(self, monitor: MonitorInstance, topic: str) -> None:
+        """Forget when the monitor's events on a topic happened, because a safe message has taken their place."""
+        if monitor.slices is not None:
+            return
+        monitor.move_to_python()
+        monitor.touch()
+        for step in monitor.steps:
+            happened = monitor.code.variables.get(f"age({step.event.name})")
+            if happened is not None and step.event.channel == topic:
+                self._interpreter.variables[happened] = -1
+
+    def _node(self) -> str:
+        return self._turn.names(self._sender.source)[1].decode(errors="replace")
 
     def expire(
         self, monitor: MonitorInstance, running: RunningProperty | None, *, explains: bool
@@ -689,6 +731,7 @@ class MonitorExecution:
         sender = monitor.safes.get(message.channel or "")
         if sender is not None:
             message.stop(sender.safe, sender.safe.site)
+            self.forget_events(monitor, sender.safe.topic)
             return
         message.dropped = True
         outcome.fatal = outcome.faults[-1]

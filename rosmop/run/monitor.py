@@ -15,6 +15,7 @@ from rosmop.run.explain import TRAIL, Bound, Exits, Steps, history_of
 from rosmop.run.interpreter import Interpreter
 from rosmop.run.slice_quota import HolderOf
 from rosmop.run.slices import Slice, Slices
+from rosmop.run.topic_source import TopicSource
 from rosmop.runtime.action_context import Context
 from rosmop.runtime.wire import WireMessage
 
@@ -180,6 +181,8 @@ class MonitorInstance:
     safes: dict[str, SafeSender] = field(default_factory=dict)
     starting: set[str] = field(default_factory=set)
     """The topics with a safe message on which no message has come since the last start."""
+    sources: dict[str, TopicSource] = field(default_factory=dict)
+    """The observed topics of a monitor declared `begin`."""
 
     @property
     def name(self) -> str:
@@ -219,6 +222,10 @@ class MonitorInstance:
 
     def start_anew(self) -> None:
         self.starting = {*self.safes}
+
+    def await_sources(self) -> None:
+        for source in self.sources.values():
+            source.waits = True
 
     def touch(self) -> None:
         if self.group is not None:
@@ -271,6 +278,9 @@ def _monitor(
         for index, event in enumerate(code.events)
     ]
     monitor.steps = tuple(step for step in steps if step.event.period_ns is None)
+    if code.begins and code.slicing is None:
+        topics = (event.topic for event in code.events if event.topic and event.part is None)
+        monitor.sources = {topic: TopicSource() for topic in topics if topic not in code.acts_on}
     monitor.timers = tuple(
         Timer(step, step.event.period_ns) for step in steps if step.event.period_ns is not None
     )

@@ -145,6 +145,8 @@ class Outcome:
     """
     began_holding: Sequence[str] = ()
     """The monitors that a fault made hold their topics."""
+    doubtful: Sequence[str] = ()
+    """The monitors that begin again, because they await the message of another node, or a readable one of it."""
     judged: Mapping[int, "Outcome"] = MappingProxyType({})
     """The outcomes of published messages in the monitors after their publisher, by index."""
     sites: Sequence[Site] = ()

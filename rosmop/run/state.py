@@ -20,6 +20,7 @@ from rosmop.logics.interface import ClockedRun, FiniteRun
 from rosmop.run.monitor import CellNames, MonitorInstance
 from rosmop.run.state_of_runs import StateTooLargeError, kept, run_of
 from rosmop.run.state_of_slices import PartSnapshot, SliceSnapshot, restore_slices
+from rosmop.run.topic_source import TopicSource
 from rosmop.runtime.values import ValueCodec
 from rosmop.types import value_types
 from rosmop.types.value_types import Type
@@ -53,6 +54,8 @@ class MonitorSnapshot(msgspec.Struct, frozen=True, array_like=True):
     variables: dict[str, Any]
     first: tuple[list[Any], list[Any]] = ([], [])
     """The initial values of parameters, and of the slices' own variables."""
+    sources: dict[str, tuple[str | None, list[str], bool]] = {}
+    """By topic: the first node, the nodes whose last bytes were no message, and whether it awaits the first."""
 
 
 def encoded(states: Sequence[MonitorSnapshot]) -> bytes:
@@ -143,6 +146,7 @@ def kept_monitor(monitor: MonitorInstance, variables: Mapping[str, Any], types: 
         [kept(running.run) for running in monitor.properties] if slices is None else [],
         {name: variables[code] for name, code in monitor.code.variables.items()},
         first,
+        {topic: (one.first, sorted(one.unreadable), one.waits) for topic, one in monitor.sources.items()},
     )
 
 
@@ -192,6 +196,10 @@ def restore(
     monitor.enabled = state.enabled
     monitor.seen, monitor.broken, monitor.faults = state.seen, state.broken, state.faults
     monitor.held, monitor.why_held = state.held, state.why_held
+    for topic, source in monitor.sources.items():
+        if topic in state.sources:
+            first, unreadable, waits = state.sources[topic]
+            source.follow(TopicSource(first, set(unreadable), waits))
 
 
 _HELD: Mapping[type, type | tuple[type, ...]] = MappingProxyType(

@@ -6,13 +6,26 @@ from rosmop.form.nodes import SafeMessage
 
 HEAD = 12
 
+_LENGTH = struct.Struct("<I")
 _STAMP = struct.Struct("<III")
 _MOST_SECONDS = (1 << 32) - 1
 
 
 def is_safe(safe: SafeMessage, buffer: bytes | bytearray | memoryview) -> bool:
-    first = HEAD if safe.stamped else 0
-    return len(buffer) == len(safe.data) and buffer[first:] == safe.data[first:]
+    """Whether a message is the safe one, but for its stamp, and but for its frame if all that follows is zero."""
+    if not safe.stamped:
+        return bytes(buffer) == safe.data
+    if len(buffer) < HEAD + _LENGTH.size:
+        return False
+    frame, body = _behind_stamp(buffer)
+    safe_frame, safe_body = _behind_stamp(safe.data)
+    return body == safe_body and (frame == safe_frame or not any(body))
+
+
+def _behind_stamp(buffer: bytes | bytearray | memoryview) -> tuple[bytes, bytes]:
+    first = HEAD + _LENGTH.size
+    end = first + _LENGTH.unpack_from(buffer, HEAD)[0]
+    return bytes(buffer[first:end]), bytes(buffer[end:])
 
 
 def sent(safe: SafeMessage, time_ns: int) -> bytes:

@@ -37,14 +37,19 @@ def _twist(before: str = "") -> TypeRow:
 _UNLIMITED = "double low = -INFINITY, high = INFINITY;"
 
 
-def _listed(*paths: str, low: str = "", high: str = "") -> TypeRow:
-    """Make `values` of the fields at `paths`. `low` and `high` are the fields of their range, if the type has them."""
-    names = [f"v{place}" for place in range(len(paths))]
+def _listed(*paths: str, low: str = "", high: str = "", may_lack: str = "") -> TypeRow:
+    """Make `values` of the fields at `paths`: none, unless each is finite but the one that a sensor `may_lack`.
+
+    `low` and `high` are the fields of their range, if the type has them.
+    """
+    names = ["lacking" if path == may_lack else f"v{place}" for place, path in enumerate(paths)]
+    finite = " && ".join(f"isfinite({name})" for name in names if name != "lacking")
     limits = {"low": low, "high": high} if low else {}
     return TypeRow(
         {**dict(zip(names, paths, strict=True)), **limits},
         parameters=", ".join(f"double {name}" for name in (*names, *limits)),
         local=f"std::vector<double> values = {{{', '.join(names)}}};"
+        + (f"\n        if (!({finite})) {{ values.clear(); }}" if len(paths) > 1 else "")
         + ("" if limits else f"\n        {_UNLIMITED}"),
         element="double",
     )
@@ -119,7 +124,7 @@ ANY_TYPE = "*"
 SENSORS = {
     "sensor_msgs/LaserScan": TypeRow({"values": "ranges", "low": "range_min", "high": "range_max"}),
     "sensor_msgs/Range": _listed("range", low="min_range", high="max_range"),
-    "sensor_msgs/NavSatFix": _listed("latitude", "longitude", "altitude"),
+    "sensor_msgs/NavSatFix": _listed("latitude", "longitude", "altitude", may_lack="altitude"),
     "sensor_msgs/Imu": _listed(
         *(f"{what}.{axis}" for what in ("angular_velocity", "linear_acceleration") for axis in "xyz")
     ),

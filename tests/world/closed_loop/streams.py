@@ -149,7 +149,7 @@ class SpeedWorld(World):
     """Commands of any size, direction and rate: the norm of the velocity and its growth have a limit."""
 
     preset: ClassVar[str] = "speed"
-    not_yet: ClassVar[Mapping[str, str]] = dict.fromkeys(("hold", "restart", "switch"), _JUMP)
+    not_yet: ClassVar[Mapping[str, str]] = {}
     span = 5000
 
     def plan(self) -> None:
@@ -389,7 +389,7 @@ class SensorWorld(EvidenceWorld):
     """A sensor that is silent, frozen, blind or unreadable."""
 
     preset: ClassVar[str] = "sensor"
-    not_yet: ClassVar[Mapping[str, str]] = {BESIDE: FORGETS}
+    not_yet: ClassVar[Mapping[str, str]] = {}
 
     def plan(self) -> None:
         r = self.random
@@ -471,7 +471,7 @@ class ArmWorld(EvidenceWorld):
     """A battery, a position fix and a check, each of which may be absent, old, invalid or too low."""
 
     preset: ClassVar[str] = "arm"
-    not_yet: ClassVar[Mapping[str, str]] = {BESIDE: FORGETS}
+    not_yet: ClassVar[Mapping[str, str]] = {}
     span = 8000
     tick = 100
 
@@ -557,7 +557,7 @@ class AgreeWorld(EvidenceWorld):
     """Two sources of the velocity that agree or not, in any part of it."""
 
     preset: ClassVar[str] = "agree"
-    not_yet: ClassVar[Mapping[str, str]] = {BESIDE: FORGETS}
+    not_yet: ClassVar[Mapping[str, str]] = {}
 
     def plan(self) -> None:
         r = self.random
@@ -635,7 +635,7 @@ class EstopWorld(World):
     """Stop buttons and resets of several nodes: ISO 13850 (stop and reset), ISO 13851 (two hands)."""
 
     preset: ClassVar[str] = "estop"
-    not_yet: ClassVar[Mapping[str, str]] = {"hold": _NO_ZERO, "cut": _NO_ZERO, "switch": _MISSES}
+    not_yet: ClassVar[Mapping[str, str]] = {}
     span = 8000
 
     def plan(self) -> None:

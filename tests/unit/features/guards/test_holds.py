@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from appliance.features.guards.message_types import VELOCITIES
 from appliance.features.guards.presets import DRIVER_CHECK, PRESETS, Guard, Preset, text_of
 from rosmop.check.sources import compiled_from
 from rosmop.form.compiled import Compiled
@@ -123,3 +124,54 @@ def test_a_holding_monitor_keeps_the_fast_path_of_what_it_observes(
     for topic, ready in (("/scan", True), ("/cmd_vel", False)):
         lane = monitors.lane(topic)
         assert lane is None or monitors.lane_ready(lane, 2) is ready
+
+
+STAMPED = [kind for kind in VELOCITIES if kind.endswith("Stamped")]
+
+
+@MADE
+@pytest.mark.parametrize("kind", VELOCITIES)
+@pytest.mark.parametrize("name", [name for name, preset in PRESETS.items() if "command" in preset.topics
+                                  and preset.topics["command"].keys() >= VELOCITIES.keys()])  # fmt: skip
+def test_a_stop_passes_a_hold_whatever_its_header(
+    name: str, kind: str, made: Callable[[Compiled], MonitorSet]
+) -> None:
+    monitors = started(text_of(Guard(name, PRESETS[name], types={"command": kind})), made)
+    monitors.hold(monitors.monitors[0], "test")
+    header = {"header__frame_id": "base_link", "header__seq": 7} if kind in STAMPED else {}
+    stop = message(kind, **header)
+    assert monitors.judge("/cmd_vel", bytearray(stop), 1).result == "passed"
+    motion = bytearray(stop[:-1] + b"\x3f")
+    assert monitors.judge("/cmd_vel", motion, 2).result == "dropped"
+
+
+@MADE
+def test_a_velocity_grows_from_zero_after_a_safe_message(made: Callable[[Compiled], MonitorSet]) -> None:
+    """The base got the guard's zero after a hold, a resume, a restart with kept state, or an `enable`."""
+    second, drive = 10**9, message("geometry_msgs/Twist", linear__x=0.5)
+    for cause in ("hold", "restart", "enable", "stop"):
+        monitors, now = started(_text(PRESETS["speed"]), made), second
+        for _ in range(100):
+            now += second // 20
+            monitors.judge("/cmd_vel", bytearray(drive), now)
+        assert monitors.value("speed", "lastX") == 0.5
+        match cause:
+            case "hold":
+                monitors.hold(monitors.monitor("speed"), "test")
+                monitors.advance(now)
+                monitors.resume("speed")
+            case "restart":
+                kept = [
+                    (one.names, one.layout, one.base(), one.cells() or None) for one in monitors.kept_groups()
+                ]
+                monitors = made(compiled_from({"guard.rv": _text(PRESETS["speed"])}, definitions()))
+                monitors.recover(kept, {}, now, restarted=True)
+            case "enable":
+                monitors.switch({"speed": False}, now)
+                monitors.switch({"speed": True}, now)
+            case "stop":
+                monitors.stop("/cmd_vel")
+        monitors.advance(now + 1)
+        buffer = bytearray(drive)
+        assert bytes(monitors.judge("/cmd_vel", buffer, now + second // 50).buffer) != drive, cause
+        assert monitors.value("speed", "lastX") <= 0.1 + 1e-9, cause

@@ -81,7 +81,7 @@ RECIPES = {
     "fence": Recipe(
         {"silent": 0.5}, by_type={"sensor_msgs/NavSatFix": {"worldFrame": True}}, velocities="bounded"
     ),
-    "sensor": Recipe({"least": 1}),
+    "sensor": Recipe(by_type={"sensor_msgs/LaserScan": {"least": 1}, "sensor_msgs/JointState": {"least": 1}}),
     "estop": Recipe(fixed={"stop": "std_msgs/Bool"}),
     "arm": Recipe(
         {"needFix": True, "needCheck": True, "silent": 0.5, "checked": 1},
@@ -164,6 +164,7 @@ REASONS: dict[tuple[str, str, str, str], str] = {
         "*",
     ): "muting is off by default: `test_muting_is_off_by_default_bounded_and_needs_a_signal_that_changes`",
     ("*", "*", "status", "NaN"): "a whole number has no NaN",
+    ("sensor", "by", "lacking", "NaN"): "an altitude is not known without a fix in three dimensions",
     ("*", "*", "fixed", "NaN"): "a whole number has no NaN",
     ("estop", "reset", "*", "absent"): "without a reset the stop stays",
     ("estop", "reset", "*", "out of range"): "every number but 0 is true",
@@ -294,7 +295,13 @@ class Lab(Guarded):
         self.advance(self.at)
 
     def run(
-        self, ms: int, *, without: str = "", bad: Callable[[], None] | None = None, drives: bool = True
+        self,
+        ms: int,
+        *,
+        without: str = "",
+        bad: Callable[[], None] | None = None,
+        drives: bool = True,
+        stands: bool = False,
     ) -> bool:
         """Let good evidence come every 50 ms, except on a topic; return whether the last command passed."""
         passed = False
@@ -306,7 +313,7 @@ class Lab(Guarded):
             if bad is not None:
                 bad()
             if drives:
-                passed = self.passes(moves=self.at > 400 or step > 8)
+                passed = self.passes(moves=not stands and (self.at > 400 or step > 8))
         return passed
 
     def own_motions(self) -> int:
@@ -432,6 +439,9 @@ def _after_a_reset(lab: Lab, place: Place) -> str:
     return "the guard moves the base" if lab.own_motions() else ""
 
 
+ZERO_FIRST = {name for name, preset in PRESETS.items() if "zeroFirst" in preset.text}
+
+
 def _after_a_hold(lab: Lab, place: Place) -> str:
     assert lab.run(1500), "an honest robot does not move"
     lab.monitors.hold(lab.monitors.monitor("guard"), "an operator asks for it")
@@ -442,6 +452,9 @@ def _after_a_hold(lab: Lab, place: Place) -> str:
     lab.run(500, drives=False)
     if lab.own_motions():
         return "the guard moves the base"
+    if lab.preset in ZERO_FIRST and lab.run(500):
+        return "a node moves the base that has not commanded zero since the hold"
+    lab.run(500, stands=True)
     lab.run(1000)
     return "" if lab.run(1500) else "an honest robot does not move afterwards"
 

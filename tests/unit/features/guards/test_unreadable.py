@@ -1,6 +1,6 @@
 """Bytes that are not a message, on a topic that a guard observes, put it in doubt: it stops what it guards."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import pytest
 
@@ -8,6 +8,8 @@ from appliance.features.guards.presets import PRESETS, Guard, text_of
 from rosmop.check.sources import compiled_from
 from rosmop.form.compiled import Compiled
 from rosmop.run.engine import MonitorSet
+from rosmop.run.outcomes import MessageSender
+from rosmop.run.topic_source import MOST, TopicSource
 from rosmop.tests.acting import message
 from rosmop.tests.on_module import on_module
 from tests.unit.features.guards.guarding import DEFINITIONS
@@ -100,6 +102,73 @@ def test_a_moving_base_is_stopped_by_an_unreadable_observation(
         monitors.resume("estop")
         monitors.judge("/cmd_vel", bytearray(STILL), now + 7)
         assert monitors.judge("/cmd_vel", bytearray(DRIVE), now + 8).result == "passed"
+
+
+BEGIN = [
+    (name, topic) for name, given in GOOD.items() if PRESETS[name].text.count("\nbegin ") for topic in given
+]
+NODES = ("", "/sensor", "/other", "/third")
+
+
+def told(monitors: MonitorSet, name: str, now: int, nodes: Mapping[str, int], broken: str = "") -> str:
+    """Give a message on each topic from these nodes (`""`: all other topics), and return what becomes of a motion."""
+    for topic, data in GOOD[name].items():
+        node = nodes.get(topic, nodes.get("", 0))
+        if node:
+            raw = bytearray(b"\1" if topic == broken else data)
+            monitors.judge(PRESETS[name].given_topics[topic], raw, now, MessageSender(node))
+    monitors.judge("/cmd_vel", bytearray(STILL), now, MessageSender(3))
+    return monitors.judge("/cmd_vel", bytearray(DRIVE), now, MessageSender(3)).result
+
+
+@MADE
+@pytest.mark.parametrize("kept", [False, True], ids=["running", "restarted"])
+@pytest.mark.parametrize(("name", "damaged"), BEGIN)
+def test_no_other_node_takes_the_place_of_one_whose_bytes_are_unreadable(
+    name: str, damaged: str, kept: bool, made: Callable[[Compiled], MonitorSet]
+) -> None:
+    def named() -> MonitorSet:
+        monitors = started(name, made)
+        monitors.name_senders(lambda source: ("10.0.0.1", NODES[source]))
+        return monitors
+
+    monitors, now = named(), SECOND
+    for topic, data in BEFORE.get(name, {}).items():
+        monitors.judge(PRESETS[name].given_topics[topic], bytearray(data), now, MessageSender(1))
+    results = [told(monitors, name, now := now + SECOND // 100, {"": 1}) for _ in range(8)]
+    assert results[-1] == "passed"
+    told(monitors, name, now := now + SECOND // 100, {"": 1}, damaged)
+    if kept:
+        groups = [(one.names, one.layout, one.base(), one.cells() or None) for one in monitors.kept_groups()]
+        monitors = named()
+        monitors.recover(groups, {}, now, restarted=True)
+    for switched in (False, True):
+        if switched:
+            for enabled in (False, True):
+                monitors.switch({name: enabled}, now)
+        for _ in range(150):
+            now += SECOND // 100
+            for topic, data in BEFORE.get(name, {}).items():
+                monitors.judge(PRESETS[name].given_topics[topic], bytearray(data), now, MessageSender(2))
+            result = told(monitors, name, now, {"": 1, damaged: 2})
+            assert result == "changed" or (name, damaged) == ("zone", "mute")
+    for topic, data in BEFORE.get(name, {}).items():
+        monitors.judge(PRESETS[name].given_topics[topic], bytearray(data), now, MessageSender(1))
+    results = [told(monitors, name, now := now + SECOND // 100, {"": 1}) for _ in range(150)]
+    assert results[-1] == "passed"
+
+
+def test_a_node_that_is_not_the_first_keeps_the_guard_in_doubt_and_never_takes_its_place() -> None:
+    source = TopicSource()
+    assert source.hears("/a") and source.read("/a") and source.hears("/b")
+    source.doubt("/b")
+    assert not source.hears("/a") and not source.hears("/c")
+    assert source.hears("/b") and not source.read("/b") and source.waits
+    assert not source.hears("/b") and source.hears("/a") and source.read("/a") and not source.waits
+    for number in range(20):
+        source.doubt(f"/{number}")
+    assert len(source.unreadable) == MOST + 1
+    assert not any([source.read(f"/{number}") for number in range(20)]) and not source.hears("/a")
 
 
 def test_a_goal_is_cancelled_in_time_despite_an_unreadable_result() -> None:
