@@ -26,7 +26,7 @@ from tests.world.closed_loop.messages import (
     scan,
     travels,
 )
-from tests.world.closed_loop.world import BESIDE, FORGETS, SLACK, World, void
+from tests.world.closed_loop.world import SLACK, World, void
 
 PERSON_RADIUS = 0.2
 KINDS = {

@@ -28,7 +28,7 @@ from tests.world.closed_loop.messages import (
     steering,
     values,
 )
-from tests.world.closed_loop.world import BESIDE, FORGETS, SLACK, World, void
+from tests.world.closed_loop.world import SLACK, World, void
 
 NEVER = -(10**9)
 _JUMP = "the guard takes up its last velocity, though the base got a stop from the engine"

@@ -452,7 +452,7 @@ def _after_a_hold(lab: Lab, place: Place) -> str:
     lab.run(500, drives=False)
     if lab.own_motions():
         return "the guard moves the base"
-    if lab.preset in ZERO_FIRST and lab.run(500):
+    if lab.preset in ZERO_FIRST and lab.kinds["command"] in VELOCITIES and lab.run(500):
         return "a node moves the base that has not commanded zero since the hold"
     lab.run(500, stands=True)
     lab.run(1000)
