@@ -1,7 +1,7 @@
 """Worlds with a base that moves: among obstacles and persons (`separation`), and inside a fence (`fence`)."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -154,7 +154,6 @@ class SeparationWorld(DrivenWorld):
     """Walls and persons around a base with a scanner: ISO 13855 and ISO/TS 15066, speed and separation."""
 
     preset: ClassVar[str] = "separation"
-    not_yet: ClassVar[Mapping[str, str]] = {}
 
     def plan(self) -> None:
         r = self.random
@@ -388,7 +387,6 @@ class FenceWorld(DrivenWorld):
     """A base inside a polygon, or at first outside: not a centimetre is left outside."""
 
     preset: ClassVar[str] = "fence"
-    not_yet: ClassVar[Mapping[str, str]] = {}
     tick = 50
 
     def plan(self) -> None:

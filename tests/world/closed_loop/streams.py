@@ -4,7 +4,7 @@ A base executes the last command that it got. So each oracle asks which motion i
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -31,9 +31,6 @@ from tests.world.closed_loop.messages import (
 from tests.world.closed_loop.world import SLACK, World, void
 
 NEVER = -(10**9)
-_JUMP = "the guard takes up its last velocity, though the base got a stop from the engine"
-_MISSES = "while the guard is disabled it misses a press, and after that it knows nothing of it"
-_NO_ZERO = "after a resume, a node that stood still before the hold need not stand still again"
 VELOCITIES = (TWIST, TWIST, TWIST, TWIST_STAMPED, ACKERMANN, ACKERMANN_STAMPED)
 
 
@@ -149,7 +146,6 @@ class SpeedWorld(World):
     """Commands of any size, direction and rate: the norm of the velocity and its growth have a limit."""
 
     preset: ClassVar[str] = "speed"
-    not_yet: ClassVar[Mapping[str, str]] = {}
     span = 5000
 
     def plan(self) -> None:
@@ -389,7 +385,6 @@ class SensorWorld(EvidenceWorld):
     """A sensor that is silent, frozen, blind or unreadable."""
 
     preset: ClassVar[str] = "sensor"
-    not_yet: ClassVar[Mapping[str, str]] = {}
 
     def plan(self) -> None:
         r = self.random
@@ -471,7 +466,6 @@ class ArmWorld(EvidenceWorld):
     """A battery, a position fix and a check, each of which may be absent, old, invalid or too low."""
 
     preset: ClassVar[str] = "arm"
-    not_yet: ClassVar[Mapping[str, str]] = {}
     span = 8000
     tick = 100
 
@@ -557,7 +551,6 @@ class AgreeWorld(EvidenceWorld):
     """Two sources of the velocity that agree or not, in any part of it."""
 
     preset: ClassVar[str] = "agree"
-    not_yet: ClassVar[Mapping[str, str]] = {}
 
     def plan(self) -> None:
         r = self.random
@@ -635,7 +628,6 @@ class EstopWorld(World):
     """Stop buttons and resets of several nodes: ISO 13850 (stop and reset), ISO 13851 (two hands)."""
 
     preset: ClassVar[str] = "estop"
-    not_yet: ClassVar[Mapping[str, str]] = {}
     span = 8000
 
     def plan(self) -> None:

@@ -36,7 +36,6 @@ from tests.world.closed_loop.guard_run import Change, RunningGuard, Value, param
 from tests.world.closed_loop.messages import STILL, TWIST, Legs, command, legs_of, moves, travels
 
 BESIDE = "a start again beside another node"
-FORGETS = "the guard begins again, forgets its sensor, and takes the other node for it"
 LAWS = ("L1", "L2", "L3", "L4", "L5", "L6", "live")
 SLACK = 30
 """Milliseconds that a guard has for an act: its timers run every 10 or 20 ms."""
