@@ -23,9 +23,9 @@ from rosmop.run.explain import Bound, of_slice
 from rosmop.run.guards import Guards
 from rosmop.run.interpreter import Interpreter, LastFailure
 from rosmop.run.monitor import Handler, MonitorInstance, RunningProperty, SafeSender, Step
+from rosmop.run.origins import Origin
 from rosmop.run.outcomes import DROPPED, NOBODY, Fault, MessageSender, Outcome, Verdict
 from rosmop.run.slices import Key, Slice, Slices, of_nan
-from rosmop.run.topic_source import TopicSource
 from rosmop.runtime import safe_messages
 from rosmop.runtime.action_context import FOLDED_NS, FaultError, LogLine, MalformedError, Published
 from rosmop.runtime.wire import Buffer, WireMessage
@@ -115,7 +115,7 @@ class MonitorExecution:
         message = WireMessage(buffer, outcome.time, steps[0].event.channel)
         passing: MonitorInstance | None = None
         writers: tuple[tuple[Step, Sequence[int]], ...] = ()
-        heard: tuple[tuple[MonitorInstance, TopicSource], ...] = ()
+        heard: tuple[tuple[MonitorInstance, Origin], ...] = ()
         for step in steps:
             if step.first:
                 monitor = step.monitor
@@ -153,7 +153,7 @@ class MonitorExecution:
     def _note_nodes(
         self,
         steps: Sequence[Step],
-        heard: Sequence[tuple[MonitorInstance, TopicSource]],
+        heard: Sequence[tuple[MonitorInstance, Origin]],
         message: WireMessage,
         outcome: Outcome,
     ) -> None:

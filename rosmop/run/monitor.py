@@ -13,9 +13,9 @@ from rosmop.form.nodes import SafeMessage
 from rosmop.logics.interface import FormulaRun, Run
 from rosmop.run.explain import TRAIL, Bound, Exits, Steps, history_of
 from rosmop.run.interpreter import Interpreter
+from rosmop.run.origins import Origin
 from rosmop.run.slice_quota import HolderOf
 from rosmop.run.slices import Slice, Slices
-from rosmop.run.topic_source import TopicSource
 from rosmop.runtime.action_context import Context
 from rosmop.runtime.wire import WireMessage
 
@@ -181,7 +181,7 @@ class MonitorInstance:
     safes: dict[str, SafeSender] = field(default_factory=dict)
     starting: set[str] = field(default_factory=set)
     """The topics with a safe message on which no message has come since the last start."""
-    sources: dict[str, TopicSource] = field(default_factory=dict)
+    sources: dict[str, Origin] = field(default_factory=dict)
     """The observed topics of a monitor declared `begin`."""
 
     @property
@@ -280,7 +280,7 @@ def _monitor(
     monitor.steps = tuple(step for step in steps if step.event.period_ns is None)
     if code.begins and code.slicing is None:
         topics = (event.topic for event in code.events if event.topic and event.part is None)
-        monitor.sources = {topic: TopicSource() for topic in topics if topic not in code.acts_on}
+        monitor.sources = {topic: Origin() for topic in topics if topic not in code.acts_on}
     monitor.timers = tuple(
         Timer(step, step.event.period_ns) for step in steps if step.event.period_ns is not None
     )

@@ -18,9 +18,9 @@ import msgspec
 from rosmop.form.compiled import Compiled
 from rosmop.logics.interface import ClockedRun, FiniteRun
 from rosmop.run.monitor import CellNames, MonitorInstance
+from rosmop.run.origins import Origin
 from rosmop.run.state_of_runs import StateTooLargeError, kept, run_of
 from rosmop.run.state_of_slices import PartSnapshot, SliceSnapshot, restore_slices
-from rosmop.run.topic_source import TopicSource
 from rosmop.runtime.values import ValueCodec
 from rosmop.types import value_types
 from rosmop.types.value_types import Type
@@ -55,7 +55,7 @@ class MonitorSnapshot(msgspec.Struct, frozen=True, array_like=True):
     first: tuple[list[Any], list[Any]] = ([], [])
     """The initial values of parameters, and of the slices' own variables."""
     sources: dict[str, tuple[str | None, list[str], bool]] = {}
-    """By topic: the first node, the nodes whose last bytes were no message, and whether it awaits the first."""
+    """By topic: the first node, the nodes whose last bytes were not a message, and whether it awaits the first."""
 
 
 def encoded(states: Sequence[MonitorSnapshot]) -> bytes:
@@ -199,7 +199,7 @@ def restore(
     for topic, source in monitor.sources.items():
         if topic in state.sources:
             first, unreadable, waits = state.sources[topic]
-            source.follow(TopicSource(first, set(unreadable), waits))
+            source.follow(Origin(first, set(unreadable), waits))
 
 
 _HELD: Mapping[type, type | tuple[type, ...]] = MappingProxyType(

@@ -8,8 +8,8 @@ from appliance.features.guards.presets import PRESETS, Guard, text_of
 from rosmop.check.sources import compiled_from
 from rosmop.form.compiled import Compiled
 from rosmop.run.engine import MonitorSet
+from rosmop.run.origins import MOST, Origin
 from rosmop.run.outcomes import MessageSender
-from rosmop.run.topic_source import MOST, TopicSource
 from rosmop.tests.acting import message
 from rosmop.tests.on_module import on_module
 from tests.unit.features.guards.guarding import DEFINITIONS
@@ -159,7 +159,7 @@ def test_no_other_node_takes_the_place_of_one_whose_bytes_are_unreadable(
 
 
 def test_a_node_that_is_not_the_first_keeps_the_guard_in_doubt_and_never_takes_its_place() -> None:
-    source = TopicSource()
+    source = Origin()
     assert source.hears("/a") and source.read("/a") and source.hears("/b")
     source.doubt("/b")
     assert not source.hears("/a") and not source.hears("/c")

@@ -3,21 +3,21 @@
 from dataclasses import dataclass, field
 
 MOST = 8
-"""Nodes whose bytes were no message; more are as one that never sends a message again."""
+"""Nodes whose bytes were not a message; more are as one that never sends a message again."""
 
 
 @dataclass(eq=False, slots=True)
-class TopicSource:
+class Origin:
     """The nodes of a topic that a monitor declared `begin` only observes.
 
     When the monitor begins again, it hears only the first node until that has sent a message, and until each node
-    whose bytes were no message has sent one. So no other node takes the place of the one that failed.
+    whose bytes were not a message has sent one. So no other node takes the place of the one that failed.
     """
 
     first: str | None = None
     """The node of the first message since the monitor was loaded."""
     unreadable: set[str] = field(default_factory=set)
-    """The nodes whose last bytes were no message, at most one more than `MOST`."""
+    """The nodes whose last bytes were not a message, at most one more than `MOST`."""
     waits: bool = True
     """Whether no message of the first node has come since the beginning."""
 
@@ -27,7 +27,7 @@ class TopicSource:
             not self.waits or node in self.unreadable or (not self.unreadable and self.first in (None, node))
         )
 
-    def follow(self, before: "TopicSource") -> None:
+    def follow(self, before: "Origin") -> None:
         self.first, self.unreadable, self.waits = before.first, before.unreadable, before.waits
 
     def doubt(self, node: str) -> None:
