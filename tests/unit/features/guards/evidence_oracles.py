@@ -149,6 +149,8 @@ def arming(seed: int, events: int = 50) -> None:
     for _ in range(events):
         moved, was = trace.moving, trace.now
         due = min(sources[one].heard + sources[one].silent for one in wanted)
+        if all(good.get(one, False) and sources[one].alone(trace.now, sources[one].silent) for one in wanted):
+            bad_since = None
         trace.wait(pause(chance, silent, 120))
         if moved:
             begin = due if bad_since is None else min(due, bad_since)

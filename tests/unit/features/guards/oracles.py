@@ -53,7 +53,7 @@ def watchdog(seed: int, events: int = 40, slower: float = 1) -> None:
         ends = [at + silent for at in moving.values()]
         _judge_stops(trace, ends, was, moved=moved)
         moving = {
-            node: at for node, at in moving.items() if not any(stop >= at + silent for stop in trace.stops)
+            node: at for node, at in moving.items() if not any(stop > at + silent for stop in trace.stops)
         }
         node, legs = chance.choice(nodes), motion(chance)
         run = runs.setdefault(node, Run())
@@ -150,7 +150,7 @@ def enabling_device(seed: int, events: int = 40) -> None:
                 assert any(end <= trace.now for end in dues), trace.said("a stop, and all devices are held")
         if not held():
             zeros.stop(devices.silence(trace.now))
-        was_silent |= {node for node, at in devices.heard.items() if trace.now - at > silent}
+        was_silent |= {node for node, at in devices.heard.items() if trace.now - at >= silent}
         if chance.random() < 0.5:
             hand = chance.choice(hands)
             on = chance.random() < 0.85
@@ -205,7 +205,7 @@ def stop_button(seed: int, events: int = 60, *, two_hands: bool = False) -> None
     def reset(hand: int) -> None:
         nonlocal latched, unsure
         first, last = up.pop(hand, (trace.now, trace.now))
-        sure, perhaps = trace.now - last >= 100, trace.now - first >= 100
+        sure, perhaps = trace.now - last > 100, trace.now - first >= 100
         if hand in down or not (buttons.all_heard(trace.now) and buttons.all_are(False)) or not perhaps:
             down.add(hand)
             return
@@ -274,8 +274,8 @@ def operating_mode(seed: int, events: int = 40) -> None:
     switches, zeros = Switches(silent), Zeros(20)
     speakers = (3, 4) if chance.random() < 0.4 else (3,)
 
-    def automatic() -> bool:
-        return switches.all_heard(trace.now) and switches.all_are(False)
+    def automatic(tick: int = 0) -> bool:
+        return switches.all_heard(trace.now - tick) and switches.all_are(False)
 
     for _ in range(events):
         moved, was = not slow(trace.force, v_max, w_max), trace.now
@@ -291,17 +291,17 @@ def operating_mode(seed: int, events: int = 40) -> None:
             trace.observe("by", boolean(manual), node, manual)
             if not switches.all_are(False):
                 zeros.stop()
-            if not automatic():
+            if not automatic(20):
                 assert slow(trace.force, v_max, w_max), trace.said("manual mode, and the base is faster")
             continue
         legs = motion(chance)
         got = trace.command(legs, 1)
         limited = (*scaled(legs[:3], v_max), *scaled(legs[3:], w_max))
         if not automatic():
-            zeros.stop()
+            zeros.stop(switches.silence(trace.now))
         if slow(legs, v_max, w_max) or (automatic() and 1 in zeros.sure):
             assert got == legs, trace.said(f"{legs} must pass")
-        elif got != legs or not automatic() or 1 not in zeros.perhaps:
+        elif got != legs or not automatic(20) or 1 not in zeros.perhaps:
             assert got is not None and near(got, limited), trace.said(f"{got} is not {limited}")
         if slow(legs, v_max, w_max) and automatic():
             zeros.add(1)
