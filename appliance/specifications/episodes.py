@@ -98,6 +98,11 @@ class Repetitions:
     def some(self) -> bool:
         return bool(self._known)
 
+    @property
+    def waits(self) -> bool:
+        """Return whether an action is counted that no record has yet."""
+        return any(known.waits is not None for known in self._known.values())
+
     def take(self, event: MonitorEvent, now: float) -> MonitorEvent | None:
         """Return the report to record now, if any; it stands for all actions since the last record."""
         key = self._key(event)

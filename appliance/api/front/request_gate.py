@@ -84,7 +84,7 @@ class RequestGate:
         self._tunnels = tunnels
         self._networks = tuple(networks)
         self._limits = limits
-        self._doorkeeper = doorkeeper
+        self.doorkeeper = doorkeeper
         self._journal = journal
         self._names = {"localhost", *(name.lower() for name in names)}
         self._rate = Buckets(limits.requests_per_second, limits.burst)
@@ -95,7 +95,7 @@ class RequestGate:
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
             return
-        answer = _Answer(scope, send, self._journal, self._doorkeeper)
+        answer = _Answer(scope, send, self._journal, self.doorkeeper)
         gone: asyncio.Future[None] | None = None
         try:
             bearer, body = await self._pass(scope, receive)
@@ -135,7 +135,7 @@ class RequestGate:
         wait = self._rate.take(host, clock.now())
         if wait:
             raise too_many("too-many-requests", "too many requests from this host", wait)
-        self._doorkeeper.require_unblocked(host)
+        self.doorkeeper.require_unblocked(host)
         self._check_tunnel(host, path, renewal=False)
 
     async def _pass(self, scope: Scope, receive: Receive) -> tuple[Bearer | None, bytes]:
@@ -144,7 +144,7 @@ class RequestGate:
         wait = rate.take(host, clock.now())
         if wait:
             raise too_many("too-many-requests", "too many requests from this host", wait)
-        self._doorkeeper.require_unblocked(host)
+        self.doorkeeper.require_unblocked(host)
         headers = Headers(scope=scope)
         self._check_host(headers)
         _check_origin(scope, headers)
@@ -152,7 +152,7 @@ class RequestGate:
         renewal = _RENEWAL.fullmatch(path) is not None
         self._check_tunnel(host, path, renewal=renewal)
         if path not in PUBLIC and not renewal and not is_console(path):
-            bearer = await self._doorkeeper.recognise(headers.get("authorization"), host)
+            bearer = await self.doorkeeper.recognise(headers.get("authorization"), host)
         limit = int(self._limits.body_bytes) if bearer is not None else _LONGEST_ANONYMOUS_BODY
         if renewal or path == "/v1/enrol" or path in _OF_FEATURES:
             limit = _REQUEST_BODY
@@ -203,7 +203,7 @@ class _Answer:
     """An answer, which gets hardening headers and a time limit, and is reported when its status is known."""
 
     def __init__(self, scope: Scope, send: Send, journal: Journal, doorkeeper: TokenAuthenticator) -> None:
-        self._doorkeeper = doorkeeper
+        self.doorkeeper = doorkeeper
         self._scope = scope
         self._send = send
         self._journal = journal
@@ -222,7 +222,7 @@ class _Answer:
             for name, value in _HEADERS.items():
                 headers.setdefault(name, value)
             self._report(message["status"])
-        elif self.bearer is not None and self._doorkeeper.is_blocked(self._scope["client"][0]):
+        elif self.bearer is not None and self.doorkeeper.is_blocked(self._scope["client"][0]):
             raise ConnectionAbortedError("this host was blocked by an operator")
         async with asyncio.timeout(_SEND_SECONDS):
             await self._send(message)

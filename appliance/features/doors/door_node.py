@@ -142,7 +142,7 @@ class DoorNode:
         self.node = node
         self._topics = DOOR_TOPICS.bounds.sized(most_topics)
         self._calls = calls
-        self._waiting_calls = of_hosts("calls of this door that wait for answers", DOOR_CALLS.bounds.whole)
+        self.waiting_calls = of_hosts("calls of this door that wait for answers", DOOR_CALLS.bounds.whole)
         self._types = types
         self._built_in = built_in
         self._publications: dict[str, _Publication] = {}
@@ -432,10 +432,10 @@ class DoorNode:
         given = request.values
         values = given.copy() if isinstance(given, Raw) else given  # not the whole frame
         size = memoryview(values).nbytes
-        if reason := self._waiting_calls.refusal(client.memory.host):
+        if reason := self.waiting_calls.refusal(client.memory.host):
             raise LimitExceededError(TOO_MANY_CALLS + reason)
         self._calls.take(size, TOO_MANY_CALLS)
-        self._waiting_calls.charge(client.memory.host)
+        self.waiting_calls.charge(client.memory.host)
         self._tasks.start(self._call(replace(request, values=values), client, size))
 
     async def _call(self, request: CallOfService, client: DoorClient, size: int) -> None:
@@ -457,7 +457,7 @@ class DoorNode:
                 if not self._calls_of[client]:
                     del self._calls_of[client]
             self._calls.add(-size)
-            self._waiting_calls.give_back(client.memory.host)
+            self.waiting_calls.give_back(client.memory.host)
 
     async def _call_node(self, request: CallOfService, seconds: float) -> Raw | bytes:
         header = await self.node.probe_service(request.service)

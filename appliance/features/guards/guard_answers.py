@@ -38,7 +38,7 @@ class PresetRow(msgspec.Struct, frozen=True):
 class LastStop(msgspec.Struct, frozen=True):
     """The last stop of a guard since control started: it sent its safe message, or put it in the place of commands."""
 
-    since: Annotated[Moment, doc("its first action")]
+    since: Annotated[Moment, doc("its first action, in seconds since the epoch")]
     until: Annotated[Moment | None, doc("its last action, or null while it goes on")]
     actions: Annotated[int, doc("the safe messages so far")]
     cause: Annotated[str, doc("the guard's own line, a fault, or why it cannot judge")]

@@ -139,22 +139,22 @@ def _state(state: Path) -> Iterator[SelftestFinding]:
         yield warn("state", f"{state}: this user may not write", "run as the appliance's owner, or root")
     else:
         yield ok("state", f"{state}, mode {mode & 0o777:o}")
-    yield from run_check("restore", lambda: _restore(state))
-    yield from run_check("pair", lambda: _pair(state))
+    yield from run_check("restore", lambda: unfinished_restore(state))
+    yield from run_check("pair", lambda: membership(state))
     yield from run_check("secrets", lambda: _secrets(state))
     yield from run_check("space", lambda: _space(state))
     yield from run_check("clock", lambda: _clock(state))
     yield from run_check("certificates", lambda: _certificates(state))
 
 
-def _restore(state: Path) -> Iterator[SelftestFinding]:
+def unfinished_restore(state: Path) -> Iterator[SelftestFinding]:
     try:
         refuse_half_restored(state)
     except StartError as error:
         yield fail("restore", str(error), "rosrv restore")
 
 
-def _pair(state: Path) -> Iterator[SelftestFinding]:
+def membership(state: Path) -> Iterator[SelftestFinding]:
     """One of two appliances does not start with a membership that it cannot read."""
     try:
         pairing = pairing_in(state)

@@ -35,9 +35,9 @@ ROS_PACKAGES = {path.name: package for path, package in ROS_PROGRAMS.items()}
 def machine(settings: Settings, *, running: bool) -> Iterator[SelftestFinding]:
     """Check this machine. `running` is whether an appliance with these settings already uses its ports."""
     yield from run_check("python", _python)
-    yield from run_check("programs", _programs)
+    yield from run_check("programs", programs)
     yield from run_check("users", _users)
-    yield from run_check("kernel", lambda: _kernel(settings))
+    yield from run_check("kernel", lambda: kernel(settings))
     if running:
         yield ok("ports", "in use by the running appliance")
     else:
@@ -49,7 +49,7 @@ def _python() -> Iterator[SelftestFinding]:
     yield ok("python", f"{version}, {sys.executable}")
 
 
-def _programs() -> Iterator[SelftestFinding]:
+def programs() -> Iterator[SelftestFinding]:
     for name, path, package, missing in (
         *((path.name, path, package, fail) for path, package in ROS_PROGRAMS.items()),
         ("charon", _CHARON, "charon-systemd", warn),
@@ -104,7 +104,7 @@ def _name_of_number(number: int) -> str | None:
         return None
 
 
-def _kernel(settings: Settings) -> Iterator[SelftestFinding]:
+def kernel(settings: Settings) -> Iterator[SelftestFinding]:
     if settings.isolation == "none":
         yield warn(
             "isolation",
@@ -128,7 +128,7 @@ def _kernel(settings: Settings) -> Iterator[SelftestFinding]:
     try:
         yield ok("namespaces", "a network namespace can be created")
         if settings.isolation == "netns":
-            yield from run_check("sysctl", lambda: _settings_of_the_kernel(read_only_settings()))
+            yield from run_check("sysctl", lambda: kernel_settings(read_only_settings()))
         yield from run_check("veth", lambda: _veth(namespace))
         interfaces.set_link(namespace, "lo", up=True)
         yield from run_check("firewall", lambda: _firewall(settings, namespace))
@@ -137,7 +137,7 @@ def _kernel(settings: Settings) -> Iterator[SelftestFinding]:
         namespace.delete()
 
 
-def _settings_of_the_kernel(read_only: list[str]) -> Iterator[SelftestFinding]:
+def kernel_settings(read_only: list[str]) -> Iterator[SelftestFinding]:
     if read_only:
         text = f"{', '.join(read_only)} cannot be written: /proc/sys is read-only"
         yield fail(

@@ -922,14 +922,14 @@ class LeaseFirewall:
         self._written = None  # type: Optional[List[str]]
         self._rules = 0
         self._restoring = threading.Lock()
-        self._waiting = False
+        self.waiting = False
 
     def admit(self, name: str, left: Left = always) -> None:
         """Raise `UncertainError` if the time that is left ends before the rules are in force."""
         before, self._written = self._written, None
-        self._waiting = True  # a trial ends, because only one program may have the lock of iptables
+        self.waiting = True  # a trial ends, because only one program may have the lock of iptables
         with self._restoring:
-            self._waiting = False
+            self.waiting = False
             try:
                 self._write(name, left)
             except UncertainError:
@@ -961,12 +961,12 @@ class LeaseFirewall:
                     text = iptables_rules(self._settings, name, self._chains(self._unhindered))
                     self._run(["iptables-restore", "--test", "--noflush"], text, self._unhindered)
             except UncertainError as error:
-                if self._waiting:
+                if self.waiting:
                     raise PostponedError(str(error)) from error
                 raise
 
     def _unhindered(self) -> float:
-        return 0.0 if self._waiting else _PROGRAM_SECONDS
+        return 0.0 if self.waiting else _PROGRAM_SECONDS
 
     @property
     def read(self) -> bool:
@@ -1245,7 +1245,7 @@ class LeaseEnforcement:
         log: BoundedLog,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._firewall = firewall
+        self.firewall = firewall
         self._idle = idle
         self._log = log
         self._names = sorted(appliances)
@@ -1267,18 +1267,18 @@ class LeaseEnforcement:
 
     def _list(self) -> None:
         changes = self._changes
-        present = self._firewall.present()
+        present = self.firewall.present()
         if changes % 2 == 0:
             self._listed = changes, present
 
     def _try_next(self) -> None:
-        self._firewall.try_out(next(name for name in self._names if name != self._admitted))
+        self.firewall.try_out(next(name for name in self._names if name != self._admitted))
 
     def admit(self, name: str, left: Left = always) -> None:
         self._changes += 1
         try:
             connecting = self._idle.connecting()
-            self._firewall.admit(name, left)
+            self.firewall.admit(name, left)
         finally:
             self._changes += 1
         self._admitted = name
@@ -1292,9 +1292,9 @@ class LeaseEnforcement:
             self._idle.go_on()
         listed, self._listed = self._listed, None
         try:
-            if listed is not None and listed[0] == self._changes and not self._firewall.intact(listed[1]):
+            if listed is not None and listed[0] == self._changes and not self.firewall.intact(listed[1]):
                 cause = "another program changed the firewall rules of the witness"
-                if not self._firewall.read:
+                if not self.firewall.read:
                     cause = "the firewall rules of the witness could not be read after they were written"
                 self._log.add(cause + "; they are written again")
                 enforce_again()

@@ -71,7 +71,7 @@ stops_everything = _body("safe TYPE { } on command every 100ms;\nevent drive() c
 
 def _forgetful(guard: RunningGuard) -> None:
     guard.restart(guard.now, lost=True)
-    _resume(guard)
+    resume_guard(guard)
 
 
 def _deaf(guard: RunningGuard, topic: str, data: bytes, at: int, node: int) -> Any:
@@ -100,7 +100,7 @@ def _late(base: Base, at: int, legs: Legs) -> None:
     base.orders.append((at + 3 * base.lag + 150, legs))
 
 
-_resume, _tell, _restart, _wanted = (
+resume_guard, _tell, _restart, _wanted = (
     RunningGuard.resume,
     RunningGuard.tell,
     RunningGuard.restart,

@@ -365,8 +365,8 @@ class EvidenceWorld(World):
     unfit_from = NEVER
     enabled_at = NEVER
 
-    def _enable(self) -> None:
-        super()._enable()
+    def enable_guard(self) -> None:
+        super().enable_guard()
         self.enabled_at = self.now
 
     def _pardoned(self) -> bool:
@@ -415,8 +415,8 @@ class SensorWorld(EvidenceWorld):
         if self.fault != "dead" and self.random.random() < 0.5:
             self.after(self.now + self.random.uniform(300, 2000), lambda: setattr(self, "fault", ""))
 
-    def _enable(self) -> None:
-        super()._enable()
+    def enable_guard(self) -> None:
+        super().enable_guard()
         self.shown, self.repeated = [], 0  # the guard counts from its new beginning
 
     def _good(self) -> bytes:
@@ -772,12 +772,12 @@ class EstopWorld(World):
 
     def _doubt(self, law: str) -> None:
         self.doubtful, self.fresh_from = law, self.now
-        self.after(self.now + self.random.choice((50, 300, 1000)), self._resume)
+        self.after(self.now + self.random.choice((50, 300, 1000)), self.resume_guard)
 
-    def _resume(self) -> None:
+    def resume_guard(self) -> None:
         """Resume the guard: the act of a person, after which each node stands still before it moves."""
         lost_at = self.fresh_from
-        super()._resume()
+        super().resume_guard()
         if self.doubtful == "L5":  # nothing is known of a button that has said nothing since
             self.stops = {node: button for node, button in self.stops.items() if button.heard >= lost_at}
             self.needs_reset = self._pressed()
@@ -824,8 +824,8 @@ class EstopWorld(World):
             if self.silent and self.now > button.heard + self.silent * 1000 + 100 + SLACK:
                 self.broken("L4", f"a motion stays in force while the button of node {one} is silent")
 
-    def _enable(self) -> None:
-        super()._enable()
+    def enable_guard(self) -> None:
+        super().enable_guard()
         if self._pressed():
             self._latch()
 

@@ -242,9 +242,9 @@ class World:
         self.trace("the guard holds")
         self.holding = True
         self.guard.hold()
-        self.after(self.now + self.random.choice((50, 300, 1000)), self._resume)
+        self.after(self.now + self.random.choice((50, 300, 1000)), self.resume_guard)
 
-    def _resume(self) -> None:
+    def resume_guard(self) -> None:
         self.trace("the guard is resumed")
         self.holding = False
         self.guard.resume()
@@ -261,9 +261,9 @@ class World:
         self.trace("the guard is disabled")
         self.switched_off = True
         self.guard.switch(self.now, enabled=False)
-        self.after(self.now + self.random.choice((50, 300, 1500)), self._enable)
+        self.after(self.now + self.random.choice((50, 300, 1500)), self.enable_guard)
 
-    def _enable(self) -> None:
+    def enable_guard(self) -> None:
         self.trace("the guard is enabled")
         self.switched_off = False
         self.guard.switch(self.now, enabled=True)

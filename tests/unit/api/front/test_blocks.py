@@ -3,7 +3,7 @@
 import asyncio
 import re
 from collections.abc import Iterator
-from typing import Any, cast
+from typing import Any
 
 import pytest
 
@@ -26,7 +26,7 @@ HOST, OTHER = "10.0.0.7", "10.0.0.8"
 
 @pytest.fixture
 def doorkeeper() -> Iterator[TokenAuthenticator]:
-    doorkeeper = world().gate._doorkeeper
+    doorkeeper = world().gate.doorkeeper
     doorkeeper.state_blocks([HOST])
     yield doorkeeper
     doorkeeper.state_blocks([])
@@ -88,7 +88,7 @@ async def test_long_answers_end_and_are_stated_to_control() -> None:
         names=["api"],
     )
     bearer = Bearer("1", "ann", "viewer", 0.0, "")
-    doorkeeper.recognise = lambda *_given: asyncio.sleep(0, bearer)  # type: ignore[method-assign]
+    doorkeeper.recognise = lambda *_given: asyncio.sleep(0, bearer)  # type: ignore[method-assign]  # the one bearer of the test
     scope = {
         "type": "http", "client": (HOST, 5), "path": "/v1/live", "method": "GET", "query_string": b"",
         "headers": [(b"host", b"api")],
@@ -127,4 +127,5 @@ def test_sessions_and_followers_of_a_host_are_named() -> None:
         assert len(uses.of(address_of(HOST))) == 2
         for number in range(5000):
             rest.called(f"10.1.{number // 250}.{number % 250}", "many")
-        assert len(cast(Any, rest)._recent) == 1000
+        assert uses.of(address_of("10.1.0.0")) == ["1 connection to the door alice"], "at most 1,000 are kept"
+        assert len(uses.of(address_of("10.1.19.249"))) == 2

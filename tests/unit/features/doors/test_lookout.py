@@ -106,7 +106,7 @@ async def test_a_new_name_of_the_robot_is_asked_about_in_the_next_look() -> None
     before = len(robot.asked)
     assert isinstance(robot.graph_now.publishers, dict)
     robot.graph_now.publishers["/robot/new"] = ["/base"]
-    robot.graph_now.types["/robot/new"] = "own/Load"  # type: ignore[index]
+    robot.graph_now.types["/robot/new"] = "own/Load"  # type: ignore[index]  # a mapping of the test
     await robot.lookout.look()
     assert "/robot/new" in robot.asked[before : before + 2]
 
@@ -140,7 +140,7 @@ async def test_a_denial_of_the_whole_list_is_words() -> None:
     async def denied() -> VisibleGraph:
         raise MasterDenialError("getSystemState is denied (site.ini:2)")
 
-    robot.graph = denied  # type: ignore[method-assign]
+    robot.graph = denied  # type: ignore[method-assign]  # the graph of the test
     with pytest.raises(MasterDenialError, match=r"site\.ini:2"):
         await robot.lookout.service_types()
     assert (await robot.lookout.look()).denial == "getSystemState is denied (site.ini:2)"
@@ -149,4 +149,4 @@ async def test_a_denial_of_the_whole_list_is_words() -> None:
 def test_a_thing_of_several_hosts_counts_for_the_one_with_the_fewest() -> None:
     shared = ("topic", "/shared")
     rows = [(("topic", f"/g{number}"), ["guest"]) for number in range(9)] + [(shared, ["guest", "robot"])]
-    assert in_turn(rows).index(shared) == 1  # type: ignore[arg-type]
+    assert in_turn(rows).index(shared) == 1  # type: ignore[arg-type]  # rows of the test

@@ -1056,10 +1056,10 @@ async def test_a_call_ends_soon_after_its_client_and_a_long_one_as_late_as_it_wi
             client.send({"op": "call_service", "service": "/slow", "id": number, "timeout": 3600})
         stays.send({"op": "call_service", "service": "/slow", "id": 3})
         await asyncio.sleep(1)
-        assert world.door._waiting_calls.total == 3
+        assert world.door.waiting_calls.total == 3
         leaves.writer.close()
         await asyncio.sleep(12)
-        assert world.door._waiting_calls.total == 2
+        assert world.door.waiting_calls.total == 2
         async with asyncio.timeout(700):
             first, second = await stays.frames.get(), await stays.frames.get()
         assert (first["id"], first["values"]["message"]) == (3, "/slow did not answer within 60 s")

@@ -57,7 +57,7 @@ def deadman(
             one = next((one for one in known if one and one.node == node), None)
             if one is None:
                 free = [place for place in (0, 1) if known[place] is None]
-                idle = [place for place in (1, 0) if motion and not free and not known[place].moves]  # type: ignore[union-attr]
+                idle = [place for place in (1, 0) if motion and not free and not known[place].moves]  # type: ignore[union-attr]  # a place that is not free has a node
                 if place := [*free, *idle][:1]:
                     one = known[place[0]] = Sender(node, at)
             passes = not motion

@@ -1,3 +1,4 @@
+from collections.abc import Callable, Sequence
 from types import SimpleNamespace
 from typing import Any
 
@@ -24,7 +25,9 @@ class Connections:
         return self.answers.pop(0)
 
 
-def placed(robot: str, host: str, *commands: str) -> tuple[Placement, Connections]:
+def placed(
+    robot: str, host: str, *topics_of_guards: str, commands: Callable[[], Sequence[str]] | None = None
+) -> tuple[Placement, Connections]:
     topics = [
         SimpleNamespace(
             name=one.name, type=one.type, subscribers=list(one.subscribers),
@@ -38,7 +41,7 @@ def placed(robot: str, host: str, *commands: str) -> tuple[Placement, Connection
         nodes=[SimpleNamespace(name=name, host=host if "mux" not in name else "10.0.0.77") for name in names],
     )
     connections = Connections()
-    return Placement(lambda: commands, lambda: graph, connections), connections
+    return Placement(commands or (lambda: topics_of_guards), lambda: graph, connections), connections
 
 
 @pytest.mark.parametrize(
@@ -96,13 +99,14 @@ async def test_a_node_without_an_answer_is_named_after_some_questions() -> None:
 
 
 async def test_a_topic_that_is_not_guarded_any_more_is_forgotten() -> None:
-    place, connections = placed("turtlebot3", "10.0.0.5", "/cmd_vel")
+    commands = ["/cmd_vel"]
+    place, connections = placed("turtlebot3", "10.0.0.5", commands=lambda: commands)
     [driver] = place.look()
     connections.answers = [[THEIRS], [THEIRS]]
     await place.ask(driver)
     await place.ask(driver)
     assert place.bypassed
-    place._commands = lambda: ()
+    commands.clear()
     assert (place.look(), place.bypassed, place.elsewhere) == ([], [], [])
 
 

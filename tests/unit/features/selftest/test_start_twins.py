@@ -76,7 +76,7 @@ def test_a_setting_of_the_kernel_that_cannot_be_written_fails(
         path.parent.mkdir(parents=True, exist_ok=True)
         if path.name not in missing:
             path.write_text("0")
-    (found,) = machine_checks._settings_of_the_kernel(read_only_settings(tmp_path))
+    (found,) = machine_checks.kernel_settings(read_only_settings(tmp_path))
     assert found.outcome == ("fail" if missing else "ok")
     assert all(name in found.text for name in missing)
 
@@ -87,24 +87,24 @@ def test_a_program_without_which_nothing_starts_is_a_failure(
 ) -> None:
     monkeypatch.setattr("shutil.which", lambda _name: None)
     monkeypatch.setattr(Path, "exists", lambda _path: False)
-    found = {one.check: one.outcome for one in machine_checks._programs()}
+    found = {one.check: one.outcome for one in machine_checks.programs()}
     assert found[name] == "fail"
 
 
 def test_a_restore_that_did_not_finish_fails(tmp_path: Path) -> None:
     set_mark(tmp_path)
-    assert [one.outcome for one in file_checks._restore(tmp_path)] == ["fail"]
+    assert [one.outcome for one in file_checks.unfinished_restore(tmp_path)] == ["fail"]
 
 
 def test_a_membership_that_cannot_be_read_fails(tmp_path: Path) -> None:
-    assert list(file_checks._pair(tmp_path)) == []
+    assert list(file_checks.membership(tmp_path)) == []
     (tmp_path / "standby").mkdir()
     (tmp_path / "standby" / "membership.json").write_text("{")
-    assert [one.outcome for one in file_checks._pair(tmp_path)] == ["fail"]
+    assert [one.outcome for one in file_checks.membership(tmp_path)] == ["fail"]
 
 
 def test_a_container_that_shares_the_network_fails(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(machine_checks, "shared_network", lambda: "it shares the network")
     monkeypatch.setattr("os.geteuid", lambda: 1)
     settings: Any = Settings(isolation="container")
-    assert "fail" in [one.outcome for one in machine_checks._kernel(settings) if one.check == "network"]
+    assert "fail" in [one.outcome for one in machine_checks.kernel(settings) if one.check == "network"]

@@ -19,7 +19,7 @@ class Control:
         self.surroundings = SimpleNamespace(probe="passed")
         self.relay = SimpleNamespace(presence="connected")
         self.switches = SimpleNamespace(enabled=lambda name: name == "gun")
-        self.checked = SimpleNamespace(states={"gun": SimpleNamespace(holds=False)})
+        self.checked = SimpleNamespace(states={"gun": SimpleNamespace(held=False)})
 
     def report(self) -> ServiceReport:
         base: Any = SimpleNamespace(
@@ -80,7 +80,7 @@ def test_damage_that_is_repaired_in_time_is_not_reported(
 
 def test_only_monitors_in_force_keep_state(control: Control) -> None:
     """A monitor that is disabled or in shadow mode holds nothing after a takeover."""
-    control.checked.states = {"gun": SimpleNamespace(holds=True), "arm": SimpleNamespace(holds=False)}
+    control.checked.states = {"gun": SimpleNamespace(held=True), "arm": SimpleNamespace(held=False)}
     assert control.report().now().keeps_state
-    control.checked.states = {"gun": SimpleNamespace(holds=False), "arm": SimpleNamespace(holds=True)}
+    control.checked.states = {"gun": SimpleNamespace(held=False), "arm": SimpleNamespace(held=True)}
     assert not control.report().now().keeps_state

@@ -770,11 +770,11 @@ def test_a_trial_gives_way_to_a_write_and_keeps_its_earlier_result() -> None:
     program.fails["trial"] = WitnessError
     enforcement.trial.run()
     failure = enforcement.trouble()
-    firewall, left = enforcement._firewall, list[float]()
+    firewall, left = enforcement.firewall, list[float]()
 
     def run(_command: list[str], _text: str, still: Left) -> str:
         left.append(still())
-        firewall._waiting = True  # as `admit` does in another thread
+        firewall.waiting = True  # as `admit` does in another thread
         left.append(still())
         raise UncertainError("iptables-restore: ended")
 

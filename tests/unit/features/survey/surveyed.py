@@ -50,4 +50,4 @@ def inventory(**changes: object) -> GraphInventory:
         "parameters": ("/base/wheel", "/wifi/password"), "listeners": (OpenPort(BASE, 11311, "a ROS master"),),
         "calls": 40, "seconds": 1.2,
     }  # fmt: skip
-    return GraphInventory(**(fields | changes))  # type: ignore[arg-type]
+    return GraphInventory(**(fields | changes))  # type: ignore[arg-type]  # fields by name
