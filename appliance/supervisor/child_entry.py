@@ -85,8 +85,8 @@ def _prepare(plan: LaunchPlan) -> None:
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
     privileges.raise_file_limit(plan.files)
     privileges.raise_oom_score(plan.ended_early)
-    privileges.add_niceness(plan.nice)
-    if plan.slice_ns:
+    # With its niceness a process runs as soon on a busy machine, and short turns would delay it on a quiet one.
+    if not privileges.add_niceness(plan.nice) and plan.slice_ns:
         privileges.shorten_slice(plan.slice_ns)
     if plan.view is not None:
         private_view.enter(plan.view, plan.account)

@@ -72,18 +72,22 @@ def raise_priority(by: int) -> int:
     return by
 
 
-def add_niceness(by: int) -> None:
-    """Lower the priority of this process, which must be alone in its session.
+def add_niceness(by: int) -> bool:
+    """Lower the priority of this process, which must be alone in its session; return whether it was permitted.
 
     With autogroups, niceness orders only the processes of a session, so a session with a process of higher priority
     also gets that priority. A session of lower priority keeps its share, or a busy machine would lock operators out.
     """
-    with contextlib.suppress(PermissionError):
+    permitted = True
+    try:
         os.nice(by)
+    except PermissionError:
+        permitted = False
     niceness = os.getpriority(os.PRIO_PROCESS, 0)
     if niceness < 0:
         with contextlib.suppress(OSError):
             _AUTOGROUP.write_text(str(niceness), encoding="ascii")
+    return permitted
 
 
 def shorten_slice(nanoseconds: int) -> None:

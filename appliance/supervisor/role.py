@@ -74,7 +74,8 @@ class Role:
     The group of the user `readable_by` may read files of `part`; a role that reads them has this user as `group`.
     `secret` is a file that the role's user may not read: the last argument of `entry` is its descriptor or None.
     `inputs` are files of the operator, which the supervisor opens. `ended_early` is the `oom_score_adj`, and
-    `slice_ns` the length of turns (0: the kernel's). `receiver` is the only other machine that the user can reach.
+    `slice_ns` is the length of its turns if it may not have its niceness (0: the kernel's). `receiver` is the only
+    other machine that the user can reach.
     """
 
     name: str
