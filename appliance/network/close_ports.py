@@ -27,7 +27,7 @@ RANGE_FILE = Path("/proc/sys/net/ipv4/ip_local_port_range")
 _THROUGH_IPSEC = ("meta ipsec exists ", 'iifname "ipsec*" ')
 _SYN = "tcp flags & (syn | ack) == syn"
 _USER = re.compile(r"[a-z_][a-z0-9_-]{0,31}|[0-9]{1,10}")
-_GROUP = re.compile(r"(?!/)[\w.@:/-]{1,512}(?<!/)", re.ASCII)
+_GROUP_NAME = re.compile(r"[\w.@:-]{1,255}", re.ASCII)
 _SERVICE = re.compile(r"(tcp|udp)/(\d{1,5})(?:-(\d{1,5}))?")
 
 
@@ -56,7 +56,7 @@ class LocalCallers:
             if not _USER.fullmatch(user):
                 raise ValueError(f"--user {user!r} is not the name or the number of a user")
         for group in self.groups:
-            if not _GROUP.fullmatch(group):
+            if not all(map(_GROUP_NAME.fullmatch, group.split("/"))):
                 raise ValueError(
                     f"--cgroup {group!r} is not the path of a control group, such as system.slice/robot.service"
                 )
