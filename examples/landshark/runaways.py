@@ -83,7 +83,7 @@ class Runaways:
     def _recorded(self) -> None:
         record = self._stage.recorded(
             lambda found: next((one for one in reversed(found) if one["detail"]["monitor"] == "deadman"), None),
-            "--event", "monitor published", "--limit", "100",
+            "--event", "stop begun", "--limit", "100",
         )  # fmt: skip
         why = record["reason"] if record else "missing"
         self._narrator.say(f"audit record: {why}")
