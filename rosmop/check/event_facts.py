@@ -1,8 +1,8 @@
-"""Compile `age(event)`, `seen(event)`, `host(event)` and `caller(event)`.
+"""Compile `age(event)`, `seen(event)`, `host(event)`, `caller(event)` and `altered(event)`.
 
 Variables keep the time when the event last happened (-1: never), and its sender, so they are saved, restored
 and undone, and each slice has its own. They are assigned after the action, unless it dropped the message or
-faulted. In the action itself, `host` and `caller` are the sender of its message.
+faulted. In the action itself, `host` and `caller` are the sender of its message. `altered` is only known there.
 """
 
 import math
@@ -17,7 +17,8 @@ from rosmop.types import value_types
 from rosmop.types.messages import nearest, shown
 
 SENDER = ("host", "caller")
-FUNCTIONS = frozenset({"age", "seen", *SENDER})
+ALTERED = "altered"
+FUNCTIONS = frozenset({"age", "seen", ALTERED, *SENDER})
 
 
 def declare_facts(
@@ -60,6 +61,11 @@ def fact(scope: FunctionScope, node: tree.CallExpression, function: str) -> Valu
     event = _event(scope, node, function)
     if function in SENDER:
         return _sender(scope, node, function, event)
+    if function == ALTERED:
+        if event != scope.event:
+            text = f"`altered({event})` is only known in the `when` and the action of `{event}`"
+            raise SpecificationError.at(node.position, text)
+        return Value(nodes.Altered(), node.position)
     variable = scope.names.variables[_name("age", event)]
     last = nodes.Read(variable.type, variable.code)
     site = scope.site(node)
@@ -113,9 +119,11 @@ def _asked(specification: tree.Specification) -> Iterator[tuple[str, str]]:
                 match node:
                     case tree.CallExpression(callee=tree.Name(parts=(name,))) if name in FUNCTIONS - own:
                         event = _argument(node)
-                        if name not in SENDER:
+                        if name in {"age", "seen"}:
                             yield "age", event
-                        elif not (isinstance(part, tree.EventDefinition) and part.name == event):
+                        elif name in SENDER and not (
+                            isinstance(part, tree.EventDefinition) and part.name == event
+                        ):
                             yield name, event
 
 

@@ -21,7 +21,7 @@ from rosmop.run.interpreter import Interpreter
 from rosmop.runtime.wire import WireMessage
 from rosmop.types.messages import shown
 
-_CHANGING = (nodes.Now, nodes.SenderName)
+_CHANGING = (nodes.Now, nodes.SenderName, nodes.Altered)
 
 
 class _UnansweredError(Exception):

@@ -15,9 +15,10 @@ from rosmop.types.messages import MessageTypes
 from rosmop.types.value_types import Type
 from roswire.definitions import Definitions
 
-POSITION, UNDO, SAID, NOW, SURE, REST, FIRST = 0, 8, 12, 16, 24, 32, 40
+POSITION, UNDO, SAID, NOW, SURE, REST, ALTERED, FIRST = 0, 8, 12, 16, 24, 32, 40, 48
 """Addresses of: the current frame; the ends of the log and of the lines; the time; the end of the lines of earlier
-messages; the number (i64) of bytes of the message that are not shown to the module; allocated memory.
+messages; the number (i64) of bytes of the message that are not shown to the module; whether an earlier event changed
+the message (i32); allocated memory.
 """
 
 MOST_KEPT = 1024

@@ -2,7 +2,7 @@
 
 from math import inf
 
-from rosmop.fast.abi import NOW
+from rosmop.fast.abi import ALTERED, NOW
 from rosmop.fast.function_parts import FunctionBuilder
 from rosmop.fast.memory_layout import NotCompiledError, is_signed, machine_type
 from rosmop.fast.wasm import (
@@ -100,6 +100,9 @@ class ArithmeticCodegen(FunctionBuilder):
 
     def _now(self, _node: nodes.Now) -> bytes:
         return load(I64, NOW)
+
+    def _altered(self, _node: nodes.Altered) -> bytes:
+        return load(I32, ALTERED) + constant(I32, 0) + compare(I32, "!=")
 
     def _convert(self, node: nodes.Convert) -> bytes:
         code, source, target = self._value(node.value), node.value.type, node.type

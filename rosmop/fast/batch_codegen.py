@@ -22,6 +22,7 @@ from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from rosmop.fast.abi import (
+    ALTERED,
     AREA,
     LEFT,
     NOW,
@@ -479,6 +480,9 @@ class TopicCodegen:
         enabled = local_get(_ENABLED) + constant(I64, 1 << event.specification) + I64_AND
         code = enabled + I64_EQZ + I32_EQZ + IF + NOTHING
         message = local_get(_AT) + constant(I32, 4) + I32_ADD + local_get(_SIZE)
+        body = self._writer.functions[event.function].body
+        if any(isinstance(node, nodes.Altered) for node in nodes.walk(body)):
+            code += store(I32, ALTERED, load(I32, UNDO) + constant(I32, self._log) + I32_NE)
         code += _set(bits, message + call(written.number))
         code += self._is(bits, ELSEWHERE) + left
         if written.writes:

@@ -883,6 +883,7 @@ EXPRESSIONS: Mapping[type[nodes.FormNode], Callable[[_FunctionCodegen, Any], byt
             nodes.Log: _FunctionCodegen._log,
             nodes.Throttle: _FunctionCodegen._throttle,
             nodes.Now: _FunctionCodegen._now,
+            nodes.Altered: _FunctionCodegen._altered,
             nodes.SenderName: nodes.Left("compares the sender of a message with a number"),
             nodes.Whole: nodes.Left("uses MESSAGE"),
         }

@@ -300,6 +300,12 @@ class SenderName(FormNode, frozen=True):
     type: Type = value_types.STRING
 
 
+class Altered(FormNode, frozen=True):
+    """Whether an earlier event changed or replaced the message, or a monitor published it."""
+
+    type: Type = value_types.BOOL
+
+
 class Whole(FormNode, frozen=True):
     """`MESSAGE`: the whole message with the fields assigned so far, which `Pending` lists."""
 
@@ -311,7 +317,7 @@ class Whole(FormNode, frozen=True):
 Expression = (
     Literal | Read | Assign | Convert | Arithmetic | Unary | Moment | MomentOf | Compare | CompareTexts | Logical | Not
     | Conditional | Sequence | Discard | Item | Vector | Zero | Copy | Recast | OfType | Call | Accumulate | Invoke
-    | Format | Join | Log | Throttle | Now | SenderName | Whole
+    | Format | Join | Log | Throttle | Now | SenderName | Altered | Whole
 )  # fmt: skip
 
 

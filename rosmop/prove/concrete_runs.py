@@ -14,7 +14,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from rosmop.fast.abi import BEYOND, MOST_KEPT, NOW, POSITION, SAID, UNDO, kept_size
+from rosmop.fast.abi import ALTERED, BEYOND, MOST_KEPT, NOW, POSITION, SAID, UNDO, kept_size
 from rosmop.fast.batch_codegen import WasmModule
 from rosmop.fast.deferred_output import HEAD
 from rosmop.fast.wasm import EXPORTED_FUNCTION, section, text, unsigned
@@ -68,12 +68,14 @@ class EventState:
     budget: int
     throttled: Mapping[tuple[str, int], int]
     names: tuple[bytes, bytes]
+    altered: bool = False
 
     def __str__(self) -> str:
         variables = ", ".join(f"{name} = {_shown(value)}" for name, value in self.variables.items())
         host, caller = (name.decode("latin-1") for name in self.names)
+        altered = ", altered" if self.altered else ""
         return (
-            f"the message {self.message.hex()} at {self.now} ns from {caller!r} on {host!r},"
+            f"the message {self.message.hex()}{altered} at {self.now} ns from {caller!r} on {host!r},"
             f" a budget of {self.budget}, and {variables or 'no variables'}"
         )
 
@@ -173,7 +175,7 @@ class ConcreteRuns:
         for name, each in interpreter.contexts.items():
             each.throttled = {site: last for (own, site), last in state.throttled.items() if own == name}
         context.begin(state.budget)
-        message = WireMessage(state.message, state.now, event.topic)
+        message = WireMessage(state.message, state.now, event.topic, altered=state.altered)
         self._latest = state, state.variables
         try:
             bits = HAPPENED * bool(interpreter.function(event.name)(message))
@@ -205,6 +207,7 @@ class ConcreteRuns:
                 _WORD.pack_into(memory, sender + 8 * place, word)
         _TIME.pack_into(memory, module.budgets[context], state.budget)
         _TIME.pack_into(memory, NOW, state.now)
+        _ADDRESS.pack_into(memory, ALTERED, state.altered)
         _ADDRESS.pack_into(memory, UNDO, module.feeds[event.topic].log)
         _ADDRESS.pack_into(memory, SAID, module.said)
         _ADDRESS.pack_into(memory, POSITION, module.frames)

@@ -80,7 +80,7 @@ _UNROLLED = (1, 2, 3)
 
 _FIRST_STATES = 100
 
-_NOW, _REST = 16, 32  # addresses of the time and of the number of bytes that are not shown
+_NOW, _REST, _ALTERED = 16, 32, 40  # addresses: see `rosmop.fast.abi`
 _LATEST = 1 << 62
 
 
@@ -317,7 +317,8 @@ class Validation:
         }
         message = z3.Array("message", z3.BitVecSort(32), z3.BitVecSort(8))
         constants = self._module.strings
-        begin = StartTerms(message, size, now, variables, budgets, throttles, senders, constants)
+        altered = cells[_ALTERED] = z3.BitVec("altered", 32)
+        begin = StartTerms(message, size, now, variables, budgets, throttles, senders, constants, altered)
         return begin, cells, known
 
     def _ends(self, meant: FormResult) -> Iterator[tuple[int, Term]]:

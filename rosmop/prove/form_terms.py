@@ -691,6 +691,9 @@ class FormTerms:
     def _sender(self, node: nodes.SenderName, state: State) -> Any:
         return self._kept(self._beginning.senders[self._context, node.part], node.type, state)
 
+    def _altered(self, _node: nodes.Altered, _state: State) -> Any:
+        return self._beginning.altered != integer(0, 32)
+
     def _logical(self, node: nodes.Logical, state: State) -> Any:
         left = self._value(node.left, state)
         looked_at = left if node.operator == "and" else opposite(left)
@@ -992,6 +995,7 @@ EXPRESSIONS: Mapping[type[nodes.FormNode], Callable[[FormTerms, Any, State], Any
             nodes.Throttle: FormTerms._throttle,
             nodes.Now: FormTerms._now,
             nodes.SenderName: FormTerms._sender,
+            nodes.Altered: FormTerms._altered,
             nodes.Whole: nodes.Left("MESSAGE"),
         }
     )

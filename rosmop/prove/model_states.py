@@ -38,6 +38,7 @@ def state_of(model: Any, begin: StartTerms, kinds: Mapping[str, Type], context: 
         reader.number(begin.budgets[context]),
         {key: reader.number(term) for key, term in begin.throttles.items()},
         (host, caller),
+        bool(reader.number(begin.altered, value_types.UINT)),
     )
 
 

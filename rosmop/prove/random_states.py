@@ -96,9 +96,8 @@ class RandomStates:
         budget = BUDGET if self._is_tame or random.random() < 0.6 else random.randrange(2000)
         last = [self._now, self._now - 1, 0, self._now + 1, (1 << 63) - 1, max(self._now - 10**9, 0)]
         throttled = {key: random.choice(last[:2] * 6 + last) for key in self._throttles}
-        return EventState(
-            self._message(), self._now, variables, budget, throttled, (self._text(), self._text())
-        )
+        names, altered = (self._text(), self._text()), random.random() < 0.25
+        return EventState(self._message(), self._now, variables, budget, throttled, names, altered)
 
     def _next(self, state: EventState, after: Mapping[str, Any]) -> EventState:
         random = self._random

@@ -166,6 +166,7 @@ class StartTerms:
     throttles: Mapping[tuple[str, int], Term]
     senders: Mapping[tuple[str, str], TextTerm]
     constants: Mapping[bytes, int]
+    altered: Term
 
 
 @dataclass(frozen=True)

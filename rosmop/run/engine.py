@@ -70,8 +70,10 @@ class ShadowCopy(NamedTuple):
     part: str | None
     data: bytes
     time: int
+    altered: bool = False
 
     def give(self, sender: MessageSender = NOBODY) -> Outcome:
+        sender = sender._replace(altered=self.altered)
         if self.part is None:
             return self.shadow.process(self.resource, self.data, self.time, sender)
         return self.shadow.process_service(self.resource, self.part, self.data, self.time, sender)
@@ -886,7 +888,9 @@ class MonitorSet:
 
         def tap(message: WireMessage | None) -> bool:
             assert message is not None  # noqa: S101  taps exist only for messages
-            tapped.append(ShadowCopy(shadow, resource, part, bytes(message.buffer), message.time))
+            tapped.append(
+                ShadowCopy(shadow, resource, part, bytes(message.buffer), message.time, message.altered)
+            )
             return False
 
         return tap

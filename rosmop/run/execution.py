@@ -112,7 +112,9 @@ class MonitorExecution:
         self._sender = sender
         self._taking_back.clear()
         self._trailed.clear()
-        message = WireMessage(buffer, outcome.time, steps[0].event.channel)
+        message = WireMessage(
+            buffer, outcome.time, steps[0].event.channel, altered=published or sender.altered
+        )
         passing: MonitorInstance | None = None
         writers: tuple[tuple[Step, Sequence[int]], ...] = ()
         heard: tuple[tuple[MonitorInstance, Origin], ...] = ()
@@ -143,6 +145,7 @@ class MonitorExecution:
                 sites = [site for bit, site in enumerate(message.marks) if message.touched >> bit & 1]
                 message.touched = 0
                 writers = (*writers, (step, sites))
+                message.event_ended()
             if message.stopped is not None:
                 writers = (*writers, (step, [message.stopped]))
                 self._replaced(message)
@@ -539,7 +542,9 @@ class MonitorExecution:
         """Run an event in a slice that lacks a parameter, which gets a copy of the message; its output is discarded."""
         turn, explains = self._turn, self._explains
         lines, published, looked = len(turn.log), len(turn.published), {**turn.looked}
-        copied = message and WireMessage(bytes(message.buffer), message.time, message.channel)
+        copied = message and WireMessage(
+            bytes(message.buffer), message.time, message.channel, altered=message.altered
+        )
         self._explains = False
         commit = self._in_slice(monitor, slice_, outcome, copied, act)
         self._explains = explains
@@ -744,6 +749,7 @@ class MonitorExecution:
         self._take_back()
         self._taking_back.clear()
         self._trailed.clear()
+        message.event_ended()
         message.stopped = None
         if self._turn.late():
             self._turn.begin()

@@ -90,7 +90,7 @@ class Exits:
         self._last = event, time_ns, sender
         categories: Categories = run.step(event, time_ns)
         if run.state != state:
-            source, number, kind = sender
+            source, number, kind, _ = sender
             who = source << 32 | kind << 24 | event
             ENTRY.pack_into(self.room, ENTRY.size * state, time_ns, who, number & 0xFFFFFFFF)
         return categories
@@ -305,7 +305,7 @@ class ClockedSteps(Steps):
         (count,) = _COUNT.unpack_from(self.room)
         if not count % KEPT:
             _RUN.pack_into(self.room, _run_at(count // KEPT), run.state, run.since, run.now)
-        source, number, kind = sender
+        source, number, kind, _ = sender
         who = source << 32 | kind << 24 | event
         ENTRY.pack_into(self.room, _step_at(count), time_ns, who, number & 0xFFFFFFFF)
         _COUNT.pack_into(self.room, 0, count + 1)

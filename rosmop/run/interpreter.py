@@ -832,6 +832,9 @@ class _Maker:
         turn, place = self._interpreter.turn, ("host", "caller").index(node.part)
         return lambda _: turn.names(turn.source)[place]
 
+    def _altered(self, _node: nodes.Altered) -> _Value:
+        return lambda v: v["m"].altered
+
     def _whole(self, node: nodes.Whole) -> _Value:
         context, decode, site = self._context, self._values.decoder(node.type), node.site
         pending = self._whole_with[node.pending]
@@ -925,6 +928,7 @@ EXPRESSIONS: Mapping[type[nodes.FormNode], Callable[[_Maker, Any], _Value]] = Ma
         nodes.Throttle: _Maker._throttle,
         nodes.Now: _Maker._now,
         nodes.SenderName: _Maker._sender,
+        nodes.Altered: _Maker._altered,
         nodes.Whole: _Maker._whole,
     }
 )

@@ -31,11 +31,15 @@ DROPPED = -1
 
 
 class MessageSender(NamedTuple):
-    """The source of a message (chosen by the caller; 0: none), and a sequence number of the given `kind`."""
+    """The source of a message (chosen by the caller; 0: none), and a sequence number of the given `kind`.
+
+    The message is `altered` if another set has changed or published it.
+    """
 
     source: int = 0
     number: int = 0
     kind: int = 0
+    altered: bool = False
 
 
 Who = Callable[[int], Mapping[str, Any]]

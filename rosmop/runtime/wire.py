@@ -127,11 +127,13 @@ class WireMessage:
     Numbers are written in place, and only the replaced bytes are kept, so a large image is not copied when
     its stamp changes. `touched` has a bit for each statement (by the sites in `marks`) that changed bytes
     since the last event. `cause` is the site that dropped the message, and `stopped` the site that replaced
-    it with the safe message of its `channel`.
+    it with the safe message of its `channel`. It is `altered` for an event if an earlier one changed bytes, or if it is
+    not the message of a sender.
     """
 
     __slots__ = (
         "_replaced",
+        "altered",
         "buffer",
         "cause",
         "channel",
@@ -144,7 +146,10 @@ class WireMessage:
         "written",
     )  # fmt: skip
 
-    def __init__(self, buffer: Buffer, time: int, channel: str | None = None) -> None:
+    def __init__(
+        self, buffer: Buffer, time: int, channel: str | None = None, *, altered: bool = False
+    ) -> None:
+        self.altered = altered
         self.buffer = buffer
         self.time = time
         self.written: list[tuple[int, bytes]] | None = None  # positions and old bytes of changes, in order
@@ -169,6 +174,9 @@ class WireMessage:
                 return bytes(self.buffer) != self._original()
             ends = start + len(old)
         return True  # `patch` compares old and new bytes
+
+    def event_ended(self) -> None:
+        self.altered = self.altered or self.written is not None or self._replaced is not None
 
     @property
     def overwritten(self) -> Sequence[tuple[int, bytes]]:

@@ -11,6 +11,7 @@ from rosmop.tests.acting import definitions, fields, load, message, refused
 from rosmop.tests.both_ways import BothWays, plain
 from rosmop.tests.examples import examples
 from rosmop.tests.logics.driving import ABC, compiled, seeded
+from rosmop.tests.random_specifications import definitions as random_definitions
 from rosmop.tests.test_suppression import FORMULAS, Timed, projected, timed
 
 TENTH = 10**8
@@ -263,6 +264,51 @@ def test_the_module_and_the_interpreter_stop_the_same_messages(text: str) -> Non
         sizes = [random.choice((0, 0, 0, 3)) for _ in range(8)]
         both.check([plain(random.randint(0, 9), rest=bytes(size)) for size in sizes], time=time)
     assert both.came["together"] and both.came["changed"]
+
+
+ALTERING = {
+    "a stop": "if (c > 6) { STOP; }",
+    "a change": "if (c > 6) { c = 1; }",
+    "a change of some": "if (c > 6) { c = c & 8; }",
+}
+ASKING = """(int n = 0; event e(int c) /plain own/Plain '{count:c}' {
+    if (altered(e)) { n++; ROS_INFO("%d", c); if (c == 8) { c = 3; } } else if (c == 2) { return; } } }"""
+
+
+@pytest.mark.parametrize("how", ALTERING)
+def test_the_module_and_the_interpreter_know_alike_which_messages_are_altered(how: str) -> None:
+    """A message that the first specification leaves as it was is not altered, also if it is the safe one."""
+    first = f"a() {{ {ON_PLAIN} event e(int c) /plain own/Plain '{{count:c}}' {{ {ALTERING[how]} }} }}"
+    both = BothWays(first, *(f"{name}() {{ {ASKING[1:]}" for name in "bc"))
+    random, told = seeded(34), 0
+    for time in range(1, 40):
+        counts = [random.randint(0, 9) for _ in range(8)]
+        both.check([plain(count) for count in counts], time=time)
+        told += len(both.lines)
+        changed = {"a stop": {7, 8, 9}, "a change": {7, 8, 9}, "a change of some": {7, 9}}[how]
+        assert sum(one.monitor == "b" for one in both.lines) == sum(count in changed for count in counts)
+    assert told
+
+
+def test_a_message_is_altered_for_later_events_if_a_monitor_published_it_and_in_shadow_mode() -> None:
+    asking = (
+        "b() { event e(int c) /plain own/Plain '{count:c}' { if (altered(e)) { ROS_INFO(\"%d\", c); } } }"
+    )
+    tick = f"a() {{ {ON_PLAIN} event e() /plain own/Plain '{{}}' {{ }} event t() every 1s {{ STOP; }} }}"
+    monitors = MonitorSet.of(compiled_from({"a.rv": tick, "b.rv": asking}, random_definitions()))
+    monitors.start(0)
+    assert not monitors.process("/plain", plain(4), 1).log
+    [published] = monitors.advance(2 * 10**9)
+    [judged] = published.judged.values()
+    assert [line.text for line in judged.log] == ["5"]
+    change = "a() { event e(int c) /plain own/Plain '{count:c}' { if (c > 6) { c = 1; } } }"
+    sources = {"a.rv": change, "b.rv": asking}
+    shadowed = MonitorSet.of(compiled_from(sources, random_definitions()), shadows=("b",))
+    shadowed.start(0)
+    for count, lines in ((4, []), (7, ["1"])):
+        shadowed.process("/plain", bytearray(plain(count)), 1)
+        outcome = shadowed.tapped.pop().give()
+        assert [line.text for line in outcome.log] == lines
 
 
 STAMPED = f"""s() {{ int n; {SAFE} event e(double v) /cmd_vel {TWIST} '{{twist.linear.x:v}}' {{

@@ -16,9 +16,6 @@ class Precedence(NamedTuple):
     otherwise: str
 
 
-ZERO = "a stop by the other guard counts as the zero that a node has to command before it moves"
-"""All the same, `standstill` comes behind other guards, since it has to see their stops, and `zone` behind `rate`."""
-
 PRECEDENCES = (
     Precedence(
         (
@@ -57,12 +54,6 @@ PRECEDENCES = (
         ("answer",),
         "a goal that was dropped is reported as late, and cancelled, after the deadline",
     ),
-    Precedence(
-        ("enable", "estop", "overspeed"),
-        ("agree", "arm", "deadman", "fence", "mode", "sane", "sensor", "separation", "standstill"),
-        ZERO,
-    ),
-    Precedence(("zone",), ("agree", "fence", "mode", "sensor", "separation"), ZERO),
 )
 
 

@@ -151,13 +151,12 @@ class ShadowMonitors:
             self._spent += time.thread_time() - last
 
     def _give(self, waiting: _Waiting) -> None:
-        (shadow, _, _, data, _), point, observed = waiting
+        tapped, point, observed = waiting
+        shadow, data = tapped.shadow, tapped.data
         observer, view = self._observer, memoryview(data)
         try:
             source = observer.senders.number(point)
-            outcome = waiting.tapped.give(
-                observed.sender(source) if observed is not None else MessageSender(source)
-            )
+            outcome = tapped.give(observed.sender(source) if observed is not None else MessageSender(source))
         except Exception as error:  # noqa: BLE001  a defect of the monitors must not end the relay
             self._resting[shadow] = observer.defect(error, point, self._now(), observed)
             self._miss(shadow, point, self._resting[shadow], observed)

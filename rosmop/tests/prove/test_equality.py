@@ -119,6 +119,9 @@ PROVED = {
     "names of nodes that are kept and compared": """s() { std::string last; double at = 0; int n = 0;
         event e() /plain own/Plain '{}' { std::string node = caller(e) == "" ? "a node" : caller(e);
         if (last == "" || last == node) { last = node; at = ros::Time::now().toSec(); } else { n++; return; } } }""",
+    "whether an earlier event altered the message": event(
+        "if (altered(e)) { n++; y = 0; }", "double y", "x:y", "int n = 0;"
+    ),
     "what is left": event(
         "n++; if (y > 3) { told.linear.x = y; PUBLISH(/told, geometry_msgs/Twist, told); }",
         "double y", "x:y", "geometry_msgs::Twist told; int n = 0;",

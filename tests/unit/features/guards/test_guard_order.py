@@ -136,7 +136,7 @@ def twist_legs(x: float) -> tuple[float, ...]:
 
 CONSEQUENCES: list[Callable[[bool], bool]] = [
     jumps, passes_a_part, leaves_the_fence, stops_a_node_that_commands, ignores_a_command_that_is_not_a_number,
-    cancels_a_dropped_goal, moves_after_a_reset_without_a_zero, moves_after_the_zone_without_a_zero,
+    cancels_a_dropped_goal,
 ]  # fmt: skip
 
 
@@ -146,6 +146,15 @@ def test_the_wrong_order_has_its_consequence_and_a_new_guard_is_put_right(
 ) -> None:
     assert happens(False)
     assert not happens(True)
+
+
+@pytest.mark.parametrize(
+    "moves",
+    [moves_after_a_reset_without_a_zero, moves_after_the_zone_without_a_zero],
+    ids=lambda one: one.__name__,
+)
+def test_a_stop_by_another_guard_is_no_zero_of_the_node_in_any_order(moves: Callable[[bool], bool]) -> None:
+    assert not moves(False) and not moves(True)
 
 
 def test_each_row_of_the_table_has_its_test_and_no_order_contradicts_another() -> None:
