@@ -40,6 +40,7 @@ from appliance.network.firewall.firewall_rules import (
 from appliance.network.firewall.nft import NftBackend
 from appliance.network.listening_sockets import listening_ports, udp_ports_in_use
 from appliance.network.namespaces import Namespace, NetworkError, end_processes, require_privileges
+from appliance.network.port_holders import PortsInUseError, described
 from appliance.network.public_address import PublicAddress, outward_address
 
 INSIDE = "eth0"
@@ -55,6 +56,7 @@ class IsolationSettings:
     """The appliance's namespace, and the ports forwarded to it."""
 
     ports: tuple[PortRange, ...]  # TCP
+    master: int | None = None  # forwarded by `forward_master` only, when RVMaster answers
     datagrams: tuple[PortRange, ...] = ()  # UDP
     name: str = "rosrv"
     directory: Path = Path("/run/rosrv")  # for the record and the lock; shared by all appliances of a host
@@ -135,6 +137,7 @@ class Isolation:
         self._rules: tuple[PacketRule, ...] = ()
         self._udp: tuple[PortRange, ...] = ()
         self._tcp: tuple[PortRange, ...] = ()
+        self._serves_nodes = False
         self._routers: tuple[Family, ...] = ()
         self._forwarding = _IpForwarding(host)
         self._lock: int | None = None
@@ -167,6 +170,7 @@ class Isolation:
             self.ends.clear()
             self._rules = ()
             self._udp = self._tcp = ()
+            self._serves_nodes = False
             os.close(self._lock)
             self._lock = None
 
@@ -218,8 +222,19 @@ class Isolation:
             self._tcp = ports
             self._install(self._wanted())
 
+    def forward_master(self) -> None:
+        """Forward the port of RVMaster, which answers now. Raises `PortsInUseError`."""
+        if self.settings.master is None or self._serves_nodes:
+            return
+        self._refuse_listeners((PortRange.one(self.settings.master),))
+        self._serves_nodes = True
+        self._install(self._wanted())
+
     def _wanted(self) -> tuple[PacketRule, ...]:
-        return isolation_rules(self.settings, self.ends, self._routers, tcp=self._tcp, udp=self._udp)
+        master = (PortRange.one(self.settings.master),) if self.settings.master and self._serves_nodes else ()
+        return isolation_rules(
+            self.settings, self.ends, self._routers, tcp=(*self._tcp, *master), udp=self._udp
+        )
 
     def put_rules_back(self) -> None:
         if self._rules:
@@ -274,16 +289,16 @@ class Isolation:
             raise NetworkError(
                 f"the interface {link} already exists, and this appliance did not create it: `ip link delete {link}`"
             )
-        in_use = self._host.run(listening_ports)
-        clashes = [
-            str(port)
-            for port in sorted(in_use)
-            if any(r.first <= port <= r.last for r in self.settings.ports)
-        ]
+        master = () if self.settings.master is None else (PortRange.one(self.settings.master),)
+        self._refuse_listeners((*master, *self.settings.ports))
+
+    def _refuse_listeners(self, ranges: tuple[PortRange, ...]) -> None:
+        """Raise `PortsInUseError` if a program of the host listens in `ranges`; it is named by the first of them."""
+        in_use = sorted(self._host.run(listening_ports))
+        clashes = [port for span in ranges for port in in_use if span.first <= port <= span.last]
         if clashes:
-            raise NetworkError(
-                f"programs of the host listen on TCP {', '.join(clashes[:8])}, which would "
-                "be forwarded to the appliance: stop them (a roscore?), or give the appliance other ports"
+            raise PortsInUseError(
+                f"{self._host.run(lambda: described(clashes))}: stop it, or give the appliance other ports"
             )
 
     def _take_lock(self) -> None:

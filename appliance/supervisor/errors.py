@@ -1,7 +1,11 @@
-"""The error that stops the appliance."""
+"""The errors that stop the appliance."""
 
 from appliance.base.user_errors import UserError
 
 
 class StartError(UserError):
     """The appliance cannot start."""
+
+
+class PortInUseError(StartError):
+    """Another program uses a port of the appliance; when it ends, the appliance can start."""

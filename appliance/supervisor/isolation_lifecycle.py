@@ -43,9 +43,10 @@ from appliance.network.namespaces import (
     lives_on_the_machines_network,
     shared_network,
 )
+from appliance.network.port_holders import PortsInUseError
 from appliance.network.probe import probe_port
 from appliance.network.public_address import PublicAddress, only_address
-from appliance.supervisor.errors import StartError
+from appliance.supervisor.errors import PortInUseError, StartError
 from appliance.supervisor.role import RemoteReceiver
 from appliance.supervisor.users import account_of
 
@@ -88,7 +89,7 @@ class NoIsolation:
     def remove(self) -> None: ...
 
     def control_ready(self, inner_port: int, own_port: int) -> None:
-        """Close both ports to other users. Raises `NetworkError`."""
+        """Close both ports to other users, and let nodes reach RVMaster. Raises `NetworkError`."""
 
     def open_tunnels(self, pool: str, address: str) -> Esp:  # noqa: ARG002  the same everywhere
         """Accept addresses of `pool` through IPsec only. Raises `NetworkError`."""
@@ -374,7 +375,7 @@ class NetnsIsolation(ContainerIsolation):
     ) -> None:
         super().__init__(ports, backend)
         nodes = PortRange(ports.nodes.start, ports.nodes.stop - 1)
-        forwarded = [PortRange.one(ports.master), nodes]
+        forwarded = [nodes]
         if ports.api is not None:
             forwarded.append(PortRange.one(ports.api))
         datagrams: tuple[PortRange, ...] = ()
@@ -382,7 +383,8 @@ class NetnsIsolation(ContainerIsolation):
             datagrams = (PortRange.one(ports.peer.port),)
             forwarded += datagrams
         self._isolation = isolation or Isolation(
-            Namespace.own(), IsolationSettings(ports=tuple(forwarded), datagrams=datagrams)
+            Namespace.own(),
+            IsolationSettings(ports=tuple(forwarded), master=ports.master, datagrams=datagrams),
         )
         self._namespace = self._isolation.namespace
         self._others: dict[str, list[str]] = {}  # the last logged rules of other programs
@@ -404,9 +406,16 @@ class NetnsIsolation(ContainerIsolation):
             super().open_own_network(network, ports)
             self._isolation.forward_also(self._own_ports)
 
+    def control_ready(self, inner_port: int, own_port: int) -> None:
+        with self._standing():
+            super().control_ready(inner_port, own_port)
+            self._isolation.forward_master()
+
     def build(self) -> None:
         try:
             self._isolation.up()
+        except PortsInUseError as error:
+            raise PortInUseError(str(error)) from error
         except NetworkError as error:
             raise StartError(str(error)) from error
         super().build()

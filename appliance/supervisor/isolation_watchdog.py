@@ -15,6 +15,7 @@ import structlog
 from appliance.channel import messages
 from appliance.channel.answers.status import FirewallState
 from appliance.network.namespaces import NetworkError
+from appliance.network.port_holders import PortsInUseError
 from appliance.supervisor import signals
 from appliance.supervisor.isolation_lifecycle import NoIsolation
 
@@ -66,6 +67,9 @@ class IsolationWatchdog:
         try:
             async with self._one_at_a_time:
                 await in_thread(lambda: self.isolation.control_ready(inner_port, own_port))
+        except PortsInUseError as error:
+            self._found(str(error))
+            return str(error)
         except Exception as error:  # noqa: BLE001  see the invariant
             reason = f"control's inner ports cannot be closed to others: {_words(error)}"
             self._found(reason)

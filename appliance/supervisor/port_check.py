@@ -1,13 +1,11 @@
-"""Check whether a port is free, and find the process that uses it."""
+"""Check whether a port is free."""
 
 import errno
 import socket
 from collections.abc import Sequence
-from contextlib import suppress
-from pathlib import Path
 
-from appliance.network.listening_sockets import listening_inodes
-from appliance.supervisor.errors import StartError
+from appliance.network.port_holders import port_holder
+from appliance.supervisor.errors import PortInUseError, StartError
 
 
 def free_port() -> int:
@@ -45,7 +43,7 @@ def spare_ports(count: int, taken: Sequence[range], within: range) -> range:
 
 
 def require_free(host: str, port: int) -> None:
-    """Raise `StartError` if the port cannot be used; its text names the process on the port, if known."""
+    """Raise `StartError` if the port cannot be used, `PortInUseError` with the program that uses it if that is why."""
     if port == 0:
         return
     try:
@@ -60,27 +58,11 @@ def require_free(host: str, port: int) -> None:
         except OSError as error:
             if error.errno != errno.EADDRINUSE:
                 raise StartError(f"cannot listen on {host}:{port}: {error.strerror}") from error
-            raise StartError(
+            raise PortInUseError(
                 f"port {port} ({host}) is in use{_by_whom(port)}: stop that program or choose another port"
             ) from error
 
 
 def _by_whom(port: int) -> str:
-    inodes = {f"socket:[{inode}]" for inode in listening_inodes(port)}
-    for process in Path("/proc").iterdir():
-        if process.name.isdigit() and inodes & _socket_inodes(process):
-            title = ""
-            with suppress(OSError):
-                words = (process / "cmdline").read_bytes().replace(b"\0", b" ")
-                title = words.decode("utf-8", "replace").strip()
-            return f" by process {process.name} ({title[:120]})"
-    return ""
-
-
-def _socket_inodes(process: Path) -> set[str]:
-    found = set()
-    with suppress(OSError):
-        for descriptor in (process / "fd").iterdir():
-            with suppress(OSError):
-                found.add(str(descriptor.readlink()))
-    return found
+    holder = port_holder(port)
+    return "" if holder is None else f" by process {holder.pid} ({holder.title})"

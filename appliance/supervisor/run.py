@@ -5,7 +5,9 @@ import json
 import os
 import socket
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import replace
+from functools import partial
 
 import structlog
 
@@ -21,6 +23,7 @@ from appliance.supervisor.errors import StartError
 from appliance.supervisor.isolation_lifecycle import AppliancePorts, NoIsolation, isolation_for
 from appliance.supervisor.monitor_memory import MonitorMemory
 from appliance.supervisor.port_check import free_port, require_free, spare_ports
+from appliance.supervisor.port_wait import built_when_free
 from appliance.supervisor.privileges import drop_unused_capabilities, raise_file_limit, raise_priority
 from appliance.supervisor.restore_mark import refuse_half_restored
 from appliance.supervisor.role import Facts, Role
@@ -126,25 +129,56 @@ def _run(
         state.write_config(json.dumps(plain(settings)))
         state.write_files(pairing.files if pairing is not None else ())
         raise_file_limit(_FILES)
-        isolation.build()
-        try:
-            _supervise(
-                settings,
-                roles,
-                state,
-                isolation,
-                ready,
-                view=view,
-                manager=manager,
-                rosout_ports=ports.own_node,
-                pairing=pairing,
-                waits=waits,
-                raised=raised,
-            )
-        finally:
-            isolation.remove()
+        admin = state.open_admin_socket()
+        with closing(admin):
+            listeners = _listeners(settings, isolation, manager, admin)
+            if listeners is None:
+                return
+            try:
+                _supervise(
+                    settings,
+                    roles,
+                    state,
+                    isolation,
+                    ready,
+                    admin=admin,
+                    listeners=listeners,
+                    view=view,
+                    manager=manager,
+                    rosout_ports=ports.own_node,
+                    pairing=pairing,
+                    waits=waits,
+                    raised=raised,
+                )
+            finally:
+                isolation.remove()
     finally:
         state.close()
+
+
+def _listeners(
+    settings: Settings, isolation: NoIsolation, manager: ServiceManager, admin: socket.socket
+) -> dict[str, socket.socket] | None:
+    """Build the isolation, and return the appliance's listeners; None if a signal ended the wait for a port."""
+    build = partial(_build, settings, isolation)
+    if manager.is_present or settings.isolation == "container":
+        return built_when_free(build, manager, admin)
+    return build()
+
+
+def _build(settings: Settings, isolation: NoIsolation) -> dict[str, socket.socket]:
+    if settings.isolation != "netns":
+        require_free(*settings.listen_address)  # before the firewall is built, which takes a second
+    isolation.build()
+    try:
+        with isolation.inside():
+            require_free(*settings.listen_address)
+            require_free("127.0.0.1", settings.rosmaster_port)
+            api = _listener(settings)
+            return {} if api is None else {"api": api}
+    except BaseException:
+        isolation.remove()
+        raise
 
 
 def _ports_of_rosout(settings: Settings, node_ports: range) -> range:
@@ -207,6 +241,8 @@ def _supervise(
     isolation: NoIsolation,
     ready: Callable[[ControlReady, Settings], None],
     *,
+    admin: socket.socket,
+    listeners: dict[str, socket.socket],
     view: PrivateView | None,
     manager: ServiceManager,
     rosout_ports: range,
@@ -214,11 +250,6 @@ def _supervise(
     waits: Callable[[], None],
     raised: int,
 ) -> None:
-    with isolation.inside():
-        require_free(*settings.listen_address)
-        require_free("127.0.0.1", settings.rosmaster_port)
-        api = _listener(settings)
-
     manager.starting("starts its processes")
 
     def say_ready(said: ControlReady) -> None:
@@ -244,11 +275,11 @@ def _supervise(
                 view=view,
                 raised=raised,
             ),
-            admin=state.open_admin_socket(),
+            admin=admin,
             ready=say_ready,
             relays=settings.relays,
             isolation=isolation,
-            listeners={"api": api} if api is not None else {},
+            listeners=listeners,
             memories=memories(settings.sections, settings.relays),
             memory=MonitorMemory(state.path, settings.relays),
             stands_by=say_standing_by,

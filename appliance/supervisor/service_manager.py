@@ -29,6 +29,10 @@ class ServiceManager:
         }
         return cls(said["NOTIFY_SOCKET"], _seconds(said))
 
+    @property
+    def is_present(self) -> bool:
+        return self._address is not None
+
     def starting(self, status: str) -> None:
         """Report a status, and request more time."""
         self._say(f"{_MORE}STATUS={status}")

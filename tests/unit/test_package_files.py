@@ -32,6 +32,13 @@ def test_the_service_has_the_rights_of_the_supervisor() -> None:
     assert given == set(SUPERVISOR_CAPABILITIES)
 
 
+def test_no_number_of_starts_ends_the_service() -> None:
+    unit = (ROOT / "distribution/debian/rosrv.service").read_text()
+    assert "\nStartLimitIntervalSec=0\n" in unit
+    assert "\nRestart=on-failure\n" in unit
+    assert "StartLimitBurst" not in unit
+
+
 def test_the_installed_configuration_is_right() -> None:
     file = ROOT / "distribution/appliance.yaml"
     settings = resolve(file, {}, {})

@@ -10,6 +10,7 @@ import msgspec
 import structlog
 
 from appliance.base.actors import OPERATOR
+from appliance.base.unix_sockets import KEEP_PATH
 from appliance.base.withdrawal import awaited
 from appliance.channel import admin
 from appliance.channel.admin import A
@@ -35,7 +36,7 @@ class AdminServer:
 
     async def start(self, sock: socket.socket) -> asyncio.Server:
         """Return the running server; the caller must keep a reference to it."""
-        return await asyncio.start_unix_server(self._serve, sock=sock, limit=_LINE_LIMIT)
+        return await asyncio.start_unix_server(self._serve, sock=sock, limit=_LINE_LIMIT, **KEEP_PATH)
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         try:

@@ -114,6 +114,37 @@ def test_a_port_in_use_is_reported_with_its_owner(directory: Path) -> None:
             assert f"port {port} (127.0.0.1) is in use by process {os.getpid()}" in said
 
 
+def test_a_service_waits_for_a_held_port_and_says_so(directory: Path) -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd, contextlib.ExitStack() as held:
+        systemd.bind(str(directory / "notify"))
+        systemd.settimeout(LIMIT)
+        port = held.enter_context(socket.create_server(("127.0.0.1", 0))).getsockname()[1]
+        flags = ("--json", "--listen", f"127.0.0.1:{port}")
+        environment = ENVIRONMENT | {"NOTIFY_SOCKET": str(directory / "notify")}
+        running = Process(ThisMachine(), command(directory, *flags), env=environment, label="rosrv up")
+        try:
+            waits = f"waits: port {port} (127.0.0.1) is in use by process {os.getpid()}"
+            while waits not in systemd.recv(4096).decode():
+                pass
+            running.wait_for_error(waits)
+            answered = rosrv("status", "--state", str(directory / "state"))
+            assert (answered.returncode, waits in answered.stderr) == (1, True)
+            held.close()
+            running.wait_for(event="ready", timeout=2 * LIMIT)
+        finally:
+            assert running.stop(with_signal=signal.SIGTERM) == 0
+
+
+def test_a_service_that_waits_for_a_port_ends_at_a_signal(directory: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        flags = ("--listen", f"127.0.0.1:{taken.getsockname()[1]}")
+        environment = ENVIRONMENT | {"NOTIFY_SOCKET": str(directory / "nobody")}
+        running = Process(ThisMachine(), command(directory, *flags), env=environment, label="rosrv up")
+        running.wait_for_error("waits: ")
+        assert running.stop(with_signal=signal.SIGTERM) == 0
+    assert not (directory / "state/admin.sock").exists()
+
+
 def test_invalid_configuration_is_reported_before_the_start(directory: Path) -> None:
     said = refusal(directory, "--isolation", "vm", "--listen", "nowhere")
     assert "--isolation: " in said

@@ -16,6 +16,7 @@ from appliance.network.firewall.firewall_rules import PortRange
 from appliance.network.isolation import Isolation, IsolationSettings
 from appliance.network.listening_sockets import listening_ports
 from appliance.network.namespaces import Namespace, NetworkError
+from appliance.network.port_holders import PortsInUseError
 from examples.landshark.lab import Host, Lab
 from tests.support.processes import runs
 
@@ -96,6 +97,31 @@ def test_source_addresses_are_preserved_in_the_namespace(bare: Host, node: Host,
         assert not any(rule.in_force for rule in isolation.rules())
         isolation.put_rules_back()
         assert source_seen(server, node, bare.address, MASTER) == node.address
+
+
+def test_the_master_is_forwarded_only_when_it_answers_and_no_other_listens(
+    bare: Host, node: Host, tmp_path: Path
+) -> None:
+    late = replace(settings(tmp_path), ports=(PortRange(FIRST, LAST),), master=MASTER)
+    isolation = Isolation(bare.namespace, late)
+    with (
+        serving(bare.namespace, MASTER),
+        pytest.raises(PortsInUseError, match=rf"pytest.* holds TCP {MASTER}:"),
+    ):
+        isolation.up()
+    isolation.up()
+    try:
+        with serving(isolation.namespace, MASTER) as server:
+            with node.entered(), pytest.raises(ConnectionRefusedError):
+                socket.create_connection((bare.address, MASTER), timeout=10)
+            with serving(bare.namespace, MASTER), pytest.raises(PortsInUseError):
+                isolation.forward_master()
+            isolation.forward_master()
+            assert source_seen(server, node, bare.address, MASTER) == node.address
+            isolation.forward_also((PortRange.one(LAST + 1),))
+            assert source_seen(server, node, bare.address, MASTER) == node.address
+    finally:
+        isolation.down()
 
 
 @pytest.mark.parametrize("wildcard", ["0.0.0.0", "::"])
@@ -281,7 +307,10 @@ def test_a_foreign_namespace_or_interface_is_not_taken(bare: Host, tmp_path: Pat
 
 def test_a_port_in_use_on_the_host_is_named(bare: Host, tmp_path: Path) -> None:
     before = state(bare)
-    with serving(bare.namespace, MASTER), pytest.raises(NetworkError, match=r"TCP 11311.*roscore"):
+    with (
+        serving(bare.namespace, MASTER),
+        pytest.raises(NetworkError, match=r"pytest.* holds TCP 11311: stop it"),
+    ):
         Isolation(bare.namespace, settings(tmp_path)).up()
     assert state(bare) == before
     assert bare.run(listening_ports) == set()
