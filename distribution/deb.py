@@ -116,6 +116,7 @@ def _gather(source: Path, architecture: Architecture, work: Path, moment: int) -
     dropin = root / "usr/lib/systemd/system/strongswan.service.d"
     dropin.mkdir(parents=True)
     shutil.copyfile(HERE / "strongswan.service.conf", dropin / "rosrv.conf")
+    shutil.copyfile(HERE / "debian/rosrv-hold.service", dropin.parent / "rosrv-hold.service")
     date = formatdate(moment)
     write_pages(root / "usr/share/man/man1", " ".join(date.split()[1:4]))
     _documentation(root / "usr/share/doc/rosrv")

@@ -89,6 +89,8 @@ def _system(status: Status) -> Iterator[_Condition]:
     if probe_failed(status):
         text = f"the ROS master is not hidden: {status.probe}; nodes are not served"
         yield "alarm", "probe", "system", text
+    if status.firewall.hold_lapsed:
+        yield "alarm", "hold-lapsed", "system", status.firewall.hold_lapsed
     relay = no_relay(status.relay)
     if relay is not None:
         yield "alarm", "relay", "system", f"{relay}, until it is back"

@@ -228,6 +228,15 @@ class FirewallSection:
     backend: Literal["auto", "iptables", "nft"] = key(
         default="auto", description="auto: the back end that the kernel enforces"
     )
+    hold: Annotated[Literal["others", "own", "off"], BeforeValidator(_off_as_text)] = key(
+        default="others",
+        description="until the service serves, new connections to ROS ports wait: of other machines, also the robot's"
+        " own to its master, or none",
+    )
+    hold_seconds: Annotated[int, Field(ge=1, le=3600)] = key(
+        default=60,
+        description="with `hold: own`, after which the robot's own programs start without the appliance",
+    )
 
 
 def _is_ipv4(pool: object) -> object:

@@ -78,6 +78,8 @@ class NoIsolation:
 
     kind = "none"
     probes = False
+    link = ""  # the interface of the host that leads to the appliance
+    lapse = ""  # why the robot's own programs may have started without the appliance
 
     @contextlib.contextmanager
     def inside(self) -> Iterator[None]:
@@ -289,7 +291,9 @@ class ContainerIsolation(NoIsolation):
                 self.firewall.install(self._settings())
                 self._owed = False
                 report = self.firewall.report()
-        return FirewallState(report.backend, list(report.not_used), list(report.rules))
+        return FirewallState(
+            report.backend, list(report.not_used), list(report.rules), hold_lapsed=self.lapse or None
+        )
 
     def probe(self) -> str | None:
         ports = {
@@ -387,6 +391,7 @@ class NetnsIsolation(ContainerIsolation):
             IsolationSettings(ports=tuple(forwarded), master=ports.master, datagrams=datagrams),
         )
         self._namespace = self._isolation.namespace
+        self.link = self._isolation.settings.link
         self._others: dict[str, list[str]] = {}  # the last logged rules of other programs
 
     @contextlib.contextmanager

@@ -19,6 +19,7 @@ from appliance.network.firewall.firewall_rules import PeerAccess
 from appliance.network.firewall.iptables import load_modules
 from appliance.network.namespaces import has_privileges
 from appliance.supervisor import signals
+from appliance.supervisor.boot_hold_lifecycle import HoldAround
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.isolation_lifecycle import AppliancePorts, NoIsolation, isolation_for
 from appliance.supervisor.monitor_memory import MonitorMemory
@@ -129,6 +130,8 @@ def _run(
         state.write_config(json.dumps(plain(settings)))
         state.write_files(pairing.files if pairing is not None else ())
         raise_file_limit(_FILES)
+        hold = HoldAround(settings, single=pairing is None, link=isolation.link)
+        hold.put()
         admin = state.open_admin_socket()
         with closing(admin):
             listeners = _listeners(settings, isolation, manager, admin)
@@ -142,6 +145,7 @@ def _run(
                     isolation,
                     ready,
                     admin=admin,
+                    hold=hold,
                     listeners=listeners,
                     view=view,
                     manager=manager,
@@ -151,6 +155,7 @@ def _run(
                     raised=raised,
                 )
             finally:
+                hold.put()
                 isolation.remove()
     finally:
         state.close()
@@ -242,6 +247,7 @@ def _supervise(
     ready: Callable[[ControlReady, Settings], None],
     *,
     admin: socket.socket,
+    hold: HoldAround,
     listeners: dict[str, socket.socket],
     view: PrivateView | None,
     manager: ServiceManager,
@@ -254,6 +260,7 @@ def _supervise(
 
     def say_ready(said: ControlReady) -> None:
         ready(said, settings)
+        isolation.lapse = hold.served()
         manager.ready(f"nodes may connect: ROS_MASTER_URI={said.master}")
 
     def say_standing_by() -> None:

@@ -4,6 +4,7 @@ from pathlib import Path
 
 from appliance.configuration.config_sources import resolve
 from appliance.configuration.inventory import RUNS
+from appliance.network import boot_hold
 from appliance.supervisor.privileges import SUPERVISOR_CAPABILITIES
 from distribution.environment import INTERPRETERS
 
@@ -37,6 +38,18 @@ def test_no_number_of_starts_ends_the_service() -> None:
     assert "\nStartLimitIntervalSec=0\n" in unit
     assert "\nRestart=on-failure\n" in unit
     assert "StartLimitBurst" not in unit
+
+
+def test_the_boot_hold_comes_and_goes_with_the_enabled_service() -> None:
+    hold = (ROOT / "distribution/debian/rosrv-hold.service").read_text()
+    unit = (ROOT / "distribution/debian/rosrv.service").read_text()
+    assert "[Install]" not in hold, "it would hold while rosrv.service is disabled or masked"
+    assert "\nStopPropagatedFrom=rosrv.service\n" in hold, "PartOf= would also lift it at a restart"
+    assert "\nBefore=network-pre.target\n" in hold
+    for key in ("Wants", "After"):
+        assert re.search(rf"^{key}=.*\brosrv-hold\.service\b", unit, re.MULTILINE)
+    assert boot_hold.UNIT_RUNS.name == re.findall(r"^RuntimeDirectory=(.*)$", hold, re.MULTILINE)[0]
+    assert boot_hold.STATE.name == re.findall(r"^StateDirectory=(.*)$", hold, re.MULTILINE)[0]
 
 
 def test_the_installed_configuration_is_right() -> None:

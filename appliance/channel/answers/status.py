@@ -57,6 +57,9 @@ class FirewallState(msgspec.Struct, frozen=True, omit_defaults=True):
     ] = None
     translations: list[str] | None = None
     obstacles: list[str] | None = None
+    hold_lapsed: Annotated[
+        str | None, doc("why the robot's own programs may have started without the appliance (`hold: own`)")
+    ] = None
 
 
 class PolicyState(msgspec.Struct, frozen=True):

@@ -28,6 +28,7 @@ class Chain(StrEnum):
     ARRIVING = "ROSRV-PRE"
     KEPT_SOURCE = "ROSRV-KEEP"
     LEAVING = "ROSRV-POST"
+    HOLD = "ROSRV-HOLD"
 
 
 class Hook(NamedTuple):
@@ -49,6 +50,7 @@ HOOKS: dict[Chain, tuple[Hook, ...]] = {
     Chain.ARRIVING: (Hook("PREROUTING", priority=-300),),  # before the connection tracker
     Chain.KEPT_SOURCE: (Hook("POSTROUTING", "nat", -199),),
     Chain.LEAVING: (Hook("POSTROUTING", priority=300),),  # after all translation
+    Chain.HOLD: (Hook("INPUT"),),
 }
 COUNTED_MARK = 0x40000000  # a bit of the connection tracker's mark
 SOURCE_TRANSLATIONS = frozenset({"MASQUERADE", "SNAT", "NETMAP"})  # targets of iptables
@@ -145,6 +147,7 @@ class PacketRule:
     answered: bool = False  # belongs to an uncounted connection whose opener answered our SYN-ACK
     translated: bool = False  # belongs to a connection with a translated destination
     to: str | None = None  # for DNAT: the new destination address
+    seconds: int | None = None  # matches for this time after it is installed, to one TCP port
 
     def __post_init__(self) -> None:
         impossible = {
@@ -158,6 +161,8 @@ class PacketRule:
             is not None
             and not self.answered,
             "DNAT and its address go together": (self.verdict is PacketVerdict.DNAT) != (self.to is not None),
+            "a rule for some seconds has one port": self.seconds is not None
+            and (self.tcp_ports is None or self.tcp_ports.first != self.tcp_ports.last),
         }
         for reason, is_so in impossible.items():
             if is_so:
@@ -184,6 +189,7 @@ class PacketRule:
             "from tcp": self.from_ports,
             "uid": self.uid,
             "above": f"{self.above.per_second}/s" if self.above else None,
+            "seconds": self.seconds,
         }
         words = [f"{name} {value}" for name, value in matches.items() if value is not None]
         flags = {

@@ -35,6 +35,8 @@ _EXPIRE_MILLISECONDS = 10_000
 _MODPROBE_SECONDS = 20.0
 _MATCH_HEADER = 32  # bytes of struct xt_entry_match before its content
 
+_CHAINS = (Chain.IN, Chain.OUT, Chain.FORWARD)
+
 Extension = tuple[str, tuple[tuple[str, str | tuple[str, ...]], ...]]
 
 
@@ -65,27 +67,31 @@ class IptablesBackend:
 
     name = "iptables"
 
-    def __init__(self, namespace: Namespace) -> None:
+    def __init__(self, namespace: Namespace, chains: tuple[Chain, ...] = _CHAINS) -> None:
         self._namespace = namespace
+        self._chains = chains
 
     @property
     def families(self) -> tuple[Family, ...]:
         return self._namespace.run(_families)
 
     def install(self, rules: tuple[PacketRule, ...]) -> None:
-        elsewhere = [rule.purpose for rule in rules if rule.chain not in _CHAINS]
+        elsewhere = [rule.purpose for rule in rules if rule.chain not in self._chains]
         if elsewhere:
             raise BackendMissingError(f"address translation needs nft, not iptables: {'; '.join(elsewhere)}")
+        timed = [rule.purpose for rule in rules if rule.seconds is not None]
+        if timed:
+            raise BackendMissingError(f"rules for some seconds need nft, not iptables: {'; '.join(timed)}")
         rendered = [line for rule in rules for line in render_rule(rule)]
-        self._in_tables(lambda table: table.replace(rendered))
+        self._in_tables(lambda table: table.replace(rendered, self._chains))
 
     def remove(self) -> None:
         """Remove the rules, and create no unused table."""
-        _in_used_tables(self._namespace, "filter", lambda table: table.replace([]))
+        _in_used_tables(self._namespace, "filter", lambda table: table.replace([], self._chains))
 
     def counters(self) -> tuple[RuleCounter, ...]:
         found: list[RuleCounter] = []
-        self._in_tables(lambda table: found.extend(table.counters()))
+        self._in_tables(lambda table: found.extend(table.counters(self._chains)))
         return tuple(found)
 
     def _in_tables(self, work: "Callable[[_Table], None]") -> None:
@@ -229,9 +235,6 @@ def _interface(interface: Interface | None) -> str | None:
     return f"!{interface.name}" if interface.other else interface.name
 
 
-_CHAINS = (Chain.IN, Chain.OUT, Chain.FORWARD)
-
-
 class _Table:
     """A table, opened in the namespace of the thread."""
 
@@ -240,10 +243,10 @@ class _Table:
         self._table = table
         self._family = family
 
-    def replace(self, all_rules: list[RenderedRule]) -> None:
+    def replace(self, all_rules: list[RenderedRule], chains: tuple[Chain, ...]) -> None:
         rules = [rule for rule in all_rules if rule.family == self._family]
-        present = {chain for chain in _CHAINS if self._table.is_chain(chain.value)}
-        wanted = {chain for chain in _CHAINS if any(rule.chain == chain for rule in rules)}
+        present = {chain for chain in chains if self._table.is_chain(chain.value)}
+        wanted = {chain for chain in chains if any(rule.chain == chain for rule in rules)}
         for chain in present:
             self._unhook(chain)
             self._table.flush_entries(chain.value)
@@ -259,10 +262,10 @@ class _Table:
         if present or wanted:
             self._table.commit()
 
-    def counters(self) -> list[RuleCounter]:
+    def counters(self, chains: tuple[Chain, ...]) -> list[RuleCounter]:
         return [
             self._counter(chain, rule)
-            for chain in _CHAINS
+            for chain in chains
             if self._table.is_chain(chain.value)
             and all(self._hooks(chain, hook.place) for hook in HOOKS[chain])
             for rule in self._library.Chain(self._table, chain.value).rules

@@ -45,20 +45,21 @@ class NftBackend:
     name = "nft"
     families: tuple[Family, ...] = (4, 6)  # an `inet` table has both
 
-    def __init__(self, namespace: Namespace) -> None:
+    def __init__(self, namespace: Namespace, table: str = TABLE) -> None:
         self._namespace = namespace
+        self._table = table
 
     def install(self, rules: tuple[PacketRule, ...]) -> None:
-        self._nft(["-f", "-"], json.dumps({"nftables": [*_delete_table(), _table("add"), *render(rules)]}))
+        self._run([*self._delete_table(), self._of_table("add"), *render(rules, self._table)])
 
     def remove(self) -> None:
-        self._nft(["-f", "-"], json.dumps({"nftables": _delete_table()}))
+        self._run(self._delete_table())
 
     def counters(self) -> tuple[RuleCounter, ...]:
         tables = self._list("table", "list", "tables")
-        if (_FAMILY, TABLE) not in [(table.get("family"), table.get("name")) for table in tables]:
+        if (_FAMILY, self._table) not in [(table.get("family"), table.get("name")) for table in tables]:
             return ()
-        rules = self._list("rule", "list", "table", _FAMILY, TABLE)
+        rules = self._list("rule", "list", "table", _FAMILY, self._table)
         hooked = {part["jump"]["target"] for rule in rules for part in rule["expr"] if "jump" in part}
         return _counters([rule for rule in rules if rule["chain"] in hooked])
 
@@ -77,6 +78,16 @@ class NftBackend:
             if not (rule["family"] == _FAMILY and rule["table"] == TABLE) and _translates_source(rule)
         )
         return tuple(dict.fromkeys(found))
+
+    def _run(self, commands: list[Json]) -> None:
+        self._nft(["-f", "-"], json.dumps({"nftables": commands}))
+
+    def _delete_table(self) -> list[Json]:
+        """Return commands that delete the table; adding it first is not an error, even if it exists."""
+        return [self._of_table("add"), self._of_table("delete")]
+
+    def _of_table(self, verb: str) -> Json:
+        return {verb: {"table": {"family": _FAMILY, "name": self._table}}}
 
     def _list(self, kind: str, *arguments: str) -> list[Json]:
         text = self._nft(list(arguments), "")
@@ -106,15 +117,20 @@ class NftBackend:
         return out
 
 
-def render(rules: tuple[PacketRule, ...]) -> list[Json]:
+def render(rules: tuple[PacketRule, ...], table: str = TABLE) -> list[Json]:
     chains = [chain for chain in Chain if any(rule.chain is chain for rule in rules)]
     limits = sorted({_meter(rule, family) for rule in rules if rule.above for family in rule.families()})
-    return [
+    commands = [
         *(_add("set", _meter_set(name)) for name in limits),
+        *(command for rule in rules if rule.seconds is not None for command in _timed_port(rule)),
         *(_add("chain", {"name": chain.value}) for chain in chains),
         *(command for chain in chains for hook in HOOKS[chain] for command in _hook(chain, hook)),
         *(_add("rule", body) for rule in rules for body in render_rule(rule)),
     ]
+    for command in commands:
+        for body in command["add"].values():
+            body["table"] = table
+    return commands
 
 
 def render_rule(rule: PacketRule) -> list[Json]:
@@ -135,7 +151,8 @@ def _transport(rule: PacketRule) -> list[Json]:
     expressions: list[Json] = []
     for transport, ports in (("tcp", rule.tcp_ports), ("udp", rule.udp_ports)):
         if ports is not None:
-            expressions.append(_match(_payload(transport, "dport"), _ports(ports)))
+            wanted = _ports(ports) if rule.seconds is None else f"@{_timed_set(rule)}"
+            expressions.append(_match(_payload(transport, "dport"), wanted))
     if rule.from_ports is not None:
         expressions.append(_match(_payload("tcp", "sport"), _ports(rule.from_ports)))
     if rule.opening or rule.accepting:
@@ -257,13 +274,19 @@ def _hook(chain: Chain, hook: Hook) -> list[Json]:
     ]
 
 
-def _delete_table() -> list[Json]:
-    """Return commands that delete the table; adding it first is not an error, even if it exists."""
-    return [_table("add"), _table("delete")]
+def _timed_port(rule: PacketRule) -> list[Json]:
+    """Return the set of the rule's port, from which the kernel removes it when its time is over."""
+    assert rule.tcp_ports is not None  # noqa: S101  checked by `PacketRule`
+    name = _timed_set(rule)
+    port = {"elem": {"val": rule.tcp_ports.first, "timeout": rule.seconds}}
+    return [
+        _add("set", {"name": name, "type": "inet_service", "flags": ["timeout"]}),
+        _add("element", {"name": name, "elem": [port]}),
+    ]
 
 
-def _table(verb: str) -> Json:
-    return {verb: {"table": {"family": _FAMILY, "name": TABLE}}}
+def _timed_set(rule: PacketRule) -> str:
+    return f"tcp-{rule.tcp_ports}-for-{rule.seconds}"
 
 
 def _add(kind: str, body: Json) -> Json:

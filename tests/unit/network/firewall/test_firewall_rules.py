@@ -315,6 +315,7 @@ def test_an_invalid_forwarder_is_an_error(wrong: tuple[int, str, int]) -> None:
 
 OUT = PacketRule(chain=Chain.OUT, purpose="p", verdict=PacketVerdict.DROP)
 LEAVING = PacketRule(chain=Chain.LEAVING, purpose="p", verdict=PacketVerdict.DROP)
+HOLD = PacketRule(chain=Chain.HOLD, purpose="p", verdict=PacketVerdict.DROP, tcp_ports=PortRange.one(7))
 NAT = PacketRule(chain=Chain.NAT, purpose="p", verdict=PacketVerdict.DNAT, to="10.0.0.1")
 CONDITIONS: dict[str, tuple[PacketRule, Any]] = {
     "family": (OUT, 6), "arrives_on": (OUT, Interface("lo")), "leaves_on": (OUT, Interface("lo", other=True)),
@@ -324,6 +325,7 @@ CONDITIONS: dict[str, tuple[PacketRule, Any]] = {
     "above": (replace(OUT, answered=True), RateLimit(7, 7)), "local_destination": (OUT, True),
     "local_source": (OUT, True), "forwarded": (LEAVING, True), "distant": (OUT, True), "new_connection": (OUT, True),
     "unknown": (OUT, True), "answered": (OUT, True), "translated": (OUT, True), "to": (NAT, "10.0.0.2"),
+    "seconds": (HOLD, 60),
 }  # fmt: skip
 
 
