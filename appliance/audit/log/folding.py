@@ -114,11 +114,13 @@ class RecordFolder:
             yield record
             return
         denial = record.decision == "deny" or record.event in _DENIALS
-        if not (denial or record.folds or (record.decision == "allow" and self._by_subject)):
+        # Most records contradict no kind: a robot is seldom denied anything.
+        contrary = self._reads.total if denial else record.decision == "allow" and self._denials.total
+        if not (denial or record.folds or contrary):
             yield record
             return
         plain = storable(record)
-        if denial or record.decision == "allow":
+        if contrary:
             yield from self._end_contradicted(plain)
         counted = self._counted(plain, denial=denial, now=now) if denial or record.folds else None
         if counted is None:

@@ -49,6 +49,7 @@ _FOR_WRITING = (
     "PRAGMA journal_size_limit = 67108864",
     "PRAGMA temp_store = MEMORY",
     "PRAGMA cache_size = -16384",
+    "PRAGMA wal_autocheckpoint = 4000",  # 16 MB: a robot's start writes the same pages again and again
 )
 COLUMNS = ", ".join(StoredColumns._fields)
 TEXT_OF_RECORD = (

@@ -8,6 +8,7 @@
 import contextlib
 import fcntl
 import functools
+import itertools
 import os
 import sqlite3
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -41,6 +42,13 @@ _AHEAD_STEPS = 20  # the most steps of checkpoints that are skipped because the 
 @functools.cache
 def _insert(rows: int) -> str:
     return "INSERT INTO record VALUES " + ", ".join([_ROW] * rows)  # noqa: S608  only question marks
+
+
+@functools.cache
+def _count(rows: int) -> str:
+    """Return the statement that stores counts. An update changes one page; a replaced row would change three."""
+    places = ", ".join(["(?, ?)"] * rows)
+    return f"INSERT INTO open_fold VALUES {places} ON CONFLICT (key) DO UPDATE SET state = excluded.state"  # noqa: S608  only question marks
 
 
 class ChainWriter:
@@ -102,13 +110,15 @@ class ChainWriter:
         self, records: Sequence[AuditRecord], folds: Iterable[tuple[bytes, FoldState | None]] = ()
     ) -> None:
         with self._transaction(records) as execute:
+            counted = list[tuple[bytes, bytes]]()
             for key, state in folds:
                 if state is None:
                     execute("DELETE FROM open_fold WHERE key = ?", (key,))
                 else:
-                    execute(
-                        "INSERT OR REPLACE INTO open_fold VALUES (?, ?)", (key, msgspec.json.encode(state))
-                    )
+                    counted.append((key, msgspec.json.encode(state)))
+            for start in range(0, len(counted), _ROWS_PER_INSERT):
+                part = counted[start : start + _ROWS_PER_INSERT]
+                execute(_count(len(part)), list(itertools.chain.from_iterable(part)))
 
     def _insert(self, records: Sequence[AuditRecord]) -> tuple[int, bytes, str]:
         sequence, digest, last_id = self.sequence, self.hash, self.last_id

@@ -139,7 +139,7 @@ def kind_of(record: AuditRecord) -> Key:
         return (UNKNOWN, record.host, record.event, record.decision, *asked, _plain_words(record.reason))
     rule = record.rule
     where: Key = () if rule is None else (rule.section, rule.key, rule.file, rule.line)
-    own = subject_of_own(record) if reads_its_own(record) else None
+    own = subject_of_own(record) if record.folds and record.decision == "allow" else None
     return (
         *(own or subject(record)),
         record.event,
