@@ -19,8 +19,9 @@ round is beyond a limit with a probability of at most one half. So chance makes 
 measurements of eight rounds.
 
 With `--again 20`, both masters stay, and the robot is started that many times in a row on each of them, by turns: a
-start begins when the nodes of the one before have ended. The table has the seconds of each start. The exit status is 1
-if a start fails, if the median of the ratios is above 1.4, or if one of them is above 2.
+start begins when the nodes of the one before have ended. The table has the seconds of each start, and the seconds of
+processor time of each master's processes until its last node is up, which other work on the machine hardly changes. The
+exit status is 1 if a start fails, if the median of the ratios is above 1.4, or if one of them is above 2.
 
 Needs root. The benchmark runs in its own process namespace, so that the kernel ends everything with it.
 """
@@ -184,10 +185,7 @@ def start(session: RosSession, masters: list[int], nodes: int, *, rospy: bool) -
             launch = session.start(["/usr/bin/roslaunch", "--disable-title", str(file)], **path)
             last = reports.wait(set(range(nodes)))
         measured.figures["last node is up"] = last - began
-        now = _used(masters)
-        measured.figures["processor time of all processes"] = sum(
-            now[pid] - used.get(pid, 0.0) for pid in now
-        )
+        measured.figures["processor time of all processes"] = _used_since(used, masters)
         for method, delays in other.delays.items():
             measured.figures[f"one {method} during the start"] = statistics.median(delays)
         measured.figures["a killed node works again"] = killed(session, folder, reports, nodes, path)
@@ -201,23 +199,29 @@ def start(session: RosSession, masters: list[int], nodes: int, *, rospy: bool) -
 
 
 class Launches:
-    """A robot that is started again and again with one master."""
+    """A robot that is started again and again with one master, whose processes descend from `masters`."""
 
-    def __init__(self, session: RosSession, folder: Path, nodes: int, *, rospy: bool) -> None:
-        self._session, self._nodes = session, nodes
+    def __init__(
+        self, session: RosSession, masters: list[int], folder: Path, nodes: int, *, rospy: bool
+    ) -> None:
+        self._session, self._masters, self._nodes = session, masters, nodes
         self._reports = Reports()
         self._file = package(folder, nodes, self._reports.port, rospy=rospy)
         self._path = {"ROS_PACKAGE_PATH": f"{folder}:/usr/share"}
 
-    def start(self) -> float:
-        """Start the robot, and end it; return the seconds until its last node is up, or infinity."""
-        began = time.monotonic()
+    def start(self) -> tuple[float, float]:
+        """Start the robot, and end it.
+
+        Return the seconds until its last node is up, or infinity, and the masters' processor seconds until then.
+        """
+        used, began = _used(self._masters), time.monotonic()
         launch = self._session.start(["/usr/bin/roslaunch", "--disable-title", str(self._file)], **self._path)
         try:
-            return self._reports.wait(set(range(self._nodes))) - began
+            taken = self._reports.wait(set(range(self._nodes))) - began
+            return taken, _used_since(used, self._masters)
         except TimeoutError as error:
             print(f"{error}\n{launch.story()[-2000:]}", file=sys.stderr)
-            return math.inf
+            return math.inf, math.inf
         finally:
             launch.stop(with_signal=signal.SIGINT, timeout=120)
 
@@ -225,30 +229,39 @@ class Launches:
 def again(nodes: int, starts: int, *, rospy: bool) -> int:
     """Start a robot `starts` times with each of the masters, by turns; return the exit status."""
     load, table = os.getloadavg()[0], Table("start", "rosmaster", "appliance", "ratio")
-    ratios = []
+    table.add_column("processor time")
+    ratios, processor = [], []
     with contextlib.ExitStack() as stack:
         launches = []
         for side in (plain, deployed):
-            session, _masters = stack.enter_context(side())
+            session, masters = stack.enter_context(side())
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-            launches.append(Launches(session, folder, nodes, rospy=rospy))
+            launches.append(Launches(session, masters, folder, nodes, rospy=rospy))
         for number in range(starts):
-            theirs, ours = (one.start() for one in launches)
+            (theirs, their_time), (ours, our_time) = (one.start() for one in launches)
             if not math.isfinite(theirs):
                 raise TimeoutError(f"start {number + 1}: the plain master's robot is not up: measure again")
             ratios.append(ours / theirs)
-            table.add_row(str(number + 1), _seconds(theirs), _seconds(ours), f"{ratios[-1]:.2f}")
+            processor.append((their_time, our_time))
+            times = f"{their_time:.2f} / {our_time:.2f} s"
+            table.add_row(str(number + 1), _seconds(theirs), _seconds(ours), f"{ratios[-1]:.2f}", times)
     median, greatest = statistics.median(ratios), max(ratios)
     kind = "rospy" if rospy else "roscpp"
     print(f"{nodes} {kind} nodes, {starts} starts in a row, load average {load:.1f}")
     Console(width=110).print(table)
     print(f"median ratio {median:.2f} (at most {MEDIAN}), greatest {greatest:.2f} (at most {GREATEST})")
+    plain_time, own_time = (statistics.median(times) for times in zip(*processor, strict=True))
+    print(f"median processor time: rosmaster {plain_time:.2f} s, appliance {own_time:.2f} s")
     return int(median > MEDIAN or greatest > GREATEST)
 
 
 def _used(masters: list[int]) -> dict[int, float]:
     pids = {pid for master in masters for pid in descendants(master)}
     return {pid: processor_seconds([pid]) for pid in pids}
+
+
+def _used_since(used: Mapping[int, float], masters: list[int]) -> float:
+    return sum(seconds - used.get(pid, 0.0) for pid, seconds in _used(masters).items())
 
 
 def killed(session: RosSession, folder: Path, reports: Reports, nodes: int, path: dict[str, str]) -> float:
@@ -309,11 +322,15 @@ def table_ratios(text: str, robot: str) -> dict[str, float]:
 def findings(
     measured: Mapping[str, Sequence[float]], table: Mapping[str, float], peer: str = "plain master's"
 ) -> list[str]:
-    """Return the rows whose ratio is beyond the table's 20 % on the same side in every round."""
+    """Return the rows whose ratio is beyond the table's 20 % on the same side in every round, or not in the table."""
     found = []
     for what, ratios in measured.items():
-        known = table[what]
-        if min(ratios) > known * CHANGE or max(ratios) < known / CHANGE:
+        known = table.get(what)
+        if known is None:
+            found.append(
+                f"finding: {what}: {RESULTS.name} has no ratio to compare {statistics.median(ratios):.2f} with"
+            )
+        elif min(ratios) > known * CHANGE or max(ratios) < known / CHANGE:
             now = f"{statistics.median(ratios):.2f} ({min(ratios):.2f} to {max(ratios):.2f})"
             found.append(f"finding: {what}: {now} times the {peer}, {known:.2f} in the table")
     return found

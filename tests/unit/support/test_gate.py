@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.cold import LONE
 from benchmarks.launch import RESULTS, findings, table_ratios
 from tests.nightly import (
     LANES,
@@ -78,6 +79,16 @@ def test_a_start_is_a_finding_only_if_every_round_differs_by_a_fifth() -> None:
     assert findings({"up": [1.0, 1.5, 1.66]}, table)
     assert findings({"up": [2.39, 2.5, 3.0]}, table) == []
     assert findings({"up": [1.0, 1.5, 3.0]}, table) == []
+
+
+def test_a_row_that_the_table_lacks_is_a_finding() -> None:
+    assert findings({"down": [1.0]}, {"up": 2.0})
+
+
+def test_the_table_of_a_lone_message_has_both_columns() -> None:
+    for column in (LONE, f"{LONE}, `--busy`"):
+        assert f"| {column}, load" in RESULTS.read_text()
+        assert all(0.1 < ratio < 10 for ratio in table_ratios(RESULTS.read_text(), column).values())
 
 
 def test_the_findings_of_a_start_are_read_from_its_output() -> None:
