@@ -29,6 +29,8 @@ POLICY_TOOLS = Feature(
                 "explain": Verb(f"{_PLACE}policy_verbs:explain_request"),
                 "who-may": Verb(f"{_PLACE}who_may_verb:list_who_may"),
                 "test": Verb(f"{_PLACE}policy_verbs:test"),
+                "enforce": Verb(f"{_PLACE}enforce_verb:enforce"),
+                "unused": Verb(f"{_PLACE}unused_verb:list_unused"),
                 "diff": Verb(f"{_PLACE}diff_verb:compare"),
             },
             after="audit",

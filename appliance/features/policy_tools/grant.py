@@ -32,11 +32,15 @@ class UngrantableError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class DecidedRequest:
-    """A request that was decided; `takeover`: it needs a node name that another host has."""
+    """A request that was decided; `takeover`: it needs a node name that another host has.
+
+    `wide` is a pattern for the first missing right, instead of its own name.
+    """
 
     request: Request
     rights: list[Right]
     takeover: bool = False
+    wide: str = ""
 
     def with_tool(self, tool: StockTool) -> Self:
         return replace(self, rights=[*tool.rights(self.request.host), *self.rights])
@@ -77,7 +81,7 @@ def grant(text: str, file: str, known: PolicyContext, asked: DecidedRequest) -> 
         reason = decide_right(policy, missing).reason
         if len(added) == most:
             raise UngrantableError(f"more than {most} lines would have to change: {reason}")
-        text, line = _changed(policy, text, missing, word)
+        text, line = _changed(policy, text, missing, word, "" if added else asked.wide)
         added.append(line)
         try:
             policy = compile_policy(text, file=file, hosts=known.hosts, robot=known.robot)
@@ -114,9 +118,9 @@ def _sections(text: str) -> list[SectionText]:
     return read(text, Findings(""))
 
 
-def _changed(policy: Policy, text: str, right: Right, word: str) -> tuple[str, str]:
+def _changed(policy: Policy, text: str, right: Right, word: str, wide: str = "") -> tuple[str, str]:
     request = right.request
-    rule, key = decide_right(policy, right).rule, _key(request)
+    rule, key = decide_right(policy, right).rule, wide or _key(request)
     name = BY_CATEGORY[request.category].name
     section = next((section for section in _sections(text) if section.name.text == name), None)
     itself = policy.decide(request)

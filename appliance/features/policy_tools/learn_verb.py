@@ -8,32 +8,23 @@ from typing import Annotated
 
 import typer
 
-from appliance.audit.log.log_database import LogUnreadableError
-from appliance.audit.log.record import AuditRecord
-from appliance.audit.log.repetition import PARAMETERS
 from appliance.audit.search.filter_options import Since
-from appliance.audit.search.query import Filter, FilterError
-from appliance.base import clock
 from appliance.base.counted import counted
-from appliance.base.timestamps import TimestampError, parse_timestamp
 from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.target import Appliance, speaks_with
+from appliance.cli.hosts_file import names_of_hosts
 from appliance.cli.output import say_json
+from appliance.features.policy_tools.ask_rights import ask_rights
 from appliance.features.policy_tools.learn import LearnedPolicy, Observation, covered, learn
-from appliance.features.policy_tools.policy_input import (
-    Robot,
-    networks_of,
-    request_of,
-    running_robot,
-    usage_error,
-)
+from appliance.features.policy_tools.policy_input import Robot, networks_of, running_robot, usage_error
+from appliance.features.policy_tools.recorded_requests import recorded_period
+from appliance.policy.cases import run_cases
 from appliance.policy.host_sets import Network
-from appliance.policy.model import Category
 from appliance.policy.policy_compiler import compile_policy
 from appliance.policy.policy_findings import PolicyError
 from rosmop.tool.terminal import refused
 
-_OWN_NODE = "the appliance's own node"
+_SHOWN_NODES = 5
 
 
 @speaks_with("One JSON object: the policy, and the number of requests it is based on")
@@ -41,27 +32,57 @@ def learn_policy(
     appliance: Appliance,
     *,
     since: Since = None,
-    output: Annotated[Path | None, typer.Option("--output", "-o", help="File, must not exist")] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "--output", "-o", help="File; must not exist, but with --ask it may: then it is continued"
+        ),
+    ] = None,
+    tests: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Write test cases of what was used, too; must not exist"),
+    ] = None,
+    ask: Annotated[
+        bool, typer.Option("--ask", help="Ask about each kind of right that the policy does not grant yet")
+    ] = False,
+    with_start: Annotated[
+        bool,
+        typer.Option("--with-start", help="Grant what a start needs to nodes that were not seen to start"),
+    ] = False,
     robot: Robot = None,
 ) -> None:
     """Write a policy that grants the requests in the audit log and no others.
 
-    Run the robot with `audit-only = all` below [Options] first. Exit status 1 if the log has no requests. An address
-    given with --robot that is not the robot of the running appliance (`rosrv policy show`) is written as an address.
+    Run the robot with `audit-only = all` below [Options] first, and start it once in that time. Exit status 1 if the
+    log has no requests, or if nodes that were taken over while they ran were not seen to start (see --with-start).
+    Hosts have their names in /etc/hosts, and the running appliance's robot (`rosrv policy show`) is the group `robot`;
+    an address given with --robot that is not in it is written as an address.
+
+    --ask starts with the policy in force, asks on the terminal, and writes the changed policy, and its tests beside it.
 
     Example: rosrv policy learn --state /var/lib/rosrv --output learned.ini
     """
+    if ask:
+        if tests is not None or with_start or robot or output is None:
+            raise usage_error("--ask needs --output FILE, and has none of --tests, --with-start and --robot")
+        raise typer.Exit(ask_rights(appliance, recorded_period(appliance, since), output))
     members = _members(appliance, networks_of(robot))
-    learned = learn(_observations(appliance, since), members)
+    learned = learn(_observations(appliance, since), members, names_of_hosts(), with_start=with_start)
     if not learned.requests:
         start = f" since {since}" if since is not None else ""
         hint = "run the robot with `audit-only = all` below [Options] first"
         raise refused([f"rosrv: the audit log has no allowed requests{start}: {hint}"])
+    if learned.unstarted and not with_start:
+        raise refused([_not_started(learned)])
     _check(learned, members)
-    if output is not None:
-        _write(output, learned.text)
+    for file, text in ((output, learned.text), (tests, learned.tests)):
+        if file is not None:
+            _write(file, text)
     if appliance.as_json:
-        say_json({"requests": learned.requests, "left_out": learned.left_out, "text": learned.text})
+        counts = {"requests": learned.requests, "left_out": learned.left_out}
+        say_json(
+            {**counts, "text": learned.text, "tests": learned.tests, "unstarted": list(learned.unstarted)}
+        )
         return
     if output is None:
         sys.stdout.write(learned.text)
@@ -72,31 +93,24 @@ def learn_policy(
 
 
 def _observations(appliance: Appliance, since: str | None) -> Iterator[Observation]:
-    try:
-        start = None if since is None else parse_timestamp(since, clock.wall_ns())
-        for event in ("decision", "repetitions folded"):
-            passed = Filter(decision=("allow", "would deny"), event=event, since=start)
-            for entry in appliance.audit().export(passed):
-                yield from _of_record(entry.record)
-    except (LogUnreadableError, NotRunningError, TimestampError, FilterError) as error:
-        raise usage_error(str(error)) from error
+    for request in recorded_period(appliance, since).requests():
+        if not request.repeated:
+            yield request.observation
 
 
-def _of_record(record: AuditRecord) -> Iterator[Observation]:
-    if record.reason == _OWN_NODE or record.host is None or record.category not in set(Category):
-        return
-    request = request_of(record.host, record.caller_id or "", str(record.category), record.resource or "")
-    detail = record.detail
-    call, approval = str(detail.get("call", "")), "approval" in detail
-    if record.event == "decision":
-        yield Observation(request, call, str(detail.get("key", "")), approval)
-    for name in detail.get(PARAMETERS, ()):  # reads that this record only counts
-        yield Observation(request, call, str(name), approval)
+def _not_started(learned: LearnedPolicy) -> str:
+    nodes = learned.unstarted
+    more = f" and {len(nodes) - _SHOWN_NODES} more" if len(nodes) > _SHOWN_NODES else ""
+    return (
+        f"rosrv: {counted(len(nodes), 'node')} ran already when the appliance took over, so the log lacks what their"
+        f" start needs, and a policy learned from it would deny the next start: {', '.join(nodes[:_SHOWN_NODES])}{more}"
+        "; start the robot once in audit-only mode, or add --with-start"
+    )
 
 
 def _members(appliance: Appliance, robot: list[Network]) -> list[Network]:
     try:
-        own = running_robot(appliance) if robot else []
+        own = running_robot(appliance)
     except NotRunningError:
         return robot
     members = [given for given in robot if covered(given, own)]
@@ -105,7 +119,7 @@ def _members(appliance: Appliance, robot: list[Network]) -> list[Network]:
         if other not in members:
             text = f"rosrv: {_shown(other)} stays an address: the group robot of this appliance is {group}"
             typer.echo(text, err=True)
-    return members
+    return members if robot else own
 
 
 def _shown(place: Network) -> str:
@@ -114,10 +128,14 @@ def _shown(place: Network) -> str:
 
 def _check(learned: LearnedPolicy, robot: list[Network]) -> None:
     try:
-        compile_policy(learned.text, file="learned", robot=robot)
+        policy = compile_policy(learned.text, file="learned", robot=robot)
+        results = run_cases(policy, learned.tests, "learned.tests.yaml")
     except PolicyError as error:
         what = "rosrv: the learned policy is invalid (see above): write rules for these names by hand"
         raise refused([*error.findings, what]) from error
+    failed = [result for result in results if not result.passed]
+    if failed:
+        raise refused([*failed, "rosrv: the learned policy does not grant what was used (see above)"])
 
 
 def _write(output: Path, text: str) -> None:

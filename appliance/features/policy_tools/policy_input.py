@@ -80,17 +80,22 @@ def _enrolled(text: str) -> tuple[str, Address]:
 def policy_in_force(
     appliance: Appliance, robot: list[str] | None, enrolled: list[str] | None
 ) -> tuple[str, str, PolicyContext]:
-    body: PolicyInForce = (
-        appliance.ask_or_exit(PolicyWanted()) if appliance.place is None else _over_rest(appliance)
-    )
-    known = PolicyContext(
+    body = body_in_force(appliance)
+    return body.text, body.file, known_of(robot, enrolled, context_of(body))
+
+
+def body_in_force(appliance: Appliance) -> PolicyInForce:
+    return appliance.ask_or_exit(PolicyWanted()) if appliance.place is None else _over_rest(appliance)
+
+
+def context_of(body: PolicyInForce) -> PolicyContext:
+    return PolicyContext(
         {name: canonical_address(ipaddress.ip_address(address)) for name, address in body.hosts.items()},
         [ipaddress.ip_network(place) for place in body.robot],
         blocks={ipaddress.ip_address(address): block for address, block in body.blocks.items()},
         holders={group: ipaddress.ip_address(host) for group, host in body.holders.items()},
         approved=approvals_of(body.approved),
     )
-    return body.text, body.file, known_of(robot, enrolled, known)
 
 
 def running_robot(appliance: Appliance) -> list[Network]:

@@ -131,7 +131,10 @@ def compiled(
 ) -> Policy:
     if file is not None:
         return _judge_or_exit(file, robot, enrolled).policy
-    text, name, known = policy_in_force(appliance, robot, enrolled)
+    return compiled_with(*policy_in_force(appliance, robot, enrolled))
+
+
+def compiled_with(text: str, name: str, known: PolicyContext) -> Policy:
     try:
         policy = compile_policy(text, file=name, hosts=known.hosts, robot=known.robot)
     except PolicyError as error:  # the appliance has another version

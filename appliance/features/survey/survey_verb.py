@@ -1,7 +1,6 @@
 """The command `rosrv survey`."""
 
 import asyncio
-import ipaddress
 import os
 from pathlib import Path
 from typing import Annotated
@@ -9,6 +8,7 @@ from typing import Annotated
 import msgspec
 import typer
 
+from appliance.cli.hosts_file import names_of_hosts
 from appliance.cli.output import Json, say_json, usage_error
 from appliance.features.survey.draft import DraftError, PolicyDraft, draft
 from appliance.features.survey.inventory import GraphInventory, problems
@@ -17,9 +17,6 @@ from appliance.features.survey.reader import SurveyError, SurveyLimits
 from appliance.features.survey.reader import survey as read_graph
 from appliance.policy.policy_findings import PolicyError
 from rosmop.tool.terminal import say
-
-_HOSTS = Path("/etc/hosts")
-_MOST_HOSTS = 1 << 20  # bytes of the file
 
 
 def survey(
@@ -74,30 +71,12 @@ def survey(
 
 def _drafted(inventory: GraphInventory, *, required: bool) -> PolicyDraft | None:
     try:
-        return draft(inventory, names_of_hosts(_HOSTS))
+        return draft(inventory, names_of_hosts())
     except (DraftError, PolicyError) as error:
         typer.echo(f"rosrv survey: no draft policy: {error}", err=True)
         if required:
             raise typer.Exit(1) from None
         return None
-
-
-def names_of_hosts(file: Path) -> dict[str, str]:
-    """Return the first name of each address in a file like /etc/hosts; nothing if it cannot be read."""
-    try:
-        with file.open("rb") as lines:
-            text = lines.read(_MOST_HOSTS).decode("ascii", "replace")
-    except OSError:
-        return {}
-    names: dict[str, str] = {}
-    for line in text.splitlines():
-        words = line.partition("#")[0].split()
-        if len(words) > 1:
-            try:
-                names.setdefault(str(ipaddress.ip_address(words[0])), words[1])
-            except ValueError:
-                continue
-    return names
 
 
 def _write(file: Path, text: str) -> None:

@@ -1,4 +1,5 @@
 import ipaddress
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -7,11 +8,13 @@ from hypothesis import strategies as st
 
 from appliance.features.policy_tools.learn import LearnedPolicy, Observation, covered, learn
 from appliance.master.calls.call import RosCall
+from appliance.policy.cases import run_cases
 from appliance.policy.commands import COMMANDS
 from appliance.policy.model import Category, Request
 from appliance.policy.policy import Policy
 from appliance.policy.policy_compiler import compile_policy
 from appliance.policy.rights import decide, rights_of, rights_of_call
+from appliance.policy.sections import DECIDERS
 from roswire.xmlrpc import Value
 from tests.unit.features.policy_tools.test_rights import KEY_GIVEN, NAME, ROWS, deeds, gate_says
 
@@ -183,6 +186,70 @@ def test_the_same_run_passes_under_what_was_learned(observations: list[Observati
     for observation in observations:
         rights = rights_of_call(observation.request, observation.call, observation.key or None)
         assert decide(policy, rights).allowed, (observation, policy.text)
+
+
+@given(st.lists(_observations, min_size=1, max_size=40))
+def test_the_learned_tests_pass_and_an_open_policy_fails_them(observations: list[Observation]) -> None:
+    learned = learn(observations, [ROBOT], {"10.0.0.1": "base.local", "10.0.0.2": "base", "fd00::5": "ask"})
+    assert all(result.passed for result in run_cases(compiled(learned), learned.tests, "tests"))
+    keys = {Category.READ: "read default", Category.WRITE: "write default"}
+    everyone = "\n".join(
+        f"[{decider.name}]\n"
+        + "\n".join(f"{keys.get(category, 'default')} = *" for category in decider.categories)
+        for decider in DECIDERS
+    )
+    results = run_cases(compile_policy(everyone, file="open", robot=[ROBOT]), learned.tests, "tests")
+    assert [result.expected for result in results if not result.passed].count("deny") > 0
+
+
+def test_a_host_has_its_name_of_the_hosts_file_unless_it_is_taken() -> None:
+    names = {"10.0.0.1": "base.example", "10.0.0.2": "base", "fd00::5": "robot"}
+    learned = learn(
+        [seen(host, Category.PUBLISH, "/a") for host in ("10.0.0.1", "10.0.0.2", "fd00::5")], (), names
+    )
+    assert "base = 10.0.0.1\n" in learned.text
+    assert "/a = " in learned.text
+    assert decide(compiled(learned), rights_of(Request(HOSTS[0], "/n", Category.PUBLISH, "/a"))).allowed
+    assert "robot" not in learned.text
+
+
+def test_the_log_levels_of_all_nodes_are_one_key() -> None:
+    learned = learn([
+        seen("10.0.0.1", Category.OFFER, f"{node}/{service}", node=node)
+        for node in ("/a", "/b", "/arm/driver") for service in ("get_loggers", "set_logger_level")
+    ])  # fmt: skip
+    (section,) = (text for text in learned.text.split("\n\n") if text.startswith("[Services]"))
+    assert [line.split()[0] for line in section.splitlines()[1:]] == [
+        "/*/get_loggers", "/*/set_logger_level", "/arm/driver/get_loggers", "/arm/driver/set_logger_level",
+    ]  # fmt: skip
+    policy = compiled(learned)
+    assert not policy.decide(Request(HOSTS[1], "/a", Category.OFFER, "/a/get_loggers")).allowed
+
+
+_ADOPTED = Observation(
+    Request(HOSTS[0], "/arm", Category.PUBLISH, "/state"), "registerPublisher", adopted=True
+)
+_STARTED = Observation(Request(HOSTS[1], "/joy", Category.PUBLISH, "/joy"), "registerPublisher")
+
+
+def test_a_node_that_was_only_taken_over_was_not_seen_to_start() -> None:
+    assert learn([_ADOPTED, _STARTED]).unstarted == ("/arm",)
+    started = replace(_ADOPTED, adopted=False)
+    assert learn([_ADOPTED, started, _STARTED]).unstarted == ()
+
+
+def test_what_a_start_needs_is_granted_to_that_host_only() -> None:
+    """The calls that an unmodified node and its `roslaunch` make at a start pass; another host gains nothing."""
+    learned = learn([_ADOPTED, _STARTED], with_start=True)
+    policy = compiled(learned)
+    assert "# Not seen to start: /arm." in learned.text
+    calls = (
+        ("hasParam", "/use_sim_time"), ("getParam", "/arm/gain"), ("setParam", "/roslaunch/x"), ("setParam", "/run_id"),
+    )  # fmt: skip
+    for call, key in calls:
+        for host, allowed in ((HOSTS[0], True), (HOSTS[1], False)):
+            request = Request(host, "/arm", Category.COMMAND, call)
+            assert decide(policy, rights_of_call(request, call, key)).allowed is allowed, (call, host)
 
 
 @given(st.lists(_observations, min_size=1, max_size=20), _observations)

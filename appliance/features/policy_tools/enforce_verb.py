@@ -1,0 +1,156 @@
+"""The command `rosrv policy enforce`."""
+
+from collections import Counter
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+import typer
+
+from appliance.audit.log.record_format import rfc3339
+from appliance.base.counted import counted
+from appliance.channel.admin import PolicyLoad
+from appliance.channel.answers.policy_answers import PolicyInForce
+from appliance.cli.commit_confirm import ConfirmWithin, seconds_within
+from appliance.cli.connection.target import Appliance, speaks
+from appliance.cli.output import say_json, write_told
+from appliance.features.policy_tools.audit_only import EnforcedText, EnforceError, enforced
+from appliance.features.policy_tools.learn import Observation, needed_rights
+from appliance.features.policy_tools.live_verbs import say_loaded
+from appliance.features.policy_tools.policy_input import body_in_force, context_of, usage_error
+from appliance.features.policy_tools.policy_verbs import compiled_with
+from appliance.features.policy_tools.recorded_requests import RecordedPeriod, recorded_period
+from appliance.policy.actions import BadWordError
+from appliance.policy.model import Request
+from appliance.policy.policy import Policy
+from appliance.policy.rights import Right, decide_right
+from appliance.policy.sections import PARAMETERS
+from rosmop.tool.terminal import printable, refused, say
+
+_MOST_SHOWN = 20
+
+
+class WouldDeny(msgspec.Struct, frozen=True):
+    """A request that passed, and that the enforced policy denies; `count`: how often."""
+
+    host: str
+    caller_id: str
+    category: str
+    resource: str
+    count: int
+    reason: str
+
+
+@speaks
+def enforce(
+    appliance: Appliance,
+    sections: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[SECTION]...", help="Sections such as Publishers (default: all)"),
+    ] = None,
+    *,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only list what would have been denied")] = False,
+    since: Annotated[
+        str, typer.Option("--since", help="Compare with the requests from this time on: 7d (ago), a date")
+    ] = "7d",
+    write: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write the changed policy to this file")
+    ] = None,
+    confirm_within: ConfirmWithin = None,
+) -> None:
+    """Enforce sections of the policy in force that are `audit-only`, after a comparison with the recorded requests.
+
+    With --dry-run, exit status 1 if a recorded request would have been denied. The policy file is not changed: a
+    reload brings its text back. A denial because another host holds a node name is not compared.
+
+    Example: rosrv policy enforce Publishers --confirm-within 5m
+    """
+    within = seconds_within(confirm_within, "policy")
+    body = body_in_force(appliance)
+    try:
+        change = enforced(body.text, sections or ())
+    except EnforceError as error:
+        raise refused([f"rosrv policy: {error}"]) from None
+    policy = compiled_with(change.text, body.file, context_of(body))
+    period = recorded_period(appliance, since)
+    rows = _would_deny(policy, period)
+    _show(appliance, rows, period, change)
+    if write is not None:
+        try:
+            write_told(write, change.text.encode())
+        except OSError as error:
+            raise usage_error(f"cannot write {write}: {error.strerror}") from None
+    if dry_run:
+        raise typer.Exit(1 if rows else 0)
+    _load(appliance, body, change, within, written=write)
+
+
+def _would_deny(policy: Policy, period: RecordedPeriod) -> list[WouldDeny]:
+    counts: Counter[tuple[Request, str]] = Counter()
+    for recorded in period.requests():
+        reason = denial(policy, recorded.observation)
+        if reason:
+            counts[recorded.observation.request, reason] += recorded.count
+    return [
+        WouldDeny(**request.fields(), count=count, reason=reason)
+        for (request, reason), count in counts.most_common()
+    ]
+
+
+def denial(policy: Policy, observation: Observation) -> str:
+    """Return the reason why the policy denies a recorded request, or an empty text."""
+    try:
+        requests = list(needed_rights(observation))
+    except BadWordError:  # no policy grants it, also not in audit-only mode
+        return ""
+    for request in requests:
+        if request.category in PARAMETERS and request.category not in policy.present:
+            continue
+        decision = decide_right(policy, Right(request))
+        if not decision.allowed and not (decision.asks and observation.asked):
+            return decision.reason
+    return ""
+
+
+def _show(appliance: Appliance, rows: list[WouldDeny], period: RecordedPeriod, change: EnforcedText) -> None:
+    start = f"{rfc3339(period.start)[:19]}Z"
+    if appliance.as_json:
+        say_json({
+            "sections": list(change.sections), "since": start, "removed": period.removed,
+            "unnamed": period.unnamed, "would_deny": [msgspec.to_builtins(row) for row in rows],
+        })  # fmt: skip
+        return
+    number = sum(row.count for row in rows)
+    say(f"would have denied since {start}: {number}", "yellow" if rows else "green")
+    for row in rows[:_MOST_SHOWN]:
+        say(printable(f"  {row.count}x {row.caller_id or 'a client'}: {row.reason}"), "yellow")
+    if len(rows) > _MOST_SHOWN:
+        say(f"  and {counted(len(rows) - _MOST_SHOWN, 'more request')}: --json lists all", "yellow")
+    if period.removed:
+        say("earlier records of that time are removed from the log", "yellow")
+    for host, count in sorted(period.unnamed.items()):
+        who = "several hosts" if host == "*" else appliance.host_in_words(host)
+        say(f"not compared: {counted(count, 'request')} of {who}, which the log only counts", "yellow")
+
+
+def _load(
+    appliance: Appliance,
+    known: PolicyInForce,
+    change: EnforcedText,
+    within: float | None,
+    *,
+    written: Path | None,
+) -> None:
+    names = " ".join(f"[{name}]" for name in change.sections)
+    if known.site_keys:
+        target = str(written) if written is not None else "FILE"
+        steps = f"sign it (rosrv sign {target} --key KEY), put it at {known.policy_file}, and run: rosrv policy reload"
+        first = "" if written is not None else "write the changed policy with --write FILE, "
+        raise refused([f"rosrv policy: this appliance loads signed policies only: {first}{steps}"])
+    body = appliance.ask_or_exit(PolicyLoad(change.text, f"enforces {names}", within, known.revision))
+    if appliance.as_json:
+        say_json(body)
+        return
+    say(f"enforces {names}")
+    say_loaded(body)
+    say(f"{known.policy_file} still says audit-only: change it before the next reload", "yellow")

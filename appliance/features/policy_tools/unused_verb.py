@@ -1,0 +1,68 @@
+"""The command `rosrv policy unused`."""
+
+from typing import Annotated
+
+import typer
+
+from appliance.audit.log.record_format import rfc3339
+from appliance.base.counted import counted
+from appliance.cli.connection.target import Appliance, speaks_with
+from appliance.cli.output import say_json
+from appliance.features.policy_tools.policy_input import live_now
+from appliance.features.policy_tools.policy_verbs import compiled
+from appliance.features.policy_tools.recorded_requests import recorded_period
+from appliance.features.policy_tools.rule_uses import RuleUse, RuleUses
+from rosmop.tool.terminal import printable, say
+
+
+@speaks_with("One JSON object for each rule that grants something")
+def list_unused(
+    appliance: Appliance,
+    *,
+    since: Annotated[
+        str, typer.Option("--since", help="From this time: 30d (ago), a date, or RFC 3339")
+    ] = "30d",
+    everything: Annotated[bool, typer.Option("--all", help="List the used rules, too")] = False,
+) -> None:
+    """List the rules of the policy in force, and the hosts in them, that nobody used since a time.
+
+    Registrations that live now count as uses. A right is `unknown` instead of `unused` where its uses may be among
+    records that were removed, or that only count the requests of a host.
+
+    Example: rosrv policy unused --since 30d
+    """
+    period = recorded_period(appliance, since)
+    uses = RuleUses(compiled(appliance, None, None, None))
+    for request in period.requests():
+        uses.add(request.observation, request.count)
+    uses.add_live(live_now(appliance))
+    rows = list(uses.rules(period.unnamed, removed=period.removed))
+    for row in rows:
+        if everything or row.state != "used":
+            _say_row(row, as_json=appliance.as_json)
+    if not appliance.as_json:
+        unused, unknown = (sum(row.state == state for row in rows) for state in ("unused", "unknown"))
+        start = f"{rfc3339(period.start)[:19]}Z"
+        text = f"{unused} of {counted(len(rows), 'rule')} name hosts that did not use them since {start}"
+        say(f"{text}; {unknown} unknown", "yellow" if unused else "green")
+        if period.removed:
+            say("the log's records before that time are removed", "yellow")
+        for host, count in sorted(period.unnamed.items()):
+            who = "several hosts" if host == "*" else appliance.host_in_words(host)
+            say(f"{counted(count, 'request')} of {who} are only counted in the log, without names", "yellow")
+
+
+def _say_row(row: RuleUse, *, as_json: bool) -> None:
+    if as_json:
+        rule = row.rule
+        place = {"section": rule.section, "key": rule.key, "file": rule.file, "line": rule.line}
+        hosts = {"unused_hosts": list(row.unused), "unknown_hosts": list(row.unknown)}
+        say_json({**place, "state": row.state, "used": row.used, **hosts})
+        return
+    if row.state == "used":
+        say(printable(f"{row.rule}: used {row.used}x"))
+    if row.unused:
+        by = " by " + " ".join(row.unused) if row.used else ""
+        say(printable(f"{row.rule}: unused{by}"), "yellow")
+    if row.unknown:
+        say(printable(f"{row.rule}: unknown for {' '.join(row.unknown)}"))

@@ -1,0 +1,108 @@
+from collections import Counter
+from ipaddress import ip_address
+
+import pytest
+
+from appliance.features.policy_tools.ask_rights import Answer, AskedPolicy, RightKind, carry_out
+from appliance.policy.judgement import PolicyContext
+from appliance.policy.model import Category, Request
+from appliance.policy.policy import Policy
+from appliance.policy.policy_compiler import compile_policy
+from appliance.policy.policy_findings import PolicyError
+
+ROBOT, PAD = ip_address("192.0.2.1"), ip_address("10.0.0.5")
+KNOWN = PolicyContext(robot=[ROBOT])
+TEXT = """[Nodes]
+default = robot
+[Publishers]
+default = robot
+[Subscribers]
+default = robot
+[Commands]
+default = robot
+[Services]
+default = robot
+[Clients]
+default = robot
+[Parameters]
+read default = robot
+write default = robot
+[Options]
+audit-only = all
+"""
+MOVE = RightKind(Category.PUBLISH, "/base/cmd_vel", PAD)
+LIGHT = RightKind(Category.PUBLISH, "/base/light", PAD)
+TOOL = RightKind(Category.NODE, "/rostopic_*", PAD)
+SCAN = RightKind(Category.SUBSCRIBE, "/scan", ROBOT)
+
+
+def asked(text: str = TEXT, cases: object = None) -> AskedPolicy:
+    return AskedPolicy(text, "p.ini", KNOWN, cases if isinstance(cases, dict) else {})
+
+
+def counts(*kinds: RightKind) -> Counter[tuple[RightKind, str]]:
+    return Counter({(kind, "/pad"): number for number, kind in enumerate(kinds, start=1)})
+
+
+def answered(policy: AskedPolicy, *kinds: RightKind, **replies: Answer) -> list[str]:
+    """Answer by the last part of the name, and return what was asked."""
+    questions: list[str] = []
+    written: list[str] = []
+
+    def answer(kind: RightKind, _node: str, _count: int) -> Answer:
+        questions.append(kind.name)
+        return replies.get(kind.name.rpartition("/")[2].strip("_*"), "later")
+
+    carry_out(policy, counts(*kinds), answer, lambda: written.append(policy.text))
+    acts = [replies.get(name.rpartition("/")[2].strip("_*")) for name in questions]
+    assert len(written) == sum(act in ("allow", "wider", "deny") for act in acts)
+    return questions
+
+
+def compiled(policy: AskedPolicy) -> Policy:
+    return compile_policy(policy.text, file="p.ini", robot=[ROBOT])
+
+
+def may(policy: AskedPolicy, kind: RightKind, name: str = "") -> bool:
+    decision = compiled(policy).decide(
+        Request(kind.host, "/pad", kind.category, name or kind.name.replace("*", "7"))
+    )
+    return decision.allowed and not decision.would_deny
+
+
+def test_only_what_the_rules_deny_is_asked_also_in_audit_only_mode() -> None:
+    assert answered(asked(), SCAN, MOVE) == ["/base/cmd_vel"]
+    assert answered(asked(TEXT.replace("audit-only = all\n", "")), SCAN, MOVE) == ["/base/cmd_vel"]
+
+
+def test_an_allowed_right_is_that_hosts_alone() -> None:
+    policy = asked()
+    answered(policy, MOVE, LIGHT, TOOL, cmd_vel="allow", rostopic="allow")
+    assert may(policy, MOVE) and may(policy, TOOL) and not may(policy, LIGHT)
+    assert not may(policy, RightKind(Category.PUBLISH, "/base/cmd_vel", ip_address("10.0.0.6")))
+    policy.judged()
+
+
+def test_a_wider_answer_covers_the_next_question() -> None:
+    policy = asked()
+    assert answered(policy, MOVE, LIGHT, cmd_vel="wider") == ["/base/cmd_vel"]
+    assert may(policy, LIGHT) and not may(policy, LIGHT, "/arm/light")
+
+
+def test_what_a_person_denied_is_a_test_case_and_is_not_asked_again() -> None:
+    policy = asked()
+    assert answered(policy, MOVE, cmd_vel="deny") == ["/base/cmd_vel"]
+    policy.judged()
+    again = asked(policy.text, policy.cases)
+    assert answered(again, MOVE) == []
+    again.text = again.text.replace("[Nodes]\n", "[Nodes]\n/pad = 10.0.0.5\n")
+    again.text = again.text.replace("[Publishers]\n", "[Publishers]\n/base/cmd_vel = robot 10.0.0.5\n")
+    with pytest.raises(PolicyError, match="expected deny"):
+        again.judged()
+
+
+def test_a_right_for_later_is_asked_again_and_quit_asks_no_more() -> None:
+    policy = asked()
+    assert answered(policy, MOVE, LIGHT) == ["/base/cmd_vel", "/base/light"]
+    assert answered(policy, MOVE, LIGHT, cmd_vel="quit") == ["/base/cmd_vel"]
+    assert policy.text == TEXT

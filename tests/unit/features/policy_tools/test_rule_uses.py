@@ -1,0 +1,83 @@
+from ipaddress import ip_address
+
+import pytest
+
+from appliance.features.policy_tools.learn import Observation
+from appliance.features.policy_tools.rule_uses import RuleUse, RuleUses
+from appliance.policy.live_rights import LiveRight
+from appliance.policy.model import Category, Request
+from appliance.policy.policy_compiler import compile_policy
+
+POLICY = compile_policy(
+    """[Groups]
+joystick = 10.0.0.5
+[Nodes]
+default = *
+[Publishers]
+/cmd_vel = joystick robot
+/scan    = robot
+[Subscribers]
+/scan = joystick
+[Commands]
+getParam = joystick
+shutdown =
+[Parameters]
+read /arm/** = joystick
+""",
+    file="p.ini",
+    robot=[ip_address("192.0.2.1")],
+)
+JOYSTICK, ROBOT = ip_address("10.0.0.5"), ip_address("192.0.2.1")
+
+
+def rows(uses: RuleUses, *, removed: bool = False, **unnamed: int) -> dict[str, RuleUse]:
+    found = uses.rules({host.replace("_", "."): count for host, count in unnamed.items()}, removed=removed)
+    return {f"{row.rule.section} {row.rule.key}": row for row in found}
+
+
+def used(*observations: tuple[str, Category, str, str, str]) -> RuleUses:
+    uses = RuleUses(POLICY)
+    for host, category, name, call, key in observations:
+        uses.add(Observation(Request(ip_address(host), "/it", category, name), call, key), 3)
+    return uses
+
+
+def test_a_request_uses_each_rule_that_it_needed() -> None:
+    found = rows(used(("10.0.0.5", Category.COMMAND, "getParam", "getParam", "/arm/gain")))
+    assert {name for name, row in found.items() if row.used} == {
+        "Commands getParam",
+        "Parameters read /arm/**",
+    }
+    assert found["Commands getParam"].state == "used"
+
+
+def test_the_hosts_of_a_line_are_told_apart() -> None:
+    found = rows(used(("10.0.0.5", Category.PUBLISH, "/cmd_vel", "registerPublisher", "")))
+    assert (found["Publishers /cmd_vel"].state, found["Publishers /cmd_vel"].unused) == ("unused", ("robot",))
+    assert found["Nodes default"].state == "used"
+
+
+def test_what_is_denied_uses_nothing_and_a_line_without_hosts_grants_nothing() -> None:
+    found = rows(used(("10.0.0.5", Category.PUBLISH, "/scan", "registerPublisher", "")))
+    assert found["Publishers /scan"].state == "unused"
+    assert "Commands shutdown" not in found
+
+
+def test_a_registration_that_lives_is_a_use_however_old() -> None:
+    uses = used()
+    uses.add_live([LiveRight(ROBOT, "/laser", "registerPublisher", "/scan")])
+    assert rows(uses)["Publishers /scan"].state == "used"
+
+
+@pytest.mark.parametrize("name", ["Publishers /cmd_vel", "Publishers /scan", "Parameters read /arm/**"])
+def test_nothing_is_unused_where_records_are_removed(name: str) -> None:
+    assert rows(used(), removed=True)[name].state == "unknown"
+    assert rows(used(), **{"*": 1})[name].state == "unknown"
+
+
+def test_a_host_whose_requests_are_only_counted_is_unknown_and_others_are_not() -> None:
+    found = rows(used(), **{"10_0_0_5": 40})
+    row = found["Publishers /cmd_vel"]
+    assert (row.unknown, row.unused) == (("joystick",), ("robot",))
+    assert found["Publishers /scan"].state == "unused"
+    assert found["Subscribers /scan"].state == "unknown"
