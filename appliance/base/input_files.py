@@ -6,6 +6,7 @@ A named pipe may block its reader forever, a device may be endless, and a file m
 import contextlib
 import errno
 import io
+import ipaddress
 import os
 import stat
 from collections.abc import Iterator
@@ -16,6 +17,7 @@ from appliance.base.owner_access import open_named
 LONGEST = 64 << 20
 """The largest file that is read, in bytes."""
 
+_MOST_HOSTS = 1 << 20  # bytes of /etc/hosts
 _NULL = os.makedev(1, 3)  # /dev/null: an empty file
 _KINDS = {
     stat.S_IFIFO: "a named pipe",
@@ -108,3 +110,19 @@ def stat_given(path: Path) -> os.stat_result:
         return os.fstat(descriptor)
     finally:
         os.close(descriptor)
+
+
+def names_of_hosts(file: Path = Path("/etc/hosts")) -> dict[str, str]:
+    """Return the first name of each address in a file like /etc/hosts; nothing if it cannot be read."""
+    try:
+        with file.open("rb") as lines:
+            text = lines.read(_MOST_HOSTS).decode("ascii", "replace")
+    except OSError:
+        return {}
+    names: dict[str, str] = {}
+    for line in text.splitlines():
+        words = line.partition("#")[0].split()
+        if len(words) > 1:
+            with contextlib.suppress(ValueError):
+                names.setdefault(str(ipaddress.ip_address(words[0])), words[1])
+    return names

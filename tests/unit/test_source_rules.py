@@ -308,7 +308,8 @@ WALL_CLOCK = {
     "a moment that people ask for (`--since 1h`), or a page that is shown once": [
         "api/front/moments.py", "audit/search/filter_options.py",
         "features/evidence/evidence_verbs.py",
-        "features/monitor_tools/offline.py", "features/policy_tools/learn_verb.py", "features/tunnels/protect_verb.py",
+        "features/monitor_tools/offline.py", "features/policy_tools/recorded_requests.py",
+        "features/tunnels/protect_verb.py",
         "base/timestamps.py",
         "features/topics/topic_verbs.py", "features/recorder/recorder_input.py", "features/recorder/record_verbs.py",
     ],

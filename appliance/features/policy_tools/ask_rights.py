@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import typer
 import yaml
@@ -20,13 +20,12 @@ from appliance.cli.output import usage_error as usage
 from appliance.cli.output import write_told
 from appliance.features.policy_tools.audit_only import EnforceError, enforced
 from appliance.features.policy_tools.grant import DecidedRequest, UngrantableError, grant
-from appliance.features.policy_tools.learn import lasting_name, needed_rights
+from appliance.features.policy_tools.learn import ROBOT, lasting_name, needed_rights
 from appliance.features.policy_tools.policy_impact import cases_beside
 from appliance.features.policy_tools.policy_input import body_in_force, context_of, read_text
 from appliance.features.policy_tools.recorded_requests import RecordedPeriod
 from appliance.policy.actions import VERBS, BadWordError
 from appliance.policy.cases import run_cases
-from appliance.policy.groups import ROBOT
 from appliance.policy.judgement import PolicyContext, judge
 from appliance.policy.model import Address, Category, Request
 from appliance.policy.policy import Policy
@@ -66,24 +65,24 @@ class AskedPolicy:
     text: str
     file: str
     known: PolicyContext
-    cases: dict[str, Any]
+    given: dict[str, object] = field(default_factory=dict)
+    cases: list[object] = field(default_factory=list)
     _denied: set[tuple[Category, str, Address]] = field(default_factory=set)
     _policy: tuple[str, Policy] | None = None
 
     def __post_init__(self) -> None:
-        if self.cases.get("cases"):
+        if self.cases:
             results = run_cases(self._compiled(), self.cases_text, f"{self.file}.tests.yaml")
             denied = (result.request for result in results if result.expected == "deny")
             self._denied |= {(request.category, request.resource, request.host) for request in denied}
-        given = self.cases.setdefault("given", {})
-        members = [str(place.network_address) for place in map(_network, self.known.robot)]
+        members = [str(ipaddress.ip_network(place).network_address) for place in self.known.robot]
         if members:
-            given.setdefault("robot", members)
-        self.cases.setdefault("cases", [])
+            self.given.setdefault("robot", members)
 
     @property
     def cases_text(self) -> str:
-        return yaml.safe_dump({name: rows for name, rows in self.cases.items() if rows}, sort_keys=False)
+        given = {"given": self.given} if self.given else {}
+        return yaml.safe_dump({**given, "cases": self.cases}, sort_keys=False)
 
     def _compiled(self) -> Policy:
         return compile_policy(self.text, file=self.file, hosts=self.known.hosts, robot=self.known.robot)
@@ -134,23 +133,19 @@ class AskedPolicy:
     def deny(self, kind: RightKind, node: str) -> None:
         """Add a test case that no later change may allow it."""
         host = str(kind.host)
-        if any(kind.host in _network(place) for place in self.known.robot):
+        if any(kind.host in ipaddress.ip_network(place) for place in self.known.robot):
             host = ROBOT
         case = {"host": host, "node": node or "/visitor", "deny": [kind.action]}
-        self.cases["cases"].append(case)
+        self.cases.append(case)
         self._denied.add((kind.category, kind.name.replace("*", "1"), kind.host))
 
     def judged(self) -> None:
         """Raise `PolicyError` if the text or one of its cases is wrong."""
-        cases = self.cases_text if self.cases["cases"] else None
+        cases = self.cases_text if self.cases else None
         known = replace(
             self.known, cases_file=f"{self.file}.tests.yaml", cases=cases, cases_error=None, site_keys=()
         )
         judge(self.text, self.file, known).accepted()
-
-
-def _network(place: Any) -> ipaddress.IPv4Network | ipaddress.IPv6Network:
-    return ipaddress.ip_network(place)
 
 
 def kinds_of(period: RecordedPeriod) -> Counter[tuple[RightKind, str]]:
@@ -172,24 +167,23 @@ def ask_rights(appliance: Appliance, period: RecordedPeriod, output: Path) -> in
     beside = cases_beside(output)
     body = body_in_force(appliance)
     known = context_of(body)
-    text = body.text
-    cases: dict[str, Any] = {}
+    text, tests = body.text, ""
     if output.exists():
-        text = read_text(output)
-        cases = yaml.safe_load(read_text(beside)) if beside.exists() else {}
+        text, tests = read_text(output), read_text(beside) if beside.exists() else ""
     elif beside.exists():
-        raise usage(
-            f"{beside} exists already, but {output} does not: remove it or give another file",
-            verb="rosrv policy",
-        )
+        text = f"{beside} exists already, but {output} does not: remove it or give another file"
+        raise usage(text, verb="rosrv policy")
     try:
-        asked = AskedPolicy(text, str(output), known, cases if isinstance(cases, dict) else {})
-    except (PolicyError, yaml.YAMLError) as error:
-        raise refused(error.findings if isinstance(error, PolicyError) else [f"{beside}: {error}"]) from error
+        cases = yaml.safe_load(tests) or {}
+        asked = AskedPolicy(text, str(output), known, cases.get("given") or {}, cases.get("cases") or [])
+    except PolicyError as error:
+        raise refused(error.findings) from error
+    except (yaml.YAMLError, AttributeError) as error:
+        raise refused([f"{beside}: not a file of test cases: {error}"]) from error
 
     def keep() -> None:
         write_told(output, asked.text.encode())
-        if asked.cases["cases"]:
+        if asked.cases:
             write_told(beside, asked.cases_text.encode())
 
     def answer(kind: RightKind, node: str, count: int) -> Answer:

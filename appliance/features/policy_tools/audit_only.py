@@ -56,7 +56,7 @@ def enforced(text: str, sections: Collection[str] = ()) -> EnforcedText:
 def _section(name: str, lenient: Collection[str]) -> str:
     section = _NAMES.get(name.strip("[]").casefold())
     if section is None:
-        raise EnforceError(f"{name!a} is no section that decides; these do: {', '.join(_NAMES.values())}")
+        raise EnforceError(f"{name!a} is not a section that decides; these are: {', '.join(_NAMES.values())}")
     if section not in lenient:
         raise EnforceError(f"[{section}] is not audit-only; these are: {', '.join(lenient)}")
     return section

@@ -101,7 +101,7 @@ def denial(policy: Policy, observation: Observation) -> str:
     """Return the reason why the policy denies a recorded request, or an empty text."""
     try:
         requests = list(needed_rights(observation))
-    except BadWordError:  # no policy grants it, also not in audit-only mode
+    except BadWordError:  # no policy grants it, not even in audit-only mode
         return ""
     for request in requests:
         if request.category in PARAMETERS and request.category not in policy.present:

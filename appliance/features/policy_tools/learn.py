@@ -23,12 +23,14 @@ from dataclasses import dataclass, field
 from appliance.features.policy_tools.stock_tools import key_of
 from appliance.policy.actions import BadWordError, check_resource
 from appliance.policy.commands import ALIASES
-from appliance.policy.groups import ROBOT
 from appliance.policy.host_sets import Network, canonical_address
 from appliance.policy.model import Address, Category, Request
 from appliance.policy.rights import COMMAND_FOR, rights_of_call
 from appliance.policy.sections import ASK, ASKING, DECIDERS, PARAMETERS
 from roswire.names import is_global_name, searched
+
+ROBOT = "robot"
+"""The group of the appliance's own machine."""
 
 _SHOWN_NODES = 3
 _LOG_LEVELS = ("get_loggers", "set_logger_level")
@@ -36,7 +38,7 @@ _REGISTRATIONS = frozenset({"registerPublisher", "registerSubscriber", "register
 _START_CALLS = ("getParam", "hasParam", "setParam", "getPid", "lookupNode")
 """The commands of a node, and of the `roslaunch` that starts it, at a start."""
 _GROUP = re.compile(r"[A-Za-z_][A-Za-z0-9_.-]{0,60}+", re.ASCII)
-_RESERVED = {"robot", "default", "ask"}
+_RESERVED = {ROBOT, "default", ASK}
 _UNKNOWN = "192.0.2.99"  # an address of TEST-NET-1, which no host has
 
 

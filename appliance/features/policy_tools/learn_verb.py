@@ -10,9 +10,9 @@ import typer
 
 from appliance.audit.search.filter_options import Since
 from appliance.base.counted import counted
+from appliance.base.input_files import names_of_hosts
 from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.target import Appliance, speaks_with
-from appliance.cli.hosts_file import names_of_hosts
 from appliance.cli.output import say_json
 from appliance.features.policy_tools.ask_rights import ask_rights
 from appliance.features.policy_tools.learn import LearnedPolicy, Observation, covered, learn
@@ -40,7 +40,7 @@ def learn_policy(
     ] = None,
     tests: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Write test cases of what was used, too; must not exist"),
+        typer.Option(metavar="FILE", help="Also write test cases for the used rights; must not exist"),
     ] = None,
     ask: Annotated[
         bool, typer.Option("--ask", help="Ask about each kind of right that the policy does not grant yet")

@@ -23,7 +23,7 @@ SEVERAL = "*"
 
 @dataclass(frozen=True, slots=True)
 class RuleUse:
-    """A rule that grants something. `unused` and `unknown` are the words of its hosts that nobody used, or perhaps."""
+    """A rule that grants something. `unused` and `unknown` are the words of hosts that did not use it, or perhaps."""
 
     rule: Rule
     category: Category

@@ -22,9 +22,9 @@ def list_unused(
     since: Annotated[
         str, typer.Option("--since", help="From this time: 30d (ago), a date, or RFC 3339")
     ] = "30d",
-    everything: Annotated[bool, typer.Option("--all", help="List the used rules, too")] = False,
+    everything: Annotated[bool, typer.Option("--all", help="Also list the used rules")] = False,
 ) -> None:
-    """List the rules of the policy in force, and the hosts in them, that nobody used since a time.
+    """List the rules of the policy in force, and the hosts in them, that have no use since a time.
 
     Registrations that live now count as uses. A right is `unknown` instead of `unused` where its uses may be among
     records that were removed, or that only count the requests of a host.

@@ -8,7 +8,7 @@ from typing import Annotated
 import msgspec
 import typer
 
-from appliance.cli.hosts_file import names_of_hosts
+from appliance.base.input_files import names_of_hosts
 from appliance.cli.output import Json, say_json, usage_error
 from appliance.features.survey.draft import DraftError, PolicyDraft, draft
 from appliance.features.survey.inventory import GraphInventory, problems

@@ -1,4 +1,5 @@
 from collections import Counter
+from collections.abc import Sequence
 from ipaddress import ip_address
 
 import pytest
@@ -36,8 +37,8 @@ TOOL = RightKind(Category.NODE, "/rostopic_*", PAD)
 SCAN = RightKind(Category.SUBSCRIBE, "/scan", ROBOT)
 
 
-def asked(text: str = TEXT, cases: object = None) -> AskedPolicy:
-    return AskedPolicy(text, "p.ini", KNOWN, cases if isinstance(cases, dict) else {})
+def asked(text: str = TEXT, cases: Sequence[object] = ()) -> AskedPolicy:
+    return AskedPolicy(text, "p.ini", KNOWN, cases=list(cases))
 
 
 def counts(*kinds: RightKind) -> Counter[tuple[RightKind, str]]:
@@ -89,7 +90,7 @@ def test_a_wider_answer_covers_the_next_question() -> None:
     assert may(policy, LIGHT) and not may(policy, LIGHT, "/arm/light")
 
 
-def test_what_a_person_denied_is_a_test_case_and_is_not_asked_again() -> None:
+def test_a_denied_right_is_a_test_case_and_is_not_asked_again() -> None:
     policy = asked()
     assert answered(policy, MOVE, cmd_vel="deny") == ["/base/cmd_vel"]
     policy.judged()

@@ -40,10 +40,12 @@ def test_all_sections_are_enforced_without_the_line() -> None:
             ["Publishers"],
             "[Publishers] is not audit-only; these are: Nodes",
         ),
-        ("[Options]\naudit-only = all\n", ["Ports"], "'Ports' is no section that decides"),
+        ("[Options]\naudit-only = all\n", ["Ports"], "'Ports' is not a section that decides"),
     ],
 )
-def test_what_cannot_be_enforced_is_said(options: str, sections: list[str], reason: str) -> None:
+def test_a_section_that_cannot_be_enforced_is_an_error(
+    options: str, sections: list[str], reason: str
+) -> None:
     with pytest.raises(EnforceError) as caught:
         enforced(f"{options}[Nodes]\n/a = 10.0.0.1\n", sections)
     assert reason in str(caught.value)

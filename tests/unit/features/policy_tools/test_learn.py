@@ -238,7 +238,7 @@ def test_a_node_that_was_only_taken_over_was_not_seen_to_start() -> None:
     assert learn([_ADOPTED, started, _STARTED]).unstarted == ()
 
 
-def test_what_a_start_needs_is_granted_to_that_host_only() -> None:
+def test_the_rights_of_a_start_are_granted_to_that_host_only() -> None:
     """The calls that an unmodified node and its `roslaunch` make at a start pass; another host gains nothing."""
     learned = learn([_ADOPTED, _STARTED], with_start=True)
     policy = compiled(learned)
