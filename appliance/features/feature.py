@@ -141,14 +141,16 @@ class FeaturePart:
 class ConsolePart(NamedTuple):
     """A component of the console, in a file of the feature's folder `console`.
 
-    A `view` is a page with this title. A `banner` is shown on every view, a `record` beside an audit record, and
-    `standby` is the page of an appliance that is not active.
+    A `view` is a page with this title. A `banner` is shown on every view, a `record` beside an audit record, a
+    `situation` is a line on top of Now, and `standby` is the page of an appliance that is not active. The parts of a
+    place are sorted by `order`, then by the table of features.
     """
 
-    place: Literal["view", "banner", "now", "record", "robot", "standby"]
+    place: Literal["view", "banner", "situation", "now", "record", "robot", "standby"]
     file: str
     component: str
     title: str = ""
+    order: int = 0
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,8 @@ from appliance.features.table import FEATURES
 
 _VIEWS = ("now", "graph", "audit", "policy", "monitors", "robot")
 _PREFIX = "/console/static/"
-_SERVED = ("css", "icon.svg", "index.html", "js", "vendor")  # the other files of the folder are Python
+# The other files of the folder are Python.
+_SERVED = ("css", "icon-calls.svg", "icon.svg", "index.html", "js", "vendor")
 _PAGE, _SCRIPT, _STYLE, _PARTS = "index.html", "js/main.js", "css/main.css", "js/features.js"
 _ADDRESS = re.compile(rf"{_PREFIX}([\w./-]++)")
 _GZIP = re.compile(r"\bgzip\b(?!\s*+;\s*+q=0(?:\.0*+)?\s*+(?:,|$))", re.IGNORECASE)
@@ -126,15 +127,13 @@ def views() -> tuple[str, ...]:
 def _parts(features: Iterable[Feature]) -> str:
     imports: list[str] = []
     rows: list[str] = []
-    for feature in features:
-        for part in feature.console:
-            alias = f"part{len(rows)}"
-            imports.append(
-                f'import {{ {part.component} as {alias} }} from "../features/{feature.name}/{part.file}";\n'
-            )
-            rows.append(
-                f"{{ place: {json.dumps(part.place)}, title: {json.dumps(part.title)}, Part: {alias} }},\n"
-            )
+    parts = ((feature.name, part) for feature in features for part in feature.console)
+    for name, part in sorted(parts, key=lambda row: row[1].order):
+        alias = f"part{len(rows)}"
+        imports.append(f'import {{ {part.component} as {alias} }} from "../features/{name}/{part.file}";\n')
+        rows.append(
+            f"{{ place: {json.dumps(part.place)}, title: {json.dumps(part.title)}, Part: {alias} }},\n"
+        )
     return "".join([*imports, "export const PARTS = [", *rows, "];\n"])
 
 

@@ -21,7 +21,11 @@ def _operations() -> "tuple[type[AdminRequest[Any]], ...]":
 APPROVALS = Feature(
     "approvals",
     operations=_operations,
-    console=(ConsolePart("now", "panel.js", "Approvals"), ConsolePart("robot", "panel.js", "Approvals")),
+    console=(
+        ConsolePart("banner", "bar.js", "WaitingCalls"),
+        ConsolePart("situation", "panel.js", "Waits", order=3),
+        ConsolePart("robot", "panel.js", "Approvals", order=3),
+    ),
     verbs={"approve": Verb(f"{_PLACE}approval_verbs:approve", after="drive")},
     quotas=ROWS,
     inherit=f"{_PLACE}control_part:inherit",

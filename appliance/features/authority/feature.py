@@ -22,7 +22,10 @@ AUTHORITY = Feature(
     "authority",
     settings=AuthoritySettings,
     operations=_operations,
-    console=(ConsolePart("robot", "panel.js", "Drive"),),
+    console=(
+        ConsolePart("situation", "panel.js", "Drives", order=1),
+        ConsolePart("robot", "panel.js", "Drive", order=1),
+    ),
     verbs={
         "drive": Group(
             "Say which host may drive: one at a time holds each group of [Authority].",

@@ -40,7 +40,10 @@ DOORS = Feature(
         ),
     ),
     operations=_operations,
-    console=(ConsolePart("robot", "own.js", "OwnDoor"), ConsolePart("robot", "panel.js", "Doors")),
+    console=(
+        ConsolePart("robot", "own.js", "OwnDoor", order=4),
+        ConsolePart("robot", "panel.js", "Doors", order=4),
+    ),
     verbs={
         "door": Group(
             "Let browsers, viewers and agents in, each with its own rights.",

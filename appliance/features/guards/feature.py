@@ -38,7 +38,10 @@ GUARDS = Feature(
     "guards",
     operations=_operations,
     operate=_operate,
-    console=(ConsolePart("robot", "panel.js", "Guards"),),
+    console=(
+        ConsolePart("situation", "situation.js", "Stops", order=2),
+        ConsolePart("robot", "panel.js", "Guards", order=2),
+    ),
     verbs={
         "guard": Group(
             "Stop a robot that runs away: monitors from presets, without editing a file.",

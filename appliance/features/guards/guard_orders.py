@@ -106,10 +106,11 @@ class GuardOrders:
             GuardsState(loaded, acting, place.elsewhere, place.bypassed, place.unanswered) if loaded else None
         )
 
-    async def guards(self, _request: guard_requests.GuardsWanted) -> GuardList:
+    async def guards(self, request: guard_requests.GuardsWanted) -> GuardList:
         rows = [self._row(name, preset) for name, preset in self._guards().items()]
+        presets = [preset_row(one) for one in PRESETS.values()] if request.presets else []
         return GuardList(
-            self._monitors.revision, self._monitors.tag, [preset_row(one) for one in PRESETS.values()], rows,
+            self._monitors.revision, self._monitors.tag, presets, rows,
             [*faults(self._placed()), *self.placement.elsewhere],
         )  # fmt: skip
 

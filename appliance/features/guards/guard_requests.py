@@ -10,7 +10,7 @@ import msgspec
 from appliance.channel.admin import MONITORS, AdminRequest, Confirm, Hold, OneMonitor, WaitingRequest
 from appliance.channel.answers.field_docs import doc
 from appliance.channel.answers.monitor_answers import Replacement
-from appliance.channel.rest_operation import rest
+from appliance.channel.rest_operation import parameter, rest
 from appliance.features.guards.guard_answers import DriverCheck, GuardList, GuardPlan, Suggestions
 
 _NO_GUARD = {404: "There is no such guard."}
@@ -58,9 +58,11 @@ class NewDriverCheck(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     patience: Annotated[float, doc("how long it waits for a slow drive, in seconds")] = 30.0
 
 
-@rest("viewer", "GET", "/v1/guards", name="guards")
+@rest("viewer", "GET", "/v1/guards", ("presets",), name="guards")
 class GuardsWanted(WaitingRequest[GuardList], frozen=True, tag="guards"):
     """The presets with their parameters, and the guards with their states."""
+
+    presets: Annotated[bool, parameter("also the presets, which a client needs once")] = True
 
 
 @rest("viewer", "GET", "/v1/guards/suggestions", name="guard_suggestions")

@@ -4,6 +4,7 @@ Leaving the block fails if the page requested anything from another host, violat
 raised a script error, or set a cookie.
 """
 
+import re
 import urllib.parse
 from collections.abc import Iterable
 from types import TracebackType
@@ -27,6 +28,13 @@ if (!sessionStorage.getItem("begun")) {
   sessionStorage.setItem("rosrv.token", "TOKEN");
 }
 """
+# Whether an element is in the window of a page that is not scrolled, with nothing over its middle.
+_SEEN_AT_ONCE = """(element) => {
+  const { left, right, top, bottom, width, height } = element.getBoundingClientRect();
+  if (scrollY || !width || !height || left < 0 || top < 0 || right > innerWidth || bottom > innerHeight) return false;
+  const above = document.elementFromPoint((left + right) / 2, (top + bottom) / 2);
+  return element.contains(above);
+}"""
 # The browser's own messages about failed requests; tests check the page's messages instead.
 _BROWSER_MESSAGES = ("Failed to load resource", "net::ERR_")
 
@@ -90,6 +98,11 @@ class Reader:
 
     def fits(self) -> None:
         wait_until(self.page, "document.documentElement.scrollWidth <= innerWidth")
+
+    def sees(self, locator: Locator, text: str | re.Pattern[str]) -> None:
+        """Wait until the element has the text and is seen without scrolling."""
+        expect(locator.first).to_contain_text(text)
+        eventually(lambda: locator.first.evaluate(_SEEN_AT_ONCE), f"{text} is seen without scrolling")
 
     def axe(self) -> list[str]:
         self.settle()

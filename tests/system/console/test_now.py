@@ -31,6 +31,7 @@ def test_health_says_what_the_appliance_says(appliance: Appliance, opened: Calla
     expect(page.get_by_role("region", name="Health")).to_contain_text("In service")
     expect(page.get_by_role("region", name="Health")).to_contain_text("Revision 1")
     status = appliance.status()
+    page.get_by_role("heading", name="Processes").click()
     for process in status["processes"]:
         if process["role"] == "compiler":
             continue  # ends when it is idle

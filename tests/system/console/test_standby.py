@@ -130,12 +130,15 @@ def test_both_appliances_are_shown(pair: PairConsoles, theme: str, width: int) -
 
 def test_a_silent_witness_is_a_banner_on_every_view(pair: PairConsoles) -> None:
     page, other = pair.open("a", "admin").go("graph"), pair.open("b", "viewer").go("now", heading="Standby")
+    narrow = pair.open("a", "viewer", width=390, height=844)
+    narrow.go("now")
     banner = page.locator(".banner").filter(has_text="the witness on the robot")
     expect(page.locator("[data-standing=live]")).to_be_visible()
     expect(page.locator(".banner")).to_have_count(0)
     assert pair.site.witness is not None
     pair.site.witness.stop()
     expect(banner).to_contain_text("the witness on the robot (10.79.0.10) has not answered")
+    narrow.sees(narrow.page.locator(".banner"), "the witness on the robot (10.79.0.10) has not answered")
     page.get_by_role("link", name="Now").click()
     expect(page.get_by_role("region", name="Open alarms")).to_contain_text("systemctl status rosrv-witness")
     expect(panel(page).get_by_role("row").nth(3)).to_contain_text("silent")

@@ -1,5 +1,6 @@
 /** The console: the sign-in page, or the shell with the view that the URL names. */
 
+import { entitle } from "./attention.js";
 import { Door, Lock } from "./door.js";
 import { html, useEffect } from "./html.js";
 import { start, stop } from "./live.js";
@@ -10,7 +11,7 @@ import { useNames } from "./parts/host.js";
 import { Toasts, clearToasts } from "./parts/toast.js";
 import { passive } from "./passive.js";
 import { place } from "./router.js";
-import { entitle, session } from "./session.js";
+import { session } from "./session.js";
 import { useShortcuts } from "./shortcuts.js";
 import { useStore } from "./store.js";
 import { NotLive } from "./standing.js";

@@ -8,7 +8,8 @@ import { Failure, Notice } from "./parts/notice.js";
 import { Check, Field } from "./parts/field.js";
 import { Problem } from "./problem.js";
 import { ask } from "./rest.js";
-import { end, entitle, kept, open, ROBOT, session, stated, UNUSED } from "./session.js";
+import { entitle } from "./attention.js";
+import { end, kept, open, ROBOT, session, stated, UNUSED } from "./session.js";
 import { begin, PROVIDER } from "./sign-on.js";
 import { useStore } from "./store.js";
 

@@ -45,6 +45,13 @@ export function retry() {
   running?.retry();
 }
 
+/** The appliance's present time in seconds since the epoch, by its last sample; null before the first one. */
+export function applianceTime() {
+  const { samples, heard } = live.get();
+  const last = samples.at(-1);
+  return last && heard !== null ? last.time + (Date.now() - heard) / 1000 : null;
+}
+
 async function recall() {
   try {
     const { samples } = await get("/v1/history", { points: 600 });

@@ -34,7 +34,7 @@ export function iso(time) {
 
 /** A text of the appliance, its times in the user's zone. @param {string} text */
 export function inOwnZone(text) {
-  return text.replace(/\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d(\.\d+)?(Z|\+00:00)/g, (time) => shown(new Date(time), undefined));
+  return text.replace(/\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d(\.\d+)?(Z|\+00:00)/g, (time) => shown(new Date(time.replace(" ", "T")), undefined));
 }
 
 /** Hours and minutes, for the axis of a plot. @param {number} seconds */

@@ -17,6 +17,7 @@ export const notable = createStore({
   denials: /** @type {AuditRecord[] | null} */ (null),
   doings: /** @type {AuditRecord[] | null} */ (null), // actions of monitors
   incidents: /** @type {AuditRecord[] | null} */ (null), // records of severity alarm
+  latest: /** @type {AuditRecord | null} */ (null), // the newest record since the page follows
 });
 
 let running = /** @type {ReturnType<typeof follow> | null} */ (null);
@@ -32,7 +33,7 @@ export async function startNotable() {
     past({ decision: ["deny", "would deny"] }), past({ category: "monitor", severity: "notice" }).then((records) => records.filter(isDoing)), past({ severity: "alarm" }),
   ]);
   if (mine !== generation) return;
-  notable.set({ denials, doings, incidents });
+  notable.update({ denials, doings, incidents });
   const last = Math.max(0, ...[...denials, ...doings, ...incidents].map((one) => one.sequence));
   running = follow(() => `/v1/audit/stream?severity=notice&equality=1&since=${NEAR}`, heard, () => {}, String(last));
 }
@@ -41,16 +42,16 @@ export function stopNotable() {
   generation += 1;
   running?.stop();
   running = null;
-  notable.set({ denials: null, doings: null, incidents: null });
+  notable.set({ denials: null, doings: null, incidents: null, latest: null });
 }
 
 function heard(/** @type {string} */ event, /** @type {AuditRecord} */ record) {
   if (event !== "record") return;
-  const change = /** @type {any} */ ({});
+  const change = /** @type {any} */ ({ latest: record });
   if (isDenial(record)) change.denials = added(notable.get().denials, record);
   if (isDoing(record)) change.doings = added(notable.get().doings, record);
   if (record.severity === "alarm") change.incidents = added(notable.get().incidents, record);
-  if (Object.keys(change).length) notable.update(change);
+  notable.update(change);
 }
 
 /** Whether a record is an action of a monitor, and not an operator's change of a monitor. @param {AuditRecord} record */

@@ -49,11 +49,6 @@ export function stated(name) {
 /** The robot's name; empty without one. */
 export const ROBOT = stated("robot");
 
-/** Name the page, first by the robot. @param {string} view */
-export function entitle(view) {
-  document.title = [ROBOT, view, "ROSRV"].filter(Boolean).join(" · ");
-}
-
 /** The name of a downloaded file, which has the robot's. @param {string} what @param {string} rest */
 export function fileName(what, rest) {
   return ["rosrv", ROBOT, what, rest].filter(Boolean).join("-");

@@ -8,14 +8,14 @@ import { done, failed } from "#console/parts/toast.js";
 
 const PASSING = ["stopping", "withholding", "shadow"]; // states whose counts change without a change of the specifications
 
-/** @returns {{body: any, error: unknown, again: () => Promise<void>, order: (said: string, more: string, method: string, path: string, options?: any) => Promise<boolean>}} */
-export function useGuards() {
+/** @param {{presets?: boolean}} [given] `presets`: with the presets, which are large @returns {{body: any, error: unknown, again: () => Promise<void>, order: (said: string, more: string, method: string, path: string, options?: any) => Promise<boolean>}} */
+export function useGuards({ presets = true } = {}) {
   const [state, setState] = useState({ body: /** @type {any} */ (null), error: /** @type {unknown} */ (null) });
   const passing = state.body?.guards.some((/** @type {any} */ row) => PASSING.includes(row.state) || row.preset === "withhold");
   const mark = useStore(live, (one) => JSON.stringify([one.status?.monitors ?? null, one.samples.at(-1)?.monitors ?? null, passing && one.samples.at(-1)?.time]));
   const again = async () => {
     try {
-      setState({ body: await get("/v1/guards"), error: null });
+      setState({ body: await get("/v1/guards", { presets: presets ? undefined : 0 }), error: null });
     } catch (error) {
       setState((state) => ({ ...state, error }));
     }

@@ -6,7 +6,7 @@ import { Mark } from "#console/parts/icon.js";
 import { Failure, Loading } from "#console/parts/notice.js";
 import { useResource } from "#console/parts/resource.js";
 import { get } from "#console/rest.js";
-import { entitle } from "#console/session.js";
+import { entitle } from "#console/attention.js";
 import { signOut } from "#console/sign-on.js";
 import { useStore } from "#console/store.js";
 import { Banner, Pair } from "./pair.js";

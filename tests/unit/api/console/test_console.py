@@ -103,7 +103,8 @@ def test_the_files_of_the_page_are_cached_for_good_and_compressed(client: Client
             assert plain.content == answer.content
             assert plain.headers["etag"] != answer.headers["etag"] or not address.endswith((".js", ".css"))
     assert {Path(address).name.partition(".")[0] for address in seen} == {
-        "console", "early", "main", "preact", "dagre", "codemirror", "inter", "jetbrains-mono", "icon", "view"
+        "console", "early", "main", "preact", "dagre", "codemirror", "inter", "jetbrains-mono", "icon", "icon-calls",
+        "view",
     }  # fmt: skip
 
 

@@ -4,7 +4,7 @@ import { html, useState } from "../html.js";
 import { inOwnZone, Moment } from "../moments.js";
 import { Badge } from "../parts/badge.js";
 import { Given } from "../parts/given.js";
-import { Empty, Loading } from "../parts/notice.js";
+import { Loading } from "../parts/notice.js";
 import { Link } from "../router.js";
 
 const PLACES = { policy: "/console/policy", monitors: "/console/monitors", hosts: "/console/hosts", audit: "/console/audit", system: "/console/audit?severity=warning", denials: "/console/audit?decision=deny&since=1h" };
@@ -29,10 +29,10 @@ export function Alarms(/** @type {{alarms: any[], incidents: any[] | null}} */ {
     }
     setSeen(last);
   };
-  return html`<section class="panel" aria-labelledby="alarms"><div class="panel-head"><h2 id="alarms">Open alarms</h2>
+  return html`<section class="panel spaced" aria-labelledby="alarms"><div class="panel-head"><h2 id="alarms">Open alarms</h2>${incidents !== null && !alarms.length && !open.length && html`<span class="muted small">No open alarms</span>`}
       ${open.length > 0 && html`<span class="end"><button class="button small" onClick=${review} title="Hide the alarms below in this browser; conditions stay until they end">Mark as reviewed</button></span>`}</div>
-    ${incidents === null ? html`<${Loading} rows=${2} />` : !alarms.length && !open.length ? html`<${Empty} icon="check" title="No open alarms">Alarms of monitors, processes and the audit log appear here.</${Empty}>`
-      : html`<ul class="alarm-list">${alarms.map((one, /** @type {number} */ at) => html`<li key=${`${one.kind} ${at}`} class=${`alarm ${one.severity}`}><${Badge} word=${one.severity} />
+    ${incidents === null ? html`<${Loading} rows=${2} />` : !alarms.length && !open.length ? null
+      : html`<ul class="alarm-list">${alarms.map((one, /** @type {number} */ at) => html`<li key=${`${one.kind} ${at}`} class="alarm"><${Badge} word=${one.severity} />
           <${Link} to=${placeOf(one)} class="alarm-text"><${Given} value=${inOwnZone(one.text)} most=${300} /></${Link}></li>`)}
         ${open.slice(0, MOST).map((one) => html`<li key=${one.id} class="alarm"><${Badge} word=${one.severity} />
           <${Link} to=${`/console/audit/${one.id}`} class="alarm-text"><${Given} value=${one.event} />: <${Given} value=${one.reason || one.resource} most=${160} /></${Link}><span class="muted small nowrap"><${Moment} at=${one.time} /></span></li>`)}

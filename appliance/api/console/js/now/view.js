@@ -15,6 +15,7 @@ import { useKeys } from "../shortcuts.js";
 import { useStore } from "../store.js";
 import { Alarms, placeOf } from "./alarms.js";
 import { Doings, Refusals } from "./lists.js";
+import { Situation } from "./situation.js";
 
 const SPAN = 900;
 const DROPS = 1; // index in the counts of a monitor: verdicts, drops, changes, faults
@@ -34,11 +35,11 @@ export function Now() {
   });
   if (!status) return html`<div class="head"><h1>Now</h1></div><section class="panel"><${Loading} /></section>`;
   return html`<div class="head"><h1>Now</h1><span class="head-sub">running for ${lasting(now / 1000 - status.since)}</span></div>
+    <${Situation} /><${Alarms} alarms=${alarms} incidents=${incidents} />
     <${Health} status=${status} alarms=${alarms} />
     <div class="now-grid">
-      <div class="now-alarms"><${Alarms} alarms=${alarms} incidents=${incidents} /></div>
-      <div class="now-main stack"><${Curves} /><${Refusals} /><${Doings} /></div>
-      <div class="now-processes stack"><${FeatureParts} place="now" status=${status} /><${Processes} status=${status} /></div>
+      <div class="stack"><${Curves} /><${Refusals} /></div>
+      <div class="stack"><${FeatureParts} place="now" status=${status} /><${Doings} /><${Processes} status=${status} /></div>
     </div>`;
 }
 
@@ -78,10 +79,11 @@ function droppedByMonitors(/** @type {import("../live.js").Sample} */ sample) {
 }
 
 function Processes(/** @type {{status: any}} */ { status }) {
-  return html`<section class="panel" aria-labelledby="processes"><div class="panel-head"><h2 id="processes">Processes</h2></div>
+  const restarted = status.processes.filter((/** @type {any} */ one) => one.restarts).length;
+  return html`<section class="panel" aria-labelledby="processes"><details><summary class="panel-head"><h2 id="processes">Processes</h2><span class="muted small">${counted(status.processes.length, "process", "processes")}${restarted ? `, ${restarted} restarted` : ""}</span></summary>
     <div class="table-wrap"><table class="table"><thead><tr><th>Role</th><th class="number">Process</th><th>Since</th><th class="number">Restarts</th></tr></thead>
     <tbody>${numbered(status.processes).map(({ name, one }) => html`<tr key=${name}><td><${Given} value=${name} /></td><td class="number">${one.pid}</td><td class="nowrap"><${Moment} at=${one.since} /></td>
-      <td class="number">${one.restarts ? html`<${Badge} word=${String(one.restarts)} tone="warn" />` : "0"}</td></tr>`)}</tbody></table></div></section>`;
+      <td class="number">${one.restarts ? html`<${Badge} word=${String(one.restarts)} tone="warn" />` : "0"}</td></tr>`)}</tbody></table></div></details></section>`;
 }
 
 /** Processes with the names that `rosrv status` prints: processes of one role are numbered from 0. @param {any[]} processes @returns {{name: string, one: any}[]} */

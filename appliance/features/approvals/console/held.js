@@ -1,0 +1,62 @@
+/** The calls that wait for an operator, and the approvals: fetched once for all places that show them. */
+
+import { callFor } from "#console/attention.js";
+import { useEffect } from "#console/html.js";
+import { live } from "#console/live.js";
+import { notable } from "#console/notable.js";
+import { counted } from "#console/numbers.js";
+import { done, failed } from "#console/parts/toast.js";
+import { ask, get } from "#console/rest.js";
+import { session } from "#console/session.js";
+import { createStore, useStore } from "#console/store.js";
+import { waitingOf } from "./slots.js";
+import { ring } from "./sound.js";
+
+/** `at`: when they came, by the browser's monotonic clock, in milliseconds. `rows` is null before they are known. */
+export const held = createStore({ rows: /** @type {any[] | null} */ (null), error: /** @type {unknown} */ (null), at: 0 });
+
+export async function again() {
+  try {
+    const { approvals } = await get("/v1/approvals");
+    held.set({ rows: approvals, error: null, at: performance.now() });
+  } catch (error) {
+    held.update({ error });
+  }
+}
+
+/**
+ * Fetch them when a record or the state says that they changed, and with each state while there are any. The bar, which
+ * is on every page, calls this.
+ */
+export function useHeldCalls() {
+  const mark = useStore(live, (one) => {
+    const counts = one.status?.approvals;
+    if (!counts) return "";
+    const some = counts.waiting + counts.leases > 0 || held.get().rows?.length;
+    return [one.status.since, counts.waiting, counts.leases, some && one.heard].join(" ");
+  });
+  const record = useStore(notable, (one) => (one.latest?.event.startsWith("approval ") ? one.latest.sequence : 0));
+  const signedIn = useStore(session, ({ current }) => current !== null);
+  const waiting = waitingOf(useStore(held, (one) => one.rows));
+  useEffect(() => {
+    if (mark || record) again();
+  }, [mark, record]);
+  useEffect(() => () => held.set({ rows: null, error: null, at: 0 }), []);
+  useEffect(() => callFor(signedIn && waiting.length ? counted(waiting.length, "call waits", "calls wait") : ""), [signedIn, waiting.length]);
+  useEffect(() => () => callFor(""), []);
+  const newest = Math.max(0, ...waiting.map((one) => one.number));
+  useEffect(() => {
+    if (signedIn && newest) ring();
+  }, [newest]);
+}
+
+/** Approve or refuse a held call, and say so. @param {number} number @param {"approve" | "refuse"} verb @param {any} [json] */
+export async function decide(number, verb, json) {
+  try {
+    const { body } = await ask("POST", `/v1/approvals/${number}/${verb}`, { json, match: "*" });
+    done(`Approval ${body.number}: ${body.state}`, `${body.host} ${body.resource}`);
+  } catch (failure) {
+    failed(failure);
+  }
+  await again();
+}
