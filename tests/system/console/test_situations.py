@@ -1,4 +1,4 @@
-"""What needs a person is seen on Now without scrolling, on a wide window and on a telephone. Each situation is real."""
+"""Situations that need a person are seen on Now without scrolling, wide and on a telephone. Each one is real."""
 
 import http.client
 import re
