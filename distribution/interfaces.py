@@ -7,55 +7,65 @@ lines, at a release. `tests/unit/test_interfaces.py` fails if a count exceeds it
 import ast
 import re
 import sys
-from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
 from distribution.checkout import ROOT
+from distribution.counts import (
+    Count,
+    functions,
+    main,
+    name_of,
+    no_collector,
+    nodes,
+    parsed,
+    python_files,
+    statements,
+)
 
 _NAMED = "doors, approvals, authority, sso, guards, standby or recorder"
 _CERTIFICATES = ("appliance/ipsec/", "appliance/hosts/")  # an authority there is a certificate authority
 _FEATURE_WORDS = re.compile(
     r"doors?|approvals?|approved?|authority|sso|sign_ons?|guards?|standby|recorder|recordings?"
 )
-_TABLES = ("appliance.features.feature", "appliance.features.table", "appliance.features.view",
-           "appliance.features.views", "appliance.features.parts")  # fmt: skip
 _MODULE_NAME = re.compile(r"appliance(\.\w+)+(?=:|$)")
-_LONG_HELPER = 40  # lines
 _MANY_ATTRIBUTES = 15
 
 
-class Count(NamedTuple):
-    """A count, with the most that it may be, and its goal."""
+class _File(NamedTuple):
+    """The facts of a file of the product. Its syntax tree would be a thousand times as large."""
 
     name: str
-    what: str
-    limit: int
-    goal: int
-    members: Callable[[], list[str]]
+    names: frozenset[str]
+    """The modules of the appliance that it names: in imports, also late ones, and in strings."""
+    late: tuple[int, ...]
+    names_a_feature: bool
+    reads_records: bool
+    wide: tuple[str, ...]
+    any: tuple[int, ...]
 
 
 @cache
-def _tree(path: Path) -> ast.Module:
-    return ast.parse(path.read_text(encoding="utf-8"), str(path))
+def _product() -> tuple[_File, ...]:
+    paths = python_files(("appliance", "roswire", "rosmop", "fleet/rosrv_fleet"), without="rosmop/tests")
+    with no_collector():
+        return tuple(map(_facts, paths))
 
 
-@cache
-def _nodes(path: Path) -> tuple[ast.AST, ...]:
-    return tuple(ast.walk(_tree(path)))
-
-
-def _product() -> Iterator[Path]:
-    for folder in ("appliance", "roswire", "rosmop", "fleet/rosrv_fleet"):
-        for path in sorted((ROOT / folder).rglob("*.py")):
-            if not path.is_relative_to(ROOT / "rosmop" / "tests"):
-                yield path
-
-
-def _name(path: Path) -> str:
-    return str(path.relative_to(ROOT))
+def _facts(path: Path) -> _File:
+    tree, name = parsed(path), name_of(path)
+    within = nodes(tree)
+    return _File(
+        name,
+        frozenset(_module_names(within)),
+        tuple(sorted(_late_imports(tree))),
+        _is_core(name) and any(map(_is_a_feature, _identifiers(within))),
+        re.search(r"\bFROM record\b", path.read_text(encoding="utf-8")) is not None,
+        tuple(_wide_classes(within)),
+        tuple(node.lineno for node in within if isinstance(node, ast.Name) and node.id == "Any"),
+    )
 
 
 @cache
@@ -66,24 +76,24 @@ def _modules() -> Mapping[str, Path]:
     }
 
 
-def _direct_imports(path: Path) -> set[str]:
-    """Return the modules of the appliance that a file names: in imports, also late ones, and in strings."""
-    modules, names = _modules(), set()
-    for node in _nodes(path):
+def _module_names(within: Sequence[ast.AST]) -> Iterator[str]:
+    modules = _modules()
+    for node in within:
         if isinstance(node, ast.Import):
-            names |= {alias.name for alias in node.names}
+            yield from (alias.name for alias in node.names if alias.name in modules)
         elif isinstance(node, ast.ImportFrom) and node.module:
-            members = {f"{node.module}.{alias.name}" for alias in node.names}
-            names |= {member if member in modules else node.module for member in members}
+            for alias in node.names:
+                member = f"{node.module}.{alias.name}"
+                yield from ({member if member in modules else node.module} & modules.keys())
         elif isinstance(node, ast.Constant) and isinstance(node.value, str):
-            names |= {match[0] for match in (_MODULE_NAME.match(node.value),) if match}
-    return names & modules.keys()
+            match = _MODULE_NAME.match(node.value)
+            yield from ({match[0]} if match else set()) & modules.keys()
 
 
 @cache
 def _reexported(module: str) -> frozenset[str]:
     """Return the core modules whose names a module passes on: those of `__all__`, or `import x as x`."""
-    tree = _tree(_modules()[module])
+    tree = parsed(_modules()[module])
     passed_on: set[str] = set()
     public = {
         element.value
@@ -103,14 +113,15 @@ def _reexported(module: str) -> frozenset[str]:
 
 def modules_that_features_import() -> list[str]:
     imported: set[str] = set()
-    for path in (ROOT / "appliance" / "features").rglob("*.py"):
-        for module in _direct_imports(path):
-            imported |= {module} | _reexported(module)
-    return sorted(one for one in imported if not one.startswith("appliance.features."))
+    for file in _product():
+        if file.name.startswith("appliance/features/"):
+            for module in file.names:
+                imported |= {module} | _reexported(module)
+    return sorted(module for module in imported if not module.startswith("appliance.features."))
 
 
 def names_of_a_feature() -> list[str]:
-    tree = _tree(ROOT / "appliance/features/feature.py")
+    tree = parsed(ROOT / "appliance/features/feature.py")
     return [
         f"{node.name}.{field.target.id}"
         for node in tree.body
@@ -127,33 +138,29 @@ def phases_of_a_feature() -> list[str]:
 
 def late_imports() -> list[str]:
     """Return the imports inside of functions."""
-    imports: list[str] = []
-    for path in _product():
-        inside = {
-            node.lineno
-            for function in _nodes(path)
-            if isinstance(function, ast.FunctionDef | ast.AsyncFunctionDef)
-            for node in ast.walk(function)
-            if isinstance(node, ast.Import | ast.ImportFrom)
-        }
-        imports += [f"{_name(path)}:{line}" for line in sorted(inside)]
-    return imports
+    return [f"{file.name}:{line}" for file in _product() for line in file.late]
+
+
+def _late_imports(tree: ast.Module) -> set[int]:
+    return {
+        node.lineno
+        for function in functions(tree)
+        for node in statements(function)
+        if isinstance(node, ast.Import | ast.ImportFrom)
+    }
 
 
 def core_files_that_name_features() -> list[str]:
     """Return the core files with an identifier that names one of seven features."""
-    return [
-        _name(path) for path in _product() if _is_core(path) and any(map(_is_a_feature, _identifiers(path)))
-    ]
+    return [file.name for file in _product() if file.names_a_feature]
 
 
-def _is_core(path: Path) -> bool:
-    name = _name(path)
+def _is_core(name: str) -> bool:
     return name.startswith("appliance/") and not name.startswith(("appliance/features/", *_CERTIFICATES))
 
 
-def _identifiers(path: Path) -> Iterator[str]:
-    for node in _nodes(path):
+def _identifiers(within: Sequence[ast.AST]) -> Iterator[str]:
+    for node in within:
         match node:
             case (
                 ast.Name(id=name) | ast.Attribute(attr=name) | ast.arg(arg=name) | ast.keyword(arg=str(name))
@@ -165,6 +172,7 @@ def _identifiers(path: Path) -> Iterator[str]:
                 yield from name.split(".")
 
 
+@cache
 def _is_a_feature(identifier: str) -> bool:
     words = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", identifier).lower()
     return any(_FEATURE_WORDS.fullmatch(part) for part in (words, *words.split("_")))
@@ -172,12 +180,10 @@ def _is_a_feature(identifier: str) -> bool:
 
 def walkers_of_the_audit_log() -> list[str]:
     """Return the modules, besides those that write the log, whose SQL reads its records."""
-    query = re.compile(r"\bFROM record\b")
     return [
-        _name(path)
-        for path in _product()
-        if not path.is_relative_to(ROOT / "appliance/audit/log")
-        and query.search(path.read_text(encoding="utf-8"))
+        file.name
+        for file in _product()
+        if file.reads_records and not file.name.startswith("appliance/audit/log/")
     ]
 
 
@@ -194,70 +200,29 @@ def files_of_a_registration() -> list[str]:
 
 
 def classes_with_many_attributes() -> list[str]:
-    return [
-        f"{_name(path)}: {node.name} {number}"
-        for path in _product()
-        for node in _nodes(path)
-        if isinstance(node, ast.ClassDef) and (number := len(_attributes(node))) >= _MANY_ATTRIBUTES
-    ]
+    return [f"{file.name}: {row}" for file in _product() for row in file.wide]
+
+
+def _wide_classes(within: Sequence[ast.AST]) -> Iterator[str]:
+    for node in within:
+        if isinstance(node, ast.ClassDef) and (number := len(_attributes(node))) >= _MANY_ATTRIBUTES:
+            yield f"{node.name} {number}"
 
 
 def _attributes(node: ast.ClassDef) -> set[str]:
     """Return the attributes that a class's methods set: its state, without the fields of plain data."""
-    names: set[str] = set()
-    for inner in ast.walk(node):
-        if (
-            isinstance(inner, ast.Attribute)
-            and isinstance(inner.ctx, ast.Store)
-            and isinstance(inner.value, ast.Name)
-            and inner.value.id == "self"
-        ):
-            names.add(inner.attr)
-    return names
+    return {
+        inner.attr
+        for inner in nodes(node)
+        if isinstance(inner, ast.Attribute)
+        and isinstance(inner.ctx, ast.Store)
+        and isinstance(inner.value, ast.Name)
+        and inner.value.id == "self"
+    }
 
 
 def uses_of_any() -> list[str]:
-    return [
-        f"{_name(path)}:{node.lineno}"
-        for path in _product()
-        for node in _nodes(path)
-        if isinstance(node, ast.Name) and node.id == "Any"
-    ]
-
-
-def long_helpers_in_tests() -> list[str]:
-    """Return the functions of more than 40 lines that a test's body calls, as `file: function lines`."""
-    helpers: dict[str, list[tuple[str, int]]] = {}
-    for path, node in _functions_of_tests():
-        length = (node.end_lineno or node.lineno) - node.lineno + 1
-        if length > _LONG_HELPER and not node.name.startswith("test_"):
-            helpers.setdefault(node.name, []).append((_name(path), length))
-    found = set()
-    for path, node in _functions_of_tests():
-        if node.name.startswith("test_"):
-            called = {
-                getattr(call.func, "id", getattr(call.func, "attr", ""))
-                for call in ast.walk(node)
-                if isinstance(call, ast.Call)
-            }
-            for name in called & helpers.keys():
-                own = [row for row in helpers[name] if row[0] == _name(path)]
-                shared = [
-                    row
-                    for row in helpers[name]
-                    if "/support/" in row[0] or row[0].rsplit("/", 1)[0] == _name(path).rsplit("/", 1)[0]
-                ]
-                for file, length in own or shared:
-                    found.add(f"{file}: {name} {length}")
-    return sorted(found)
-
-
-def _functions_of_tests() -> Iterator[tuple[Path, ast.FunctionDef | ast.AsyncFunctionDef]]:
-    for folder in ("tests", "rosmop/tests"):
-        for path in sorted((ROOT / folder).rglob("*.py")):
-            for node in _nodes(path):
-                if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
-                    yield path, node
+    return [f"{file.name}:{line}" for file in _product() for line in file.any]
 
 
 COUNTS = (
@@ -270,26 +235,8 @@ COUNTS = (
     Count("registration", "files of one registerPublisher", 50, 48, files_of_a_registration),
     Count("wide", "classes with 15 attributes or more", 48, 36, classes_with_many_attributes),
     Count("any", "uses of `Any` in product code", 1360, 900, uses_of_any),
-    Count("helpers", "helpers of more than 40 lines that a test's body calls", 7, 0, long_helpers_in_tests),
 )  # fmt: skip
 
 
-def main(arguments: list[str]) -> int:
-    """Print the counts, or the members of the counts that the arguments name."""
-    known = {count.name: count for count in COUNTS}
-    for name in arguments:
-        if name not in known:
-            sys.stderr.write(f"interfaces: {name!r} is not a count; use one of: {', '.join(known)}\n")
-            return 2
-        for member, number in Counter(known[name].members()).items():
-            sys.stdout.write(f"{member}{f' ({number})' if number > 1 else ''}\n")
-    if not arguments:
-        sys.stdout.write(f"{'name':<14}{'now':>6}{'limit':>7}{'goal':>6}  count\n")
-        for count in COUNTS:
-            row = f"{count.name:<14}{len(count.members()):>6}{count.limit:>7}{count.goal:>6}  {count.what}\n"
-            sys.stdout.write(row)
-    return 0
-
-
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(main("interfaces", COUNTS, sys.argv[1:]))

@@ -121,6 +121,11 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
     return cores + 1 if config.option.numprocesses == "logical" else 2 * cores
 
 
+def pytest_collection_finish() -> None:
+    """Leave the collected tests and their modules out of the garbage collector's scans."""
+    gc.freeze()
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Run the files of tests/long.txt first, in the order of the list."""
     names = Path(__file__).with_name("long.txt").read_text(encoding="utf-8").splitlines()

@@ -7,13 +7,14 @@ hosts, even if its time is linear: 8 MB of spaces took a second.
 import ast
 import importlib
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
 
+from distribution.counts import nodes
 from roswire import names
 from roswire.errors import InvalidNameError, PeerError
 from roswire.xmlrpc import XmlRpcLimits
@@ -89,23 +90,26 @@ def files() -> Iterator[Path]:
 def patterns_of(path: Path) -> Iterator[Pattern]:
     tree = ast.parse(path.read_text(encoding="utf-8"))
     module = ".".join(path.relative_to(ROOT).with_suffix("").parts).removeprefix("fleet.")
-    used = _methods(tree)
-    for name, pattern, flags in _constants(tree, module):
+    within = nodes(tree)
+    used = _methods(within)
+    for name, pattern, flags in _constants(tree, _calls(within, "re"), module):
         yield Pattern(f"{module}:{name}", pattern, flags, not (used.get(name) or used[""]) <= _AT_ITS_PLACE)
-    for call in _calls(tree, "re"):
+    for call in _calls(within, "re"):
         if (function := _function(call)) in _FUNCTIONS:
             assert isinstance(call.args[0], ast.Constant), (
                 f"{module}:{call.lineno}: make this pattern a constant"
             )
             yield Pattern(f"{module}:{call.lineno}", _text(call.args[0]), 0, function not in _AT_ITS_PLACE)
-    for call in _calls(tree, "msgspec"):
+    for call in _calls(within, "msgspec"):
         for keyword in call.keywords:
             if keyword.arg == "pattern" and isinstance(keyword.value, ast.Constant):
                 yield Pattern(f"{module}:{call.lineno}", _text(keyword.value), 0, anywhere=False)
 
 
-def _constants(tree: ast.Module, module: str) -> Iterator[tuple[str, str | bytes, int]]:
-    compiled = [call for call in _calls(tree, "re") if _function(call) == "compile"]
+def _constants(
+    tree: ast.Module, calls: Sequence[ast.Call], module: str
+) -> Iterator[tuple[str, str | bytes, int]]:
+    compiled = [call for call in calls if _function(call) == "compile"]
     plain: dict[ast.expr, str] = {
         node.value: node.targets[0].id
         for node in tree.body
@@ -125,9 +129,15 @@ def _constants(tree: ast.Module, module: str) -> Iterator[tuple[str, str | bytes
             waiting += [(name, part) for part in (one.values() if isinstance(one, dict) else one)]
 
 
-def _calls(tree: ast.AST, module: str) -> list[ast.Call]:
-    calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call)]
-    return [call for call in calls if ast.unparse(call.func) == f"{module}.{_function(call)}"]
+def _calls(within: Sequence[ast.AST], module: str) -> list[ast.Call]:
+    return [
+        node
+        for node in within
+        if isinstance(node, ast.Call)
+        and isinstance(node.func, ast.Attribute)
+        and isinstance(node.func.value, ast.Name)
+        and node.func.value.id == module
+    ]
 
 
 def _text(constant: ast.expr) -> str | bytes:
@@ -140,9 +150,9 @@ def _function(call: ast.Call) -> str:
     return call.func.attr if isinstance(call.func, ast.Attribute) else ""
 
 
-def _methods(tree: ast.Module) -> dict[str, set[str]]:
+def _methods(within: Sequence[ast.AST]) -> dict[str, set[str]]:
     found: dict[str, set[str]] = {}
-    for node in ast.walk(tree):
+    for node in within:
         if isinstance(node, ast.Attribute) and node.attr in _FUNCTIONS - {"split"}:
             name = node.value
             while isinstance(name, ast.Subscript):

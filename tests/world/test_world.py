@@ -1,14 +1,12 @@
-import os
-
 import pytest
 
+from tests.support.examples import ALL
 from tests.world.mutants import MUTANTS, NOT_SEEN, PAIR_MUTANTS, first_broken
 from tests.world.pair import PairWorld
 from tests.world.world import World, run
 
-_ALL = os.environ.get("TESTS_EXAMPLES") == "all"
-_SEEDS, _PAIR_SEEDS = (3000, 500) if _ALL else (200, 20)
-_IN_ONE_CASE = 20
+_SEEDS, _PAIR_SEEDS = (3000, 500) if ALL else (100, 10)
+_IN_ONE_CASE = 10
 
 
 @pytest.mark.timeout(300)

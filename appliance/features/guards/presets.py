@@ -28,7 +28,6 @@ _GIVEN = re.compile(
 _HEAD = re.compile(r"^((?:begin |hold )?)(\w+)\(", re.MULTILINE)
 _FIRST_LINE = re.compile(r"// preset (?P<preset>\w+) (?P<version>\d+):.*\n")
 _NAME = re.compile(r"[A-Za-z_]\w{0,63}", re.ASCII)
-_VALUE = re.compile(r"(\b(\w+) (\w+) = )[^ ;]+")
 _TABLE = re.compile(r"(\b(\w+)\[\] = \{)[^}]*")
 _TOPIC = re.compile(r"/[A-Za-z]\w*+(?:/[A-Za-z]\w*+)*+", re.ASCII)
 _NUMBER = r"[-+]?(?:\d++(?:\.\d*+)?|\.\d++)(?:[eE][-+]?\d++)?"
@@ -164,12 +163,12 @@ class Preset:
     def what(self) -> str:
         return self.text.split("\n", 2)[1].removeprefix("// ")
 
-    @property
+    @functools.cached_property
     def _given(self) -> "list[re.Match[str]]":
         block, brace, _rest = self.text.partition("\n} {\n")
         return [*_GIVEN.finditer(block)] if brace else []
 
-    @property
+    @functools.cached_property
     def parameters(self) -> tuple[Parameter, ...]:
         given = (
             Parameter(one["name"], one["kind"], one["default"], one["unit"] or "", one["least"] or "",
@@ -417,9 +416,13 @@ def _with_value(text: str, parameter: Parameter, value: str) -> str:
 
 
 def _given(text: str, kind: str, name: str, value: str) -> str:
-    return _VALUE.sub(
-        lambda found: found[1] + value if (found[2], found[3]) == (kind, name) else found[0], text
-    )
+    return _value_of(kind, name).sub(lambda found: found[1] + value, text)
+
+
+@functools.cache
+def _value_of(kind: str, name: str) -> re.Pattern[str]:
+    """Return the pattern of one value: that of all values takes a millisecond for a text, and a guard has twenty."""
+    return re.compile(rf"(\b{kind} {name} = )[^ ;]+")
 
 
 def _with_table(text: str, name: str, cells: Sequence[str]) -> str:

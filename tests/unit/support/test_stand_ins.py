@@ -2,6 +2,7 @@ import ast
 import re
 from collections.abc import Iterator
 
+from distribution.counts import nodes
 from tests.support.sources import ROOT, files_of_tests
 
 # Names with an underscore that are part of a published interface.
@@ -51,7 +52,7 @@ def trees(words: str) -> Iterator[tuple[str, ast.Module]]:
 
 
 def private(tree: ast.Module) -> Iterator[str]:
-    for node in ast.walk(tree):
+    for node in nodes(tree):
         if not isinstance(node, ast.Attribute) or node.attr in PUBLISHED:
             continue
         own = isinstance(node.value, ast.Name) and node.value.id in ("self", "cls")
@@ -60,7 +61,7 @@ def private(tree: ast.Module) -> Iterator[str]:
 
 
 def answers_anything(tree: ast.Module) -> Iterator[str]:
-    for node in ast.walk(tree):
+    for node in nodes(tree):
         match node:
             case ast.FunctionDef(name="__getattr__" | "__getattribute__"):
                 yield node.name

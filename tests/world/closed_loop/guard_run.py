@@ -1,39 +1,21 @@
 """A guard that runs in the product's own engine, in virtual time."""
 
 import functools
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 
-from appliance.features.guards.presets import Guard, preset_named, text_of
-from rosmop.check.sources import compiled_from
-from rosmop.fast.abi import SetPart
-from rosmop.fast.build import certified, parts_of
-from rosmop.fast.serialization import decoded_part
-from rosmop.fast.wasm_runner import WasmFastPath
+from appliance.features.guards.presets import preset_named
 from rosmop.run.engine import MonitorSet
 from rosmop.run.outcomes import MessageSender, Outcome
-from roswire.standard import standard_definitions
+from tests.support.features.guards.running_guard import Change, Value, on_its_module, part_with, unchanged
 from tests.world.closed_loop.messages import EPOCH
 
-Change = Callable[[str], str]
-Value = bool | int | float | str
-DEFINITIONS = standard_definitions()
 NODES = ("", "/a", "/b", "/c", "/d", "/e", "/f")
 MS = 10**6
-
-
-def unchanged(text: str) -> str:
-    return text
 
 
 @functools.cache
 def parameters_of(preset: str) -> frozenset[str]:
     return frozenset(one.name for one in preset_named(preset).parameters)
-
-
-@functools.lru_cache(maxsize=256)
-def _part(text: str) -> SetPart:
-    [part] = parts_of(certified(compiled_from({"guard.rv": text}, DEFINITIONS)).data, [(("guard",), ())])
-    return decoded_part(part)
 
 
 def _ns(at: int) -> int:
@@ -46,17 +28,14 @@ class RunningGuard:
     def __init__(
         self, preset: str, types: Mapping[str, str], values: Mapping[str, Value], change: Change = unchanged
     ) -> None:
-        chosen = preset_named(preset)
-        in_text = {name: str(value) for name, value in values.items() if chosen.parameter(name).loads}
-        self._given = {name: value for name, value in values.items() if name not in in_text}
-        self._part = _part(change(text_of(Guard("guard", chosen, types=types, values=in_text))))
-        self.topics = chosen.given_topics
+        self._part, self._given = part_with(preset, types, values, change)
+        self.topics = preset_named(preset).given_topics
         self._monitors = self._set()
         self.now = 0
         self._monitors.start(_ns(0))
 
     def _set(self) -> MonitorSet:
-        monitors = MonitorSet.of(self._part.compiled, fast=WasmFastPath(self._part.module))
+        monitors = on_its_module(self._part)
         monitors.name_senders(lambda source: (f"10.0.0.{source}", NODES[source]))
         monitors.give({"guard": self._given})
         return monitors

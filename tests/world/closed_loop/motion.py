@@ -7,10 +7,10 @@ from typing import ClassVar
 
 import numpy as np
 
+from tests.support.features.guards.running_guard import Value
 from tests.world.closed_loop import geometry
 from tests.world.closed_loop.bases import DIFFERENTIAL, OMNIDIRECTIONAL, STEERED, Base
 from tests.world.closed_loop.geometry import Point, Segment
-from tests.world.closed_loop.guard_run import Value
 from tests.world.closed_loop.messages import (
     ACKERMANN,
     ACKERMANN_STAMPED,

@@ -14,8 +14,9 @@ from dataclasses import dataclass
 from typing import Any
 from unittest import mock
 
+from tests.support.features.guards.running_guard import Change, unchanged
 from tests.world.closed_loop.bases import Base
-from tests.world.closed_loop.guard_run import Change, RunningGuard, unchanged
+from tests.world.closed_loop.guard_run import RunningGuard
 from tests.world.closed_loop.messages import Legs
 from tests.world.closed_loop.worlds import run_one
 

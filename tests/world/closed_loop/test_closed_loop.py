@@ -1,8 +1,7 @@
-import os
-
 import pytest
 
 from appliance.features.guards.presets import PRESETS
+from tests.support.examples import ALL
 from tests.world.closed_loop.planted import FAULTS, WITHIN, no_guard, stops_everything
 from tests.world.closed_loop.worlds import NOT_MODELLED, WORLDS, replay, run_many, run_one
 
@@ -71,5 +70,4 @@ def test_a_seed_gives_the_same_world_again(preset: str) -> None:
 @pytest.mark.timeout(1200)
 @pytest.mark.parametrize("name", FAULTS)
 def test_each_planted_fault_is_found(name: str) -> None:
-    within = WITHIN if os.environ.get("TESTS_EXAMPLES") != "all" else 10 * WITHIN
-    assert FAULTS[name].first(within) is not None
+    assert FAULTS[name].first(10 * WITHIN if ALL else WITHIN) is not None

@@ -32,7 +32,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import ClassVar
 
-from tests.world.closed_loop.guard_run import Change, RunningGuard, Value, parameters_of, unchanged
+from tests.support.features.guards.running_guard import Change, Value, unchanged
+from tests.world.closed_loop.guard_run import RunningGuard, parameters_of
 from tests.world.closed_loop.messages import STILL, TWIST, Legs, command, legs_of, moves, travels
 
 BESIDE = "a start again beside another node"

@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 
-from tests.world.closed_loop.guard_run import Change, unchanged
+from tests.support.features.guards.running_guard import Change, unchanged
 from tests.world.closed_loop.motion import FenceWorld, SeparationWorld
 from tests.world.closed_loop.streams import (
     AgreeWorld,

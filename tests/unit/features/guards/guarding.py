@@ -1,29 +1,16 @@
-import functools
 import math
 import random
 from collections.abc import Iterable
 from typing import Any
 
-from rosbags.typesys import get_types_from_msg
-
-from appliance.features.guards.presets import DRIVER_CHECK, PRESETS, Guard, text_of
-from rosmop.check.sources import compiled_from
-from rosmop.fast.build import certified, parts_of
-from rosmop.fast.load import loaded
-from rosmop.run.engine import MonitorSet
 from rosmop.run.outcomes import MessageSender, Outcome
-from rosmop.tests.acting import STORE, fields, message
-from roswire.standard import standard_definitions
+from rosmop.tests.acting import fields, message
+from tests.support.features.guards.running_guard import Value, named, on_its_module, part_with
 
 MS = 10**6
 BEGIN = 1_700_000_000 * 10**9
 TWIST = "geometry_msgs/Twist"
 NODES = ("", *(f"/{letter}" for letter in "abcdefghijk"))
-DEFINITIONS = standard_definitions()
-for _kind in ("AckermannDrive", "AckermannDriveStamped"):
-    STORE.register(
-        get_types_from_msg(DEFINITIONS.message(f"ackermann_msgs/{_kind}").text, f"ackermann_msgs/msg/{_kind}")
-    )
 SPEEDS = (0.0, -0.0, 0.2, -0.2, 0.5, -0.5, 0.5000001, 1.0, -3.0, 1e300, math.inf, -math.inf, math.nan)
 
 
@@ -41,21 +28,13 @@ def same(one: Iterable[float], other: Iterable[float]) -> bool:
     return all(a == b or (math.isnan(a) and math.isnan(b)) for a, b in zip(one, other, strict=True))
 
 
-@functools.cache
-def _part(text: str) -> bytes:
-    [part] = parts_of(certified(compiled_from({"guard.rv": text}, DEFINITIONS)).data, [(("guard",), ())])
-    return part
-
-
 class Guarded:
-    def __init__(self, preset: str, types: dict[str, str] | None = None, **values: object) -> None:
-        wanted = {name: str(value).lower() for name, value in values.items()}
-        chosen = {**PRESETS, DRIVER_CHECK.name: DRIVER_CHECK}[preset]
-        self.text = text_of(Guard("guard", chosen, types=types or {}, values=wanted))
-        compiled, fast = loaded(_part(self.text))
-        self.monitors = MonitorSet.of(compiled, fast=fast)
+    def __init__(self, preset: str, types: dict[str, str] | None = None, **values: Value) -> None:
+        part, given = part_with(preset, types or {}, values)
+        self.monitors = on_its_module(part)
+        self.monitors.give({"guard": given})
         self.monitors.name_senders(lambda source: ("10.0.0.1", NODES[source]))
-        self.topics = chosen.given_topics
+        self.topics = named(preset).given_topics
         self.got: list[tuple[int, Any]] = []
         self.monitors.start(BEGIN - 100 * MS)
         self.advance(0)

@@ -12,7 +12,8 @@ from appliance.features.guards.presets import PRESETS, Guard, text_of
 from rosmop.check.sources import compiled_from
 from rosmop.run.engine import MonitorSet
 from rosmop.tests.acting import fields, message
-from tests.unit.features.guards.guarding import BEGIN, DEFINITIONS, MS, NODES, Guarded, twist
+from tests.support.features.guards.running_guard import DEFINITIONS
+from tests.unit.features.guards.guarding import BEGIN, MS, NODES, Guarded, twist
 from tests.unit.features.guards.test_watching_presets import button, with_id
 
 

@@ -1,21 +1,24 @@
 """While a monitor cannot judge, it holds the topics on which it acts. It only observes the others: they flow on."""
 
+import functools
 from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 
 from appliance.features.guards.message_types import VELOCITIES
 from appliance.features.guards.presets import DRIVER_CHECK, PRESETS, Guard, Preset, text_of
 from rosmop.check.sources import compiled_from
-from rosmop.form.compiled import Compiled
+from rosmop.fast.abi import SetPart
 from rosmop.run.engine import MonitorSet
 from rosmop.tests.acting import message
-from rosmop.tests.on_module import on_module
-from roswire.definitions import Definitions
-from tests.unit.features.guards.guarding import DEFINITIONS
+from tests.support.features.guards.running_guard import (
+    DEFINITIONS,
+    MONITORS,
+    interpreted,
+    on_its_module,
+    part_of,
+)
 
-MONITORS = Path(__file__).parents[4] / "monitors"
 COMMAND = {"command"}
 ACTED = {
     **dict.fromkeys(PRESETS, COMMAND),
@@ -27,14 +30,7 @@ ACTED = {
     "driver_check": COMMAND,
 }
 """The topics on which each preset (by the name of the topic in its text) and each shipped monitor acts."""
-MADE = pytest.mark.parametrize("made", [MonitorSet.of, on_module], ids=["interpreter", "module"])
-
-
-def definitions() -> Definitions:
-    trigger = MONITORS / "msg" / "landshark_msgs" / "PaintballTrigger.msg"
-    return DEFINITIONS.extended(
-        Definitions.from_files({"landshark_msgs/PaintballTrigger.msg": trigger.read_text()})
-    )
+MADE = pytest.mark.parametrize("made", [interpreted, on_its_module], ids=["interpreter", "module"])
 
 
 def shipped() -> dict[str, tuple[str, set[str]]]:
@@ -55,13 +51,14 @@ def _topics(name: str, preset: Preset) -> set[str]:
 CASES = [pytest.param(*case, id=name) for name, case in shipped().items()]
 
 
+@functools.cache
 def empty(kind: str) -> bytes:
     """Return a message without elements and texts, whose other fields are zero."""
-    return bytes(definitions().layout(kind).minimum)
+    return bytes(DEFINITIONS.layout(kind).minimum)
 
 
-def started(text: str, made: Callable[[Compiled], MonitorSet] = MonitorSet.of) -> MonitorSet:
-    monitors = made(compiled_from({"guard.rv": text}, definitions()))
+def started(text: str, made: Callable[[SetPart], MonitorSet] = interpreted) -> MonitorSet:
+    monitors = made(part_of(text))
     monitors.start(0)
     return monitors
 
@@ -70,14 +67,14 @@ def started(text: str, made: Callable[[Compiled], MonitorSet] = MonitorSet.of) -
 def test_the_table_of_topics_on_which_a_monitor_acts(text: str, acted: set[str]) -> None:
     for monitor in started(text).monitors:
         assert set(monitor.code.acts_on) == acted
-    without = compiled_from({"guard.rv": text}, definitions(), without_code=["guard.rv"])
+    without = compiled_from({"guard.rv": text}, DEFINITIONS, without_code=["guard.rv"])
     assert {one.acts_on for one in without.specifications} == {tuple(sorted(acted))}
 
 
 @MADE
 @pytest.mark.parametrize(("text", "acted"), CASES)
 def test_a_hold_takes_no_observed_topic_from_others(
-    text: str, acted: set[str], made: Callable[[Compiled], MonitorSet]
+    text: str, acted: set[str], made: Callable[[SetPart], MonitorSet]
 ) -> None:
     for cause in ("held", "broken"):
         monitors = started(text, made)
@@ -97,7 +94,7 @@ def test_a_hold_takes_no_observed_topic_from_others(
 
 
 @MADE
-def test_observations_during_a_hold_count_after_it(made: Callable[[Compiled], MonitorSet]) -> None:
+def test_observations_during_a_hold_count_after_it(made: Callable[[SetPart], MonitorSet]) -> None:
     """An emergency stop that is pressed while its guard holds stops the base after `resume`."""
     for pressed in (True, False):
         monitors = started(_text(PRESETS["estop"]), made)
@@ -114,7 +111,7 @@ def test_observations_during_a_hold_count_after_it(made: Callable[[Compiled], Mo
 
 @MADE
 def test_a_holding_monitor_keeps_the_fast_path_of_what_it_observes(
-    made: Callable[[Compiled], MonitorSet],
+    made: Callable[[SetPart], MonitorSet],
 ) -> None:
     monitors = started(_text(PRESETS["separation"]), made)
     scan = message("sensor_msgs/LaserScan", range_max=9.0, ranges=[5.0])
@@ -134,7 +131,7 @@ STAMPED = [kind for kind in VELOCITIES if kind.endswith("Stamped")]
 @pytest.mark.parametrize("name", [name for name, preset in PRESETS.items() if "command" in preset.topics
                                   and preset.topics["command"].keys() >= VELOCITIES.keys()])  # fmt: skip
 def test_a_stop_passes_a_hold_whatever_its_header(
-    name: str, kind: str, made: Callable[[Compiled], MonitorSet]
+    name: str, kind: str, made: Callable[[SetPart], MonitorSet]
 ) -> None:
     monitors = started(text_of(Guard(name, PRESETS[name], types={"command": kind})), made)
     monitors.hold(monitors.monitors[0], "test")
@@ -146,7 +143,7 @@ def test_a_stop_passes_a_hold_whatever_its_header(
 
 
 @MADE
-def test_a_velocity_grows_from_zero_after_a_safe_message(made: Callable[[Compiled], MonitorSet]) -> None:
+def test_a_velocity_grows_from_zero_after_a_safe_message(made: Callable[[SetPart], MonitorSet]) -> None:
     """The base got the guard's zero after a hold, a resume, a restart with kept state, or an `enable`."""
     second, drive = 10**9, message("geometry_msgs/Twist", linear__x=0.5)
     for cause in ("hold", "restart", "enable", "stop"):
@@ -164,7 +161,7 @@ def test_a_velocity_grows_from_zero_after_a_safe_message(made: Callable[[Compile
                 kept = [
                     (one.names, one.layout, one.base(), one.cells() or None) for one in monitors.kept_groups()
                 ]
-                monitors = made(compiled_from({"guard.rv": _text(PRESETS["speed"])}, definitions()))
+                monitors = made(part_of(_text(PRESETS["speed"])))
                 monitors.recover(kept, {}, now, restarted=True)
             case "enable":
                 monitors.switch({"speed": False}, now)

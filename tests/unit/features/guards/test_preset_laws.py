@@ -17,6 +17,7 @@ from appliance.features.guards.message_types import ANY_TYPE, GOAL, VELOCITIES
 from appliance.features.guards.presets import PRESETS, Guard, below_the_standard, text_of
 from rosmop.run.outcomes import MessageSender
 from rosmop.tests.acting import fields, message
+from tests.support.examples import ALL
 from tests.unit.features.guards.guarding import BEGIN, MS, NODES, Guarded
 from tests.unit.features.guards.test_watching_presets import trajectory, with_id
 
@@ -354,9 +355,8 @@ def judge(place: Place, state: str) -> str:
     """Return what is wrong with a cell, or an empty text."""
     lab = Lab(place.preset, place)
     if state == "default":
-        default = Guarded(place.preset)
         given = {one.name: one.default for one in PRESETS[place.preset].parameters}
-        assert default.text and not below_the_standard(PRESETS[place.preset], given)
+        assert not below_the_standard(PRESETS[place.preset], given)
         return "" if lab.run(1500) else "an honest robot does not move"
     return CELLS[state](lab, place)
 
@@ -474,8 +474,13 @@ ROWS = [
 def test_each_state_of_each_observed_field_keeps_the_laws(preset: str, topic: str, kind: str) -> None:
     places = [one for one in places_of(preset) if (one.topic, one.kind) == (topic, kind)]
     wrong = []
-    for place, state in product(places, STATES):
-        if not reason(preset, topic, place.name, state) and (why := judge(place, state)):
+    for number, (place, state) in enumerate(product(places, STATES), start=ROWS.index((preset, topic, kind))):
+        # At the gate every seventh cell, so that the states rotate over the fields; at night every cell.
+        if (
+            (ALL or number % 7 == 0)
+            and not reason(preset, topic, place.name, state)
+            and (why := judge(place, state))
+        ):
             wrong.append(f"{preset}, {topic} {kind} {place.path or 'arrival'}, {state}: {why}")
     assert not wrong, "\n".join(wrong)
 

@@ -5,14 +5,17 @@ from collections.abc import Callable, Mapping
 import pytest
 
 from appliance.features.guards.presets import PRESETS, Guard, text_of
-from rosmop.check.sources import compiled_from
-from rosmop.form.compiled import Compiled
+from rosmop.fast.abi import SetPart
 from rosmop.run.engine import MonitorSet
 from rosmop.run.origins import MOST, Origin
 from rosmop.run.outcomes import MessageSender
 from rosmop.tests.acting import message
-from rosmop.tests.on_module import on_module
-from tests.unit.features.guards.guarding import DEFINITIONS
+from tests.support.features.guards.running_guard import (
+    DEFINITIONS,
+    interpreted,
+    on_its_module,
+    part_of,
+)
 
 SECOND = 10**9
 STILL, DRIVE = message("geometry_msgs/Twist"), message("geometry_msgs/Twist", linear__x=0.4)
@@ -42,7 +45,13 @@ SEND_NOTHING = {
     "withhold": "it withholds until a message",
     "joints": "its safe message is a trajectory",
 }
-MADE = pytest.mark.parametrize("made", [MonitorSet.of, on_module], ids=["interpreter", "module"])
+MADE = pytest.mark.parametrize("made", [interpreted, on_its_module], ids=["interpreter", "module"])
+MADE_AT_NIGHT = pytest.mark.parametrize(
+    "made",
+    [pytest.param(interpreted, marks=pytest.mark.nightly), on_its_module],
+    ids=["interpreter", "module"],
+)
+"""At the gate only as a relay runs a guard: `rosmop/tests/test_fast_path.py` compares both."""
 DAMAGE: dict[str, Callable[[bytes], bytes]] = {
     "empty": lambda _: b"",
     "half": lambda data: data[: len(data) // 2],
@@ -52,12 +61,9 @@ DAMAGE: dict[str, Callable[[bytes], bytes]] = {
 }
 
 
-def started(name: str, made: Callable[[Compiled], MonitorSet]) -> MonitorSet:
-    monitors = made(
-        compiled_from(
-            {"guard.rv": text_of(Guard(name, PRESETS[name], values=VALUES.get(name, {})))}, DEFINITIONS
-        )
-    )
+def started(name: str, made: Callable[[SetPart], MonitorSet]) -> MonitorSet:
+    text = text_of(Guard(name, PRESETS[name], values=VALUES.get(name, {})))
+    monitors = made(part_of(text))
     monitors.start(0)
     return monitors
 
@@ -69,13 +75,13 @@ def test_the_table_has_each_preset_that_observes_a_topic() -> None:
     }
 
 
-@MADE
+@MADE_AT_NIGHT
 @pytest.mark.parametrize("damage", DAMAGE)
 @pytest.mark.parametrize(
     ("name", "damaged"), [(name, topic) for name, given in GOOD.items() for topic in given]
 )
 def test_a_moving_base_is_stopped_by_an_unreadable_observation(
-    name: str, damaged: str, damage: str, made: Callable[[Compiled], MonitorSet]
+    name: str, damaged: str, damage: str, made: Callable[[SetPart], MonitorSet]
 ) -> None:
     monitors, topics, now = started(name, made), PRESETS[name].given_topics, SECOND
     for topic, data in BEFORE.get(name, {}).items():
@@ -121,11 +127,11 @@ def told(monitors: MonitorSet, name: str, now: int, nodes: Mapping[str, int], br
     return monitors.judge("/cmd_vel", bytearray(DRIVE), now, MessageSender(3)).result
 
 
-@MADE
+@MADE_AT_NIGHT
 @pytest.mark.parametrize("kept", [False, True], ids=["running", "restarted"])
 @pytest.mark.parametrize(("name", "damaged"), BEGIN)
 def test_no_other_node_takes_the_place_of_one_whose_bytes_are_unreadable(
-    name: str, damaged: str, kept: bool, made: Callable[[Compiled], MonitorSet]
+    name: str, damaged: str, kept: bool, made: Callable[[SetPart], MonitorSet]
 ) -> None:
     def named() -> MonitorSet:
         monitors = started(name, made)
@@ -173,7 +179,7 @@ def test_a_node_that_is_not_the_first_keeps_the_guard_in_doubt_and_never_takes_i
 
 def test_a_goal_is_cancelled_in_time_despite_an_unreadable_result() -> None:
     """The message belongs to no goal, so it ends none."""
-    monitors = started("answer", MonitorSet.of)
+    monitors = started("answer", interpreted)
     goal = bytearray(bytes(DEFINITIONS.layout("move_base_msgs/MoveBaseActionGoal").minimum))
     head = bytes(16)  # header, and the stamp of the goal's id
     goal = bytearray(head[:16] + bytes(8) + b"\1\0\0\0a" + goal[28:])
@@ -185,7 +191,7 @@ def test_a_goal_is_cancelled_in_time_despite_an_unreadable_result() -> None:
 
 
 @MADE
-def test_an_unreadable_joint_state_ends_the_trajectory(made: Callable[[Compiled], MonitorSet]) -> None:
+def test_an_unreadable_joint_state_ends_the_trajectory(made: Callable[[SetPart], MonitorSet]) -> None:
     monitors = started("joints", made)
     outcome = monitors.judge("/joint_states", bytearray(b"\1"), SECOND)
     assert [one.malformed for one in outcome.faults] == [True]
@@ -194,7 +200,7 @@ def test_an_unreadable_joint_state_ends_the_trajectory(made: Callable[[Compiled]
 
 
 @MADE
-def test_the_topic_is_withheld_after_an_unreadable_switch(made: Callable[[Compiled], MonitorSet]) -> None:
+def test_the_topic_is_withheld_after_an_unreadable_switch(made: Callable[[SetPart], MonitorSet]) -> None:
     monitors = started("withhold", made)
     monitors.judge("/privacy", bytearray(b"\0"), 1)
     assert monitors.withheld_from("/camera/image_raw") == ()
@@ -206,13 +212,13 @@ def test_the_topic_is_withheld_after_an_unreadable_switch(made: Callable[[Compil
 @pytest.mark.parametrize("part", ["request", "response"])
 @pytest.mark.parametrize("damage", ["cut", "trailing"])
 def test_an_unreadable_observation_of_a_service(
-    part: str, damage: str, made: Callable[[Compiled], MonitorSet]
+    part: str, damage: str, made: Callable[[SetPart], MonitorSet]
 ) -> None:
     field, data = ("data", b"\1") if part == "request" else ("success", b"\1\0\0\0\0")
     text = f"""guard() {{ safe geometry_msgs/Twist {{ }} on /cmd_vel every 100ms; bool off = false;
         event arm(bool on) service /arm std_srvs/SetBool {part} '{{{field}:on}}' {{ off = !on; }}
         event drive() /cmd_vel geometry_msgs/Twist '{{}}' {{ if (off) {{ STOP; }} }} }}"""
-    monitors = made(compiled_from({"guard.rv": text}, DEFINITIONS))
+    monitors = made(part_of(text))
     monitors.start(0)
     channel = monitors.channel_of("/arm", part)
     assert monitors.judge(channel, bytearray(data), 1).result == "passed"

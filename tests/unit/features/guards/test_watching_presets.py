@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from appliance.features.guards.message_types import ANY_TYPE, GOAL
-from appliance.features.guards.presets import PRESETS, loaded_values
+from appliance.features.guards.presets import PRESETS, Guard, loaded_values, text_of
 from rosmop.tests.acting import STORE, fields, message
 from rosmop.tests.examples import examples
 from tests.unit.features.guards.guarding import NODES, Guarded, legs_of, seeded, twist
@@ -514,7 +514,8 @@ def test_a_topic_is_withheld_until_all_switches_are_off_and_speak() -> None:
     assert guard.monitors.withheld_from("/camera/image_raw") == ()
     guard.advance(2100)
     assert guard.monitors.withheld_from("/camera/image_raw") == hosts
-    assert loaded_values(guard.text) == {"hosts": " ".join(hosts)}
+    text = text_of(Guard("guard", PRESETS["withhold"], types=types, values={"hosts": "10.0.0.7 10.8.0.0/16"}))
+    assert loaded_values(text) == {"hosts": " ".join(hosts)}
     guard = Guarded("withhold", types, silent=0)
     for place in range(9):
         guard.tell("by", button(False), 1, NODES[place + 1])

@@ -1,0 +1,84 @@
+"""Guards that run in the product's own engine. Each text is compiled once for a process: that takes 0.1 s."""
+
+import functools
+from collections.abc import Callable, Mapping
+
+from rosbags.typesys import get_types_from_msg
+
+from appliance.features.guards.presets import DRIVER_CHECK, Guard, Preset, preset_named, text_of
+from rosmop.check.sources import compiled_from
+from rosmop.fast.abi import SetPart
+from rosmop.fast.build import certified, parts_of
+from rosmop.fast.serialization import decoded_part
+from rosmop.fast.wasm_runner import WasmFastPath
+from rosmop.run.engine import MonitorSet
+from rosmop.tests.acting import STORE
+from roswire.definitions import Definitions
+from roswire.standard import standard_definitions
+from tests.support.sources import ROOT
+
+Change = Callable[[str], str]
+Value = bool | int | float | str
+MONITORS = ROOT / "monitors"
+_TRIGGER = "landshark_msgs/PaintballTrigger.msg"
+DEFINITIONS = standard_definitions().extended(
+    Definitions.from_files({_TRIGGER: (MONITORS / "msg" / _TRIGGER).read_text(encoding="utf-8")})
+)
+"""The types of the guards, and those of the shipped monitors."""
+for _kind in ("AckermannDrive", "AckermannDriveStamped"):
+    STORE.register(
+        get_types_from_msg(DEFINITIONS.message(f"ackermann_msgs/{_kind}").text, f"ackermann_msgs/msg/{_kind}")
+    )
+
+
+def unchanged(text: str) -> str:
+    return text
+
+
+def part_with(
+    preset: str,
+    types: Mapping[str, str],
+    values: Mapping[str, Value],
+    change: Change = unchanged,
+) -> tuple[SetPart, dict[str, Value]]:
+    """Return the part of a guard with the name `guard`, and the values that the running guard has to be given.
+
+    The other values are in its text. So guards that differ only in given values share one compilation. `change` makes
+    another text of it.
+    """
+    in_text = tuple(
+        (name, str(value).lower()) for name, value in values.items() if name in _loaded_values(preset)
+    )
+    given = {name: value for name, value in values.items() if name not in _loaded_values(preset)}
+    return part_of(change(_text(preset, tuple(types.items()), in_text))), given
+
+
+@functools.lru_cache(maxsize=256)
+def part_of(text: str) -> SetPart:
+    compiled = compiled_from({"guard.rv": text}, DEFINITIONS, lints=False)
+    [part] = parts_of(certified(compiled).data, [([one.name for one in compiled.specifications], ())])
+    return decoded_part(part)
+
+
+def on_its_module(part: SetPart) -> MonitorSet:
+    """Return the monitors as a relay runs them."""
+    return MonitorSet.of(part.compiled, fast=WasmFastPath(part.module))
+
+
+def interpreted(part: SetPart) -> MonitorSet:
+    return MonitorSet.of(part.compiled)
+
+
+@functools.cache
+def named(preset: str) -> Preset:
+    return DRIVER_CHECK if preset == DRIVER_CHECK.name else preset_named(preset)
+
+
+@functools.cache
+def _loaded_values(preset: str) -> frozenset[str]:
+    return frozenset(each.name for each in named(preset).parameters if each.loads)
+
+
+@functools.cache
+def _text(preset: str, types: tuple[tuple[str, str], ...], values: tuple[tuple[str, str], ...]) -> str:
+    return text_of(Guard("guard", named(preset), types=dict(types), values=dict(values)))
