@@ -54,8 +54,10 @@ def part_with(
 
 
 @functools.lru_cache(maxsize=256)
-def part_of(text: str) -> SetPart:
-    compiled = compiled_from({"guard.rv": text}, DEFINITIONS, lints=False)
+def part_of(*texts: str) -> SetPart:
+    """Return the part with the guards of these texts, in this order."""
+    sources = {f"guard{number or ''}.rv": text for number, text in enumerate(texts)}
+    compiled = compiled_from(sources, DEFINITIONS, lints=False)
     [part] = parts_of(certified(compiled).data, [([one.name for one in compiled.specifications], ())])
     return decoded_part(part)
 

@@ -6,13 +6,10 @@ import re
 import pytest
 
 from appliance.features.guards.presets import PRESETS, Guard, text_of
-from rosmop.check.sources import compiled_from
-from rosmop.fast.build import certified, parts_of
-from rosmop.fast.load import loaded
-from rosmop.run.engine import MonitorSet
 from rosmop.run.outcomes import MessageSender
 from rosmop.tests.acting import message
-from tests.unit.features.guards.guarding import BEGIN, DEFINITIONS, MS, NODES, TWIST, legs_of, twist
+from tests.support.features.guards.running_guard import on_its_module, part_of
+from tests.unit.features.guards.guarding import BEGIN, MS, NODES, TWIST, legs_of, twist
 from tests.unit.features.guards.test_preset_laws import EVIDENCE, RECIPES
 
 WAITING = ("enable", "estop", "mode", "overspeed", "standstill", "zone")
@@ -38,10 +35,7 @@ class Pair:
         kinds = {topic: next(iter(rows)) for topic, rows in PRESETS[preset].topics.items()}
         values = {name: str(value).lower() for name, value in recipe.values.items()}
         text = text_of(Guard("waiting", PRESETS[preset], types=kinds, values=values))
-        sources = {"1.rv": before, "2.rv": text}
-        [part] = parts_of(certified(compiled_from(sources, DEFINITIONS)).data, [(("before", "waiting"), ())])
-        compiled, fast = loaded(part)
-        self.monitors = MonitorSet.of(compiled, fast=fast)
+        self.monitors = on_its_module(part_of(before, text))
         self.monitors.name_senders(lambda source: ("10.0.0.1", NODES[source]))
         self.topics, self.at, self.count = PRESETS[preset].given_topics, 0, 0
         self.kinds = {**kinds, **recipe.fixed}
