@@ -52,6 +52,9 @@ class SupervisorMessages:
                 self._operators.tokens.first_token_shown()
             case messages.ClockRead(synchronised):
                 self._operators.clock.synchronisation_reported(synchronised)
+            case messages.MachineAddresses(addresses):
+                _log.info("addresses of the robot's machine", addresses=addresses)
+                self._base.policies.hosts_changed()
             case messages.ProbeFailed(reason):
                 self._base.listener_limits.probed(reason)
             case messages.ProbePassed():

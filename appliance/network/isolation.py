@@ -39,6 +39,7 @@ from appliance.network.firewall.firewall_rules import (
 )
 from appliance.network.firewall.nft import NftBackend
 from appliance.network.listening_sockets import listening_ports, udp_ports_in_use
+from appliance.network.machine_addresses import machine_addresses
 from appliance.network.namespaces import Namespace, NetworkError, end_processes, require_privileges
 from appliance.network.port_holders import PortsInUseError, described
 from appliance.network.public_address import PublicAddress, outward_address
@@ -176,6 +177,11 @@ class Isolation:
 
     def host_address_for(self, peer: str) -> str:
         return interfaces.source_address_for(self._host, peer)
+
+    def machine_addresses(self) -> tuple[str, ...]:
+        """Return the host's addresses, without those of the appliance's link. Cheap."""
+        ours = {end.host for end in self.ends.values()}
+        return tuple(address for address in self._host.run(machine_addresses) if address not in ours)
 
     def endpoint(self) -> PublicAddress:
         """Return the address by which other networks reach this machine. Raises `NetworkError` if it is unknown."""

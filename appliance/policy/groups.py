@@ -57,6 +57,13 @@ class HostGroups:
             self._table.put((atom for _, atom in self.read(group.values)), group.atom)
         self._find_cycles()
 
+    def add_own(self, addresses: Collection[Address]) -> None:
+        """Put addresses of the robot's machine in `robot`, except those that a rule or an enrolled host has already."""
+        named = self._table.networks()
+        own = [network for network in map(_as_network, addresses) if network not in named]
+        self.robot += tuple(dict.fromkeys(own))
+        self._table.put((self._table.network(network) for network in own), self.groups[ROBOT].atom)
+
     def _declare(self, entry: Entry) -> None:
         word = entry.key
         first = self.groups.get(word.text)

@@ -22,6 +22,7 @@ def approvals_of(rows: Iterable[Iterable[str]]) -> frozenset[Approval]:
 class PolicyContext:
     """The surroundings of a policy: the addresses of `host:NAME` and `robot`, and the test cases.
 
+    `own` are the other addresses of the robot's machine, which belong to `robot` unless the policy names them.
     If the test cases could not be read, `cases_error` says why, and rejects the policy. `blocks`, `holders` and
     `approved` do not affect checks and test cases.
     """
@@ -35,6 +36,7 @@ class PolicyContext:
     blocks: Mapping[Address, str] = field(default_factory=dict)
     holders: Mapping[str, Address] | None = None
     approved: frozenset[Approval] | None = None
+    own: Collection[Address] = ()
 
     @classmethod
     def of(cls, fields: Mapping[str, Any]) -> Self:
@@ -45,12 +47,14 @@ class PolicyContext:
             blocks={ipaddress.ip_address(address): block for address, block in fields["blocks"].items()},
             holders={group: ipaddress.ip_address(host) for group, host in (fields["holders"] or {}).items()},
             approved=approvals_of(fields["approved"]),
+            own=[ipaddress.ip_address(address) for address in fields["own"] or ()],
         )
 
     def fields(self) -> dict[str, Any]:
         return {
             "hosts": {name: str(address) for name, address in self.hosts.items()},
             "robot": [str(place) for place in self.robot],
+            "own": [str(address) for address in self.own],
             "cases_file": self.cases_file,
             "cases": self.cases,
             "cases_error": self.cases_error,
@@ -78,7 +82,7 @@ class PolicyJudgement(NamedTuple):
 
 def judge(text: str, file: str, known: PolicyContext, signature: str = "") -> PolicyJudgement:
     """Check a text. Raises `PolicyError` with all its errors, or else those of the signature and the test cases."""
-    policy = compile_policy(text, file=file, hosts=known.hosts, robot=known.robot)
+    policy = compile_policy(text, file=file, hosts=known.hosts, robot=known.robot, own=known.own)
     try:
         signed_by = signer(known.site_keys, text, signature)
     except UnsignedError as error:

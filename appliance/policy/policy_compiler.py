@@ -23,9 +23,11 @@ def compile_policy(
     file: str,
     hosts: Mapping[str, Address] | None = None,
     robot: Collection[Address | Network] = (),
+    own: Collection[Address] = (),
 ) -> Policy:
     """Return the policy. Raises `PolicyError` with every error in the text.
 
+    `own` are further addresses of the robot's machine. They are in the group `robot`, unless the text names them.
     A name in `hosts` without an address matches no host and causes a warning.
     """
     findings = Findings(file)
@@ -47,6 +49,7 @@ def compile_policy(
             present.update(decider.categories)
         for category in decider.categories:
             compiler.tables[category].audit_only = decider.name in options.audit_only
+    groups.add_own(own)
     findings.raise_errors()
     lint(compiler.tables, present, written, groups=groups, hosts=table, findings=findings)
     named = {atom for rules in compiler.tables.values() for rule in rules.rules for atom in rule.hosts}

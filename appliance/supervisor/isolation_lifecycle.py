@@ -79,6 +79,7 @@ class NoIsolation:
     kind = "none"
     probes = False
     link = ""  # the interface of the host that leads to the appliance
+    trusted_machine: tuple[str, ...] = ()  # addresses of the machine; foreign packets with them are dropped
     lapse = ""  # why the robot's own programs may have started without the appliance
 
     @contextlib.contextmanager
@@ -109,6 +110,13 @@ class NoIsolation:
 
     def clear_tunnels(self) -> None:
         """Remove the IPsec states and policies of an ended charon. Raises `NetworkError`, `LeftoversError`."""
+
+    def machine_addresses(self) -> tuple[str, ...]:
+        """Return the addresses whose packets, if they reach the appliance, were made on the robot's machine."""
+        return ()
+
+    def trust_machine(self, addresses: tuple[str, ...]) -> None:
+        """Drop packets with these addresses that were not made on the machine. Raises `NetworkError`."""
 
     def route_to(self, host: str) -> str | None:  # noqa: ARG002  the same everywhere
         return None
@@ -423,6 +431,7 @@ class NetnsIsolation(ContainerIsolation):
             raise PortInUseError(str(error)) from error
         except NetworkError as error:
             raise StartError(str(error)) from error
+        self.trusted_machine = self.machine_addresses()
         super().build()
 
     def remove(self) -> None:
@@ -433,12 +442,29 @@ class NetnsIsolation(ContainerIsolation):
             except NetworkError as error:
                 log.error("the namespace may remain; the next start removes it", error=str(error))
 
+    def machine_addresses(self) -> tuple[str, ...]:
+        return () if self._ports.peer is not None else self._isolation.machine_addresses()
+
+    def trust_machine(self, addresses: tuple[str, ...]) -> None:
+        with self._standing():
+            wanted = tuple(sorted({*addresses}))
+            if self.firewall is not None and wanted != self.trusted_machine:
+                before, self.trusted_machine = self.trusted_machine, wanted
+                try:
+                    self.firewall.update(self._settings())
+                except NetworkError:
+                    self.trusted_machine = before
+                    raise
+
     def _api_networks(self) -> tuple[str, ...]:
         # Connections from the host's loopback arrive with the address of the host's end of the link.
-        return (*self._neighbours(), *super()._api_networks())
+        return (*self._link_ends(), *super()._api_networks())
+
+    def _link_ends(self) -> tuple[str, ...]:
+        return tuple(ends.host for ends in self._isolation.ends.values())
 
     def _neighbours(self) -> tuple[str, ...]:
-        return tuple(ends.host for ends in self._isolation.ends.values())
+        return (*self._link_ends(), *self.trusted_machine)
 
     def route_to(self, host: str) -> str | None:
         # `host` comes from control, which is not trusted: accept only an address.

@@ -43,10 +43,34 @@ class IsolationWatchdog:
         self._one_at_a_time = asyncio.Lock()
         self._few_at_a_time = asyncio.Semaphore(_ROUTES_AT_ONCE)  # route queries change nothing
         self._probe: messages.Message | None = None
+        self._machine = isolation.trusted_machine
+        self._taking_machine = False
         self._report = messages.FirewallReported(isolation=isolation.kind, report=FirewallState())
 
     def news(self) -> list[messages.Message]:
         return [self._report] if self._probe is None else [self._report, self._probe]
+
+    def machine(self) -> messages.MachineAddresses:
+        return messages.MachineAddresses(list(self._machine))
+
+    def machine_has_changed(self) -> bool:
+        return not self._taking_machine and self.isolation.machine_addresses() != self._machine
+
+    async def take_machine(self) -> None:
+        """Tell control the new addresses of the machine, while the firewall drops foreign packets with them."""
+        self._taking_machine = True
+        try:
+            async with self._one_at_a_time:
+                found = self.isolation.machine_addresses()
+                await in_thread(lambda: self.isolation.trust_machine((*self._machine, *found)))
+                self._machine = found
+                self._tell(self.machine())
+                await in_thread(lambda: self.isolation.trust_machine(found))
+        except Exception as error:  # noqa: BLE001  see the invariant
+            log.error("new addresses of the machine are not the robot's yet", error=_words(error))
+            await asyncio.sleep(self._every)
+        finally:
+            self._taking_machine = False
 
     async def look(self) -> str | None:
         async with self._one_at_a_time:

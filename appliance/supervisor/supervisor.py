@@ -280,6 +280,7 @@ class Supervisor:
             process.send(messages.Activated(self._gate.epoch))
         for name, descriptor in self.kept:
             process.send(messages.SocketRestored(name), (descriptor,))
+        process.send(self._watchdog.machine())  # before control decides by its policy
         process.send(messages.SocketsRestored(len(self.kept), self.is_ready))
         for message in (*self._watchdog.news(), self._clock):
             process.send(message)
@@ -576,6 +577,8 @@ class Supervisor:
                     self._look_at(slot, slot.process, slept)
                 if slot.recovers():
                     self._tell_processes()
+            if self._watchdog.machine_has_changed():
+                self._spawn(self._watchdog.take_machine())
             read = messages.ClockRead(clock_is_synchronised())
             if read != self._clock:
                 self._clock = read

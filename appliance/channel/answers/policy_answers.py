@@ -47,6 +47,12 @@ class PolicyInForce(RevisionText, frozen=True, kw_only=True):
     ] = {}
     holders: Annotated[dict[str, str], doc("address of the host that holds each group of [Authority]")] = {}
     approved: Annotated[list[list[str]], doc("approvals that last: host, category, name")] = []
+    own: Annotated[
+        list[str],
+        doc(
+            "other addresses of the robot's machine, which are in the group robot unless the policy names them"
+        ),
+    ] = []
 
 
 class PolicyKnown(PolicyInForce, frozen=True):

@@ -112,6 +112,12 @@ class ClockRead(Message):
     synchronised: bool | None
 
 
+class MachineAddresses(Message):
+    """The addresses of the robot's machine; packets with them are its own. Sent at the start, and on changes."""
+
+    addresses: list[str]
+
+
 class FirewallReported(Message):
     """The state of isolation and firewall, for `rosrv status`."""
 
@@ -256,8 +262,8 @@ class Activated(Message):
 
 Lifeline = (
     Ping | Pong | Stop | Walled | Ready | Failed | LinkOpened | SocketKept | SocketDropped | SocketRestored
-    | SocketsRestored | Announced | ProcessesChanged | ClockRead | FirewallReported | ProbeFailed | ProbePassed
-    | PolicyReloadRequested | RouteWanted | EndpointWanted | EndpointFound
+    | SocketsRestored | Announced | ProcessesChanged | ClockRead | MachineAddresses | FirewallReported | ProbeFailed
+    | ProbePassed | PolicyReloadRequested | RouteWanted | EndpointWanted | EndpointFound
     | TunnelsWanted | TunnelsEnclosed | ProcessWanted | ProcessOverdue
     | OwnNetworkWanted | OwnNetworkOpened
     | MemoryGiven | StateGiven | RouteFound | LogHeld | CompilerWanted | ApplianceStopRequested

@@ -133,6 +133,7 @@ async def make_foundation(
         trail,
         policy,
         robot=robot_addresses(settings, role.robot),
+        own=lambda: lifeline.surroundings.machine,
         hosts=lambda: {**tunnels().addresses, **features.addresses()},
         blocks=lambda: blocks.reasons,
         holders=features.holders,

@@ -78,6 +78,7 @@ class Policies(Revisions[RevisionRow]):
         policy: CurrentPolicy,
         *,
         robot: Collection[Address | Network],
+        own: Callable[[], Collection[Address]],
         hosts: Callable[[], Mapping[str, Address]],
         blocks: Callable[[], Mapping[Address, str]],
         holders: Callable[[], Mapping[str, Address]],
@@ -89,7 +90,8 @@ class Policies(Revisions[RevisionRow]):
     ) -> None:
         """`start` brings a policy into force, and sets it in `policy`.
 
-        The owner of `hosts` calls `hosts_changed`; those of `blocks`, `holders` and `approved` call `decide_again`.
+        The owners of `hosts` and `own` call `hosts_changed`; those of `blocks`, `holders` and `approved` call
+        `decide_again`.
         `changed(before, policy)` decides all live rights again, and returns the number of revocations.
         """
         nothing = RevisionRow(0, "", "", 0.0, "", "")
@@ -97,6 +99,7 @@ class Policies(Revisions[RevisionRow]):
         self.file = file
         self._trail = trail
         self._robot = robot
+        self._own = own
         self._hosts = hosts
         self._blocks = blocks
         self._holders = holders
@@ -268,6 +271,7 @@ class Policies(Revisions[RevisionRow]):
             blocks=self._blocks(),
             holders=self._holders(),
             approved=self._approved(),
+            own=self._own(),
         )
 
     # --- inside ---
@@ -281,7 +285,7 @@ class Policies(Revisions[RevisionRow]):
             while True:
                 known = self.known
                 policy, signature = await asyncio.to_thread(self._tested, read, file, known, cases)
-                if self._hosts() == known.hosts:
+                if (self._hosts(), self._own()) == (known.hosts, known.own):
                     break
         except PolicyRefusedError as error:
             self._refused(error, who)

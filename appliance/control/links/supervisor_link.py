@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import ipaddress
 import os
 import socket
 from collections.abc import Callable, Mapping
@@ -13,6 +14,7 @@ from appliance.channel import messages
 from appliance.channel.answers.status import FirewallState, ProcessInfo
 from appliance.channel.channel import Channel, ChannelClosedError
 from appliance.channel.messages.api import ApiLink
+from appliance.policy.model import Address
 
 ROUTES_AT_ONCE = 32  # the most open route queries; unknown hosts cause them, and the supervisor limits them
 
@@ -34,6 +36,7 @@ class Surroundings:
     def __init__(self) -> None:
         self.processes: list[ProcessInfo] = []
         self.firewall = messages.FirewallReported("unknown", FirewallState())
+        self.machine: tuple[Address, ...] = ()  # addresses of the robot's machine
         self.probe = ""
         self.master = ""
 
@@ -181,6 +184,8 @@ class ControlLifeline:
 
     def _note(self, message: Any) -> None:
         match message:
+            case messages.MachineAddresses(addresses):
+                self.surroundings.machine = tuple(map(ipaddress.ip_address, addresses))
             case messages.ProcessesChanged(processes):
                 self.surroundings.processes = processes
             case messages.ProbeFailed(reason):

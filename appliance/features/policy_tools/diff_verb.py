@@ -144,7 +144,9 @@ def _known(
 
 def _compiled(source: _Source, known: PolicyContext) -> Policy:
     try:
-        return compile_policy(source.text, file=source.name, hosts=known.hosts, robot=known.robot)
+        return compile_policy(
+            source.text, file=source.name, hosts=known.hosts, robot=known.robot, own=known.own
+        )
     except PolicyError as error:
         raise refused(error.findings) from error
 

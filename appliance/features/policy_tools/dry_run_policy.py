@@ -25,7 +25,9 @@ from appliance.policy.policy_findings import PolicyError
 def judge_change(order: PolicyLoad, current: PolicyKnown, registrations: Iterable[Registration]) -> Report:
     """Return the effects of a change. Raises `ProblemError` with every finding if the text is rejected."""
     known = PolicyContext.of(msgspec.structs.asdict(current))
-    before = compile_policy(current.text, file=current.file, hosts=known.hosts, robot=known.robot)
+    before = compile_policy(
+        current.text, file=current.file, hosts=known.hosts, robot=known.robot, own=known.own
+    )
     try:
         policy = judge(order.text, "policy", known, order.signature).accepted()
     except PolicyError as error:

@@ -69,7 +69,7 @@ class Grant:
 def grant(text: str, file: str, known: PolicyContext, asked: DecidedRequest) -> Grant:
     """Grant a request. Raises `UngrantableError`, and `PolicyError` if the text is not a valid policy."""
     word = _word(text, known, asked.request.host)
-    policy = compile_policy(text, file=file, hosts=known.hosts, robot=known.robot)
+    policy = compile_policy(text, file=file, hosts=known.hosts, robot=known.robot, own=known.own)
     block = replace(policy, blocks=known.blocks).blocked(asked.request.host)
     if block is not None:
         raise UngrantableError(f"no line of a policy grants it: {block.reason}")
@@ -84,7 +84,7 @@ def grant(text: str, file: str, known: PolicyContext, asked: DecidedRequest) -> 
         text, line = _changed(policy, text, missing, word, "" if added else asked.wide)
         added.append(line)
         try:
-            policy = compile_policy(text, file=file, hosts=known.hosts, robot=known.robot)
+            policy = compile_policy(text, file=file, hosts=known.hosts, robot=known.robot, own=known.own)
         except PolicyError:  # the line is invalid: the call is unknown, or no key can name the resource
             raise UngrantableError(f"no line of a policy grants it: {reason}") from None
     if asked.takeover and policy.takeover != TAKEOVERS[-1]:

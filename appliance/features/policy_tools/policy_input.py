@@ -95,6 +95,7 @@ def context_of(body: PolicyInForce) -> PolicyContext:
         blocks={ipaddress.ip_address(address): block for address, block in body.blocks.items()},
         holders={group: ipaddress.ip_address(host) for group, host in body.holders.items()},
         approved=approvals_of(body.approved),
+        own=[ipaddress.ip_address(address) for address in body.own],
     )
 
 

@@ -136,7 +136,7 @@ def compiled(
 
 def compiled_with(text: str, name: str, known: PolicyContext) -> Policy:
     try:
-        policy = compile_policy(text, file=name, hosts=known.hosts, robot=known.robot)
+        policy = compile_policy(text, file=name, hosts=known.hosts, robot=known.robot, own=known.own)
     except PolicyError as error:  # the appliance has another version
         raise refused(error.findings) from error
     return replace(policy, blocks=known.blocks, holders=known.holders, approved=known.approved)

@@ -15,12 +15,12 @@ from pathlib import Path
 import pytest
 
 from appliance.supervisor.roles import ROSMASTER, ROSOUT
-from examples.landshark.lab import Lab
+from examples.landshark.lab import Host, Lab
 from tests.support.command import ROSRV, rosrv
 from tests.support.own_namespace import own_namespace
 from tests.support.processes import LIMIT, Process, ThisMachine
 from tests.support.requirements import need_root, needs
-from tests.support.waiting import allowed
+from tests.support.waiting import allowed, eventually
 
 PLACE = ("--listen", "127.0.0.1:0", "--rosmaster-port", "0", "--isolation", "none")
 POLICY = (
@@ -240,3 +240,29 @@ def test_a_policy_that_was_loaded_outlasts_its_file(directory: Path) -> None:
         assert running.wait_for(event="ready", timeout=2 * LIMIT)["revision"] == 4
     shutil.rmtree(state)
     assert "the policy cannot be read" in refusal(directory)
+
+
+def test_the_machines_own_addresses_are_the_robot_as_they_come_and_go(directory: Path) -> None:
+    (directory / "policy.ini").write_text("[Commands]\ndefault = robot\n")
+    need_root()
+    with own_namespace(), Lab("rosrv-up") as lab:
+        host, other = lab.host("machine", "10.81.0.2/24"), lab.host("robot", "10.81.0.10/24")
+
+        def allows(caller: Host, address: str) -> bool:
+            try:
+                return caller.run(partial(pid_of_master, f"http://{address}:11311")).startswith("[1, ")
+            except xmlrpc.client.Fault:
+                return False
+
+        flags = ("--json", "--isolation", "netns", "--listen", "0.0.0.0:11311")
+        running = Process(host, command(directory, *flags), env=ENVIRONMENT, label="rosrv up")
+        try:
+            running.wait_for(event="ready", timeout=2 * LIMIT)
+            assert allows(host, "127.0.0.1")
+            assert allows(host, "10.81.0.2")
+            assert not allows(other, "10.81.0.2")
+            assert host.popen(["ip", "address", "add", "10.81.0.3/24", "dev", "eth0"]).wait() == 0
+            eventually(lambda: allows(host, "10.81.0.3"), running.story)
+            assert not allows(other, "10.81.0.3")
+        finally:
+            assert running.stop(with_signal=signal.SIGTERM) == 0

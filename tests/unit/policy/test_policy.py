@@ -266,3 +266,30 @@ def test_a_blocked_host_learns_neither_operator_nor_note(tell: str, told: str) -
     decision = ask(policy, "10.0.0.5", "node", "/n")
     assert text_for_caller(decision, tell).removeprefix("10.0.0.5 ") == told
     assert text_for_caller(decision, "full") == decision.reason
+
+
+OWN = [ipaddress.ip_address(text) for text in ("192.168.1.2", "172.17.0.1", "fd00::2")]
+
+
+def test_the_machines_own_addresses_are_the_robot() -> None:
+    policy = compiled("[Publishers]\ndefault = robot\n", robot=[ipaddress.ip_address("10.111.0.1")], own=OWN)
+    hosts = {
+        "10.111.0.1": True,
+        "192.168.1.2": True,
+        "fd00::2": True,
+        "192.168.1.3": False,
+        "172.17.0.2": False,
+    }
+    assert {host: ask(policy, host, "publish", "/cmd_vel").allowed for host in hosts} == hosts
+
+
+def test_a_policy_that_names_an_own_address_decides_as_before() -> None:
+    text = (
+        "[Groups]\nbase = 192.168.1.2\nlab = 172.17.0.0/16\n[Publishers]\ndefault = robot\n/led = base lab\n"
+    )
+    policy = compiled(text, robot=[ipaddress.ip_address("10.111.0.1")], own=OWN)
+    assert ask(policy, "192.168.1.2", "publish", "/led").allowed
+    assert not ask(policy, "192.168.1.2", "publish", "/cmd_vel").allowed
+    assert ask(policy, "172.17.0.1", "publish", "/cmd_vel").allowed, "named only by its network"
+    hosts = compiled(text, hosts={"other": OWN[0]}, robot=[ipaddress.ip_address("10.111.0.1")], own=OWN)
+    assert not ask(hosts, "192.168.1.2", "publish", "/cmd_vel").allowed

@@ -64,7 +64,7 @@ class Appliance:
         store = StateStore(self.state, failed=fail, kind=InlineDatabase)
         self.records = Records()
         policies = Policies(
-            self.file, store, cast(Any, self.records), CurrentPolicy(), robot=(), hosts=hosts, blocks=blocks,
+            self.file, store, cast(Any, self.records), CurrentPolicy(), robot=(), own=tuple, hosts=hosts, blocks=blocks,
             holders=holders, approved=approved, live=live, changed=changed, carried_out=at_once, site_keys=site_keys,
         )  # fmt: skip
         policies.start(restarted=restarted)

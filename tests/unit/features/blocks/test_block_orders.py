@@ -75,8 +75,8 @@ class Control(ControlParts):
         self.uses: list[str] = []
         self.policies = Policies(
             state / "policy.ini", self.state, cast(Any, self.records), CurrentPolicy(),
-            robot=[ipaddress.ip_network(ROBOT)], hosts=dict, blocks=lambda: self.blocks.reasons, holders=dict,
-            approved=frozenset, live=list,
+            robot=[ipaddress.ip_network(ROBOT)], own=tuple, hosts=dict, blocks=lambda: self.blocks.reasons,
+            holders=dict, approved=frozenset, live=list,
             changed=self.changed, carried_out=at_once, site_keys=(),
         )  # fmt: skip
         self.policies.start(restarted=False)
