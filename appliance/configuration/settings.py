@@ -298,7 +298,7 @@ class ApiLimits:
     connections: Count = key(default=512, description="of all hosts")
     connections_per_host: Count = key(default=320, description="connections of one host")
     header_seconds: Seconds = key(default=10.0, description="until the request's headers must have arrived")
-    streams: Count = key(default=16, description="clients that follow the audit log, at once")
+    streams: Count = key(default=64, description="clients that follow the audit log, at once")
 
 
 def relays_for_this_machine() -> int:

@@ -410,33 +410,19 @@ REST_CONNECTIONS = QuotaRow(
 )
 _STREAMS_SHOWN_BY = (
     "unit/api/front/test_streams.py::test_two_hundred_viewers_leave_slots_to_operators",
-    "unit/api/front/test_streams.py::test_one_token_and_one_host_have_a_quota",
+    "unit/api/front/test_streams.py::test_one_token_has_a_quota_and_one_machine_none",
 )
 REST_STREAMS = QuotaRow(
     thing="streams of REST by token: followers of the audit log, and of `/v1/live` (a limit for each)",
-    bounds=Bounds(whole=16, host=6, unknown=0, kept=4),
+    bounds=Bounds(whole=64, host=24, unknown=0, kept=16),
     at_limit="503 with the reason and Retry-After",
-    counting="a host is a token; kept: not for viewers",
+    counting="a host is a token or a session; kept: not for viewers",
     alarm="`rest call` with status 503",
     setting="api_limits.streams (the quotas scale with it)",
     margin=HonestUse(
-        "12 viewers, each on a page that follows the robot",
-        12,
+        "24 viewers behind one address, each on a page that follows the robot",
+        24,
         of="unkept",
-        beyond='a page shows "too many clients follow" and tries again; raise `api_limits.streams` for more',
-    ),
-    shown_by=_STREAMS_SHOWN_BY,
-)
-REST_STREAM_PEERS = QuotaRow(
-    thing="streams of REST by client machine",
-    bounds=Bounds(whole=16, host=8, unknown=0, kept=0),
-    at_limit="503 with the reason and Retry-After",
-    counting="a host is a machine",
-    alarm="`rest call` with status 503",
-    setting="api_limits.streams (the quotas scale with it)",
-    margin=HonestUse(
-        "eight browsers behind one address",
-        8,
         beyond='a page shows "too many clients follow" and tries again; raise `api_limits.streams` for more',
     ),
     shown_by=_STREAMS_SHOWN_BY,
@@ -617,7 +603,7 @@ QUOTA_ROWS = (
     RVMASTER_CONNECTIONS, RVMASTER_ARRIVALS, RVMASTER_BYTES, RVMASTER_FAREWELLS, RVMASTER_REQUESTS, RVMASTER_TIME,
     PARAMETER_BYTES, LARGE_WRITES, PROBES, NODE_CALLS_UNDER_WAY, QUEUED_NODE_CALLS, RELAY_FRAMES,
     RELAY_QUEUES, RELAY_LATCHED, RELAY_CONNECTIONS, RELAY_HEADERS, RELAY_TURN, LIMITED_TOPIC, RELAY_MESSAGE,
-    DRY_RUNS, SLICES, REST_CONNECTIONS, REST_STREAMS, REST_STREAM_PEERS,
+    DRY_RUNS, SLICES, REST_CONNECTIONS, REST_STREAMS,
     REST_EXPORTS, REST_WORK, AUDIT_KINDS, AUDIT_READ_KINDS, AUDIT_BYTES, AUDIT_RESERVE, NODE_PORTS, NAMES, GRANTS,
     IKE_HANDSHAKES, DESCRIPTORS,
 )  # fmt: skip

@@ -101,7 +101,7 @@ CELLS: dict[str, dict[str, str]] = {
         "end of a right": f"{_REST}test_access.py::test_a_stream_ends_with_the_grace_time_of_its_token",
         "unknown": "- a follower has a token",
         "folding": f"{_REST}test_journal.py::test_equal_reads_are_reported_once_and_counted",
-        "share": f"{_REST}test_streams.py::test_one_token_and_one_host_have_a_quota"
+        "share": f"{_REST}test_streams.py::test_one_token_has_a_quota_and_one_machine_none"
         f" {_REST}test_streams.py::test_two_hundred_viewers_leave_slots_to_operators",
         "binding": f"{_FIREWALL}test_the_rest_port_is_limited_before_its_networks_pass",
         "failure": "- it begins as any request with a token",

@@ -31,9 +31,7 @@ class Services:
     judging: Work = field(default_factory=lambda: Work("dry runs and explanations", REST_WORK.bounds.whole))
     searches: Work = field(default_factory=lambda: Work("searches of the audit log", _SEARCHES))
     ordering: asyncio.Semaphore = field(default_factory=lambda: asyncio.Semaphore(2))
-    exports: Streams = field(
-        default_factory=lambda: Streams(REST_EXPORTS, REST_EXPORTS, REST_EXPORTS.bounds.whole)
-    )
+    exports: Streams = field(default_factory=lambda: Streams(REST_EXPORTS, REST_EXPORTS.bounds.whole))
 
     @property
     def audit_log(self) -> Path:

@@ -1,4 +1,7 @@
-"""Limit long answers, which are streams and exports, for each token and each peer."""
+"""Limit long answers, which are streams and exports, for each token.
+
+Machines have no quota: an office of browsers may share one address, and each of its people has a token or session.
+"""
 
 import asyncio
 import contextlib
@@ -25,35 +28,25 @@ def peer_of(request: Request) -> str:
 
 
 class Streams:
-    """Permits `whole` long answers at once, with quotas for `tokens` and `peers`."""
+    """Permits `whole` long answers at once, with the quotas of `row` for each token."""
 
-    def __init__(self, tokens: QuotaRow, peers: QuotaRow, whole: int) -> None:
+    def __init__(self, row: QuotaRow, whole: int) -> None:
         self.roles: dict[str, TokenRole] = {}
-        part = whole / tokens.bounds.whole
-        self._tokens: Pool[str] = Pool(
-            "of these", tokens.bounds.sized(whole, max(1, int(tokens.bounds.host * part))), self._quota_class
-        )
-        self._peers: Pool[str] = Pool(
-            "of these",
-            peers.bounds.sized(whole, max(1, int(peers.bounds.host * part))),
-            lambda _peer: QuotaClass.REGISTERED,
-        )
+        host = max(1, row.bounds.host * whole // row.bounds.whole)
+        self._tokens: Pool[str] = Pool("of these", row.bounds.sized(whole, host), self._quota_class)
 
-    def take(self, bearer: Bearer, peer: str, what: str) -> Callable[[], None]:
+    def take(self, bearer: Bearer, what: str) -> Callable[[], None]:
         """Return the function that ends the long answer. Raises `ProblemError` (503)."""
         self.roles[bearer.id] = bearer.role
-        busy = self._tokens.refusal(bearer.id) or self._peers.refusal(peer)
-        if busy:
+        if self._tokens.refusal(bearer.id):
             self._forget(bearer.id)
-            mine, here = self._tokens.held(bearer.id), self._peers.held(peer)
-            text = f"too many {what}: of {self._tokens.total} the token {bearer.name} has {mine}, your machine {here}"
+            mine = self._tokens.held(bearer.id)
+            text = f"too many {what}: of {self._tokens.total} the token {bearer.name} has {mine}"
             raise ProblemError(503, "busy", text, retry_after=10)
         self._tokens.charge(bearer.id)
-        self._peers.charge(peer)
 
         def give_back() -> None:
             self._tokens.give_back(bearer.id)
-            self._peers.give_back(peer)
             self._forget(bearer.id)
 
         return give_back

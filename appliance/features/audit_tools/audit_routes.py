@@ -32,7 +32,7 @@ from appliance.audit.search.query import Filter
 from appliance.audit.search.search import Follower, export
 from appliance.features.audit_tools.audit_summary import add_summary
 from appliance.features.audit_tools.record_pages import PAGE, page_of, streamed
-from appliance.quotas.table import REST_STREAM_PEERS, REST_STREAMS
+from appliance.quotas.table import REST_STREAMS
 
 _T = TypeVar("_T")
 _POLL_SECONDS = 0.2
@@ -132,7 +132,7 @@ def routes(services: Services) -> Routes:
 
 
 def _add_searches(router: Routes, services: Services, desk: LogReader) -> None:
-    streams = Streams(REST_STREAMS, REST_STREAM_PEERS, services.settings.api_limits.streams)
+    streams = Streams(REST_STREAMS, services.settings.api_limits.streams)
 
     @router.get("", responses=_json(PAGE))
     async def search_audit(
@@ -181,7 +181,7 @@ def _add_searches(router: Routes, services: Services, desk: LogReader) -> None:
         wanted = await desk.named(bearer, wanted)
         start = int(last_event_id) if last_event_id is not None else after
         follower = await desk.read(bearer, Follower, desk.path, wanted, start)
-        give_back = streams.take(bearer, peer_of(request), "clients follow the audit log")
+        give_back = streams.take(bearer, "clients follow the audit log")
         following = _follow(
             services, desk, follower, bearer, wanted.text, peer=peer_of(request), equality=equality
         )
@@ -212,7 +212,7 @@ def _add_proofs(router: Routes, services: Services, desk: LogReader) -> None:
     @router.get(
         "/export", responses=file("application/x-ndjson", "One record per line."), response_class=Response
     )
-    async def export_audit(request: Request, bearer: Viewer, wanted: Wanted) -> Response:
+    async def export_audit(bearer: Viewer, wanted: Wanted) -> Response:
         """Return all records that match, oldest first, one JSON object a line.
 
         Each has in `chain` its place in the hash chain, as far as a signed checkpoint. Viewers get records
@@ -220,7 +220,7 @@ def _add_proofs(router: Routes, services: Services, desk: LogReader) -> None:
         """
         wanted = await desk.named(bearer, wanted)
         found = await desk.read(bearer, _exported, desk.path, wanted, bearer, services.settings.name)
-        give_back = services.exports.take(bearer, peer_of(request), "exports")
+        give_back = services.exports.take(bearer, "exports")
         return StreamResponse(
             StreamingResponse(in_thread(_joined(found)), media_type="application/x-ndjson"), give_back
         )

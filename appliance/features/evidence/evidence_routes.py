@@ -3,7 +3,7 @@
 import asyncio
 from typing import Annotated, Any
 
-from fastapi import Query, Request, Response
+from fastapi import Query, Response
 from starlette.responses import StreamingResponse
 
 from appliance.api.front.access import Bearer
@@ -13,7 +13,7 @@ from appliance.api.front.recording_id import OneId
 from appliance.api.front.route_roles import Investigator, Reader, problem_of
 from appliance.api.front.routing import Responses, Routes, file
 from appliance.api.front.services import Services
-from appliance.api.front.streams import StreamResponse, in_thread, peer_of
+from appliance.api.front.streams import StreamResponse, in_thread
 from appliance.api.routes.named_hosts import host_in_words
 from appliance.audit.log.log_database import LogUnreadableError
 from appliance.channel.admin import AdminAnswer, AdminRequest, PolicyWanted
@@ -30,34 +30,30 @@ def routes(services: Services) -> Routes:
     router = Routes(prefix="/v1", tags=["evidence"])
 
     @router.get("/evidence", responses=_ZIP, response_class=Response)
-    async def export_evidence(
-        request: Request, bearer: Reader, since: _Moment, until: _Moment = "0s"
-    ) -> Response:
+    async def export_evidence(bearer: Reader, since: _Moment, until: _Moment = "0s") -> Response:
         """The audit records of a period, and the policies and specifications in force, as a bundle that
         proves itself.
 
         For investigators, operators and admins. The audit log records each export.
         """
-        return await _bundle(services, request, bearer, TimeSpan(given(since), given(until)))
+        return await _bundle(services, bearer, TimeSpan(given(since), given(until)))
 
     @router.get("/recordings/{recording_id:recording}/evidence", responses=_ZIP, response_class=Response)
-    async def recording_evidence(recording_id: OneId, request: Request, bearer: Investigator) -> Response:
+    async def recording_evidence(recording_id: OneId, bearer: Investigator) -> Response:
         """Return a bundle of the time of a recording, with its messages. For investigators."""
         kept = RecordingSelection(recording_id, services.settings.state / "recordings")
-        return await _bundle(services, request, bearer, kept)
+        return await _bundle(services, bearer, kept)
 
     return router
 
 
-async def _bundle(
-    services: Services, request: Request, bearer: Bearer, wanted: TimeSpan | RecordingSelection
-) -> Response:
+async def _bundle(services: Services, bearer: Bearer, wanted: TimeSpan | RecordingSelection) -> Response:
     loop = asyncio.get_running_loop()
 
     def ask(asked: AdminRequest[Any]) -> AdminAnswer[Any]:
         return asyncio.run_coroutine_threadsafe(services.control.ask(asked, bearer), loop).result()
 
-    give_back = services.exports.take(bearer, peer_of(request), "exports")
+    give_back = services.exports.take(bearer, "exports")
     try:
         policy = await services.control.ask(PolicyWanted(), bearer)
         named = await asyncio.to_thread(host_in_words, policy.given() if policy.ok else None)

@@ -27,7 +27,7 @@ from appliance.channel.alarms import Alarm, activity, open_alarms
 from appliance.channel.answers.field_docs import Moment, doc
 from appliance.channel.answers.status import Status
 from appliance.channel.answers.token_answers import TokenRole
-from appliance.quotas.table import REST_STREAM_PEERS, REST_STREAMS
+from appliance.quotas.table import REST_STREAMS
 
 _PING_SECONDS = 15
 _PATIENCE_SECONDS = 1.0
@@ -57,7 +57,7 @@ class _Now(msgspec.Struct, frozen=True):
 
 def routes(services: Services) -> Routes:
     router = Routes(prefix="/v1", tags=["status"])
-    streams = Streams(REST_STREAMS, REST_STREAM_PEERS, services.settings.api_limits.streams)
+    streams = Streams(REST_STREAMS, services.settings.api_limits.streams)
 
     @router.get("/whoami")
     async def whoami(bearer: Viewer) -> Holder:
@@ -87,7 +87,7 @@ def routes(services: Services) -> Routes:
             seen = await services.history.again(_PATIENCE_SECONDS)
         if seen.active:
             raise only_standby(seen.away or "", seen.active)
-        give_back = streams.take(bearer, peer_of(request), "clients follow")
+        give_back = streams.take(bearer, "clients follow")
         following = _follow(services, bearer, graph, peer_of(request))
         return StreamResponse(EventSourceResponse(following, ping=_PING_SECONDS), give_back)
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Literal, TypeVar
 
-from fastapi import Query, Request, Response
+from fastapi import Query, Response
 from fastapi.responses import StreamingResponse
 
 from appliance.api.front.access import Bearer
@@ -18,7 +18,7 @@ from appliance.api.front.recording_id import OneId
 from appliance.api.front.route_roles import Investigator, Viewer, answered
 from appliance.api.front.routing import Responses, Routes, file
 from appliance.api.front.services import Services
-from appliance.api.front.streams import StreamResponse, Work, in_thread, peer_of
+from appliance.api.front.streams import StreamResponse, Work, in_thread
 from appliance.audit.log.log_database import LogUnreadableError
 from appliance.features.recorder import recording_requests
 from appliance.features.recorder.bag_reader import MessagePosition
@@ -68,12 +68,11 @@ def _add_bag(router: Routes, services: Services) -> None:
     )
     async def bag(
         recording_id: OneId,
-        request: Request,
         bearer: Investigator,
         format: Annotated[Literal["bag", "mcap"], Query(description="mcap: converted from the bag")] = "bag",  # noqa: A002  its name in the contract
     ) -> Response:
         """Return the messages of a recording. For investigators; the audit log records who fetched them."""
-        give_back = services.exports.take(bearer, peer_of(request), "exports")
+        give_back = services.exports.take(bearer, "exports")
         try:
             return StreamResponse(
                 await bag_response(services, recording_id, bearer, mcap=format == "mcap"), give_back
