@@ -4,7 +4,7 @@
    that also works in clear text does not identify a host.
 2. Every update sends charon the complete wanted state; updates keep the order of the changes.
 3. Every tunnel that comes up, moves, goes down or is rejected is recorded.
-4. A tunnel is closed when its certificate ends, and while its host is blocked.
+4. A tunnel is closed when its certificate ends, and while its host or the address from which it came is blocked.
 """
 
 import asyncio
@@ -78,6 +78,7 @@ class Tunnels:
         self.revocations = SignedRevocations(table, authority)
         self.seen: dict[str, messages.TunnelSeen] = {}
         self.last: dict[str, float] = {}
+        self._closed_from: dict[str, Address] = {}  # hosts whose tunnel came from a blocked address
         self.charon: messages.CharonStarted | None = None
         self._enclosed: messages.TunnelsEnclosed | None = None
         self._answered = asyncio.Event()
@@ -206,10 +207,13 @@ class Tunnels:
         authority = await self._authority.certificate()
         revocations = await self.revocations.signed()
         now, blocked = clock.wall(), self._blocked()
+        self._note_closed(blocked)
         hosts = [
             messages.TunnelHost(row.name, row.address, row.serial)
             for row in self._table.admitted()
-            if row.expires > now and address_of(row.address) not in blocked
+            if row.expires > now
+            and address_of(row.address) not in blocked
+            and row.name not in self._closed_from
         ]
         self._number += 1
         self._stated[self._number] = self._changes
@@ -217,6 +221,15 @@ class Tunnels:
             self._number, esp, self._table.own_address, authority, certificate, revocations, hosts
         )
         link.send(message)
+
+    def _note_closed(self, blocked: Container[Address]) -> None:
+        """Keep the tunnels closed that came from a blocked address, wherever their hosts try again, until it is free."""
+        self._closed_from |= {name: address_of(seen.remote) for name, seen in self.seen.items()}
+        self._closed_from = {name: one for name, one in self._closed_from.items() if one in blocked}
+
+    def _came_from(self, remote: str) -> None:
+        if address_of(remote) in self._blocked():
+            self.state_anew()
 
     def _received(self, message: object) -> None:
         match message:
@@ -290,6 +303,7 @@ class Tunnels:
             self._trail.happened(
                 "tunnel up", f"{name} is connected from {remote}", host=row.address, name=name, remote=remote
             )
+            self._came_from(remote)
 
     def _reported(self, rows: list[messages.TunnelSeen]) -> None:
         now = clock.wall()
@@ -315,6 +329,7 @@ class Tunnels:
                 remote=row.remote,
                 before=before,
             )
+            self._came_from(row.remote)
 
     def _went_down(self, name: str, reason: str) -> None:
         seen = self.seen.pop(name, None)

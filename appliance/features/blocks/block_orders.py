@@ -281,7 +281,7 @@ class BlockOrders:
         tunnels = [
             f"the tunnel of {name}, from {remote}"
             for name, remote in self._remotes().items()
-            if self._enrolled().get(name) == str(address)
+            if str(address) in {self._enrolled().get(name), remote}
         ]
         return requests.BlockEnded(
             **{name: count[name] for name in _REGISTERED.values()},

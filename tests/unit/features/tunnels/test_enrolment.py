@@ -19,6 +19,7 @@ from appliance.channel.channel import Channel
 from appliance.channel.messages import (
     CertificateNeeded,
     Message,
+    TunnelChanged,
     TunnelLink,
     TunnelsEnclosed,
     TunnelsReported,
@@ -709,6 +710,16 @@ async def test_the_tunnel_of_a_blocked_host_is_closed_until_the_block_ends(bench
         bench.blocked = {bench.tunnels.addresses["a"]} if blocked else set()
         bench.tunnels.state_anew()
         assert await stated.get() == left
+    bench.blocked = {ipaddress.ip_address("192.0.2.20")}
+    charon.send(TunnelChanged("b", True, "192.0.2.20"))  # its real address is blocked
+    assert await stated.get() == ["a"]
+    charon.send(TunnelsReported(0, []))  # it is down, and may not return from elsewhere
+    charon.send(TunnelChanged("a", True, "192.0.2.21"))
+    bench.tunnels.state_anew()
+    assert await stated.get() == ["a"]
+    bench.blocked = set()
+    bench.tunnels.state_anew()
+    assert await stated.get() == ["a", "b"]
     running.cancel()
     for one in (link, charon):
         one.close()
