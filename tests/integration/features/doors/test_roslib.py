@@ -1,0 +1,92 @@
+"""roslib from npm, as browsers use it, at the door of a running appliance."""
+
+import re
+import shutil
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from examples.landshark.lab import Host, Lab
+from tests.support.appliance import Appliance
+from tests.support.nodes import RosSession
+from tests.support.processes import Process
+from tests.support.requirements import need_program
+from tests.support.waiting import eventually
+
+HERE = Path(__file__).with_name("roslib")
+POLICY = """
+[Groups]
+site = 10.77.0.0/24
+agent = door:agent-1
+[Nodes]
+default = site agent
+[Publishers]
+default = site
+/answer = site agent
+/held = site, ask agent
+[Subscribers]
+default = site agent
+[Services]
+default = site
+[Clients]
+default = site
+/brake = site agent
+[Commands]
+default = site agent
+"""
+
+
+@pytest.fixture(scope="module")
+def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the program beside the libraries of its lock file."""
+    npm = need_program("npm", "npm")
+    folder = tmp_path_factory.mktemp("roslib")
+    for file in HERE.iterdir():
+        shutil.copy(file, folder)
+    subprocess.run(
+        [npm, "ci", "--ignore-scripts", "--no-audit", "--no-fund", "--silent"], cwd=folder, check=True
+    )
+    return folder / "client.mjs"
+
+
+@pytest.fixture
+def appliance(common_lab: Lab) -> Iterator[Appliance]:
+    with Appliance(common_lab.host("appliance", "10.77.0.2/24"), policy=POLICY) as running:
+        running.rosrv("door", "add", "agent-1", "--port", "9091", "--from", "10.77.0.10")
+        eventually(lambda: not running.row("door", "list")["trouble"], "the door serves")
+        yield running
+
+
+@pytest.fixture
+def ros(appliance: Appliance, common_robot: Host, tmp_path: Path) -> Iterator[RosSession]:
+    with RosSession(appliance.master_uri, tmp_path, common_robot) as session:
+        session.talker("roscpp", "/chatter")
+        session.service_server("roscpp", "/brake")
+        session.service_server("roscpp", "/forbidden_brake")
+        yield session
+
+
+def refusal(client: Process, topic: str) -> str:
+    found = client.wait_for(lambda event: topic in str(event.get("words")), event="status", level="error")
+    return str(found["words"])
+
+
+def test_roslib_uses_a_door_and_shows_why_it_is_refused(
+    appliance: Appliance, ros: RosSession, program: Path
+) -> None:
+    """It hears, publishes and calls within its rights, gets refusals in words, and gets through after a yes."""
+    answers, held = ros.listener("rospy", "/answer"), ros.listener("rospy", "/held")
+    client = ros.start(["/usr/bin/node", str(program), "ws://10.77.0.2:9091"], label="roslib")
+    assert client.wait_for(event="heard")["data"].startswith("hello ")
+    assert answers.wait_for(event="received")["data"] == "to /answer"
+    assert client.wait_for(event="answered", service="/brake")["success"] is False
+    refused = client.wait_for(event="not answered", service="/forbidden_brake")
+    assert "198.19.240." in str(refused["error"]) and "policy.ini" in str(refused["error"])
+    assert "policy.ini" in refusal(client, "/forbidden")
+    words = refusal(client, "/held")
+    number = re.search(r"held for approval ([0-9]+); ask the operator", words)
+    assert number is not None, words
+    appliance.rosrv("approve", number[1], "--for", "60s")
+    assert held.wait_for(event="received")["data"] == "to /held"
