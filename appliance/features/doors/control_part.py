@@ -17,7 +17,7 @@ from appliance.features.doors import door_requests
 from appliance.features.doors.door_link import node_name
 from appliance.features.doors.door_processes import ROLE, DoorProcesses
 from appliance.features.doors.door_table import DoorTable
-from appliance.features.doors.door_tickets import DoorTickets
+from appliance.features.doors.door_tickets import DoorTickets, left_by_its_maker
 from appliance.features.doors.door_visits import DoorVisits
 from appliance.features.doors.kept_doors import KeptDoors
 from appliance.features.doors.own_doors import OwnDoors
@@ -277,9 +277,18 @@ class DoorOrders:
             sent=counts.sent,
             dropped=counts.dropped,
             refused=counts.refused,
-            tickets=[_ticket(one) for one in self._tickets.valid(row.name)],
+            tickets=self._valid_tickets(row),
             clients=self._clients(row),
         )
+
+    def _valid_tickets(self, row: DoorRow) -> list[door_requests.Ticket]:
+        bearers = {one.name for one in self._base.features.bearers()()}
+        return [
+            door_requests.Ticket(
+                one.id, one.created, one.expires, one.who, warning=left_by_its_maker(one, bearers)
+            )
+            for one in self._tickets.valid(row.name)
+        ]
 
     def _clients(self, row: DoorRow) -> list[door_requests.ConnectedClient]:
         makers = {
@@ -320,7 +329,3 @@ def missing_port(port: int | None, role: ActiveRole) -> str:
         f"port {port} does not exist at {role.address}, the fixed address of the two appliances, so an agent there is"
         f" cut off: use a free port of {there}, or make new kits: rosrv standby join … --again --ports …"
     )
-
-
-def _ticket(row: TicketRow) -> door_requests.Ticket:
-    return door_requests.Ticket(row.id, row.created, row.expires, row.who)

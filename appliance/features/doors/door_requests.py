@@ -22,6 +22,10 @@ class Ticket(msgspec.Struct, frozen=True):
     created: Moment
     expires: Moment
     who: Annotated[str, doc("who made it")]
+    warning: Annotated[
+        str,
+        doc("that who made it has no token or session any longer, which does not end the ticket, or empty"),
+    ] = ""
 
 
 class ConnectedClient(msgspec.Struct, frozen=True, kw_only=True):

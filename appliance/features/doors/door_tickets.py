@@ -8,9 +8,10 @@ import hashlib
 import hmac
 import re
 import secrets
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 from appliance.base import clock
+from appliance.base.actors import OPERATOR
 from appliance.base.deadlines import Deadlines
 from appliance.control.errors import SenselessError
 from appliance.store.door_tables import TicketRow
@@ -69,6 +70,16 @@ class DoorTickets:
 def new_ticket(door: str, seconds: float, who: str) -> tuple[TicketRow, str]:
     number, secret, now = secrets.token_hex(6), secrets.token_urlsafe(32), clock.wall()
     return TicketRow(number, door, _hash(secret), now, now + seconds, who), f"{number}.{secret}"
+
+
+def left_by_its_maker(row: TicketRow, bearers: Collection[str]) -> str:
+    """Return a warning if the maker of a ticket is none of the `bearers`, the names of usable tokens and sessions.
+
+    The ticket stays valid: whoever starts a dashboard signs out before it ends.
+    """
+    if row.who in bearers or row.who == OPERATOR:
+        return ""
+    return f"{row.who} has no token or session any longer; rosrv door remove {row.door} ends this ticket"
 
 
 def shown(text: str, rows: Mapping[str, TicketRow]) -> TicketRow | None:

@@ -75,6 +75,8 @@ def list_doors(appliance: Appliance) -> None:
             say(f"{row.name:<20}  {row.address:<15}  {_entry(row)}, {counted(row.connections, 'connection')}")
             for one in row.tickets:
                 say(f"    ticket {one.id} until {moment(one.expires)}, by {one.who}")
+                if one.warning:
+                    say(f"    ! {one.warning}", "yellow")
             for client in row.clients:
                 say(f"    {_client(client)}")
             if row.connections > len(row.clients) > 0:

@@ -5,7 +5,7 @@ import pytest
 from appliance.base import clock
 from appliance.control.errors import SenselessError, UnknownThingError
 from appliance.features.doors.door_table import DoorTable
-from appliance.features.doors.door_tickets import DoorTickets
+from appliance.features.doors.door_tickets import DoorTickets, left_by_its_maker, new_ticket
 from appliance.features.doors.settings import MOST_DOORS, Doors
 from appliance.store.state_file import StateStore
 from appliance.store.stored_deadlines import StoredDeadlines
@@ -109,3 +109,11 @@ def test_a_ticket_opens_one_door_until_its_end(tmp_path: Path) -> None:
         assert tickets.find("alice", text) is None
         assert tickets.valid() == []
         assert store.doors.tickets() == [] and store.time_left() == {}
+
+
+def test_a_ticket_warns_when_its_maker_has_no_token_any_longer() -> None:
+    row, _text = new_ticket("alice", 60.0, "ann")
+    assert left_by_its_maker(row, {"ann"}) == ""
+    assert "rosrv door remove alice" in left_by_its_maker(row, {"bob"})
+    by_the_machine, _text = new_ticket("alice", 60.0, "operator")  # on the admin socket
+    assert left_by_its_maker(by_the_machine, set()) == ""
