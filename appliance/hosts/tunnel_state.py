@@ -223,12 +223,15 @@ class Tunnels:
         link.send(message)
 
     def _note_closed(self, blocked: Container[Address]) -> None:
-        """Keep the tunnels closed that came from a blocked address, wherever their hosts try again, until it is free."""
-        self._closed_from |= {name: address_of(seen.remote) for name, seen in self.seen.items()}
-        self._closed_from = {name: one for name, one in self._closed_from.items() if one in blocked}
+        """Keep tunnels that came from a blocked address closed until it is free, wherever their hosts try again."""
+        came_from = self._closed_from | {name: _real(seen.remote) for name, seen in self.seen.items()}
+        self._closed_from = {
+            name: one for name, one in came_from.items() if one is not None and one in blocked
+        }
 
     def _came_from(self, remote: str) -> None:
-        if address_of(remote) in self._blocked():
+        address = _real(remote)
+        if address is not None and address in self._blocked():
             self.state_anew()
 
     def _received(self, message: object) -> None:
@@ -342,3 +345,9 @@ class Tunnels:
             name=name,
             remote=seen.remote,
         )
+
+
+def _real(remote: str) -> Address | None:
+    with contextlib.suppress(ValueError):
+        return address_of(remote.partition("%")[0])
+    return None
