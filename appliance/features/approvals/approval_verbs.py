@@ -9,6 +9,7 @@ from appliance.base.counted import counted
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.durations import span_given
 from appliance.cli.output import say_json, usage_error
+from appliance.features.approvals import approval_watch
 from appliance.features.approvals.approval_requests import (
     Approval,
     ApprovalsWanted,
@@ -33,6 +34,9 @@ def approve(
         ),
     ] = None,
     refuse: Annotated[bool, typer.Option("--refuse", help="Refuse the call, or end the approval")] = False,
+    watch: Annotated[
+        bool, typer.Option("--watch", help="Show calls as they come, with a bell, until interrupted")
+    ] = False,
 ) -> None:
     """Approve a call that the policy holds for an operator. Without a number, list all calls and approvals.
 
@@ -40,6 +44,11 @@ def approve(
 
     Example: rosrv approve 48213 --for 30s
     """
+    if watch:
+        if number is not None or last is not None or refuse:
+            raise usage_error("--watch takes no call: approve in another terminal", "rosrv approve")
+        approval_watch.watch(appliance, lambda one: _line(appliance, one))
+        return
     if number is None:
         if last is not None or refuse:
             raise usage_error("name the call: rosrv approve NUMBER", "rosrv approve")
@@ -62,10 +71,15 @@ def _list(appliance: Appliance) -> None:
 def _say(appliance: Appliance, one: Approval) -> None:
     if appliance.as_json:
         say_json(msgspec.structs.asdict(one))
-        return
+    else:
+        say(*_line(appliance, one))
+
+
+def _line(appliance: Appliance, one: Approval) -> tuple[str, str]:
     who = f" by {one.who}" if one.who else ""
-    what = f"{one.number}: {one.host} {one.category} {one.resource}{_arguments(one)}"
-    say(f"{what}: {one.state}{who}, {one.left_seconds:g} s left", "yellow" if one.state == "waits" else "")
+    host = appliance.host_in_words(one.host)
+    what = f"{one.number}: {host} {one.category} {one.resource}{_arguments(one)}"
+    return f"{what}: {one.state}{who}, {one.left_seconds:g} s left", "yellow" if one.state == "waits" else ""
 
 
 def _arguments(one: Approval) -> str:

@@ -49,7 +49,7 @@ def status(
         say(f"[Authority] has no group {group!r}; its groups: {names}" if names else _NO_GROUPS)
         raise typer.Exit(1)
     for one in rows:
-        _show(one)
+        _show(appliance, one)
 
 
 @speaks
@@ -58,7 +58,7 @@ def take(appliance: Appliance, group: _GroupName, *, host: _Host) -> None:
 
     Example: rosrv drive take base --host host:ocu-1
     """
-    _show(appliance.answer_or_exit(DriveTake(group, host)))
+    _show(appliance, appliance.answer_or_exit(DriveTake(group, host)))
 
 
 @speaks
@@ -74,7 +74,7 @@ def give(
 
     Example: rosrv drive give base
     """
-    _show(appliance.answer_or_exit(DriveGive(group, to)))
+    _show(appliance, appliance.answer_or_exit(DriveGive(group, to)))
 
 
 @speaks
@@ -83,10 +83,11 @@ def ask(appliance: Appliance, group: _GroupName, *, host: _Host) -> None:
 
     Example: rosrv drive ask base --host host:agent-1
     """
-    _show(appliance.answer_or_exit(DriveAsk(group, host)))
+    _show(appliance, appliance.answer_or_exit(DriveAsk(group, host)))
 
 
-def _show(one: GroupState) -> None:
-    held = f"held by {one.holder}, {one.left_seconds:g} s left of its lease" if one.holder else "free"
-    waiting = f"; waiting: {', '.join(one.waiting)}" if one.waiting else ""
+def _show(appliance: Appliance, one: GroupState) -> None:
+    shown = appliance.host_in_words
+    held = f"held by {shown(one.holder)}, {one.left_seconds:g} s left of its lease" if one.holder else "free"
+    waiting = f"; waiting: {', '.join(map(shown, one.waiting))}" if one.waiting else ""
     say(f"{one.group}: {held}{waiting}")

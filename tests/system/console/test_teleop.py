@@ -92,6 +92,7 @@ def test_a_person_sees_and_drives_the_robot_through_their_own_door(
         own.get_by_label("Topic").select_option("/battery")
         expect(own.get_by_role("img", name="data of /battery: 12.5")).to_be_visible()
         assert console.axe() == []
+        lock(page, base)
         drive(page, base)
         own.get_by_label("Commands").fill("/other")
         expect(own).to_contain_text("not listed by the door")
@@ -106,6 +107,55 @@ def test_a_person_sees_and_drives_the_robot_through_their_own_door(
         )
         appliance.rosrv("door", "remove", "first")
         expect(own).to_contain_text("you have no door: rosrv door add first")
+
+
+FRESHNESS = """async () => {
+    const { Freshness, OLD } = await import("/console/static/features/doors/teleop/freshness.js");
+    const shown = new Freshness();
+    const ages = [shown.age(1e6)];
+    shown.begin(true);
+    ages.push(shown.age(100) > OLD);
+    shown.drawn("one", 1000);
+    ages.push(shown.age(1200));
+    shown.drawn("one", 1400);
+    ages.push(shown.age(1600));
+    shown.drawn("two", 1700);
+    ages.push(shown.age(1700));
+    shown.begin(false);
+    return [...ages, shown.age(9000), OLD];
+}"""
+
+
+def lock(page: Page, base: Process) -> None:
+    """The camera repeats one image: the pad is locked, and drives without a picture."""
+    own = page.get_by_role("region", name="Your door")
+    pad = own.get_by_role("application")
+    assert page.evaluate(FRESHNESS) == [0, True, 200, 600, 0, 0, 500]
+    own.get_by_label("Commands").fill("/cmd_vel")
+    own.get_by_role("button", name="Take it").click()
+    expect(own).to_contain_text("Locked: the picture is older than 0.5 s")
+    pad.focus()
+    page.keyboard.down("ArrowUp")
+    own.get_by_label("Camera", exact=True).evaluate(
+        "(field) => { field.value = ''; field.dispatchEvent(new Event('input', { bubbles: true })); }"
+    )
+    expect(own.get_by_role("img", name="Picture of /camera/compressed")).to_have_count(0)
+    page.wait_for_timeout(500)
+    expect(pad).to_have_attribute("aria-disabled", "true")
+    assert not moving(base), "a key that is held since the lock does not drive"
+    page.keyboard.up("ArrowUp")
+    expect(pad).not_to_have_attribute("aria-disabled", "true")
+    page.keyboard.down("ArrowUp")
+    eventually(lambda: moving(base), "the robot drives")
+    own.get_by_label("Camera", exact=True).evaluate(
+        "(field) => { field.value = '/camera/compressed';"
+        " field.dispatchEvent(new Event('input', { bubbles: true })); }"
+    )
+    expect(own.get_by_role("alert")).to_contain_text("the robot was stopped")
+    eventually(lambda: stopped(base), "the lock stops the robot")
+    page.keyboard.up("ArrowUp")
+    own.get_by_role("button", name="Give it up").click()
+    own.get_by_label("Camera", exact=True).select_option("")
 
 
 def drive(page: Page, base: Process) -> None:

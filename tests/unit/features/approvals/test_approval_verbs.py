@@ -1,11 +1,14 @@
 from types import SimpleNamespace
 from typing import Any, cast
 
+import msgspec
 import pytest
 
+from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.target import Appliance
-from appliance.features.approvals import approval_verbs
+from appliance.features.approvals import approval_verbs, approval_watch
 from appliance.features.approvals.approval_requests import Approval, Approvals
+from appliance.features.approvals.approval_watch import changes
 
 REST = ("10.0.0.7", "/agent", "call", "/log", "roscpp/SetLoggerLevel", "4bf5")
 
@@ -19,7 +22,7 @@ def test_an_operator_sees_that_arguments_are_cut(
 ) -> None:
     data = (5000).to_bytes(4, "little") + b"x" * 4092
     row = Approval(48213, "waits", *REST, data.hex(), size, 60.0, "")  # type: ignore[arg-type]  # of a tuple
-    fake = SimpleNamespace(as_json=False, answer_or_exit=lambda _request: Approvals([row]))
+    fake = SimpleNamespace(as_json=False, host_in_words=str, answer_or_exit=lambda _request: Approvals([row]))
     cast(Any, approval_verbs.approve).function(cast(Appliance, fake), None)
     assert shown in capsys.readouterr().out
 
@@ -45,6 +48,41 @@ def test_an_operator_sees_every_byte_of_the_arguments(
 ) -> None:
     call = ("10.0.0.7", "/agent", "call", "/set", service, "4bf5")
     row = Approval(48213, "waits", *call, data.hex(), len(data), 60.0, "")  # type: ignore[arg-type]  # of a tuple
-    fake = SimpleNamespace(as_json=False, answer_or_exit=lambda _request: Approvals([row]))
+    fake = SimpleNamespace(as_json=False, host_in_words=str, answer_or_exit=lambda _request: Approvals([row]))
     cast(Any, approval_verbs.approve).function(cast(Appliance, fake), None)
     assert shown in capsys.readouterr().out
+
+
+def test_a_watched_call_is_shown_when_it_comes_changes_and_ends() -> None:
+    call = Approval(7, "waits", *REST, "", 0, 60.0, "")  # type: ignore[arg-type]  # of a tuple
+    lease = msgspec.structs.replace(call, state="lease", who="ann")
+    assert list(changes({}, [call])) == [call]
+    assert list(changes({7: call}, [msgspec.structs.replace(call, left_seconds=50.0)])) == []
+    assert list(changes({7: call}, [lease])) == [lease]
+    assert list(changes({7: lease}, [])) == [msgspec.structs.replace(lease, left_seconds=0.0)]
+
+
+def test_the_watch_goes_on_while_the_appliance_restarts(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    call = Approval(7, "waits", *REST, "", 0, 60.0, "")  # type: ignore[arg-type]  # of a tuple
+    answers = iter([Approvals([call]), NotRunningError("away"), NotRunningError("away"), Approvals([])])
+
+    def ask(_request: object) -> Approvals:
+        answer = next(answers, None)
+        if answer is None:
+            raise KeyboardInterrupt
+        if isinstance(answer, NotRunningError):
+            raise answer
+        return answer
+
+    monkeypatch.setattr(approval_watch, "_EVERY_SECONDS", 0)
+    fake = SimpleNamespace(
+        as_json=False, host_in_words=lambda host: f"agent ({host})", ask=ask, body_or_exit=lambda one: one
+    )
+    cast(Any, approval_verbs.approve).function(cast(Appliance, fake), None, watch=True)
+    out, err = capsys.readouterr()
+    assert "7: agent (10.0.0.7) call /log" in out
+    assert "rosrv approve 7 --for 30s" in out
+    assert out.splitlines()[-1] == "7: has ended"
+    assert err.count("trying again") == 1

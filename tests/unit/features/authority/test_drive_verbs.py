@@ -20,7 +20,10 @@ def appliance_of(rows: list[GroupState], *, as_json: bool) -> Any:
         return GroupStates(rows)
 
     return SimpleNamespace(
-        as_json=as_json, ask_or_exit=lambda _request: GroupStates(rows), answer_or_exit=answer_or_exit
+        host_in_words=str,
+        as_json=as_json,
+        ask_or_exit=lambda _request: GroupStates(rows),
+        answer_or_exit=answer_or_exit,
     )
 
 

@@ -32,6 +32,10 @@ export class Drive {
     this.#told = told;
   }
 
+  get driving() {
+    return this.#publication !== null;
+  }
+
   /** Drive with this velocity until the next call or `stop`. @param {number} forward m/s @param {number} left rad/s */
   go(forward, left) {
     this.#wanted = { forward, left };

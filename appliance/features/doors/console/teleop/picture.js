@@ -6,9 +6,9 @@ import { decoded } from "./pixels.js";
 const TYPES = { "sensor_msgs/CompressedImage": 100, "sensor_msgs/Image": 250 }; // least milliseconds between two images
 const SHOWN = 2000; // milliseconds between two changes of the text
 
-/** @typedef {{parts: any, door: import("./connection.js").DoorConnection, topics: {name: string, type: string}[]}} Given */
+/** @typedef {{parts: any, door: import("./connection.js").DoorConnection, topics: {name: string, type: string}[], freshness: import("./freshness.js").Freshness}} Given */
 
-export function Picture(/** @type {Given} */ { parts, door, topics }) {
+export function Picture(/** @type {Given} */ { parts, door, topics, freshness }) {
   const images = topics.filter(({ type }) => type in TYPES);
   const [chosen, setChosen] = useState(/** @type {string | null} */ (null));
   const topic = chosen ?? images[0]?.name ?? "";
@@ -19,17 +19,21 @@ export function Picture(/** @type {Given} */ { parts, door, topics }) {
   useEffect(() => {
     setWrong("");
     setAbout("");
+    freshness.begin(Boolean(type));
     if (!type) return undefined;
-    const drawing = newestOnly((message) => decoded(message), (picture) => {
+    const drawing = newestOnly(({ message }) => decoded(message), (picture, { message, arrived }) => {
       draw(canvas.current, picture);
+      freshness.drawn(message.data, arrived);
       setWrong("");
     }, (error) => setWrong(error.message));
-    const leave = door.subscribe(topic, { interval: TYPES[/** @type {keyof typeof TYPES} */ (type)], newest: true }, drawing.give, setWrong);
+    const heard = (/** @type {any} */ message) => drawing.give({ message, arrived: performance.now() });
+    const leave = door.subscribe(topic, { interval: TYPES[/** @type {keyof typeof TYPES} */ (type)], newest: true }, heard, setWrong);
     const timer = setInterval(() => setAbout(drawing.about(SHOWN)), SHOWN);
     return () => {
       clearInterval(timer);
       drawing.end();
       leave();
+      freshness.begin(false);
     };
   }, [door, topic, type]);
   const options = images.length ? [...images.map(({ name }) => [name, name]), ["", "no picture"]] : [["", "no topic of images"]];
@@ -40,7 +44,7 @@ export function Picture(/** @type {Given} */ { parts, door, topics }) {
 }
 
 /** Draw one picture after another: of those that come in the meantime, only the newest. */
-function newestOnly(/** @type {(message: any) => Promise<ImageBitmap>} */ decode, /** @type {(picture: ImageBitmap) => void} */ show, /** @type {(error: Error) => void} */ failed) {
+function newestOnly(/** @type {(message: any) => Promise<ImageBitmap>} */ decode, /** @type {(picture: ImageBitmap, message: any) => void} */ show, /** @type {(error: Error) => void} */ failed) {
   let [busy, ended, drawn, size] = [false, false, 0, ""];
   let next = /** @type {any} */ (null);
   const work = async () => {
@@ -50,7 +54,7 @@ function newestOnly(/** @type {(message: any) => Promise<ImageBitmap>} */ decode
       next = null;
       try {
         const picture = await decode(message);
-        if (!ended) show(picture);
+        if (!ended) show(picture, message);
         size = `${picture.width} × ${picture.height}`;
         drawn += 1;
         picture.close();

@@ -1,7 +1,8 @@
 /** The robot through the person's own door: a picture, a plot and a pad. Loaded when the door is opened. */
 
-import { html, useEffect, useState } from "/console/static/vendor/preact.js";
+import { html, useEffect, useMemo, useState } from "/console/static/vendor/preact.js";
 import { DoorConnection } from "./connection.js";
+import { Freshness } from "./freshness.js";
 import { Pad } from "./pad.js";
 import { Picture } from "./picture.js";
 import { FieldPlot } from "./plot.js";
@@ -17,6 +18,7 @@ export function Teleop({ parts, ticket, name, address, ended }) {
   const [door, setDoor] = useState(/** @type {DoorConnection | null} */ (null));
   const [topics, setTopics] = useState(/** @type {{name: string, type: string}[] | null} */ (null));
   const [wrong, setWrong] = useState("");
+  const freshness = useMemo(() => new Freshness(), []);
   useEffect(() => {
     const connection = new DoorConnection(ticket, () => setDoor(connection), ended);
     return () => connection.close();
@@ -37,7 +39,7 @@ export function Teleop({ parts, ticket, name, address, ended }) {
     return () => clearInterval(timer);
   }, [door]);
   if (!door || (!topics && !wrong)) return html`<${parts.Loading} rows=${3} />`;
-  const given = { parts, door, topics: topics ?? [] };
+  const given = { parts, door, topics: topics ?? [], freshness };
   return html`<div class="panel-body stack">
     ${wrong && html`<${parts.Notice} tone="deny" title="The door lists no topics" role="alert"><${parts.Given} value=${wrong} most=${600} /></${parts.Notice}>`}
     <div class="door-robot"><${Picture} ...${given} /><${FieldPlot} ...${given} /><${Pad} ...${given} name=${name} address=${address} /></div></div>`;
