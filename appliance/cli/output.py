@@ -3,7 +3,6 @@
 Text from the network is printed without control characters and never as markup.
 """
 
-import datetime
 import shutil
 import sys
 from collections.abc import Callable, Iterable, Mapping
@@ -17,6 +16,7 @@ import typer
 from appliance.api.front.moments import in_full
 from appliance.base import actors
 from appliance.base.atomic_files import NotLastingError, write_where_told
+from appliance.base.timestamps import local_minute
 from rosmop.tool import terminal
 from rosmop.tool.terminal import printable
 
@@ -26,7 +26,7 @@ Json = Annotated[bool, typer.Option("--json", help="Machine-readable output, one
 
 
 def moment(seconds: float) -> str:
-    return datetime.datetime.fromtimestamp(seconds, datetime.UTC).strftime("%Y-%m-%d %H:%MZ")
+    return local_minute(seconds)
 
 
 def loaded_by(who: str, seconds: float | None) -> str:

@@ -14,7 +14,7 @@ from rich.text import Text
 from appliance.api.front.moments import in_full
 from appliance.base.actors import DISK
 from appliance.base.counted import counted
-from appliance.base.timestamps import age
+from appliance.base.timestamps import age, in_local_zone
 from appliance.channel.admin import A, AdminAnswer, StatusWanted
 from appliance.channel.alarms import Alarm, activity, open_alarms
 from appliance.channel.answers.host_answers import PortsSeen
@@ -137,9 +137,9 @@ class StatusScreen:
     host_in_words: HostInWords
 
     def __rich_console__(self, _console: Console, options: ConsoleOptions) -> RenderResult:
-        for trouble in shortened(self.troubles, _MOST_TROUBLES):
+        for trouble in map(in_local_zone, shortened(self.troubles, _MOST_TROUBLES)):
             yield Text(f"! {trouble}", style=_RED)
-        for line in shortened(self.attention, _MOST_TROUBLES):
+        for line in map(in_local_zone, shortened(self.attention, _MOST_TROUBLES)):
             yield Text(f"attention: {line}", style=_YELLOW)
         yield _grid(self.body, self.host_in_words)
         yield processes_table(self.body.processes, options.max_width)

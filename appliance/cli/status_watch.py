@@ -15,6 +15,7 @@ from rich.text import Text
 
 from appliance.audit.log.record_format import rfc3339
 from appliance.base import clock
+from appliance.base.timestamps import local_text
 from appliance.cli.connection.admin_client import AccessDeniedError, NotRunningError
 from appliance.cli.output import say_json
 from rosmop.tool.terminal import printable
@@ -25,7 +26,6 @@ Watch = Annotated[
 LEAST_SECONDS, LONGEST_SECONDS = 1.0, 3600.0
 _INTERRUPTED, _AWAY = 130, 2
 _MOST_DENIED = 3  # answers in a row: a restarted api knows no token for a moment
-_MINUTES = slice(11, 19)  # the time of day in RFC 3339
 
 
 class StatusView(NamedTuple):
@@ -67,10 +67,14 @@ class _Looks:
         if self._away_since is None:
             self._away_since = clock.wall_ns()
         since = rfc3339(self._away_since)
-        text = f"not running since {since[_MINUTES]}Z: {printable(str(error))}"
+        text = f"not running since {_time_of_day(self._away_since)}: {printable(str(error))}"
         return StatusView(
             _AWAY, Text(text, style="bold red"), {"not_running_since": since, "error": str(error)}
         )
+
+
+def _time_of_day(nanoseconds: int) -> str:
+    return local_text(nanoseconds, digits=0).partition("T")[2]
 
 
 def watched(look: Look, seconds: float, *, as_json: bool) -> int:
@@ -111,7 +115,7 @@ def _redraw(looks: _Looks, seconds: float, console: Console) -> None:
         with Live(console=console, screen=True, auto_refresh=False) as live:
             while True:
                 view = looks.next()
-                now = f"{rfc3339(clock.wall_ns())[_MINUTES]}Z, every {seconds:g} s until Ctrl-C"
+                now = f"{_time_of_day(clock.wall_ns())}, every {seconds:g} s until Ctrl-C"
                 live.update(Group(Text(now, style="dim"), view.screen), refresh=True)
                 end = clock.now() + seconds
                 while (left := end - clock.now()) > 0:

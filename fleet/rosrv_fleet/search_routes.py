@@ -6,7 +6,7 @@ from typing import Annotated, Any
 import msgspec
 from fastapi import APIRouter, Depends, HTTPException, Query, Response
 
-from appliance.audit.search.filter_options import filter_given
+from appliance.audit.search.filter_options import filter_given, in_utc
 from appliance.audit.search.query import Filter, FilterError
 from appliance.base.timestamps import TimestampError
 from rosrv_fleet.access import holder_of
@@ -27,7 +27,7 @@ MOST_WAITING = 1000
 @functools.wraps(filter_given)
 def filter_asked(**words: Any) -> Filter:
     try:
-        return filter_given(**words)
+        return filter_given(**words | {name: in_utc(words.get(name)) for name in ("since", "until")})
     except TimestampError as error:
         raise HTTPException(422, str(error)) from error
 

@@ -5,12 +5,15 @@ from typing import Annotated, Any
 import typer
 
 from appliance.audit.log.record import Severity
+from appliance.audit.log.record_format import rfc3339
 from appliance.audit.search.query import Filter
 from appliance.base import clock
 from appliance.base.option_group import GroupedCommand, OptionGroup
 from appliance.base.timestamps import TimestampError, parse_timestamp
 
-Since = Annotated[str | None, typer.Option("--since", help="From this time: 1h (ago), a date, or RFC 3339")]
+Since = Annotated[
+    str | None, typer.Option("--since", help="From this time: 1h (ago), 14:03, a date, or RFC 3339")
+]
 Until = Annotated[str | None, typer.Option("--until", help="Before this time")]
 
 
@@ -77,13 +80,21 @@ def filter_given(
 
 
 def times_given(since: str | None, until: str | None) -> tuple[int | None, int | None]:
-    """Return both times in nanoseconds since the epoch. Raises `TimestampError`."""
+    """Return both times in nanoseconds since the epoch; without a zone, they are in the machine's.
+
+    Raises `TimestampError`.
+    """
     now = clock.wall_ns()
-    begin = None if since is None else parse_timestamp(since, now)
-    end = None if until is None else parse_timestamp(until, now)
+    begin = None if since is None else parse_timestamp(since, now, None)
+    end = None if until is None else parse_timestamp(until, now, None)
     if begin is not None and end is not None and begin > end:
         raise TimestampError(f"--since {since} is later than --until {until}")
     return begin, end
+
+
+def in_utc(since: str | None) -> str | None:
+    """Return a time of a request over REST with its zone: without one, it is UTC. Raises `TimestampError`."""
+    return None if since is None else rfc3339(parse_timestamp(since, clock.wall_ns()))
 
 
 FILTER = OptionGroup(filter_given)

@@ -4,6 +4,7 @@ from typing import Annotated
 
 import typer
 
+from appliance.base.timestamps import in_local_zone
 from appliance.channel.alarms import AlarmList
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.durations import span_given
@@ -73,7 +74,7 @@ def _say(body: AlarmList, *, as_json: bool) -> None:
             say_json(alarm)
         else:
             say(f"{alarm.severity}  {alarm.kind}", _STYLES[alarm.severity])
-            for line in alarm.text.splitlines():
+            for line in in_local_zone(alarm.text).splitlines():
                 say(f"    {line}")
     if not body.alarms and not as_json:
         say("no alarms")

@@ -31,10 +31,13 @@ from appliance.audit.proof.verification import verify
 from appliance.audit.search.query import Filter
 from appliance.audit.search.search import Follower, export
 from appliance.features.audit_tools.audit_summary import add_summary
+from appliance.features.audit_tools.csv_records import csv_head, csv_lines
 from appliance.features.audit_tools.record_pages import PAGE, page_of, streamed
 from appliance.quotas.table import REST_STREAMS
 
 _T = TypeVar("_T")
+Form = Literal["ndjson", "csv"]
+_FORMS: dict[Form, str] = {"ndjson": "application/x-ndjson", "csv": "text/csv; charset=utf-8"}
 _POLL_SECONDS = 0.2
 _PING_SECONDS = 15
 _STREAM_PAGE = 500
@@ -210,19 +213,24 @@ def _add_proofs(router: Routes, services: Services, desk: LogReader) -> None:
         return LogCheckpoints(await desk.read(bearer, signed_checkpoints, desk.path, after, limit))
 
     @router.get(
-        "/export", responses=file("application/x-ndjson", "One record per line."), response_class=Response
+        "/export",
+        responses=file("application/x-ndjson", "One record per line, or with `format=csv` as CSV."),
+        response_class=Response,
     )
-    async def export_audit(bearer: Viewer, wanted: Wanted) -> Response:
-        """Return all records that match, oldest first, one JSON object a line.
+    async def export_audit(
+        bearer: Viewer, wanted: Wanted, form: Annotated[Form, Query(alias="format")] = "ndjson"
+    ) -> Response:
+        """Return all records that match, oldest first, one JSON object a line, or as CSV.
 
         Each has in `chain` its place in the hash chain, as far as a signed checkpoint. Viewers get records
         without contents of messages and without `chain`, because only complete records can be proven.
         """
         wanted = await desk.named(bearer, wanted)
-        found = await desk.read(bearer, _exported, desk.path, wanted, bearer, services.settings.name)
+        exported = _as_csv if form == "csv" else _exported
+        found = await desk.read(bearer, exported, desk.path, wanted, bearer, services.settings.name)
         give_back = services.exports.take(bearer, "exports")
         return StreamResponse(
-            StreamingResponse(in_thread(_joined(found)), media_type="application/x-ndjson"), give_back
+            StreamingResponse(in_thread(_joined(found)), media_type=_FORMS[form]), give_back
         )
 
 
@@ -271,6 +279,11 @@ def _exported(path: pathlib.Path, wanted: Filter, bearer: Bearer, robot: str) ->
     shown = (readable([entry], bearer, wanted.text) for entry in export(path, wanted))
     name = {"robot": robot} if robot else {}
     return _begun(_as_line(as_object(entry) | name) for entries in shown for entry in entries)
+
+
+def _as_csv(path: pathlib.Path, wanted: Filter, bearer: Bearer, _robot: str) -> Iterator[str]:
+    shown = (entry for found in export(path, wanted) for entry in readable([found], bearer, wanted.text))
+    return _begun(itertools.chain([csv_head()], (line for _sequence, line in csv_lines(shown))))
 
 
 def _begun(entries: Iterator[_T]) -> Iterator[_T]:

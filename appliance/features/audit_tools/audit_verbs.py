@@ -30,6 +30,7 @@ from appliance.cli.connection.admin_client import AccessDeniedError, NotRunningE
 from appliance.cli.connection.audit_file import FileLog
 from appliance.cli.connection.audit_over_rest import RestLog
 from appliance.cli.connection.target import Appliance, speaks_with
+from appliance.features.audit_tools.csv_records import csv_head, csv_lines
 from appliance.features.audit_tools.record_table import line, print_entries, print_shown
 from appliance.features.audit_tools.unrecorded import unrecorded
 from appliance.features.views import pair_view
@@ -262,16 +263,20 @@ def export(
     appliance: Appliance,
     *,
     output: Annotated[Path | None, typer.Option("--output", "-o", help="File, must not exist")] = None,
+    as_csv: Annotated[
+        bool, typer.Option("--csv", help="CSV for a spreadsheet, which proves nothing")
+    ] = False,
 ) -> None:
     """Write all matching records as NDJSON, oldest first, each with its position in the hash chain.
 
-    To prove records on another machine, use `rosrv evidence export`.
+    In CSV, a cell that a spreadsheet would take for a formula begins with an apostrophe. To prove records on another
+    machine, use `rosrv evidence export`.
 
     Example: rosrv audit export --since 7d --output week.ndjson
     """
     wanted = _filter_of(appliance)
     source = appliance.audit()
-    entries = source.evidence(wanted)
+    entries = _csv(source.export(wanted)) if as_csv else source.evidence(wanted)
     with progress("exporting", source.last, shares_screen=output is None) as report:
         if output is None:
             count = _write_all(entries, report, sys.stdout)
@@ -279,7 +284,12 @@ def export(
             with _new_file(output) as file:
                 count = _write_all(entries, report, file)
     if output is not None:
-        note(f"{counted(count, 'record')} in {output}")
+        note(f"{counted(count - as_csv, 'record')} in {output}")
+
+
+def _csv(entries: Iterator[LogEntry]) -> Iterator[tuple[int, str]]:
+    yield 0, csv_head()
+    yield from csv_lines(entries)
 
 
 def _filter_of(appliance: Appliance) -> Filter:

@@ -9,10 +9,11 @@ from rich.table import Table
 from rich.text import Text
 
 from appliance.audit.log.record import AuditRecord, Severity
-from appliance.audit.log.record_format import LogEntry, fields_of, printable, requested, rfc3339, rule_text
+from appliance.audit.log.record_format import LogEntry, fields_of, printable, requested, rule_text
 from appliance.audit.search.equality import FOLDED, EqualRecords, grouped, time_span
 from appliance.audit.search.search import RecordInContext
 from appliance.base.actors import actor
+from appliance.base.timestamps import local_text
 from appliance.cli.audit.verification_text import write
 from appliance.policy.host_names import HostInWords
 
@@ -20,7 +21,7 @@ _STYLES = {"allow": "green", "deny": "bold red", "would deny": "yellow"}
 _SECONDS, _MILLISECONDS = 19, 23  # characters of a time
 _DATE = 11
 _LEAST_WHY = 40  # characters; with less room for the reasons in a column, they are below the records
-_COLUMNS = ("record", "time (UTC)", "decision", "event", "who", "what", "why")
+_COLUMNS = ("record", "time", "decision", "event", "who", "what", "why")
 _GAP = 2
 
 
@@ -41,7 +42,7 @@ def print_entries(entries: list[LogEntry], host_in_words: HostInWords, *, each: 
 def line(entry: LogEntry, host_in_words: HostInWords) -> str:
     record = entry.record
     parts = [
-        rfc3339(record.time),
+        local_text(record.time),
         f"#{entry.sequence}",
         (record.decision or record.severity.value).upper(),
         record.event,
@@ -59,7 +60,7 @@ def print_shown(shown: RecordInContext, host_in_words: HostInWords) -> None:
     record = shown.entry.record
     fields = {
         "id": record.id,
-        "time": rfc3339(record.time),
+        "time": local_text(record.time),
         **fields_of(shown.entry),
         "host": _host(record, host_in_words),
         "reason": record.reason,
@@ -119,11 +120,15 @@ def _cells(row: EqualRecords, host_in_words: HostInWords) -> tuple[Text, ...]:
 
 def _times(row: EqualRecords) -> str:
     spans = time_span(row.first.record), time_span(row.last.record)
-    first, last = (rfc3339(time).replace("T", " ") for time in (spans[0][0], spans[1][1]))
+    first, last = (local_text(time).replace("T", " ") for time in (spans[0][0], spans[1][1]))
     if row.records == 1:
-        return first[:_MILLISECONDS]
+        return first[:_MILLISECONDS] + _offset(first)
     same_day = first[:_DATE] == last[:_DATE]
-    return f"{first[:_SECONDS]} to {last[_DATE if same_day else 0 : _SECONDS]}"
+    return f"{first[:_SECONDS]} to {last[_DATE if same_day else 0 : _SECONDS]}{_offset(last)}"
+
+
+def _offset(text: str) -> str:
+    return "Z" if text.endswith("Z") else text[-6:]
 
 
 def _host(record: AuditRecord, host_in_words: HostInWords) -> str | None:

@@ -66,7 +66,7 @@ def export_evidence(
         if (recording is None) is (since is None) or (recording is not None and until is not None):
             raise usage_error("give a recording, or --since (and --until)")
         now = clock.wall_ns()
-        span = TimeSpan(parse_timestamp(since or "0s", now), parse_timestamp(until or "0s", now))
+        span = TimeSpan(parse_timestamp(since or "0s", now, None), parse_timestamp(until or "0s", now, None))
         size, part = 0, name_to_make(output)
         if os.path.lexists(output):
             raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(output))

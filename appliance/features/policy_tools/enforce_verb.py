@@ -7,8 +7,8 @@ from typing import Annotated
 import msgspec
 import typer
 
-from appliance.audit.log.record_format import rfc3339
 from appliance.base.counted import counted
+from appliance.base.timestamps import local_text
 from appliance.channel.admin import PolicyLoad
 from appliance.channel.answers.policy_answers import PolicyInForce
 from appliance.cli.commit_confirm import ConfirmWithin, seconds_within
@@ -113,7 +113,7 @@ def denial(policy: Policy, observation: Observation) -> str:
 
 
 def _show(appliance: Appliance, rows: list[WouldDeny], period: RecordedPeriod, change: EnforcedText) -> None:
-    start = f"{rfc3339(period.start)[:19]}Z"
+    start = local_text(period.start, digits=0)
     if appliance.as_json:
         say_json({
             "sections": list(change.sections), "since": start, "removed": period.removed,

@@ -87,7 +87,7 @@ class RecordedPeriod:
 def recorded_period(appliance: Appliance, since: str | None) -> RecordedPeriod:
     """Return the period since a time, or all of the log. Exits with usage errors, and if the log is unreadable."""
     try:
-        asked = None if since is None else parse_timestamp(since, clock.wall_ns())
+        asked = None if since is None else parse_timestamp(since, clock.wall_ns(), None)
         first = next(islice(appliance.audit().export(Filter()), 1), None)
     except (LogUnreadableError, NotRunningError, TimestampError, FilterError) as error:
         raise usage_error(str(error)) from error

@@ -4,8 +4,8 @@ from typing import Annotated
 
 import typer
 
-from appliance.audit.log.record_format import rfc3339
 from appliance.base.counted import counted
+from appliance.base.timestamps import local_text
 from appliance.cli.connection.target import Appliance, speaks_with
 from appliance.cli.output import say_json
 from appliance.features.policy_tools.policy_input import live_now
@@ -42,7 +42,7 @@ def list_unused(
             _say_row(row, as_json=appliance.as_json)
     if not appliance.as_json:
         unused, unknown = (sum(row.state == state for row in rows) for state in ("unused", "unknown"))
-        start = f"{rfc3339(period.start)[:19]}Z"
+        start = local_text(period.start, digits=0)
         text = f"{unused} of {counted(len(rows), 'rule')} name hosts that did not use them since {start}"
         say(f"{text}; {unknown} unknown", "yellow" if unused else "green")
         if period.removed:

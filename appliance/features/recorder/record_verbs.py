@@ -4,7 +4,6 @@ import hashlib
 import os
 import shutil
 from collections.abc import Callable, Iterator
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
@@ -12,11 +11,10 @@ import msgspec
 import typer
 
 from appliance.audit.log.log_database import LogUnreadableError
-from appliance.audit.log.record_format import rfc3339
 from appliance.base import clock
 from appliance.base.atomic_files import name_to_make
 from appliance.base.counted import counted
-from appliance.base.timestamps import parse_timestamp
+from appliance.base.timestamps import local_text, parse_timestamp
 from appliance.cli import completion
 from appliance.cli.connection.admin_client import AdminSocket, NotRunningError
 from appliance.cli.connection.target import Appliance, speaks
@@ -196,7 +194,7 @@ def messages(
             continue
         mark = "->" if number == found.chosen else "  "
         sender = _sender(message.sender, appliance.host_in_words)
-        words = (rfc3339(message.time), message.topic, sender, f"{message.size} bytes", message.why)
+        words = (local_text(message.time), message.topic, sender, f"{message.size} bytes", message.why)
         say(f"{mark} {'  '.join(printable(word) for word in words if word)}", "dim")
         for line in lines_of(message.fields, 2):
             say(line)
@@ -305,7 +303,7 @@ def _read(what: Callable[[], _T]) -> _T:
 
 def _moment_given(option: str, text: str | None) -> int | None:
     try:
-        return None if text is None else parse_timestamp(text, clock.wall_ns())
+        return None if text is None else parse_timestamp(text, clock.wall_ns(), None)
     except ValueError as error:
         raise usage_error(f"{option}: {error}") from None
 
@@ -361,7 +359,7 @@ def _seconds(option: str, given: str | None) -> float | None:
 
 
 def _moment(nanoseconds: int) -> str:
-    return datetime.fromtimestamp(nanoseconds / _SECOND, UTC).strftime("%Y-%m-%d %H:%M:%SZ")
+    return local_text(nanoseconds, digits=0).replace("T", " ")
 
 
 def _summary(recording: Recording) -> str:

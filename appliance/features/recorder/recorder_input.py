@@ -48,8 +48,8 @@ def span_of(since: str | None, until: str | None) -> Span:
     now = clock.wall_ns()
     try:
         span = Span(
-            0 if since is None else parse_timestamp(since, now),
-            now if until is None else min(now, parse_timestamp(until, now)),
+            0 if since is None else parse_timestamp(since, now, None),
+            now if until is None else min(now, parse_timestamp(until, now, None)),
         )
     except ValueError as error:
         raise MONITOR.usage_error(str(error)) from None

@@ -3,7 +3,6 @@
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict
-from datetime import UTC, datetime
 from typing import Annotated, Any
 
 import typer
@@ -12,7 +11,7 @@ from appliance.api.front.moments import in_full
 from appliance.audit.log.record_format import rfc3339
 from appliance.audit.search.query import Filter
 from appliance.base import clock
-from appliance.base.timestamps import parse_timestamp
+from appliance.base.timestamps import in_local_zone, local_text, parse_timestamp
 from appliance.base.validation_messages import meant
 from appliance.channel import admin
 from appliance.channel.answers.graph_answers import Topic
@@ -118,7 +117,7 @@ def publishers(
     """
     with Errors():
         now = clock.wall_ns()
-        then = now if at == "now" else parse_timestamp(at, now)
+        then = now if at == "now" else parse_timestamp(at, now, None)
         if then > now:
             raise usage_error(f"--at {at} is in the future")
         log = appliance.audit()
@@ -130,10 +129,10 @@ def publishers(
     if appliance.as_json:
         say_json({"topic": topic, "at": rfc3339(then), "publishers": rows, "unknown": found.unknown})
     else:
-        say(f"{topic} at {_to_seconds(rfc3339(then))}", "bold")
+        say(f"{topic} at {local_text(then, digits=0)}", "bold")
         for row in rows:
             began = (
-                f"since {_to_seconds(row['since'])} (#{row['sequence']})"
+                f"since {_to_seconds(in_local_zone(row['since']))} (#{row['sequence']})"
                 if row["since"]
                 else "before the log begins"
             )
@@ -141,12 +140,12 @@ def publishers(
         if not found.publishers:
             say("  no publisher is found")
         for line in found.unknown:
-            say(f"not known: {_to_seconds(line)}", "yellow")
+            say(f"not known: {_to_seconds(in_local_zone(line))}", "yellow")
     raise typer.Exit(0 if found.publishers else 1)
 
 
 def _to_seconds(text: str) -> str:
-    return re.sub(r"(T\d\d:\d\d:\d\d)\.\d++Z", r"\1Z", text)
+    return re.sub(r"(T\d\d:\d\d:\d\d)\.\d++", r"\1", text)
 
 
 def _described(topic: Topic) -> Iterator[str]:
@@ -172,7 +171,7 @@ def _show(message: TopicMessage, field: str | None, *, as_json: bool) -> None:
     if as_json:
         say_json({**in_full(message), "fields": value})
         return
-    at = datetime.fromtimestamp(message.time / 1e9, UTC).isoformat(timespec="milliseconds")
+    at = local_text(message.time, digits=3)
     words = [at, printable(message.node), f"{message.size} bytes", printable(message.why)]
     say("  ".join(filter(None, words)), "dim")
     for line in lines_of(value, 0):

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from appliance.audit.search.filter_options import filter_given
+from appliance.audit.search.filter_options import filter_given, in_utc
 from appliance.audit.search.query import FilterError
 from appliance.base.timestamps import TimestampError
 from rosrv_fleet.collector import Collector
@@ -50,6 +50,7 @@ def _result(collector: Collector, viewer: str, asked: Mapping[str, str]) -> str:
     if asked["decision"] in dict(_DECISIONS) and asked["decision"]:
         words[asked["decision"]] = True
     try:
+        words |= {name: in_utc(words.get(name)) for name in ("since", "until")}
         wanted = FleetFilter(asked["robot"] or None, filter_given(**words))
         with collector.searches.turn(viewer) as database:
             waiting = collector.store.waiting(MOST_WAITING)

@@ -52,10 +52,10 @@ def test_a_narrow_terminal_has_the_reason_below(
     )  # fmt: skip
     print_entries([LogEntry(12, denied), LogEntry(11, AuditRecord(id="1", time=0, event="log begun"))], str)
     assert [line.rstrip() for line in capsys.readouterr().out.splitlines()] == [
-        "12  1970-01-01 00:00:00.000  deny  decision  10.77.0.66 /tablet  publish",
+        "12  1970-01-01 00:00:00.000Z  deny  decision  10.77.0.66 /tablet  publish",
         "    /cmd_vel",
         "    10.77.0.66 is not among the hosts that may publish /cmd_vel",
-        "11  1970-01-01 00:00:00.000  log begun",
+        "11  1970-01-01 00:00:00.000Z  log begun",
     ]
 
 
@@ -76,7 +76,7 @@ def test_equal_records_are_one_row(
     print_entries(entries, str)
     _head, row = _STYLE.sub("", capsys.readouterr().out).splitlines()
     assert " ".join(row.split()) == (
-        "3 1970-01-01 23:53:23 to 23:53:25 message dropped monitor speedLimit /cmd_vel 3 times, last: speed 0.5"
+        "3 1970-01-01 23:53:23 to 23:53:25Z message dropped monitor speedLimit /cmd_vel 3 times, last: speed 0.5"
     )
     print_entries(entries, str, each=True)
     assert [_STYLE.sub("", row).split()[0] for row in capsys.readouterr().out.splitlines()] == [

@@ -38,7 +38,9 @@ function Verdict(/** @type {{value: any}} */ { value }) {
 /** @param {{filter: Record<string, string>}} given */
 export function Export({ filter }) {
   return html`<${Button} onClick=${() => take(`/v1/audit/export${queryText(askedOf(filter))}`, fileName("audit", `${now()}.ndjson`))}
-    title="All records that match, one JSON object a line"><${Icon} name="down" size=${16} />Export</${Button}>`;
+    title="All records that match, one JSON object a line"><${Icon} name="down" size=${16} />Export</${Button}>
+    <${Button} onClick=${() => take(`/v1/audit/export${queryText({ ...askedOf(filter), format: "csv" })}`, fileName("audit", `${now()}.csv`))}
+    title="All records that match, for a spreadsheet; times in UTC"><${Icon} name="down" size=${16} />CSV</${Button}>`;
 }
 
 /** An evidence bundle of the filtered period. @param {{filter: Record<string, string>}} given */

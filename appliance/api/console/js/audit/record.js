@@ -5,6 +5,7 @@ import { Block } from "../hosts/block.js";
 import { html, useEffect, useRef, useState } from "../html.js";
 import { iso, Moment } from "../moments.js";
 import { Badge, Outcome, requested } from "../parts/badge.js";
+import { Copy } from "../parts/copy.js";
 import { Given } from "../parts/given.js";
 import { Host } from "../parts/host.js";
 import { Icon } from "../parts/icon.js";
@@ -65,7 +66,7 @@ function Shown(/** @type {{shown: any, filter: Record<string, string>}} */ { sho
     ${(record.detail.before || record.detail.after) && html`<div><h3>Message</h3><${Change} detail=${record.detail} /></div>`}
     ${detail.length > 0 && html`<div><h3>Details</h3><dl class="facts">${detail.map(([name, value]) => html`<dt key=${name}><${Given} value=${name} most=${40} /></dt><dd><${Detail} name=${name} value=${value} filter=${filter} /></dd>`)}</dl></div>`}
     <${Around} title="Before it, by the same host or node" records=${before} filter=${filter} /><${Around} title="After it, by the same host or node" records=${after} filter=${filter} />
-    <div class="stack-tight"><div class="row"><button class="button small" aria-expanded=${String(raw)} onClick=${() => setRaw(!raw)}>${raw ? "Hide JSON" : "Show JSON"}</button><span class="muted small mono">${record.id}</span></div>
+    <div class="stack-tight"><div class="row"><button class="button small" aria-expanded=${String(raw)} onClick=${() => setRaw(!raw)}>${raw ? "Hide JSON" : "Show JSON"}</button><span class="muted small mono">${record.id}</span><${Copy} text=${record.id} what="id" /></div>
       ${raw && html`<pre class="bytes">${plain(JSON.stringify(record, null, 2), 20_000).replaceAll("⟨LF⟩", "\n")}</pre>`}</div>
   </div>`;
 }

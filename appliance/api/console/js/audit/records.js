@@ -3,7 +3,7 @@
 import { useCallback, useEffect, useRef, useState } from "../html.js";
 import { follow } from "../events.js";
 import { get, queryText } from "../rest.js";
-import { byHostAndKind, compared, grouped } from "./rows.js";
+import { byHostAndKind, compared, grouped, inOrder } from "./rows.js";
 
 const PAGE = 100;
 const FEW_ROWS = 20; // with fewer rows of a page, older pages follow at once
@@ -30,7 +30,7 @@ export function asksForAll(filter) {
 /** @param {Record<string, string>} filter @param {any[]} records */
 export function rowsOf(filter, records) {
   const rows = grouped(records);
-  return asksForAll(filter) ? byHostAndKind(rows) : rows;
+  return inOrder(asksForAll(filter) ? byHostAndKind(rows) : rows);
 }
 
 /** @param {Record<string, string>} filter @param {boolean} following */

@@ -79,6 +79,15 @@ function kindOf({ decision, event, host, category, resource, detail, ...record }
   return category === "monitor" && detail.monitor && !detail.who ? JSON.stringify([event, detail.monitor, host, resource, record.severity]) : null;
 }
 
+/** Rows in the order of the times that they show, the newest first: a record that counts repetitions is made after them. @param {Row[]} rows */
+export function inOrder(rows) {
+  return rows.toSorted((one, other) => shownTime(other).localeCompare(shownTime(one)));
+}
+
+function shownTime(/** @type {Row} */ { last }) {
+  return last.equality.ended;
+}
+
 /** How many other resources, or callers, a row's records have than the one that it shows. @param {Row} row @param {"resource" | "caller_id"} [field] */
 export function othersOf({ records }, field = "resource") {
   return new Set(records.map((one) => one[field])).size - 1;

@@ -3,6 +3,7 @@
 import { html, useState } from "../html.js";
 import { inOwnZone, Moment } from "../moments.js";
 import { Badge } from "../parts/badge.js";
+import { CopyCommand } from "../parts/copy.js";
 import { Given } from "../parts/given.js";
 import { Loading } from "../parts/notice.js";
 import { Link } from "../router.js";
@@ -33,7 +34,7 @@ export function Alarms(/** @type {{alarms: any[], incidents: any[] | null}} */ {
       ${open.length > 0 && html`<span class="end"><button class="button small" onClick=${review} title="Hide the alarms below in this browser; conditions stay until they end">Mark as reviewed</button></span>`}</div>
     ${incidents === null ? html`<${Loading} rows=${2} />` : !alarms.length && !open.length ? null
       : html`<ul class="alarm-list">${alarms.map((one, /** @type {number} */ at) => html`<li key=${`${one.kind} ${at}`} class="alarm"><${Badge} word=${one.severity} />
-          <${Link} to=${placeOf(one)} class="alarm-text"><${Given} value=${inOwnZone(one.text)} most=${300} /></${Link}></li>`)}
+          <${Link} to=${placeOf(one)} class="alarm-text"><${Given} value=${inOwnZone(one.text)} most=${300} /></${Link}><${CopyCommand} text=${one.text} /></li>`)}
         ${open.slice(0, MOST).map((one) => html`<li key=${one.id} class="alarm"><${Badge} word=${one.severity} />
           <${Link} to=${`/console/audit/${one.id}`} class="alarm-text"><${Given} value=${one.event} />: <${Given} value=${one.reason || one.resource} most=${160} /></${Link}><span class="muted small nowrap"><${Moment} at=${one.time} /></span></li>`)}
         ${open.length > MOST && html`<li class="alarm"><${Link} to="/console/audit?severity=alarm&since=1d">${open.length - MOST} more in the last day</${Link}></li>`}</ul>`}</section>`;

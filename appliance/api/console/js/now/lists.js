@@ -1,7 +1,7 @@
 /** The latest denials and actions of monitors, live. */
 
 import { DeniedHosts } from "../audit/denied_hosts.js";
-import { byHostAndKind, Count, grouped, othersOf, Range, shownOf } from "../audit/rows.js";
+import { byHostAndKind, Count, grouped, inOrder, othersOf, Range, shownOf } from "../audit/rows.js";
 import { html, useState } from "../html.js";
 import { isSelftest } from "../graph/model.js";
 import { Moment } from "../moments.js";
@@ -32,7 +32,7 @@ export function Doings() {
 }
 
 function List(/** @type {{records: any[], what: (row: import("../audit/rows.js").Row, count: any) => any}} */ { records, what }) {
-  return html`<ul class="event-list">${byHostAndKind(grouped(records)).slice(0, SHOWN).map((row) => html`<${Entry} key=${row.first.id} row=${row} what=${what} />`)}</ul>`;
+  return html`<ul class="event-list">${inOrder(byHostAndKind(grouped(records))).slice(0, SHOWN).map((row) => html`<${Entry} key=${row.first.id} row=${row} what=${what} />`)}</ul>`;
 }
 
 function Entry(/** @type {{row: import("../audit/rows.js").Row, what: (row: import("../audit/rows.js").Row, count: any) => any}} */ { row, what }) {
