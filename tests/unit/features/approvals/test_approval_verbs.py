@@ -1,3 +1,4 @@
+from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -66,7 +67,9 @@ def test_the_watch_goes_on_while_the_appliance_restarts(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     call = Approval(7, "waits", *REST, "", 0, 60.0, "")  # type: ignore[arg-type]  # of a tuple
-    answers = iter([Approvals([call]), NotRunningError("away"), NotRunningError("away"), Approvals([])])
+    answers: Iterator[Approvals | NotRunningError] = iter(
+        [Approvals([call]), NotRunningError("away"), NotRunningError("away"), Approvals([])]
+    )
 
     def ask(_request: object) -> Approvals:
         answer = next(answers, None)
