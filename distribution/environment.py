@@ -20,7 +20,7 @@ from distribution.programs import BuildError, run
 
 UV = ROOT / ".venv/bin/uv"
 PIP = ROOT / ".venv/bin/pip"
-INTERPRETERS = ("3.11", "3.12")  # of Debian 12 and of Ubuntu 24.04
+INTERPRETERS = ("3.11", "3.12", "3.13")  # of Debian 12, of Ubuntu 24.04, of Debian 13
 _SOURCE_ONLY = "python-iptables"
 
 

@@ -2,8 +2,9 @@
 
     python -m appliance.network.boot_hold on|off        (rosrv-hold.service)
 
-1. It is in force only while rosrv-hold.service is active, which systemd starts with the enabled rosrv.service and stops
-   with it, but not at a restart. The unit's runtime directory shows that it is active.
+1. It is in force only while rosrv-hold.service is active, which systemd starts with the enabled rosrv.service, and
+   stops with it if an operator does; a crash does not stop it. The unit's runtime directory shows that it is active.
+   systemd also restarts it with rosrv.service; then `off` leaves the hold in force, without a gap.
 2. It is armed by a start that serves. An appliance that never served, or that is off, holds up no host.
 3. Other machines: new TCP connections to RVMaster's port and the kernel's range, in which nodes listen, are dropped, so
    their clients try again. Loopback, the appliance's link, established connections and other ports pass.
@@ -13,6 +14,7 @@
 
 import contextlib
 import json
+import subprocess
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -35,6 +37,7 @@ from appliance.network.firewall.nft import NftBackend
 from appliance.network.namespaces import Namespace
 
 TABLE = "rosrv-hold"
+_SERVICE = "rosrv.service"
 UNIT_RUNS = Path("/run/rosrv-hold")  # the unit's RuntimeDirectory
 STATE = Path("/var/lib/rosrv-hold")  # the unit's StateDirectory
 
@@ -169,13 +172,25 @@ class BootHold:
             return 0.0
 
 
+def _starts_again() -> bool:
+    """Return whether systemd is to start rosrv.service, as after the stop of a restart."""
+    command = ["systemctl", "list-jobs", "--no-legend", "--plain", _SERVICE]
+    try:
+        jobs = subprocess.run(command, capture_output=True, text=True, timeout=10, check=False).stdout
+    except (OSError, subprocess.TimeoutExpired):
+        return False
+    rows = [line.split() for line in jobs.splitlines()]  # number, unit, type, state
+    return any(len(row) >= 3 and row[1] == _SERVICE and row[2].endswith("start") for row in rows)
+
+
 def main(arguments: Sequence[str]) -> None:
     hold = BootHold(Namespace.own())
     try:
         if list(arguments) == ["on"]:
             hold.put()
         elif list(arguments) == ["off"]:
-            hold.lift()
+            if not _starts_again():
+                hold.lift()
         else:
             sys.exit("usage: python -m appliance.network.boot_hold on|off")
     except FirewallError as error:

@@ -11,13 +11,13 @@ log = structlog.get_logger()
 
 
 class HoldAround:
-    """The boot hold of the service; only the service of a single appliance has one."""
+    """The boot hold of the service; `used`: this is the service of a single appliance."""
 
-    def __init__(self, settings: Settings, *, single: bool, link: str, hold: BootHold | None = None) -> None:
+    def __init__(self, settings: Settings, *, used: bool, link: str, hold: BootHold | None = None) -> None:
         self._hold = hold or BootHold(Namespace.own())
         self._ports: HeldPorts | None = None
         if (
-            single
+            used
             and settings.isolation != "none"
             and settings.firewall.hold != "off"
             and self._hold.is_present

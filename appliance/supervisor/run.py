@@ -130,7 +130,7 @@ def _run(
         state.write_config(json.dumps(plain(settings)))
         state.write_files(pairing.files if pairing is not None else ())
         raise_file_limit(_FILES)
-        hold = HoldAround(settings, single=pairing is None, link=isolation.link)
+        hold = HoldAround(settings, used=pairing is None and manager.is_present, link=isolation.link)
         hold.put()
         admin = state.open_admin_socket()
         with closing(admin):

@@ -44,7 +44,7 @@ def test_the_boot_hold_comes_and_goes_with_the_enabled_service() -> None:
     hold = (ROOT / "distribution/debian/rosrv-hold.service").read_text()
     unit = (ROOT / "distribution/debian/rosrv.service").read_text()
     assert "[Install]" not in hold, "it would hold while rosrv.service is disabled or masked"
-    assert "\nStopPropagatedFrom=rosrv.service\n" in hold, "PartOf= would also lift it at a restart"
+    assert "\nPartOf=rosrv.service\n" in hold, "StopPropagatedFrom= would also lift it at a crash"
     assert "\nBefore=network-pre.target\n" in hold
     for key in ("Wants", "After"):
         assert re.search(rf"^{key}=.*\brosrv-hold\.service\b", unit, re.MULTILINE)

@@ -40,7 +40,7 @@ def running(appliance: Appliance) -> Iterator[SelftestFinding]:
     status = answer.given()
     yield ok(
         "appliance",
-        f"{status.version}, {counted(len(status.processes), 'process')}, nodes find it at {status.master}",
+        f"{status.version}, {counted(len(status.processes), 'process', 'processes')}, nodes find it at {status.master}",
     )
     yield from run_check("status", lambda: _status(status))
     yield from run_check("processes", lambda: _processes(status.processes))

@@ -36,10 +36,10 @@ def around(
     mode: Literal["others", "own", "off"] = "others",
     *,
     isolation: Literal["netns", "none"] = "netns",
-    single: bool = True,
+    used: bool = True,
 ) -> HoldAround:
     settings = Settings(isolation=isolation, firewall=FirewallSection(hold=mode))
-    return HoldAround(settings, single=single, link="veth-rosrv", hold=hold)
+    return HoldAround(settings, used=used, link="veth-rosrv", hold=hold)
 
 
 @pytest.mark.parametrize(
@@ -65,7 +65,7 @@ def test_the_service_holds_until_it_serves_and_at_its_end(
     [
         lambda hold: around(hold, "off"),
         lambda hold: around(hold, isolation="none"),
-        lambda hold: around(hold, single=False),
+        lambda hold: around(hold, used=False),
     ],
 )
 def test_a_run_without_a_hold_ends_an_earlier_one(made: Callable[[BootHold], HoldAround]) -> None:
