@@ -34,6 +34,10 @@ LEASE = Model(
         "1": "accepted",
     },
 )
+FOLLOWER = Model(
+    _PROOFS / "follower.pml",
+    {"holder": "fenced", "learnt": "newest", "admitted": "shut", "since": "kept"},
+)
 
 
 class Bounded(Protocol):
@@ -59,6 +63,26 @@ class LeaseBounds:
     @property
     def defined(self) -> list[str]:
         return [f"-DGRANTS={self.grants}"] + ["-DLAST_FAULT"] * self.last_fault
+
+
+@dataclass(frozen=True, slots=True)
+class FollowerBounds:
+    """The ticks that a lease lasts and a write of rules takes at most."""
+
+    expiry: int
+    write: int
+    served: bool = False
+
+    def __str__(self) -> str:
+        return f"{self.expiry}-ticks-{self.write}-a-write" + "-served" * self.served
+
+    @property
+    def model(self) -> Model:
+        return FOLLOWER
+
+    @property
+    def defined(self) -> list[str]:
+        return [f"-DEXPIRY={self.expiry}", f"-DWRITE={self.write}"] + ["-DSERVED"] * self.served
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,8 +4,8 @@ from collections.abc import Collection
 
 import pytest
 
-from tests.proofs import test_insertion_mutants, test_lease_mutants
-from tests.support.spin import INSERTION, LEASE, Model
+from tests.proofs import test_follower, test_insertion_mutants, test_lease_mutants
+from tests.support.spin import FOLLOWER, INSERTION, LEASE, Model
 
 ROOT = INSERTION.path.parents[1]
 _NAME = re.compile(r"^(?:/\*|  +/\*|) *= (appliance/\S+\.py) (\w+(?:\.\w+)?)", re.MULTILINE)
@@ -15,7 +15,7 @@ def named(model: Model) -> list[tuple[str, str]]:
     return sorted(set(_NAME.findall(model.path.read_text())))
 
 
-@pytest.mark.parametrize(("path", "name"), named(INSERTION) + named(LEASE))
+@pytest.mark.parametrize(("path", "name"), named(INSERTION) + named(LEASE) + named(FOLLOWER))
 def test_the_model_names_existing_code(path: str, name: str) -> None:
     inside: list[ast.stmt] = ast.parse((ROOT / path).read_text()).body
     for part in name.split("."):
@@ -46,8 +46,12 @@ def test_every_process_names_what_it_models(model: Model, others: set[str]) -> N
 
 @pytest.mark.parametrize(
     ("model", "mutants"),
-    [(INSERTION, test_insertion_mutants.MUTANTS), (LEASE, test_lease_mutants.MUTANTS)],
-    ids=["insertion", "lease"],
+    [
+        (INSERTION, test_insertion_mutants.MUTANTS),
+        (LEASE, test_lease_mutants.MUTANTS),
+        (FOLLOWER, test_follower.MUTANTS),
+    ],
+    ids=["insertion", "lease", "follower"],
 )
 def test_every_mutant_is_tried(model: Model, mutants: Collection[str]) -> None:
     assert set(re.findall(r"MUTANT_(\w+)", model.path.read_text())) == set(mutants)
