@@ -101,6 +101,10 @@ class AgeClock:
         """Return the latest time that it may be: with the time off that does not count yet."""
         return self() + max(0, self._kept.step)
 
+    def uncounted(self, date: int) -> int:
+        """Return the time off after this date by the clock that does not count yet, although it may be real."""
+        return max(0, self._kept.step) if date < self._kept.since + self._kept.credited else 0
+
     def _was_off(self, ahead: int) -> None:
         kept, counts = self._kept, 0
         if abs(ahead) <= _AT_ONCE:

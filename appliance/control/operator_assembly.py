@@ -20,7 +20,6 @@ from appliance.control.operators.token_orders import TokenOrders
 from appliance.control.rest.rest import RestLink
 from appliance.control.rest.rest_certificate import RestCertificate
 from appliance.control.rest.rest_uses import RestUses
-from appliance.store.stored_deadlines import StoredDeadlines
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,7 +27,6 @@ class Operators:
     """The parts that serve operators."""
 
     tokens: TokenOrders
-    ends_of_tokens: StoredDeadlines
     clock: ClockCheck
     switched_off: SwitchedOffWatch
     administration: Administration
@@ -38,10 +36,9 @@ class Operators:
 def make_operators(base: Foundation, parts: Parts) -> Operators:
     """Make the parts; the specifications must already be loaded."""
     settings, trail, ends = base.settings, base.trail, parts.endpoints
-    ends_of_tokens = StoredDeadlines(base.store)
     rest = Current[RestLink]()
     tokens = TokenOrders(
-        base.store, trail, ends_of_tokens, lambda: rest().state_tokens(), sessions=base.features.sessions
+        base.store, trail, base.ends, lambda: rest().state_tokens(), sessions=base.features.sessions
     )
     base.features.bearers.set(tokens.usable)
     clock = ClockCheck(trail, lambda: base.audit.ids.ahead)
@@ -49,10 +46,11 @@ def make_operators(base: Foundation, parts: Parts) -> Operators:
         parts.monitors, base.policies, base.store, trail, settings.forgotten_after
     )
     core = parts.core
-    handled, looks = HandledAlarms(base.store), Current[Queries]()
+    handled, looks = HandledAlarms(base.store, base.ends), Current[Queries]()
     base.features.operate(
         appliance=base.role.name,
         store=base.store,
+        ends=base.ends,
         policies=base.policies,
         monitors=parts.monitors,
         processes=lambda: base.lifeline.surroundings.processes,
@@ -109,7 +107,6 @@ def make_operators(base: Foundation, parts: Parts) -> Operators:
     )
     return Operators(
         tokens=tokens,
-        ends_of_tokens=ends_of_tokens,
         clock=clock,
         switched_off=switched_off,
         administration=administration,

@@ -57,7 +57,8 @@ from appliance.specifications.specification_revisions import (
 )
 from appliance.specifications.switches import SWITCHES, Switches, require_whole
 from appliance.specifications.timed_switches import LONGEST, TimedSwitches
-from appliance.store.revisions import LIMITS, Revisions, reloaded_by
+from appliance.store.ends import EndKind, Ends
+from appliance.store.revisions import Revisions, reloaded_by
 from appliance.store.state_file import MonitorRevisionRow, StateStore
 from appliance.telemetry.audit_trail import AuditTrail
 
@@ -120,12 +121,14 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
 
     refusal = SpecificationsRefusedError
     outdated = MonitorsChangedError
+    unconfirmed = EndKind("confirm monitors")
 
     def __init__(
         self,
         folder: Path | None,
         enable: str,
         store: StateStore,
+        ends: Ends,
         trail: AuditTrail,
         *,
         on_fault: Literal["drop", "pass"],
@@ -145,7 +148,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
 
         `live()` returns the topics published now.
         """
-        super().__init__(store, store.monitor_revisions, store.save_monitor_revision, NOTHING, LIMITS[1])
+        super().__init__(store, ends, store.monitor_revisions, store.save_monitor_revision, NOTHING)
         self.folder = folder
         self._folder = SpecificationFolder(folder)
         self.site_keys = site_keys
@@ -162,7 +165,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         )  # fmt: skip
         self._acts = 0  # number of all switches and resumptions so far
         self._attempting: set[str] = set()  # clients with a dry run under way
-        self.returns = TimedSwitches(store, self._come_back)
+        self.returns = TimedSwitches(store, ends, self._come_back)
         self.sources = Sources()
         self.checked = CheckedSpecifications()
         self.records = MonitorRecords(
@@ -200,7 +203,6 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         if last is not None or (self.revision and sources_of(self.in_force) == sources):
             self._enforce(sources, checked)
             self._keep_warnings()
-            self._resume()
         else:
             self._end_limit()
             if sources.files or self.revision:

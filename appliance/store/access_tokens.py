@@ -11,7 +11,6 @@ import secrets
 from typing import NamedTuple
 
 from appliance.base.actors import DISK, OPERATOR
-from appliance.base.deadlines import Deadlines
 from appliance.signing.request_signing import TokenKeys, keys_of
 
 _FORM = re.compile(r"rosrv_([0-9a-f]{12})_([A-Za-z0-9_-]{43})")
@@ -27,7 +26,7 @@ class BadTokenNameError(ValueError):
 
 
 class TokenRow(NamedTuple):
-    """A stored token. Times are seconds since the epoch."""
+    """A stored token. Times are seconds since the epoch; `Ends` decides when it ends, and `expires` is for people."""
 
     id: str
     name: str
@@ -38,9 +37,6 @@ class TokenRow(NamedTuple):
     expires: float
     revoked: float | None
     keys: TokenKeys | None = None  # None: made by a version that derived no keys
-
-    def usable(self, ends: Deadlines) -> bool:
-        return self.revoked is None and not ends.passed(self.id, self.expires)
 
 
 def make_token(name: str, role: str, *, now: float, seconds: float) -> tuple[TokenRow, str]:

@@ -33,7 +33,7 @@ class DoorRow(NamedTuple):
 
 
 class TicketRow(NamedTuple):
-    """A ticket for a door, without its secret; times are seconds since the epoch."""
+    """A ticket for a door, without its secret; times are seconds since the epoch, and `expires` is for people."""
 
     id: str
     door: str
@@ -55,10 +55,8 @@ class DoorTables:
     def doors(self) -> list[DoorRow]:
         return [DoorRow(*row) for row in self._database.query("SELECT * FROM door ORDER BY added, name")]
 
-    def save_tickets(self, *rows: TicketRow) -> None:
-        with self._database.together():
-            for row in rows:
-                self._database.put("door_ticket", *row)
+    def save_ticket(self, row: TicketRow) -> None:
+        self._database.put("door_ticket", *row)
 
     def forget_ticket(self, ticket: str) -> None:
         self._database.delete("door_ticket", id=ticket)

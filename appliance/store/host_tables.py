@@ -101,14 +101,10 @@ class RevokedCertificateRow(NamedTuple):
 
 
 class HostBlockRow(NamedTuple):
-    """A host that an operator blocks.
-
-    `ends` is the end by the age clock (`base/age_clock.py`), in nanoseconds; None: it ends by an order only.
-    """
+    """A host that an operator blocks; `since` is seconds since the epoch. Its end is in `Ends`, if it has one."""
 
     address: str
     since: float
-    ends: int | None
     who: str
     note: str
 
@@ -190,13 +186,14 @@ class HostTables:
         return [RevokedCertificateRow(*row) for row in rows]
 
     def save_block(self, row: HostBlockRow) -> None:
-        self._database.put("host_block", *row)
+        self._database.put("host_block", row.address, row.since, None, row.who, row.note)
 
     def forget_block(self, address: str) -> None:
         self._database.delete("host_block", address=address)
 
     def blocks(self) -> list[HostBlockRow]:
-        return [HostBlockRow(*row) for row in self._database.query("SELECT * FROM host_block ORDER BY since")]
+        rows = self._database.query("SELECT address, since, who, note FROM host_block ORDER BY since")
+        return [HostBlockRow(*row) for row in rows]
 
     def save_authority(self, row: AuthorityRow) -> None:
         self._database.put("authority", 1, *row)

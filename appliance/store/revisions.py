@@ -8,25 +8,13 @@ from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 import structlog
 
-from appliance.base import clock
 from appliance.base.actors import DISK
 from appliance.base.withdrawal import require_awaited
+from appliance.store.ends import EndKind, Ends
 from appliance.store.state_file import StateStore
 from appliance.store.writer_thread import StoreError
 
 _log = structlog.get_logger()
-_AGAIN_SECONDS = 5.0
-
-
-LIMITS = ("confirm", "confirm monitors")
-"""The settings with the time limits of an unconfirmed policy and of unconfirmed specifications."""
-
-
-def limit_moved(text: str, seconds: float) -> str:
-    if not text:
-        return text
-    back_to, deadline, length = text.split()
-    return f"{back_to} {float(deadline) + seconds} {length}"
 
 
 def reloaded_by(who: str) -> str:
@@ -61,25 +49,26 @@ class Revisions(ABC, Generic[R]):
     """The error for a revision that cannot come into force; it takes findings."""
     outdated: ClassVar[type[Exception]]
     """The error for a change that expected another tag; it takes the expected tag and the present one."""
+    unconfirmed: ClassVar[EndKind]
+    """The end of the time to confirm. Its name is the number of the last revision that needed no confirmation."""
 
     def __init__(
         self,
         store: StateStore,
+        ends: Ends,
         rows: Callable[..., list[R]],
         save: Callable[[R], None],
         nothing: R,
-        setting: str,
     ) -> None:
         """`rows(limit)` returns revisions, newest first; `nothing` is in force until the last one is loaded."""
         self.store = store
+        self.ends = ends
         self._rows = rows
         self._save = save
-        self._setting = setting
         self._one_change = asyncio.Lock()
-        self._back_to = 0  # the last revision that needed no confirmation
         self.in_force = nothing
-        self.confirm_by: float | None = None  # seconds since the epoch
         self.going_back: asyncio.Task[None] | None = None
+        ends.when_due(self.unconfirmed, self._due)
 
     @property
     def revision(self) -> int:
@@ -88,6 +77,13 @@ class Revisions(ABC, Generic[R]):
     @property
     def tag(self) -> int | str:
         return self.revision
+
+    @property
+    def confirm_by(self) -> float | None:
+        """Return the end of the time to confirm, in seconds since the epoch, or None."""
+        return next(
+            (self.ends.date(self.unconfirmed, name) for name in self.ends.names(self.unconfirmed)), None
+        )
 
     @abstractmethod
     async def _go_back(self, revision: int) -> None:
@@ -102,14 +98,6 @@ class Revisions(ABC, Generic[R]):
         """
         self.in_force = next(iter(self._rows(1)), self.in_force)
         return self.revision > 0 and (restarted or self.in_force.who != DISK)
-
-    def _resume(self) -> None:
-        kept = self.store.settings().get(self._setting, "")
-        if kept:
-            back_to, deadline, length = kept.split()
-            within = float(length)
-            # Wait at most the whole length: the clock may have been set back since.
-            self._limit(int(back_to), min(float(deadline), clock.wall() + within), within)
 
     # --- reading ---
 
@@ -149,42 +137,32 @@ class Revisions(ABC, Generic[R]):
 
     def _put_in_force(self, row: R, within: float | None = None) -> None:
         if within is not None:  # set the limit first, because control may die during the change
-            back_to = self.revision if self.confirm_by is None else self._back_to
-            self._limit(back_to, clock.wall() + within, within)
+            back_to = next(iter(self.ends.names(self.unconfirmed)), str(self.revision))
+            with self.store.database.together():
+                self._end_limit()
+                self.ends.set(self.unconfirmed, back_to, within)
         self._save(row)
         self.in_force = row
         if within is None:
             self._end_limit()
 
     def _end_limit(self) -> None:
-        self._stop_waiting()
-        self.store.save_setting(self._setting, "")
-
-    def _stop_waiting(self) -> None:
         if self.going_back is not None and self.going_back is not asyncio.current_task():
             self.going_back.cancel()
-        self.going_back = self.confirm_by = None
+        self.going_back = None
+        self.ends.forget(self.unconfirmed, *self.ends.names(self.unconfirmed))
 
-    def _limit(self, back_to: int, deadline: float, within: float) -> None:
-        self.store.save_setting(self._setting, f"{back_to} {deadline} {within}")
-        self._stop_waiting()
-        self._back_to, self.confirm_by = back_to, deadline
-        self.going_back = asyncio.get_running_loop().create_task(self._run(back_to, deadline))
+    def _due(self, revisions: list[str]) -> None:
+        if self.going_back is None or self.going_back.done():
+            self.going_back = asyncio.get_running_loop().create_task(self._run(int(revisions[0])))
 
-    async def _run(self, back_to: int, deadline: float) -> None:
-        await asyncio.sleep(max(0.0, deadline - clock.wall()))
-        while True:
-            try:
-                await self._go_back(back_to)
-            except (self.refusal, StoreError) as error:
-                if self.confirm_by is None:  # the rollback was complete before the error
-                    _log.error(
-                        "an unconfirmed change was rolled back, but this is not saved", reason=str(error)
-                    )
-                    return
+    async def _run(self, back_to: int) -> None:
+        try:
+            await self._go_back(back_to)
+        except (self.refusal, StoreError) as error:
+            if self.confirm_by is None:  # the rollback was complete before the error
+                _log.error("an unconfirmed change was rolled back, but this is not saved", reason=str(error))
+            else:  # `Ends` calls again
                 _log.error(
                     "an unconfirmed change cannot be rolled back yet", revision=back_to, error=str(error)
                 )
-                await asyncio.sleep(_AGAIN_SECONDS)
-            else:
-                return

@@ -5,7 +5,7 @@ of an active appliance of the old one. A new value gets a new table.
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -53,6 +53,10 @@ CREATE TABLE IF NOT EXISTS token_keys (
 ) WITHOUT ROWID;
 CREATE TABLE IF NOT EXISTS token_use (id TEXT PRIMARY KEY, used REAL NOT NULL) WITHOUT ROWID;
 CREATE TABLE IF NOT EXISTS token_left (id TEXT PRIMARY KEY, seconds REAL NOT NULL) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS ends (
+    kind TEXT NOT NULL, name TEXT NOT NULL, at INTEGER NOT NULL, since INTEGER NOT NULL, late INTEGER NOT NULL,
+    PRIMARY KEY (kind, name)
+) WITHOUT ROWID;
 CREATE TABLE IF NOT EXISTS monitor_state (
     relay INTEGER PRIMARY KEY, epoch INTEGER NOT NULL, content BLOB NOT NULL
 );
@@ -123,6 +127,16 @@ class MonitorRevisionRow(NamedTuple):
     loaded: float
     who: str
     note: str
+
+
+class EndRow(NamedTuple):
+    """An end and its beginning by the age clock, in nanoseconds; `late` is 0 or 1 (see `EndKind`)."""
+
+    kind: str
+    name: str
+    at: int
+    since: int
+    late: int
 
 
 class StateStore:
@@ -312,16 +326,20 @@ class StateStore:
     def token_uses(self) -> dict[str, float]:
         return dict(self.database.query("SELECT id, used FROM token_use"))
 
-    def save_time_left(self, left: Mapping[str, float]) -> None:
-        with self.database.together():
-            for token, seconds in left.items():
-                self.database.put("token_left", token, seconds)
+    # --- ends ---
 
-    def forget_time_left(self, token: str) -> None:
-        self.database.delete("token_left", id=token)
+    def save_end(self, row: EndRow) -> None:
+        self.database.put("ends", *row)
 
-    def time_left(self) -> dict[str, float]:
-        return dict(self.database.query("SELECT id, seconds FROM token_left"))
+    def forget_end(self, kind: str, name: str) -> None:
+        self.database.delete("ends", kind=kind, name=name)
+
+    def ends(self) -> list[EndRow]:
+        return [EndRow(*row) for row in self.database.query("SELECT * FROM ends")]
+
+    def forget_time_left(self) -> None:
+        """Empty the table of versions up to 0.3.0."""
+        self.database.delete("token_left", ("id", ">", ""))
 
     # --- settings ---
 

@@ -287,24 +287,25 @@ WALL_CLOCK = {
         "specifications/specification_manager.py", "supervisor/process_handle.py", "supervisor/monitor_memory.py",
         "supervisor/supervisor.py",
     ],
-    "an end that is a date: of a certificate, a token, a revocation": [
-        "features/sso/sessions.py", "features/sso/sign_on.py",
+    "the date of an end of `Ends`, for people and for the api": [
+        "api/front/access.py", "control/operators/handled_alarms.py", "control/operators/token_orders.py",
+        "features/blocks/block_orders.py", "features/sso/sessions.py", "features/tunnels/enrolment_tokens.py",
+        "features/standby/passive_rest.py",
+    ],
+    "an end that is a date: of a certificate or a revocation": [
+        "features/sso/sign_on.py",
         "features/metrics/metrics_route.py", "features/fleet/view.py", "api/process.py",
         "features/selftest/file_checks.py",
-        "base/deadlines.py", "features/fleet/verified_bundles.py",
-        "control/operators/token_orders.py", "features/standby/appliance_table.py",
-        "features/tunnels/certification.py", "features/tunnels/enrolment_tokens.py",
-        "hosts/revoked_certificates.py", "hosts/tunnel_state.py", "features/tunnels/host_view.py",
-        "ipsec/certificate_authority.py",
+        "features/fleet/verified_bundles.py", "features/standby/appliance_table.py",
+        "features/tunnels/certification.py", "hosts/revoked_certificates.py",
+        "hosts/tunnel_state.py", "features/tunnels/host_view.py", "ipsec/certificate_authority.py",
         "signing/own_certificate.py",
     ],
     "a span that goes on over restarts of the machine, which has no other clock": [
-        "control/operators/handled_alarms.py", "features/alarms/alarm_orders.py", "features/standby/stored_times.py",
-        "control/operators/switched_off.py", "features/tunnels/self_service.py", "specifications/timed_switches.py",
-        "store/revisions.py",
+        "control/operators/switched_off.py", "features/tunnels/self_service.py",
     ],
     "whether the wall clock can be believed, and where it is read": [
-        "base/age_clock.py", "base/clock.py", "base/shipped.py", "control/operators/clock_check.py",
+        "base/age_clock.py", "base/clock.py", "base/shipped.py", "control/operators/clock_check.py", "store/ends.py",
     ],
     "a moment that people ask for (`--since 1h`), or a page that is shown once": [
         "api/front/moments.py", "audit/search/filter_options.py",

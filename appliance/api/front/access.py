@@ -20,7 +20,6 @@ from typing import cast
 from appliance.api.front.problems import ProblemError, too_many
 from appliance.api.front.rates import Buckets, peer_key
 from appliance.base import clock
-from appliance.base.deadlines import Deadlines
 from appliance.channel.answers.token_answers import TokenRole
 from appliance.channel.messages.api import ClientRequest, TokenKept
 from appliance.configuration.sections import is_loopback
@@ -61,7 +60,7 @@ class TokenAuthenticator:
         self._used = used
         self._reported: dict[str, float] = {}  # by token: the time of the last report
         self._tokens: dict[str, TokenKept] = {}
-        self._ends = Deadlines()
+        self._ends: dict[str, tuple[float, float]] = {}  # by token: its date, and seconds since the boot
         self._stated = False
         self._recognised: dict[bytes, str] = {}
         self._key = secrets.token_bytes(32)
@@ -81,9 +80,11 @@ class TokenAuthenticator:
 
     def state(self, tokens: Iterable[TokenKept]) -> None:
         self._tokens = {token.id: token for token in tokens}
-        self._ends.retain(self._tokens)
-        for token in self._tokens.values():
-            self._ends.passed(token.id, token.expires)  # from now on, no step of the clock postpones an end
+        # No step of the clock changes an end. Control states the tokens again when one has ended.
+        dates = {token.id: token.expires for token in self._tokens.values()}
+        boot = clock.wall() - clock.since_boot()
+        known = {token: end for token, end in self._ends.items() if end[0] == dates.get(token)}
+        self._ends = {token: (date, date - boot) for token, date in dates.items()} | known
         self._stated = True
         self._recognised.clear()
         self._reported.clear()
@@ -104,10 +105,10 @@ class TokenAuthenticator:
         """Return why a long answer must end, or an empty text."""
         if self.is_blocked(peer):
             return _BLOCKED
-        kept = self._tokens.get(bearer.id)
-        # A rotation may have brought its end forward.
-        good = kept is not None and not self._ends.passed(kept.id, kept.expires)
-        return "" if good else "the token has expired"
+        return "" if self._lasts(bearer.id) else "the token has expired"
+
+    def _lasts(self, token: str) -> bool:
+        return clock.since_boot() < self._ends.get(token, (0.0, 0.0))[1]
 
     async def recognise(self, authorization: str | None, host: str) -> Bearer:
         """Return the bearer. Raises `ProblemError` (401, 429, 503)."""
@@ -124,7 +125,7 @@ class TokenAuthenticator:
             if parsed is None
             else await self._matches(text, parsed[1], kept, host)
         ):
-            if not self._ends.passed(kept.id, kept.expires):
+            if self._lasts(kept.id):
                 self._remember(peer_key(host))
                 self._report_use(kept.id)
                 return Bearer(kept.id, kept.name, cast(TokenRole, kept.role), kept.expires, text)

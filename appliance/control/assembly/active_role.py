@@ -29,7 +29,8 @@ class ActiveRole:
     """The right to serve, and its consequences.
 
     `paired`: another appliance can serve in place of this one, so it may have written the state. `took_over`: this
-    process waited for the role. `ports`: the TCP ports that exist at `address`, or None for all.
+    process waited for the role, `away_seconds` after it last followed the other appliance. `ports`: the TCP ports that
+    exist at `address`, or None for all.
     """
 
     paired = False
@@ -38,6 +39,7 @@ class ActiveRole:
     ports: tuple[range, ...] | None = None
     robot: str | None = None
     took_over = False
+    away_seconds: float | None = None
     api: Channel | None = None
     pin = ""
 
@@ -46,7 +48,7 @@ class ActiveRole:
         """Return the wait until changes may be answered, or None if answers need not wait."""
         return None
 
-    def inherit(self, store: StateStore, age: Callable[[], int]) -> None:
+    def inherit(self, store: StateStore) -> None:
         """Take over the state, before any part reads or changes it."""
 
     def host_authority(

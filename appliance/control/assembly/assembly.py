@@ -143,6 +143,7 @@ def _make_monitors(
         settings.monitors,
         settings.enable,
         base.store,
+        base.ends,
         base.trail,
         on_fault=settings.on_fault,
         slices=settings.slices,

@@ -31,6 +31,7 @@ from appliance.policy.policy import CurrentPolicy, Policy
 from appliance.rpc.server import listen
 from appliance.specifications.compiler_link import SpecificationCompiler
 from appliance.specifications.specification_manager import SpecificationManager
+from appliance.store.ends import Ends
 from appliance.store.state_file import StateStore
 from appliance.telemetry.audit_trail import AuditTrail
 
@@ -55,6 +56,7 @@ class Foundation:
     features: FeatureParts
     monitors: Current[SpecificationManager]
     store: StateStore
+    ends: Ends
     blocks: BlockTable
     table: HostTable
     tunnels: Tunnels
@@ -101,9 +103,10 @@ async def make_foundation(
     store = StateStore(
         settings.state / "control", failed=lambda reason: _log.error("state is not written", reason=reason)
     )
+    role.inherit(store)
     age = AgeClock(settings.state / "control" / "age")
-    role.inherit(store, age)
-    blocks = BlockTable(store, age, age.dated)
+    ends = Ends(store, age, appliance=role.name, away_seconds=role.away_seconds)
+    blocks = BlockTable(store, ends)
     await features.keep(store, lifeline)
     # The policy names hosts by address. These addresses are reliable only once clear text from them is blocked, so
     # start the tunnels before the policy.
@@ -130,6 +133,7 @@ async def make_foundation(
     policies = Policies(
         settings.policy,
         store,
+        ends,
         trail,
         policy,
         robot=robot_addresses(settings, role.robot),
@@ -156,6 +160,7 @@ async def make_foundation(
         features=features,
         monitors=monitors,
         store=store,
+        ends=ends,
         blocks=blocks,
         table=table,
         tunnels=tunnels(),

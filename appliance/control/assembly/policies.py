@@ -37,7 +37,8 @@ from appliance.policy.model import Address
 from appliance.policy.policy import Approval, CurrentPolicy, Policy
 from appliance.signing.fingerprints import fingerprint
 from appliance.signing.site_keys import signer
-from appliance.store.revisions import LIMITS, Revisions, reloaded_by
+from appliance.store.ends import EndKind, Ends
+from appliance.store.revisions import Revisions, reloaded_by
 from appliance.store.state_file import RevisionRow, StateStore
 from appliance.telemetry.audit_trail import AuditTrail
 
@@ -69,11 +70,13 @@ class Policies(Revisions[RevisionRow]):
 
     refusal = PolicyRefusedError
     outdated = RevisionChangedError
+    unconfirmed = EndKind("confirm")
 
     def __init__(
         self,
         file: Path,
         store: StateStore,
+        ends: Ends,
         trail: AuditTrail,
         policy: CurrentPolicy,
         *,
@@ -95,7 +98,7 @@ class Policies(Revisions[RevisionRow]):
         `changed(before, policy)` decides all live rights again, and returns the number of revocations.
         """
         nothing = RevisionRow(0, "", "", 0.0, "", "")
-        super().__init__(store, store.revisions, store.save_revision, nothing, LIMITS[0])
+        super().__init__(store, ends, store.revisions, store.save_revision, nothing)
         self.file = file
         self._trail = trail
         self._robot = robot
@@ -147,7 +150,6 @@ class Policies(Revisions[RevisionRow]):
             self._keep(policy, signature, who=DISK, note="read at start")
             return
         self._enforce(policy)
-        self._resume()
         if refused is not None:
             self._file_refused(refused)
         elif not kept_first:

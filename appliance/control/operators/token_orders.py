@@ -5,21 +5,22 @@ The api gets data to recognise tokens, but never their secrets; if compromised, 
 """
 
 import contextlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import cast
 
 from appliance.base import clock
-from appliance.base.deadlines import Deadlines
 from appliance.channel import admin
 from appliance.channel.answers import token_answers as answers
 from appliance.channel.messages.api import TokenKept
 from appliance.control.errors import TokenRefusedError
 from appliance.control.operators.sessions import Sessions
 from appliance.store.access_tokens import BadTokenNameError, TokenRow, make_token
+from appliance.store.ends import EndKind, Ends
 from appliance.store.state_file import StateStore
 from appliance.store.writer_thread import StoreError
 from appliance.telemetry.audit_trail import AuditTrail
 
+TOKENS = EndKind("token")
 FIRST_NAME = "first"
 _UNTOLD = "first token untold"  # this setting exists while the first token has not been shown
 _USES_SINCE = "token uses since"
@@ -27,6 +28,7 @@ _LEAST_SECONDS = 30.0  # between two stored uses of a token; an api that works r
 DEFAULT_SECONDS = 90 * 86_400.0
 LONGEST_SECONDS = 3650 * 86_400.0
 _MOST = 1000
+_SAME_DATE = 2.0  # seconds; a smaller difference is not shown
 
 
 class TokenOrders:
@@ -36,7 +38,7 @@ class TokenOrders:
         self,
         store: StateStore,
         trail: AuditTrail,
-        ends: Deadlines,
+        ends: Ends,
         changed: Callable[[], None],
         *,
         sessions: Callable[[], Sessions | None] = lambda: None,
@@ -46,7 +48,6 @@ class TokenOrders:
         self._sessions = sessions
         self._ends = ends
         self._rows = {row.id: row for row in store.tokens()}
-        self.usable()  # from now on, no step of the clock postpones an end
         settings = store.settings()
         self._untold = bool(settings.get(_UNTOLD))
         self._uses = store.token_uses()
@@ -56,18 +57,19 @@ class TokenOrders:
             store.save_setting(_USES_SINCE, str(self._uses_since))
         self._rotating: set[str] = set()  # names
         self._changed = changed
+        ends.when_due(TOKENS, self._due)
 
     async def listed(self, _request: admin.TokenList) -> answers.Tokens:
         return answers.Tokens([self._shown(row) for row in self._rows.values()], self._uses_since)
 
     def usable(self) -> list[TokenKept]:
         """Return the usable tokens, as the api gets them; the api also checks `expires`."""
-        tokens = {row.id: row for row in self._rows.values() if row.usable(self._ends)}
+        tokens = {row.id: self._dated(row) for row in self._rows.values() if self._is_usable(row)}
         return [kept_by_api(row) for row in ({row.id: row for row in self._session_rows()} | tokens).values()]
 
     def usable_row(self, token_id: str) -> TokenRow | None:
         row = self._rows.get(token_id)
-        if row is not None and row.usable(self._ends):
+        if row is not None and self._is_usable(row):
             return row
         return next((row for row in self._session_rows() if row.id == token_id), None)
 
@@ -113,7 +115,7 @@ class TokenOrders:
             row, text = make_token(name, request.role, now=now, seconds=request.seconds)
         except BadTokenNameError as error:
             raise TokenRefusedError(str(error)) from error
-        self._keep(row)
+        self._keep({row: request.seconds})
         self._trail.happened(
             "token added",
             f"token {name} ({row.role}) was made",
@@ -145,11 +147,14 @@ class TokenOrders:
             self._require_room()
         row, text = make_token(name, last.role, now=now, seconds=seconds)
         until = now + request.grace
-        ended = [
-            one._replace(expires=min(one.expires, until)) if request.grace else one._replace(revoked=now)
-            for one in earlier
-        ]
-        self._keep(*ended, row)
+        left = {one: self._ends.left(TOKENS, one.id) or 0.0 for one in earlier}
+        ended = {
+            one._replace(expires=min(one.expires, until))
+            if request.grace
+            else one._replace(revoked=now): min(seconds_left, request.grace)
+            for one, seconds_left in left.items()
+        }
+        self._keep(ended | {row: seconds})
         self._trail.happened(
             "token rotated",
             f"token {name} ({row.role}) was rotated",
@@ -166,7 +171,7 @@ class TokenOrders:
             await self._store.settled()
         except StoreError:
             if self._rows[row.id] is row:  # not revoked since
-                self._keep(*earlier)
+                self._keep(left)
                 self._end(row, who, "was not rotated; the earlier ones stay valid")
             raise
         finally:
@@ -181,7 +186,7 @@ class TokenOrders:
 
     def _end(self, row: TokenRow, who: str, reason: str = "was revoked") -> TokenRow:
         revoked = row._replace(revoked=clock.wall())
-        self._keep(revoked)
+        self._keep({revoked: 0.0})
         self._trail.happened(
             "token revoked",
             f"token {row.name} ({row.role}) {reason}",
@@ -192,28 +197,52 @@ class TokenOrders:
         return revoked
 
     def _named(self, name: str) -> list[TokenRow]:
-        return [row for row in self._rows.values() if row.name == name and row.usable(self._ends)]
+        return [row for row in self._rows.values() if row.name == name and self._is_usable(row)]
 
     def _require_named(self, name: str) -> list[TokenRow]:
         found = self._named(name)
         if not found:
-            names = {row.name for row in self._rows.values() if row.usable(self._ends)}
+            names = {row.name for row in self._rows.values() if self._is_usable(row)}
             known = ", ".join(sorted(names)) or "none"
             raise TokenRefusedError(f"there is no token {name[:80]!r} that is valid; there are: {known}")
         return found
 
     def _require_room(self) -> None:
-        if sum(row.usable(self._ends) for row in self._rows.values()) >= _MOST:
+        if sum(self._is_usable(row) for row in self._rows.values()) >= _MOST:
             raise TokenRefusedError(f"there are {_MOST} tokens already: revoke some")
 
-    def _keep(self, *rows: TokenRow) -> None:
+    def _keep(self, rows: Mapping[TokenRow, float]) -> None:
+        """Store tokens with the seconds that each has left; after a crash, either all are stored or none.
+
+        A new token's end is stored before it, and the nearer end of an earlier one after it.
+        """
+        new = [row for row in rows if row.id not in self._rows]
         self._rows |= {row.id: row for row in rows}
-        self.usable()
-        self._store.save_tokens(*rows)
+        with self._store.database.together():
+            for row in new:
+                self._ends.set(TOKENS, row.id, rows[row])
+            self._store.save_tokens(*rows)
+            for row, seconds in rows.items():
+                if row.revoked is None:
+                    self._ends.set(TOKENS, row.id, seconds)
+                else:
+                    self._ends.forget(TOKENS, row.id)
         self._changed()
 
+    def _due(self, ended: list[str]) -> None:
+        self._ends.forget(TOKENS, *ended)
+        self._changed()
+
+    def _is_usable(self, row: TokenRow) -> bool:
+        return row.revoked is None and not self._ends.passed(TOKENS, row.id)
+
+    def _dated(self, row: TokenRow) -> TokenRow:
+        """Return the token with its end by the present system clock."""
+        date = self._ends.date(TOKENS, row.id)
+        return row if date is None or abs(date - row.expires) < _SAME_DATE else row._replace(expires=date)
+
     def _shown(self, row: TokenRow) -> answers.Token:
-        return answers.Token(*_fields(row), self._uses.get(row.id), row.usable(self._ends))
+        return answers.Token(*_fields(self._dated(row)), self._uses.get(row.id), self._is_usable(row))
 
 
 def _require_lifetime(seconds: float) -> None:

@@ -4,9 +4,8 @@ silences.
 
 from collections.abc import Callable
 
-from appliance.base import clock
 from appliance.channel.alarms import AlarmList, activity, open_alarms
-from appliance.channel.answers.status import HandledAlarm, Status
+from appliance.channel.answers.status import Status
 from appliance.control.errors import SenselessError, UnknownThingError
 from appliance.control.operators.handled_alarms import HandledAlarms
 from appliance.control.operators.request_method import RequestMethod
@@ -44,7 +43,7 @@ class AlarmOrders:
 
     async def acknowledge(self, request: AlarmAcknowledge, who: str) -> AlarmList:
         self._must_be_present(request.kind)
-        self._handled.put(HandledAlarm(request.kind, who, clock.wall(), None, request.note))
+        self._handled.acknowledge(request.kind, who, request.note)
         self._record("alarm acknowledged", f"{request.kind} is acknowledged", request.kind, who, request.note)
         return self._list()
 
@@ -58,15 +57,14 @@ class AlarmOrders:
         if not 1 <= seconds <= LONGEST_SILENCE_SECONDS:
             raise SenselessError(f"silence an alarm for 1 to {LONGEST_SILENCE_SECONDS:.0f} seconds")
         self._must_be_present(kind)
-        now = clock.wall()
-        self._handled.put(HandledAlarm(kind, who, now, now + seconds, request.note))
+        until = self._handled.silence(kind, who, request.note, seconds)
         self._record(
             "alarm silenced",
             f"{kind} is silenced for {seconds:.0f} s",
             kind,
             who,
             request.note,
-            until=now + seconds,
+            until=until,
         )
         return self._list()
 

@@ -33,6 +33,7 @@ from appliance.master.endpoints.host_signs import HostSigns
 from appliance.policy.model import Address, Category, Decision, Request, address_of
 from appliance.policy.policy import Policy
 from appliance.policy.rights import Right, decide_right
+from appliance.store.ends import Ends
 from appliance.telemetry.audit_trail import NOT_RECORDED, Asker, AuditTrail
 
 CHECK_SECONDS = 0.25
@@ -55,6 +56,7 @@ class ApprovalOrders:
         trail: AuditTrail,
         signs: HostSigns,
         stop: MotionStop,
+        ends: Ends,
         *,
         first: int,
         decide_again: Callable[[], int],
@@ -71,7 +73,7 @@ class ApprovalOrders:
         self._carried_out = carried_out
         self._bearers = bearers
         self._guards = guards
-        self._table = ApprovalTable(first)
+        self._table = ApprovalTable(first, ends)
         self._unanswered: list[float] = []
         self._cut_off: list[ApprovalEntry] = []  # by a change of the policy
         self._moved: dict[int, float] = {}  # of leases: the last message, even after its publisher ended
@@ -136,7 +138,7 @@ class ApprovalOrders:
                 return f"not held: {held}; ask the operator about those first"
             entry = held
             self._record("approval wanted", entry, f"waits for approval {entry.number}")
-        left = max(1, round(entry.until - now))
+        left = max(1, round(self._table.seconds_left(entry)))
         if entry.state is ApprovalState.REFUSED:
             return f"an operator refused approval {entry.number}; ask again in {left} s"
         return f"held for approval {entry.number}; ask the operator, then repeat; expires in {left} s"
@@ -145,7 +147,7 @@ class ApprovalOrders:
 
     async def listed(self, _request: requests.ApprovalsWanted) -> requests.Approvals:
         return requests.Approvals(
-            [_shown(one) for one in sorted(self._table.entries(), key=lambda e: e.number)]
+            [self._shown(one) for one in sorted(self._table.entries(), key=lambda e: e.number)]
         )
 
     async def approve(self, request: requests.ApproveCall, who: str) -> requests.Approval:
@@ -174,7 +176,7 @@ class ApprovalOrders:
         self._record("approval given", entry, f"{who} gave approval {entry.number}, {what}", who=who)
         if self._enforce():
             await self._carried_out({entry.call.resource})
-        return _shown(entry)
+        return self._shown(entry)
 
     async def refuse(self, request: requests.RefuseCall, who: str) -> requests.Approval:
         """Refuse a held call, or end an approval. A refused call is not held again until its entry expires."""
@@ -184,10 +186,10 @@ class ApprovalOrders:
             self._end(entry, f"{who} ended it", who)
             self._enforce()
             await self._stop_motion(entry)
-            return _shown(replace(entry, state=ApprovalState.REFUSED, until=clock.now(), who=who))
-        entry = self._table.refuse(entry, who, clock.now())
+            return self._shown(replace(entry, state=ApprovalState.REFUSED, who=who))
+        entry = self._table.refuse(entry, who)
         self._record("approval refused", entry, f"{who} refused approval {entry.number}", who=who)
-        return _shown(entry)
+        return self._shown(entry)
 
     # --- the end of approvals ---
 
@@ -239,7 +241,7 @@ class ApprovalOrders:
 
     def _ended(self, entry: ApprovalEntry, approvers: Mapping[str, str]) -> str:
         approved = entry.state is ApprovalState.APPROVED
-        if entry.until <= clock.now():
+        if not self._table.seconds_left(entry):
             return "its time is over" if approved else "no operator answered in time"
         if approved and entry.credentials.isdisjoint(approvers):
             return f"{entry.who}, who approved it, no longer has a token or session with the role operator"
@@ -278,7 +280,7 @@ class ApprovalOrders:
         return self._moved[entry.number]
 
     def _end(self, entry: ApprovalEntry, reason: str, who: str = "") -> None:
-        if entry.state is ApprovalState.WAITS and entry.until <= clock.now():
+        if entry.state is ApprovalState.WAITS and not self._table.seconds_left(entry):
             self._unanswered.append(clock.now())
             self._table.end_unanswered(entry)
         self._table.end(entry)
@@ -322,7 +324,7 @@ class ApprovalOrders:
 
     def _entry(self, number: int) -> ApprovalEntry:
         entry = self._table.entry(number)
-        if entry is None or entry.until <= clock.now():
+        if entry is None or not self._table.seconds_left(entry):
             raise UnknownThingError(
                 f"no call has the approval number {number}, or its {WAIT_SECONDS:g} s have passed: rosrv approve"
                 " lists all"
@@ -344,20 +346,19 @@ class ApprovalOrders:
             who=who,
         )
 
-
-def _shown(entry: ApprovalEntry) -> requests.Approval:
-    call = entry.call
-    return requests.Approval(
-        entry.number,
-        "lease" if entry.lease else entry.state.value,
-        str(call.host),
-        entry.caller_id,
-        call.category.value,  # type: ignore[arg-type]  # only these categories ask
-        call.resource,
-        entry.type,
-        call.digest,
-        entry.arguments.hex(),
-        entry.size,
-        round(max(0.0, entry.until - clock.now()), 1),
-        entry.who,
-    )
+    def _shown(self, entry: ApprovalEntry) -> requests.Approval:
+        call = entry.call
+        return requests.Approval(
+            entry.number,
+            "lease" if entry.lease else entry.state.value,
+            str(call.host),
+            entry.caller_id,
+            call.category.value,  # type: ignore[arg-type]  # only these categories ask
+            call.resource,
+            entry.type,
+            call.digest,
+            entry.arguments.hex(),
+            entry.size,
+            round(self._table.seconds_left(entry), 1),
+            entry.who,
+        )

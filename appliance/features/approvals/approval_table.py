@@ -1,4 +1,4 @@
-"""Keep the calls that wait for an approval, and the approvals. Times are monotonic seconds.
+"""Keep the calls that wait for an approval, and the approvals.
 
 1. A call has one number while it waits, however often its host repeats it. If no operator answered, its repetition
    keeps the number: the operator may have it from the agent. A call with other arguments is another call.
@@ -17,8 +17,10 @@ from appliance.features.approvals.quotas import APPROVALS
 from appliance.policy.model import Address, Category
 from appliance.policy.policy import Approval, Policy
 from appliance.quotas.pool import Pool, QuotaClass
+from appliance.store.ends import EndKind, Ends
 
 _MOST_UNANSWERED = 256
+APPROVING = EndKind("approval", stored=False)
 WAIT_SECONDS = 120.0
 """How long a call waits for an answer, and how long an approval of one call can be used."""
 
@@ -71,10 +73,10 @@ class ApprovalEntry:
     """The first bytes of the arguments; `size` is the length of all of them."""
     size: int
     since: float
-    until: float
+    """Monotonic seconds."""
     state: ApprovalState = ApprovalState.WAITS
     once: bool = False
-    """An approval is for one call; otherwise it is a lease for all calls of this host and name until `until`."""
+    """An approval is for one call; otherwise it is a lease for all calls of this host and name until its end."""
     who: str = ""
     credentials: frozenset[str] = frozenset()
     """The ids of the approver's tokens and sessions; the approval ends with the last of them."""
@@ -87,8 +89,9 @@ class ApprovalEntry:
 class ApprovalTable:
     """The held calls and approvals; the first entry has the number `first`."""
 
-    def __init__(self, first: int) -> None:
+    def __init__(self, first: int, ends: Ends) -> None:
         self._next = first
+        self._ends = ends
         self._entries: dict[int, ApprovalEntry] = {}
         self._by_call: dict[HeldCall, int] = {}
         self._unanswered: OrderedDict[HeldCall, int] = OrderedDict()  # their numbers, oldest first
@@ -124,11 +127,9 @@ class ApprovalTable:
         if refusal := self.pool.take(charged):
             return refusal
         number = self._unanswered.pop(call, 0) or self._next
-        entry = ApprovalEntry(
-            number, call, charged, caller_id, type_, arguments, size, now, now + WAIT_SECONDS
-        )
+        entry = ApprovalEntry(number, call, charged, caller_id, type_, arguments, size, now)
         self._next = max(self._next, number + 1)
-        return self._put(entry)
+        return self._put(entry, WAIT_SECONDS)
 
     def approve(
         self,
@@ -140,7 +141,7 @@ class ApprovalTable:
         credentials: frozenset[str],
     ) -> ApprovalEntry:
         """Approve one call (`seconds` is None), or all calls of its key for some seconds."""
-        call, until = entry.call, now + (WAIT_SECONDS if seconds is None else seconds)
+        call = entry.call
         if seconds is not None and call.digest:
             call = call._replace(digest="")
             if (other := self._by_call.get(call)) is not None:
@@ -151,16 +152,19 @@ class ApprovalTable:
                 entry,
                 call=call,
                 since=entry.since if entry.lease else now,
-                until=until,
                 state=ApprovalState.APPROVED,
                 once=seconds is None,
                 who=who,
                 credentials=credentials,
-            )
+            ),
+            WAIT_SECONDS if seconds is None else seconds,
         )
 
-    def refuse(self, entry: ApprovalEntry, who: str, now: float) -> ApprovalEntry:
-        return self._put(replace(entry, until=now + WAIT_SECONDS, state=ApprovalState.REFUSED, who=who))
+    def refuse(self, entry: ApprovalEntry, who: str) -> ApprovalEntry:
+        return self._put(replace(entry, state=ApprovalState.REFUSED, who=who), WAIT_SECONDS)
+
+    def seconds_left(self, entry: ApprovalEntry) -> float:
+        return self._ends.left(APPROVING, str(entry.number)) or 0.0
 
     def end_unanswered(self, entry: ApprovalEntry) -> None:
         """End a call that no operator answered, and keep its number for a repetition."""
@@ -177,6 +181,7 @@ class ApprovalTable:
     def end(self, entry: ApprovalEntry) -> None:
         if self._entries.pop(entry.number, None) is not None:
             self._by_call.pop(entry.call, None)
+            self._ends.forget(APPROVING, str(entry.number))
             self.pool.give_back(entry.charged)
 
     def approved(self) -> frozenset[Approval]:
@@ -187,7 +192,8 @@ class ApprovalTable:
             if entry.lease and entry.call.category is not Category.CALL
         )
 
-    def _put(self, entry: ApprovalEntry) -> ApprovalEntry:
+    def _put(self, entry: ApprovalEntry, seconds: float) -> ApprovalEntry:
+        self._ends.set(APPROVING, str(entry.number), seconds)
         self._entries[entry.number] = entry
         self._by_call[entry.call] = entry.number
         return entry

@@ -33,6 +33,7 @@ async def inherit(base: "Foundation", parts: "Parts") -> FeaturePart:
         base.trail,
         host_signs(parts.core.registry, parts.core.carried),
         stop,
+        base.ends,
         first=10_000 + secrets.randbelow(80_000),
         decide_again=base.policies.decide_again,
         carried_out=relay.carried_out,

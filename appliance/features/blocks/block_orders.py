@@ -1,6 +1,5 @@
 """Block hosts, and lift blocks on order or when their time ends. Withdrawn registrations then return."""
 
-import asyncio
 import contextlib
 import ipaddress
 import socket
@@ -9,11 +8,12 @@ from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping
 
 from msgspec.structs import asdict, replace
 
+from appliance.base import clock
 from appliance.base.counted import counted
 from appliance.base.withdrawal import caller_host, take_effect
 from appliance.control.assembly.assembly import Parts
 from appliance.control.assembly.foundation import Foundation
-from appliance.control.assembly.host_blocks import BlockTable
+from appliance.control.assembly.host_blocks import BLOCKS, BlockTable
 from appliance.control.assembly.policies import Policies
 from appliance.control.errors import SenselessError, UnknownThingError
 from appliance.control.operators.overview import hosts_connected
@@ -31,6 +31,7 @@ from appliance.policy.host_names import HostNames, UnknownHostNameError
 from appliance.policy.live_rights import LiveRight
 from appliance.policy.model import Address, address_of
 from appliance.rpc.front import plain_address
+from appliance.store.ends import Ends
 from appliance.store.host_tables import HostBlockRow
 from appliance.store.state_file import StateStore
 from appliance.store.writer_thread import StoreError
@@ -41,7 +42,6 @@ _LONGEST_NOTE = 200
 _LONGEST_NAME = 300
 _MOST_NAMED = 5
 _FEW = 10  # registrations: two nodes; a robot has more
-_LOOK_SECONDS = 10.0  # the timer does not count while the machine is suspended; the age clock does
 _REGISTERED = {
     "registerPublisher": "publications",
     "registerSubscriber": "subscriptions",
@@ -56,6 +56,7 @@ async def inherit(base: Foundation, parts: Parts) -> FeaturePart:
         base.policies,
         base.store,
         base.trail,
+        base.ends,
         live=parts.core.revocation.live,
         connected=lambda: hosts_connected(parts),
         enrolled=lambda: {
@@ -72,7 +73,6 @@ async def inherit(base: Foundation, parts: Parts) -> FeaturePart:
             RequestMethod(HostUnblock, orders.unblock, who=True),
             RequestMethod(HostBlocks, orders.listed, order=False),
         ),
-        work={"the blocks of hosts": orders.watch},
     )
 
 
@@ -85,6 +85,7 @@ class BlockOrders:
         policies: Policies,
         store: StateStore,
         trail: AuditTrail,
+        ends: Ends,
         *,
         live: Callable[[], list[LiveRight]],  # the rights that a change of the policy may end
         connected: Callable[[], Iterable[Collection[str]]],  # the two hosts of each connection
@@ -103,11 +104,9 @@ class BlockOrders:
         self._enrolled = enrolled
         self._remotes = remotes
         self._carried_out = carried_out
-        self._clock_reads = asyncio.Lock()
-        self._changed = asyncio.Event()
+        ends.when_due(BLOCKS, self._due)
 
     async def listed(self, _request: HostBlocks) -> requests.BlockedHosts:
-        await self._read_clock()
         return requests.BlockedHosts([self._row(row) for row in self._blocks.rows().values()])
 
     async def block(self, request: HostBlock, who: str) -> requests.HostBlocked:
@@ -115,7 +114,6 @@ class BlockOrders:
         _require_sensible(request)
         if str(address) not in self._enrolled().values():
             _require_possible(address)
-        await self._read_clock()
         before = self._held_by(address)
         if not request.force:
             self._require_not_the_robot(address, before)
@@ -125,12 +123,12 @@ class BlockOrders:
             raise HostRefusedError(f"{MOST} hosts are blocked, the limit: lift a block (rosrv host blocks)")
         replaced = None if earlier is None else self._row(earlier)
         if request.dry_run:
-            return self._answer(
-                self._blocks.planned(address, request.for_seconds, who, request.note), before, replaced
-            )
+            planned = HostBlockRow(str(address), clock.wall(), who, request.note)
+            until = None if request.for_seconds is None else planned.since + request.for_seconds
+            return self._answer(replace(self._row(planned), until=until), before, replaced)
         take_effect()
         row = self._blocks.put(address, seconds=request.for_seconds, who=who, note=request.note)
-        self._apply()
+        self._policies.decide_again()
         # The relays report later that they closed the connections.
         ended = replace(
             _difference(before, self._held_by(address)), connections=before.connections, uses=before.uses
@@ -156,20 +154,17 @@ class BlockOrders:
                 f"{address} is blocked now, but a stop of the appliance ends it: {error}"
             ) from error
         await self._carried_out()
-        return self._answer(row, ended, replaced)
+        return self._answer(shown, ended, replaced)
 
     def _answer(
-        self, row: HostBlockRow, ended: requests.BlockEnded, replaced: requests.BlockedHost | None
+        self, row: requests.BlockedHost, ended: requests.BlockEnded, replaced: requests.BlockedHost | None
     ) -> requests.HostBlocked:
         knows = self._policies.current.knows
         others = sorted(other for other in self._same_machine(row.address) if knows(address_of(other)))
-        return requests.HostBlocked(
-            **asdict(self._row(row)), ended=ended, replaced=replaced, other_addresses=others
-        )
+        return requests.HostBlocked(**asdict(row), ended=ended, replaced=replaced, other_addresses=others)
 
     async def unblock(self, request: HostUnblock, who: str) -> requests.HostUnblocked:
         address = self._address(request.address)
-        await self._read_clock()
         earlier = self._blocks.rows().get(address)
         if earlier is None:
             raise UnknownThingError(f"{address} is not blocked: `rosrv host blocks` lists the blocked hosts")
@@ -188,20 +183,9 @@ class BlockOrders:
         await self._carried_out()
         return requests.HostUnblocked(**asdict(shown), restored=restored)
 
-    async def watch(self) -> None:
-        while True:
-            self._changed.clear()
-            await self._read_clock()
-            self._end_due()
-            left = self._blocks.seconds_left()
-            with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(None if left is None else min(left, _LOOK_SECONDS)):
-                    await self._changed.wait()
-
-    def _end_due(self) -> None:
-        rows, due = self._blocks.rows(), self._blocks.due()
-        if not due:
-            return
+    def _due(self, ended: list[str]) -> None:
+        rows = self._blocks.rows()
+        due = [address for address in map(address_of, ended) if address in rows]
         self._lift(due)
         for address in due:
             self._trail.happened(
@@ -217,16 +201,8 @@ class BlockOrders:
         before = self._registrations()
         for address in addresses:
             self._blocks.take(address)
-        self._apply()
-        return self._registrations() - before
-
-    def _apply(self) -> None:
         self._policies.decide_again()
-        self._changed.set()
-
-    async def _read_clock(self) -> None:
-        async with self._clock_reads:
-            await asyncio.to_thread(self._blocks.read_clock)
+        return self._registrations() - before
 
     # --- what may be blocked ---
 

@@ -27,7 +27,6 @@ from appliance.features.feature import FeaturePart
 from appliance.policy.model import address_of
 from appliance.store.door_tables import DoorRow, TicketRow
 from appliance.store.state_file import StateStore
-from appliance.store.stored_deadlines import StoredDeadlines
 
 _LOOK_SECONDS = 1.0
 _RETRY_SECONDS = 10
@@ -49,9 +48,8 @@ async def inherit(base: Foundation, parts: Any) -> FeaturePart:
     kept = base.features.kept["doors"]
     assert isinstance(kept, KeptDoors)  # noqa: S101  `keep` made it
     table = kept.table
-    ends = StoredDeadlines(base.store)
-    tickets = DoorTickets(base.store, ends)
-    visits = DoorVisits(lambda: {row.id: row.name for row in base.features.bearers()()})
+    tickets = DoorTickets(base.store, base.ends)
+    visits = DoorVisits(base.ends, lambda: {row.id: row.name for row in base.features.bearers()()})
     processes = DoorProcesses(
         base,
         table,
@@ -69,7 +67,7 @@ async def inherit(base: Foundation, parts: Any) -> FeaturePart:
         limits=orders.limits,
         status_fields=orders.state,
         connected=orders.enter,
-        work={"the doors": orders.watch, "the ends of tickets of doors": ends.watch},
+        work={"the doors": orders.watch},
     )
 
 
@@ -235,7 +233,6 @@ class DoorOrders:
                 for row in [one for one in self._table.live() if one.name == name]:
                     self._processes.end_ticket(row, ticket)
             if number % _RETRY_SECONDS == 0:
-                self._tickets.valid()
                 with contextlib.suppress(OSError):
                     self._processes.retry()
 

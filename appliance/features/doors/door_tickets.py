@@ -1,7 +1,7 @@
 """Tickets that open a door. A viewer carries nothing but a URL, so the ticket is part of the URL.
 
 A ticket is `ID.SECRET`: 48 bits that name it in records, and 256 random bits, which cannot be guessed, so a fast hash
-is stored. Neither a step of the clock nor a restart gives it more time (`StoredDeadlines`).
+is stored.
 """
 
 import hashlib
@@ -12,30 +12,34 @@ from collections.abc import Collection, Mapping
 
 from appliance.base import clock
 from appliance.base.actors import OPERATOR
-from appliance.base.deadlines import Deadlines
 from appliance.control.errors import SenselessError
 from appliance.store.door_tables import TicketRow
+from appliance.store.ends import EndKind, Ends
 from appliance.store.state_file import StateStore
 
 _FORM = re.compile(r"([0-9a-f]{12})\.([A-Za-z0-9_-]{43})", re.ASCII)
 _MOST = 1000
+TICKETS = EndKind("door ticket")
 LONGEST_SECONDS = 30 * 86_400.0
 
 
 class DoorTickets:
     """All tickets that have not ended."""
 
-    def __init__(self, store: StateStore, ends: Deadlines) -> None:
+    def __init__(self, store: StateStore, ends: Ends) -> None:
         self._store = store
         self._ends = ends
         self._rows = {row.id: row for row in store.doors.tickets()}
-        self.valid()  # from now on, no step of the clock postpones an end
+        ends.when_due(TICKETS, self._due)
 
     def valid(self, door: str | None = None) -> list[TicketRow]:
-        for row in [*self._rows.values()]:
-            if self._ends.passed(row.id, row.expires):
-                self._forget(row.id)
-        return [row for row in self._rows.values() if door in (None, row.door)]
+        """Return the tickets that have not ended, with their ends by the present system clock."""
+        self._due([ticket for ticket in self._rows if self._ends.passed(TICKETS, ticket)])
+        return [
+            row._replace(expires=self._ends.date(TICKETS, row.id) or row.expires)
+            for row in self._rows.values()
+            if door in (None, row.door)
+        ]
 
     def make(self, door: str, seconds: float, who: str) -> tuple[TicketRow, str]:
         """Return a new ticket and its text, which is stored nowhere."""
@@ -45,26 +49,26 @@ class DoorTickets:
             raise SenselessError(f"there are {_MOST} tickets, the limit: wait until some end")
         row, text = new_ticket(door, seconds, who)
         self._rows[row.id] = row
-        self._ends.passed(row.id, row.expires)
-        self._store.doors.save_tickets(row)
+        with self._store.database.together():
+            self._ends.set(TICKETS, row.id, seconds)
+            self._store.doors.save_ticket(row)
         return row, text
 
     def find(self, door: str, text: str) -> TicketRow | None:
         row = shown(text, self._rows)
-        return None if row is None or row.door != door or self._ends.passed(row.id, row.expires) else row
+        return None if row is None or row.door != door or self._ends.passed(TICKETS, row.id) else row
 
     def ended(self, ticket: str) -> bool:
-        row = self._rows.get(ticket)
-        return row is None or self._ends.passed(row.id, row.expires)
+        return ticket not in self._rows or self._ends.passed(TICKETS, ticket)
 
     def forget(self, door: str) -> None:
-        for row in self.valid(door):
-            self._forget(row.id)
+        self._due([row.id for row in self.valid(door)])
 
-    def _forget(self, ticket: str) -> None:
-        del self._rows[ticket]
-        self._store.doors.forget_ticket(ticket)
-        self._ends.forget(ticket)
+    def _due(self, ended: list[str]) -> None:
+        for ticket in ended:
+            if self._rows.pop(ticket, None) is not None:
+                self._store.doors.forget_ticket(ticket)
+        self._ends.forget(TICKETS, *ended)
 
 
 def new_ticket(door: str, seconds: float, who: str) -> tuple[TicketRow, str]:

@@ -7,11 +7,13 @@ had. A person has at most `_MOST_OF_PERSON` visits; beyond them, a new visit end
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from appliance.base import clock
 from appliance.features.doors.door_tickets import new_ticket, shown
 from appliance.store.door_tables import TicketRow
+from appliance.store.ends import EndKind, Ends
 
 _OPEN_SECONDS = 60.0
+VISITS = EndKind("door visit", stored=False)
+"""Visits whose ticket is not used yet."""
 _MOST_OF_PERSON = 8
 
 
@@ -19,24 +21,26 @@ _MOST_OF_PERSON = 8
 class _Visit:
     row: TicketRow
     credentials: frozenset[str]
-    until: float | None  # seconds since the boot, until the ticket is used
+    used: bool = False
     over: bool = False
 
 
 class DoorVisits:
     """All visits. `bearers()` returns the names of the usable tokens and sessions by their ids."""
 
-    def __init__(self, bearers: Callable[[], Mapping[str, str]]) -> None:
+    def __init__(self, ends: Ends, bearers: Callable[[], Mapping[str, str]]) -> None:
+        self._ends = ends
         self._bearers = bearers
         self._visits: dict[str, _Visit] = {}
 
-    def make(self, door: str, who: str) -> tuple[TicketRow, str]:
+    def make(self, door: str, who: str, seconds: float = _OPEN_SECONDS) -> tuple[TicketRow, str]:
         own = [one for one in self._visits.values() if one.row.who == who and not one.over]
         for visit in own[: max(0, len(own) + 1 - _MOST_OF_PERSON)]:
             visit.over = True
-        row, text = new_ticket(door, _OPEN_SECONDS, who)
+        row, text = new_ticket(door, seconds, who)
         credentials = frozenset(number for number, name in self._bearers().items() if name == who)
-        self._visits[row.id] = _Visit(row, credentials, clock.since_boot() + _OPEN_SECONDS)
+        self._visits[row.id] = _Visit(row, credentials)
+        self._ends.set(VISITS, row.id, seconds)
         return row, text
 
     def find(self, door: str, text: str) -> TicketRow | None:
@@ -44,7 +48,8 @@ class DoorVisits:
         return None if row is None or row.door != door or not self._may_open(self._visits[row.id]) else row
 
     def opened(self, ticket: str) -> None:
-        self._visits[ticket].until = None
+        self._visits[ticket].used = True
+        self._ends.forget(VISITS, ticket)
 
     def left(self, door: str, ticket: str) -> None:
         visit = self._visits.get(ticket)
@@ -65,18 +70,17 @@ class DoorVisits:
         ended = [
             one
             for one in self._visits.values()
-            if one.over
-            or one.credentials.isdisjoint(bearers)
-            or (one.until is not None and not self._may_open(one))
+            if one.over or one.credentials.isdisjoint(bearers) or (not one.used and not self._may_open(one))
         ]
         for visit in ended:
             del self._visits[visit.row.id]
+            self._ends.forget(VISITS, visit.row.id)
         return [visit.row for visit in ended]
 
     def _may_open(self, visit: _Visit) -> bool:
         return (
-            visit.until is not None
+            not visit.used
             and not visit.over
-            and clock.since_boot() < visit.until
+            and not self._ends.passed(VISITS, visit.row.id)
             and not visit.credentials.isdisjoint(self._bearers())
         )

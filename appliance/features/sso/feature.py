@@ -57,7 +57,7 @@ def _operate(context: OperatorContext) -> FeaturePart:
     from appliance.features.sso.orders import SsoOrders  # noqa: PLC0415  as above
 
     configured = _configured(context.core.sections)
-    orders = SsoOrders(context.core.trail, context.tokens_changed, configured=configured)
+    orders = SsoOrders(context.core.trail, context.ends, context.tokens_changed, configured=configured)
     return FeaturePart(
         {ROLE: (orders.link, SsoLink)},
         methods=(

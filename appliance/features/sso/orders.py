@@ -17,6 +17,7 @@ from appliance.features.sso.link import (
     SignOnWanted,
 )
 from appliance.features.sso.sessions import SessionTable
+from appliance.store.ends import Ends
 from appliance.telemetry.audit_trail import AuditTrail
 
 M = TypeVar("M", bound=messages.Message)
@@ -26,9 +27,11 @@ _TEXT = 500
 class SsoOrders:
     """Answers operators and browsers. `changed()` is called when the usable sessions have changed."""
 
-    def __init__(self, trail: AuditTrail, changed: Callable[[], None], *, configured: bool) -> None:
+    def __init__(
+        self, trail: AuditTrail, ends: Ends, changed: Callable[[], None], *, configured: bool
+    ) -> None:
         self.link = Link(self._received)
-        self.sessions = SessionTable()
+        self.sessions = SessionTable(ends, changed)
         self._trail = trail
         self._changed = changed
         self._configured = configured

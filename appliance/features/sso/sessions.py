@@ -1,12 +1,11 @@
 """Keep the sessions of people in memory.
 
 1. Sessions are never stored. A restart with changed roles, and a takeover, end all of them.
-2. A session ends by the system time or by the time since the boot, whichever is earlier, so a step back of the
-   clock postpones no end.
-3. A name in the audit log means one person at a time: while a person is signed in, another `sub` with this name
+2. A name in the audit log means one person at a time: while a person is signed in, another `sub` with this name
    is refused. A sign-on with changed rights ends the person's earlier sessions.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 from appliance.base import clock
@@ -17,7 +16,9 @@ from appliance.features.sso.link import SessionKeys, SignedInPerson
 from appliance.features.sso.quotas import SESSIONS
 from appliance.signing.request_signing import TokenKeys
 from appliance.store.access_tokens import TokenRow
+from appliance.store.ends import EndKind, Ends
 
+ONLINE = EndKind("session", stored=False)
 _PREFIX = "sso:"  # no token has such a name
 _MOST, _MOST_OF_PERSON = SESSIONS.bounds.whole, SESSIONS.bounds.host
 
@@ -25,13 +26,15 @@ _MOST, _MOST_OF_PERSON = SESSIONS.bounds.whole, SESSIONS.bounds.host
 class _Kept(NamedTuple):
     session: Session
     row: TokenRow
-    until: float  # seconds since the boot
 
 
 class SessionTable:
-    """All sessions, oldest first."""
+    """All sessions, oldest first. `changed()` is called when some have ended by themselves."""
 
-    def __init__(self) -> None:
+    def __init__(self, ends: Ends, changed: Callable[[], None]) -> None:
+        self._ends = ends
+        self._changed = changed
+        ends.when_due(ONLINE, self._due)
         self._kept: dict[str, _Kept] = {}
 
     def rows(self) -> list[TokenRow]:
@@ -59,8 +62,7 @@ class SessionTable:
         ended += staying[: max(0, len(staying) + 1 - _MOST_OF_PERSON)]
         if len(present) - len(ended) >= _MOST:
             raise TokenRefusedError(f"{_MOST} people's sessions are open: end some (rosrv sso end NAME)")
-        for one in ended:
-            del self._kept[one.id]
+        self._drop(*(one.id for one in ended))
         session = Session(
             keys.id, name, identity.subject, identity.mail, identity.role, identity.doors, identity.ends
         )
@@ -76,14 +78,15 @@ class SessionTable:
             None,
             TokenKeys(keys.reading, keys.verifying),
         )
-        self._kept[keys.id] = _Kept(session, row, clock.since_boot() + identity.ends - now)
+        self._ends.set(ONLINE, keys.id, identity.ends - now)
+        self._kept[keys.id] = _Kept(session, row)
         return session, ended
 
     def end(self, session_id: str, who: str) -> Session:
         found = self.of(session_id)
         if found is None or found.name != who:
             raise UnknownThingError("this is not a session of yours")
-        del self._kept[session_id]
+        self._drop(session_id)
         return found
 
     def end_all(self, name: str) -> list[Session]:
@@ -92,15 +95,17 @@ class SessionTable:
         if not ended:
             names = ", ".join(sorted({one.name for one in self.sessions()})[:20]) or "none"
             raise UnknownThingError(f"no person is signed in as {name[:140]!r}; there are: {names}")
-        for one in ended:
-            del self._kept[one.id]
+        self._drop(*(one.id for one in ended))
         return ended
 
     def _usable(self) -> list[_Kept]:
-        wall, boot = clock.wall(), clock.since_boot()
-        self._kept = {
-            name: kept
-            for name, kept in self._kept.items()
-            if wall < kept.session.expires and boot < kept.until
-        }
-        return list(self._kept.values())
+        return [kept for name, kept in self._kept.items() if not self._ends.passed(ONLINE, name)]
+
+    def _due(self, ended: list[str]) -> None:
+        self._drop(*ended)
+        self._changed()
+
+    def _drop(self, *sessions: str) -> None:
+        for session in sessions:
+            self._kept.pop(session, None)
+        self._ends.forget(ONLINE, *sessions)

@@ -9,7 +9,6 @@ from appliance.control.assembly.host_authority import HostAuthority
 from appliance.features.standby.appliance_table import ApplianceTable
 from appliance.features.standby.replication import Pair, Replication, host_endpoint
 from appliance.features.standby.shared_authority import SharedAuthority
-from appliance.features.standby.stored_times import adopt_times
 from appliance.hosts.certificate_requests import Authority
 from appliance.hosts.host_table import HostTable
 from appliance.hosts.tunnel_state import Tunnels
@@ -29,7 +28,7 @@ class PairedRole(ActiveRole):
         self.name, self.address = pair.membership.name, pair.membership.fixed
         self.ports = pair.membership.port_ranges()
         self.robot = pair.membership.witness
-        self.took_over = pair.taken_over
+        self.took_over, self.away_seconds = pair.taken_over, pair.away_seconds
         self.api, self.pin = pair.api, pair.tunnels.pin
 
     @property
@@ -42,7 +41,7 @@ class PairedRole(ActiveRole):
     def before_answer(self) -> Callable[[], Awaitable[None]]:
         return self.replication.stored
 
-    def inherit(self, store: StateStore, age: Callable[[], int]) -> None:
+    def inherit(self, store: StateStore) -> None:
         pair, settings = self.pair, self._settings
         store.note_whole_parameters()
         self._replication = Replication(
@@ -53,7 +52,6 @@ class PairedRole(ActiveRole):
             taken_over=pair.taken_over,
             folder=settings.state / "control",
         )
-        adopt_times(store, pair, age)
 
     def host_authority(
         self, signer: Link, store: StateStore, trail: AuditTrail, table: HostTable

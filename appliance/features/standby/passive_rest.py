@@ -1,14 +1,16 @@
 """Serve the api of a standby: it knows the replicated tokens, and gets the same answers as the admin socket."""
 
 import asyncio
+import math
 import sqlite3
+from collections.abc import Mapping
 from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 
 import structlog
 
-from appliance.base.deadlines import Deadlines
+from appliance.base import clock
 from appliance.channel.admin import AdminAnswer, encode
 from appliance.channel.channel import Channel, ChannelFullError
 from appliance.channel.link import Link
@@ -22,10 +24,11 @@ from appliance.channel.messages.api import (
     TokensStated,
 )
 from appliance.control.operators.admin_socket import RequestHandler
-from appliance.control.operators.token_orders import kept_by_api
+from appliance.control.operators.token_orders import TOKENS, kept_by_api
 from appliance.control.rest.rest_proof import RequestAuthenticator, UnprovenError
 from appliance.signing.request_signing import TokenKeys
 from appliance.store.access_tokens import TokenRow
+from appliance.store.ends import replicated_ends
 
 _MOST_WAITING = 64
 _READ_SECONDS = 2.0
@@ -41,7 +44,8 @@ class ReplicatedTokens:
     def __init__(self, path: Path) -> None:
         self._path = path
         self._rows: dict[str, TokenRow] | None = None
-        self._ends = Deadlines()
+        self._ends: dict[str, tuple[int, float]] = {}  # by token: its stored end, and seconds since the boot
+        self._stated: object = None
         self.blocked: list[str] = []
         """The addresses that operators block."""
 
@@ -50,26 +54,40 @@ class ReplicatedTokens:
         return self._rows is not None
 
     def read(self) -> bool:
+        """Read the replica; return whether the api must be told."""
         with suppress(sqlite3.Error):  # no state yet
             with closing(sqlite3.connect(f"file:{self._path}?mode=ro", uri=True)) as connection:
                 connection.execute("BEGIN")  # one snapshot: keys and tokens of the same time
                 keys = {row[0]: TokenKeys(*row[1:]) for row in connection.execute("SELECT * FROM token_keys")}
                 found = connection.execute("SELECT * FROM token").fetchall()
-                blocked = [row[0] for row in connection.execute("SELECT address FROM host_block")]
-                self._ends.limit(dict(connection.execute("SELECT id, seconds FROM token_left")))
-            rows = {row[0]: TokenRow._make((*row, keys.get(row[0]))) for row in found}
-            changed = (rows, blocked) != (self._rows, self.blocked)
-            self._rows, self.blocked = rows, blocked
-            self.usable()  # from now on, no step of the clock postpones an end
-            return changed
+                self.blocked = [row[0] for row in connection.execute("SELECT address FROM host_block")]
+                left = replicated_ends(connection, TOKENS)
+            self._rows = {row[0]: TokenRow._make((*row, keys.get(row[0]))) for row in found}
+            if left is None:  # the active appliance has version 0.3.0
+                left = {row.id: (0, row.expires - clock.wall()) for row in self._rows.values()}
+            self._keep_ends(left)
+            before, self._stated = self._stated, ([*map(self.usable_row, self._rows)], self.blocked)
+            return before != self._stated
         return False
 
+    def _keep_ends(self, left: Mapping[str, tuple[int, float]]) -> None:
+        """Keep the earliest known time of each end: an older reading of the clocks gives a token no more time."""
+        ends, now = {}, clock.since_boot()
+        for name, (at, seconds) in left.items():
+            earlier = self._ends.get(name)
+            same = earlier is not None and earlier[0] == at
+            ends[name] = at, min(now + seconds, earlier[1] if earlier is not None and same else math.inf)
+        self._ends = ends
+
     def usable_row(self, token_id: str) -> TokenRow | None:
-        row = (self._rows or {}).get(token_id)
-        return row if row is not None and row.usable(self._ends) else None
+        row, end = (self._rows or {}).get(token_id), self._ends.get(token_id)
+        lasts = row is not None and row.revoked is None and end is not None and clock.since_boot() < end[1]
+        return row if lasts else None
 
     def usable(self) -> list[TokenKept]:
-        return [kept_by_api(row) for row in (self._rows or {}).values() if row.usable(self._ends)]
+        now = clock.wall() - clock.since_boot()
+        rows = filter(None, map(self.usable_row, self._rows or {}))
+        return [kept_by_api(row._replace(expires=now + self._ends[row.id][1])) for row in rows]
 
 
 class PassiveRest:

@@ -18,7 +18,6 @@ from appliance.features.standby.inheritance import StateCopies, inherited_state,
 from appliance.features.standby.paired_role import PairedRole
 from appliance.features.standby.replication import Pair
 from appliance.features.standby.standby_orders import ActiveAppliance, SingleAppliance, StandbyOrders
-from appliance.features.standby.stored_times import note_times
 from appliance.features.standby.takeover_check import lacking_room
 from appliance.features.standby.takeover_record import TakeoverRecorder
 
@@ -95,7 +94,6 @@ async def begin(base: Foundation, parts: Parts) -> FeaturePart:
     orders = StandbyOrders(active, base.trail)
     work: dict[str, Callable[[], Awaitable[None]]] = {
         "the replication": replication.run,
-        "the readings of the clocks": partial(note_times, base.store, pair, base.blocks.age_now),
         "the copies of monitors' state": copies.run,
         "the orders of the standby": partial(
             orders.obey, replication.switchover_wanted, replication.sender.refuse_switchover

@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from appliance.base import clock
-from appliance.base.deadlines import Deadlines
 from appliance.channel.messages import CertificateMade
 from appliance.features.tunnels import host_requests
 from appliance.features.tunnels.enrolment_tokens import EnrolmentTokens
@@ -23,6 +22,7 @@ from appliance.hosts.certificate_requests import AuthorityError
 from appliance.hosts.host_table import HostForbiddenError, HostRefusedError, HostTable
 from appliance.hosts.stored_authority import StoredAuthority
 from appliance.hosts.tunnel_state import Tunnels
+from appliance.store.ends import Ends
 from appliance.store.state_file import StateStore
 from appliance.store.writer_thread import StoreError
 from appliance.telemetry.audit_trail import AuditTrail
@@ -44,7 +44,7 @@ class Certification:
         appliances: Appliances,
         master_port: int,
         rest: RestAddress,
-        ends: Deadlines,
+        ends: Ends,
         changed: Callable[[], int],
     ) -> None:
         self.store = store

@@ -10,7 +10,6 @@ from appliance.features.tunnels import host_requests
 from appliance.features.tunnels.certification import Certification
 from appliance.features.tunnels.enrolment import HostEnrolment, find_endpoint
 from appliance.features.tunnels.rest_address import rest_address
-from appliance.store.stored_deadlines import StoredDeadlines
 
 
 def machines(base: Foundation, parts: Parts) -> dict[str, int]:
@@ -21,7 +20,7 @@ def machines(base: Foundation, parts: Parts) -> dict[str, int]:
 
 
 async def inherit(base: Foundation, parts: Parts) -> FeaturePart:
-    settings, ends = base.settings, StoredDeadlines(base.store)
+    settings = base.settings
     certification = Certification(
         base.store,
         base.trail,
@@ -31,7 +30,7 @@ async def inherit(base: Foundation, parts: Parts) -> FeaturePart:
         appliances=base.host_authority.appliances,
         master_port=settings.listen_address[1],
         rest=rest_address(settings),
-        ends=ends,
+        ends=base.ends,
         changed=base.policies.hosts_changed,
     )
     hosts = HostEnrolment(
@@ -60,8 +59,5 @@ async def inherit(base: Foundation, parts: Parts) -> FeaturePart:
             RequestMethod(host_requests.AuthorityWanted, certification.authority),
         ),
         hosts=hosts,
-        work={
-            "the tunnels": partial(base.tunnels.run, certification.each_hour),
-            "the ends of one-time tokens": ends.watch,
-        },
+        work={"the tunnels": partial(base.tunnels.run, certification.each_hour)},
     )

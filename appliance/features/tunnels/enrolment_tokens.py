@@ -10,12 +10,13 @@ import re
 import secrets
 
 from appliance.base import clock
-from appliance.base.deadlines import Deadlines
+from appliance.store.ends import EndKind, Ends
 from appliance.store.host_tables import EnrolmentTokenRow, HostTables
 
 _FORM = re.compile(r"rosrv-enrol_([0-9a-f]{12})_([A-Za-z0-9_-]{43})")
 LONGEST_SECONDS = 7 * 86_400.0
 MOST = 1000
+ENROLMENT = EndKind("enrolment")
 
 
 class BadEnrolmentTokenError(Exception):
@@ -23,19 +24,21 @@ class BadEnrolmentTokenError(Exception):
 
 
 class EnrolmentTokens:
-    """All tokens that have not expired. `ends` keeps their ends although the clock may step back."""
+    """All tokens that have not expired."""
 
-    def __init__(self, tables: HostTables, ends: Deadlines) -> None:
+    def __init__(self, tables: HostTables, ends: Ends) -> None:
         self._tables = tables
         self._ends = ends
         self._rows = {row.name: row for row in tables.awaited()}
-        self.rows()  # from now on, no step of the clock postpones an end
+        ends.when_due(ENROLMENT, self._due)
 
     def rows(self) -> dict[str, EnrolmentTokenRow]:
-        for row in list(self._rows.values()):
-            if self._ends.passed(row.id, row.expires):
-                self.forget(row.name)
-        return dict(self._rows)
+        """Return the tokens by the names of their hosts, with their ends by the present system clock."""
+        self._due([name for name in self._rows if self._ends.passed(ENROLMENT, name)])
+        return {
+            name: row._replace(expires=self._ends.date(ENROLMENT, name) or row.expires)
+            for name, row in self._rows.items()
+        }
 
     def addresses(self) -> dict[str, str]:
         return {row.address: name for name, row in self.rows().items()}
@@ -47,7 +50,7 @@ class EnrolmentTokens:
         secret = secrets.token_urlsafe(32)
         row = EnrolmentTokenRow(name, token_id, _hash(secret), now, now + seconds, address, days, kit, who)
         self._rows[name] = row
-        self._ends.passed(row.id, row.expires)
+        self._ends.set(ENROLMENT, name, seconds)
         self._tables.save_awaited(row)
         return row, f"rosrv-enrol_{token_id}_{secret}"
 
@@ -69,8 +72,14 @@ class EnrolmentTokens:
             self._tables.save_awaited(row)
 
     def forget(self, name: str) -> None:
+        """Forget a token. Its end stays, for `give_back`."""
         if self._rows.pop(name, None) is not None:
             self._tables.forget_awaited(name)
+
+    def _due(self, ended: list[str]) -> None:
+        for name in ended:
+            self.forget(name)
+        self._ends.forget(ENROLMENT, *ended)
 
 
 def _hash(secret: str) -> bytes:

@@ -11,7 +11,6 @@ import msgspec
 import pytest
 
 from appliance.audit.log.record import Severity
-from appliance.base.deadlines import Deadlines
 from appliance.channel import admin
 from appliance.channel.admin import A, AdminAnswer, AdminRequest, TokenAdd, TokenRevoke, decode
 from appliance.channel.messages.api import ApiLink, ClientRequest, RequestAnswered, RequestMade
@@ -21,6 +20,7 @@ from appliance.control.rest.rest import RestLink
 from appliance.control.rest.rest_uses import RestUses
 from appliance.signing.request_signing import proof_of, reading_key, statement
 from appliance.store.state_file import StateStore
+from tests.support.ends import ends_of
 from tests.support.engines import InlineDatabase
 from tests.support.heard import Heard
 from tests.support.memory_channel import memory_link
@@ -34,15 +34,16 @@ LOAD = ClientRequest("10.0.0.1", "POST", "/v1/policy", '"3"', "text/plain", "", 
 class World:
     def __init__(self, directory: Path) -> None:
         self.store = StateStore(directory, failed=lambda _text: None, kind=InlineDatabase)
+        self.ends = ends_of(self.store, directory)
         self.done: list[tuple[AnyRequest, str]] = []
         self.recorded: list[dict[str, Any]] = []
         self.obstacle: str | None = None
         self.apis: list[Api] = []
-        self.tokens = TokenOrders(self.store, self, Deadlines(), self.token_changed)  # type: ignore[arg-type]  # this class is the trail
+        self.tokens = TokenOrders(self.store, self, self.ends, self.token_changed)  # type: ignore[arg-type]  # this class is the trail
         self.begin(require_proof=False)
 
     def begin(self, *, require_proof: bool) -> None:
-        self.tokens = TokenOrders(self.store, self, Deadlines(), self.token_changed)  # type: ignore[arg-type]  # as above
+        self.tokens = TokenOrders(self.store, self, self.ends, self.token_changed)  # type: ignore[arg-type]  # as above
         parts: Any = self
         self.link = RestLink(
             parts,

@@ -47,6 +47,7 @@ from appliance.specifications.specification_manager import (
 from appliance.specifications.specification_revisions import Check, CheckBeside
 from appliance.store.state_file import StateStore
 from tests.support.audit import RecordingTrail
+from tests.support.ends import ends_of
 from tests.support.engines import InlineDatabase, open_log
 from tests.support.stated import parts_here
 
@@ -86,6 +87,7 @@ class Desk:
         self.log = open_log(home / "audit.db")
         self.trail = RecordingTrail(self.log)
         self.store = StateStore(home, failed=pytest.fail, kind=InlineDatabase)
+        self._ending: asyncio.Task[None] | None = None
         self.sent: list[messages.Message] = []
         self.findings: list[str] = []
         self.began: list[str] = []
@@ -111,10 +113,14 @@ class Desk:
         site_keys: Sequence[str] = (),
     ) -> SpecificationManager:
         relay = Taking(self)
+        self.kill()
+        ends = ends_of(self.store, self.home)
+        self._ending = asyncio.create_task(ends.run())
         relay.monitors = WaitingManager(
             self.folder if folder else None,
             enable,
             self.store,
+            ends,
             self.trail,
             on_fault="drop",
             slices=1000,
@@ -132,6 +138,11 @@ class Desk:
         relay.monitors.desk = self
         await relay.monitors.start(restarted=restarted, taken_over=taken_over)
         return relay.monitors
+
+    def kill(self) -> None:
+        """Let the last control end no more timed switches."""
+        if self._ending is not None:
+            self._ending.cancel()
 
     def close(self) -> None:
         self.store.close()

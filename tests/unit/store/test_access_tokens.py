@@ -1,9 +1,6 @@
 import pytest
 
-from appliance.base.clock import using
-from appliance.base.deadlines import Deadlines
 from appliance.store.access_tokens import BadTokenNameError, is_secret, make_token, parse_token
-from tests.support.virtual_clock import VirtualClock
 
 
 def test_only_its_own_secret_proves_a_token() -> None:
@@ -24,18 +21,6 @@ def test_the_stored_row_does_not_have_the_secret() -> None:
     assert text.split("_", 2)[2] not in repr(row)
     again, _text = make_token("alice", "viewer", now=1000.0, seconds=60)
     assert (row.salt, row.hash, row.id) != (again.salt, again.hash, again.id)
-
-
-def test_a_token_is_valid_until_its_end_or_revocation() -> None:
-    row, _text = make_token("alice", "viewer", now=1000.0, seconds=60)
-    ends = Deadlines()
-    with using(machine := VirtualClock(wall=1059.9)):
-        assert row.usable(ends)
-        assert not row._replace(revoked=1001.0).usable(ends)
-        machine.advance(0.1)
-        assert not row.usable(ends)
-        machine.set_wall(1000.0)
-        assert not row.usable(ends)
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ from appliance.features.alarms.alarm_orders import AlarmOrders
 from appliance.features.alarms.alarm_requests import AlarmAcknowledge, AlarmSilence, AlarmsWanted
 from appliance.store.state_file import StateStore
 from tests.support.answers import example
+from tests.support.ends import ends_of
 from tests.support.engines import InlineDatabase
 from tests.support.virtual_clock import VirtualClock
 
@@ -28,7 +29,9 @@ class Robot:
         self.restart()
 
     def restart(self) -> None:
-        handled = HandledAlarms(StateStore(self.state, failed=pytest.fail, kind=InlineDatabase))
+        store = StateStore(self.state, failed=pytest.fail, kind=InlineDatabase)
+        self.ends = ends_of(store, self.state)
+        handled = HandledAlarms(store, self.ends)
         self.orders = AlarmOrders(handled, self, lambda: handled.marked(example(Status, **self.fields)))  # type: ignore[arg-type]  # it records
 
     def happened(self, event: str, reason: str, **fields: Any) -> str:
@@ -67,7 +70,7 @@ def test_an_acknowledged_alarm_stays_one_until_it_is_over(robot: Robot) -> None:
     assert robot.events == ["alarm acknowledged by ann: rosmaster is acknowledged: spare part"]
 
 
-@pytest.mark.parametrize(("passed", "severity"), [(3599, "notice"), (3601, "warning"), (-1, "warning")])
+@pytest.mark.parametrize(("passed", "severity"), [(3599, "notice"), (3601, "warning"), (-1, "notice")])
 def test_a_silenced_alarm_is_a_notice_for_its_time(robot: Robot, passed: float, severity: str) -> None:
     clock = VirtualClock()
     with using(clock):

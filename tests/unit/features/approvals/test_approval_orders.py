@@ -4,6 +4,7 @@ import random
 import re
 from collections.abc import Iterable
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -22,6 +23,8 @@ from appliance.policy.model import Address, Category, Request, address_of
 from appliance.policy.policy import Policy
 from appliance.policy.policy_compiler import compile_policy
 from appliance.policy.rights import Right, decide_right
+from appliance.store.ends import Ends
+from tests.support.ends import ends_in
 from tests.support.virtual_clock import VirtualClock
 
 pytestmark = pytest.mark.anyio
@@ -46,7 +49,7 @@ def bearer(number: str, name: str, role: str = "operator") -> TokenKept:
 
 
 class Site:
-    def __init__(self, time: VirtualClock) -> None:
+    def __init__(self, time: VirtualClock, ends: Ends) -> None:
         self.time = time
         self.text = compile_policy(TEXT, file="site.ini")
         self.policy: Policy
@@ -65,6 +68,7 @@ class Site:
             cast(Any, self),
             HostSigns(lambda _host: True, lambda _host, _names: self.moved),
             cast(Any, SimpleNamespace(after=self.stop)),
+            ends,
             first=17,
             decide_again=self.decide_again,
             carried_out=self.carried_out,
@@ -131,9 +135,9 @@ class Site:
 
 
 @pytest.fixture
-def site() -> Any:
+def site(tmp_path: Path) -> Any:
     with clock.using(time := VirtualClock()):
-        yield Site(time)
+        yield Site(time, ends_in(tmp_path))
 
 
 def number_in(text: str) -> int:

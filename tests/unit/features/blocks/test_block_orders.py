@@ -8,13 +8,13 @@ from typing import Any, cast
 
 import pytest
 
+from appliance.base.age_clock import AgeClock
 from appliance.base.clock import using
 from appliance.base.withdrawal import WithdrawnError, awaited
 from appliance.channel.admin import PolicyReload
 from appliance.control.assembly import host_blocks
 from appliance.control.assembly.policies import Policies
 from appliance.control.errors import SenselessError, UnknownThingError
-from appliance.features.blocks import block_orders
 from appliance.features.blocks.block_orders import BlockOrders
 from appliance.features.blocks.block_requests import (
     BlockEnded,
@@ -27,6 +27,7 @@ from appliance.hosts.host_table import HostRefusedError
 from appliance.master.graph.registry import Kind
 from appliance.policy.model import Category, Request, address_of
 from appliance.policy.policy import CurrentPolicy, Policy
+from appliance.store.ends import Ends
 from appliance.store.state_file import StateStore
 from appliance.store.writer_thread import StoreError
 from tests.support.control_parts import OPEN, ControlParts
@@ -50,15 +51,15 @@ async def at_once() -> None: ...
 class Clock:
     def __init__(self) -> None:
         self.now = 1_700_000_000 * SECOND
-        self.reads = 0
 
     def __call__(self) -> int:
-        self.reads += 1
         return self.now
 
-    def read_again(self) -> Callable[[], bool]:
-        reads = self.reads
-        return lambda: self.reads >= reads + 2
+    def dated(self, date: int) -> int:
+        return date
+
+    def uncounted(self, _date: int) -> int:
+        return 0
 
     def advance(self, seconds: float) -> None:
         self.now += int(seconds * SECOND)
@@ -70,11 +71,13 @@ class Control(ControlParts):
         state.mkdir(exist_ok=True)
         (state / "policy.ini").write_text(text)
         self.state = StateStore(state, failed=print, kind=InlineDatabase)
-        self.blocks = host_blocks.BlockTable(self.state, clock)
+        self.clock = clock
+        self.ends = Ends(self.state, cast(AgeClock, clock))
+        self.blocks = host_blocks.BlockTable(self.state, self.ends)
         self.remotes: dict[str, str] = {}
         self.uses: list[str] = []
         self.policies = Policies(
-            state / "policy.ini", self.state, cast(Any, self.records), CurrentPolicy(),
+            state / "policy.ini", self.state, self.ends, cast(Any, self.records), CurrentPolicy(),
             robot=[ipaddress.ip_network(ROBOT)], own=tuple, hosts=dict, blocks=lambda: self.blocks.reasons,
             holders=dict, approved=frozenset, live=list,
             changed=self.changed, carried_out=at_once, site_keys=(),
@@ -82,10 +85,15 @@ class Control(ControlParts):
         self.policies.start(restarted=False)
         self.current = self.policies.current
         self.orders = BlockOrders(
-            self.blocks, self.policies, self.state, cast(Any, self.records), live=self.revocation.live,
+            self.blocks, self.policies, self.state, cast(Any, self.records), self.ends, live=self.revocation.live,
             connected=lambda: connected, enrolled=self.enrolled, remotes=lambda: self.remotes,
             uses=lambda _host: self.uses, carried_out=at_once,
         )  # fmt: skip
+
+    def advance(self, seconds: float) -> None:
+        self.clock.advance(seconds)
+        self.ends.read_clock()
+        self.ends.look()
 
     def keep(self, task: asyncio.Task[None]) -> None:
         self._not_ours.add(task)
@@ -116,7 +124,7 @@ async def control(
     tmp_path: Path, clock: Clock, connected: list[set[str]] | None = None, text: str = OPEN
 ) -> AsyncIterator[Control]:
     made = Control(tmp_path / "state", clock, connected or [], text)
-    timer = asyncio.create_task(made.orders.watch())
+    timer = asyncio.create_task(made.ends.run())
     made.keep(timer)
     await made.round()
     try:
@@ -196,10 +204,7 @@ async def test_an_order_whose_client_gave_up_changes_nothing(tmp_path: Path) -> 
         assert await made.blocked() == [OTHER]
 
 
-async def test_a_block_ends_by_the_age_clock_and_not_by_the_system_clock(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(block_orders, "_LOOK_SECONDS", 0.01)
+async def test_a_block_ends_by_the_age_clock_and_not_by_the_system_clock(tmp_path: Path) -> None:
     clock, machine = Clock(), VirtualClock()
     with using(machine):
         async with control(tmp_path, clock) as made:
@@ -208,10 +213,9 @@ async def test_a_block_ends_by_the_age_clock_and_not_by_the_system_clock(
             await made.block(NODE, 3600)
             await made.block(OTHER)
             machine.set_wall(4e9)
-            clock.advance(3599.9)
-            await until(clock.read_again())
+            made.advance(3599.9)
             assert await made.blocked() == [NODE, OTHER]
-            clock.advance(0.1)
+            made.advance(0.1)
             await until(lambda: made.denial(NODE) is None)
             await made.settle()
             assert made.hidden.has(Kind.PUBLICATION, "/scan") == ["/talker"]
@@ -332,7 +336,7 @@ async def test_a_host_with_most_registrations_is_blocked_only_by_force(tmp_path:
 
 
 async def test_the_number_of_blocks_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(block_orders, "MOST", 2)
+    monkeypatch.setattr("appliance.features.blocks.block_orders.MOST", 2)
     async with control(tmp_path, Clock()) as made:
         await made.block(NODE)
         await made.block(OTHER)
@@ -354,9 +358,12 @@ async def test_an_order_at_the_moment_of_the_end_finds_one_state(tmp_path: Path)
     async with control(tmp_path, clock) as made:
         await made.block(NODE, 60)
         clock.advance(60)
-        outcomes = await asyncio.gather(
+        made.ends.read_clock()
+        orders = asyncio.gather(
             made.unblock(NODE), made.unblock(NODE), made.block(OTHER), return_exceptions=True
         )
+        made.ends.look()
+        outcomes = await orders
         await until(lambda: made.denial(NODE) is None)
         ends = [event for event, _ in made.records.events if event in {"host unblocked", "host block ended"}]
         assert len(ends) == 1

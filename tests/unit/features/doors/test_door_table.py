@@ -8,7 +8,7 @@ from appliance.features.doors.door_table import DoorTable
 from appliance.features.doors.door_tickets import DoorTickets, left_by_its_maker, new_ticket
 from appliance.features.doors.settings import MOST_DOORS, Doors
 from appliance.store.state_file import StateStore
-from appliance.store.stored_deadlines import StoredDeadlines
+from tests.support.ends import ends_of
 from tests.support.engines import InlineDatabase
 from tests.support.virtual_clock import VirtualClock
 
@@ -83,8 +83,7 @@ def test_a_ticket_opens_one_door_until_its_end(tmp_path: Path) -> None:
     machine = VirtualClock(wall=WALL)
     with clock.using(machine):
         store = opened(tmp_path)
-        ends = StoredDeadlines(store)
-        tickets = DoorTickets(store, ends)
+        tickets = DoorTickets(store, ends_of(store, tmp_path))
         row, text = tickets.make("alice", 3600.0, "first")
         assert tickets.find("alice", text) == row
         wrong = (
@@ -97,18 +96,10 @@ def test_a_ticket_opens_one_door_until_its_end(tmp_path: Path) -> None:
         assert [tickets.find("alice", one) for one in wrong] == [None] * len(wrong)
         assert tickets.find("bob", text) is None
         assert text.partition(".")[2].encode() not in (tmp_path / "state.db").read_bytes()
-        machine.advance(3000.0)
-        ends.save()
-        store.close()
-    machine = VirtualClock(wall=WALL - 86_400.0, now=5.0)
-    with clock.using(machine):
-        store = opened(tmp_path)
-        tickets = DoorTickets(store, StoredDeadlines(store))
-        assert tickets.find("alice", text) == row
-        machine.advance(601.0)
+        machine.advance(3601.0)
         assert tickets.find("alice", text) is None
         assert tickets.valid() == []
-        assert store.doors.tickets() == [] and store.time_left() == {}
+        assert store.doors.tickets() == [] and store.ends() == []
 
 
 def test_a_ticket_warns_when_its_maker_has_no_token_any_longer() -> None:

@@ -1,3 +1,4 @@
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -8,6 +9,7 @@ from appliance.features.doors.door_table import DoorTable
 from appliance.features.doors.door_visits import DoorVisits
 from appliance.features.doors.own_doors import OwnDoors
 from appliance.store.door_tables import DoorRow
+from tests.support.ends import ends_in
 from tests.support.virtual_clock import VirtualClock
 
 
@@ -43,11 +45,11 @@ def test_a_token_has_the_door_of_its_name_and_a_person_that_of_a_group(
     assert found.row is None or found.row.name == door
 
 
-def test_a_visit_is_one_connection_and_ends_with_its_token() -> None:
+def test_a_visit_is_one_connection_and_ends_with_its_token(tmp_path: Path) -> None:
     """A new token of the same name does not keep it."""
     machine, bearers = VirtualClock(), {"1": "alice"}
     with clock.using(machine):
-        visits = DoorVisits(lambda: bearers)
+        visits = DoorVisits(ends_in(tmp_path), lambda: bearers)
         row, text = visits.make("alice", "alice")
         assert visits.find("bob", text) is None
         assert visits.find("alice", text) == row
@@ -61,10 +63,10 @@ def test_a_visit_is_one_connection_and_ends_with_its_token() -> None:
         assert visits.present("alice") == []
 
 
-def test_an_unused_ticket_is_over_after_a_minute_whatever_the_clock_says() -> None:
+def test_an_unused_ticket_is_over_after_a_minute_whatever_the_clock_says(tmp_path: Path) -> None:
     machine = VirtualClock(wall=1_790_000_000.0)
     with clock.using(machine):
-        visits = DoorVisits(lambda: {"1": "alice"})
+        visits = DoorVisits(ends_in(tmp_path), lambda: {"1": "alice"})
         row, text = visits.make("alice", "alice")
         machine.set_wall(1_789_990_000.0)
         machine.advance(61.0)
@@ -72,9 +74,9 @@ def test_an_unused_ticket_is_over_after_a_minute_whatever_the_clock_says() -> No
         assert visits.ended() == [row]
 
 
-def test_visits_of_a_person_are_bounded_and_only_their_door_reports_their_end() -> None:
+def test_visits_of_a_person_are_bounded_and_only_their_door_reports_their_end(tmp_path: Path) -> None:
     with clock.using(VirtualClock()):
-        visits = DoorVisits(lambda: {"1": "alice"})
+        visits = DoorVisits(ends_in(tmp_path), lambda: {"1": "alice"})
         rows = [visits.make("alice", "alice")[0] for _ in range(10)]
         assert visits.ended() == rows[:2]
         visits.left("bob", rows[2].id)

@@ -5,7 +5,6 @@ from typing import Any, cast
 import pytest
 
 from appliance.base import clock
-from appliance.base.deadlines import Deadlines
 from appliance.channel.admin import PolicyReload, StatusWanted, TokenAdd
 from appliance.channel.messages.api import RequestMade
 from appliance.control.errors import TokenRefusedError, UnavailableError, UnknownThingError
@@ -19,6 +18,7 @@ from appliance.features.sso.sessions import SessionTable
 from appliance.signing.request_signing import keys_of, reading_key
 from appliance.store.state_file import StateStore
 from appliance.telemetry.audit_trail import AuditTrail
+from tests.support.ends import ends_of
 from tests.support.engines import InlineDatabase
 from tests.support.virtual_clock import let_time_pass, set_wall
 
@@ -49,10 +49,11 @@ class World:
         )
         self.trail = trail
         self.changes = 0
-        self.sso = SsoOrders(cast(AuditTrail, trail), self._changed, configured=True)
         store = StateStore(home, failed=pytest.fail, kind=InlineDatabase)
+        ends = ends_of(store, home)
+        self.sso = SsoOrders(cast(AuditTrail, trail), ends, self._changed, configured=True)
         self.tokens = TokenOrders(
-            store, cast(AuditTrail, trail), Deadlines(), lambda: None, sessions=lambda: self.sso.sessions
+            store, cast(AuditTrail, trail), ends, lambda: None, sessions=lambda: self.sso.sessions
         )
         self.checks = RequestAuthenticator(self.tokens, require_proof=False)
         self.answer: Any = None
@@ -159,8 +160,9 @@ async def test_other_rights_end_the_earlier_sessions_of_the_person(world: World)
     assert world.events()[-2:] == ["signed off", "signed on"]
 
 
-def test_a_person_and_all_people_have_a_quota_of_sessions() -> None:
-    table, bounds = SessionTable(), SESSIONS.bounds
+def test_a_person_and_all_people_have_a_quota_of_sessions(tmp_path: Path) -> None:
+    store = StateStore(tmp_path, failed=pytest.fail, kind=InlineDatabase)
+    table, bounds = SessionTable(ends_of(store, tmp_path), lambda: None), SESSIONS.bounds
     for number in range(bounds.host + 1):
         table.open(_person(), _keys(number))
     assert [one.id for one in table.sessions()] == [f"{number:012x}" for number in range(1, bounds.host + 1)]

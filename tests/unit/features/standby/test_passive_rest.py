@@ -18,6 +18,7 @@ from appliance.channel.messages.api import (
     RequestMade,
     TokensStated,
 )
+from appliance.control.operators.token_orders import TOKENS
 from appliance.features.standby import passive_rest
 from appliance.features.standby.lease_client import HandOverError
 from appliance.features.standby.passive_rest import PassiveRest, ReplicatedTokens
@@ -28,6 +29,7 @@ from appliance.store.access_tokens import TokenRow, make_token
 from appliance.store.host_tables import HostBlockRow
 from appliance.store.state_file import StateStore
 from tests.support.answers import example
+from tests.support.ends import ends_of
 from tests.support.engines import InlineDatabase
 
 pytestmark = pytest.mark.anyio
@@ -47,7 +49,10 @@ def made(name: str) -> tuple[TokenRow, str]:
 
 def save(folder: Path, *rows: TokenRow) -> None:
     store = StateStore(folder, failed=pytest.fail, kind=InlineDatabase)
-    store.save_tokens(*rows)
+    ends = ends_of(store, folder)
+    for row in rows:
+        store.save_tokens(row)
+        ends.set(TOKENS, row.id, 60.0)
     store.close()
 
 
@@ -139,6 +144,8 @@ def test_keys_and_tokens_are_of_the_same_time(tmp_path: Path, monkeypatch: pytes
                 assert row.keys
                 database.execute("INSERT INTO token_keys VALUES (?, ?, ?)", (row.id, *row.keys))
                 database.execute("INSERT INTO token VALUES (?, ?, ?, ?, ?, ?, ?, ?)", row[:-1])
+                end = ("token", row.id, 1 << 62, 0, 0)
+                database.execute("INSERT INTO ends VALUES (?, ?, ?, ?, ?)", end)
         return TokenKeys(*columns)
 
     monkeypatch.setattr(passive_rest, "TokenKeys", keys)
@@ -155,7 +162,7 @@ def test_a_standby_knows_the_blocked_hosts(tmp_path: Path) -> None:
     tokens = ReplicatedTokens(tmp_path / "state.db")
     assert tokens.read() and tokens.blocked == []
     store = StateStore(tmp_path, failed=pytest.fail, kind=InlineDatabase)
-    store.hosts.save_block(HostBlockRow("10.0.0.7", 1.0, None, "ann", ""))
+    store.hosts.save_block(HostBlockRow("10.0.0.7", 1.0, "ann", ""))
     store.close()
     assert tokens.read() and tokens.blocked == ["10.0.0.7"]
     assert not tokens.read()

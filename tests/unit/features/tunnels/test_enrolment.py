@@ -13,7 +13,6 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
 from appliance.base.clock import using
-from appliance.base.deadlines import Deadlines
 from appliance.channel.answers.host_answers import PortsSeen
 from appliance.channel.channel import Channel
 from appliance.channel.messages import (
@@ -68,6 +67,7 @@ from appliance.store.host_tables import ApplianceRow, HostTables
 from appliance.store.state_file import StateStore
 from appliance.store.writer_thread import StoreError
 from tests.support.audit import RecordingTrail
+from tests.support.ends import ends_of
 from tests.support.engines import InlineDatabase, open_log
 from tests.support.near_authority import NearAuthority
 from tests.support.virtual_clock import VirtualClock
@@ -115,7 +115,7 @@ class Bench:
             appliances=appliances,
             master_port=11311,
             rest=RestAddress(8443, "", 8443),
-            ends=Deadlines(),
+            ends=ends_of(self.store, directory),
             changed=self._changed,
         )
         certification.served_by("sha256//pin")

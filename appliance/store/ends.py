@@ -1,0 +1,250 @@
+"""Keep the end of everything that ends: tokens, tickets, blocks, timed switches, silences, sessions, approvals.
+
+1. An end is a time of the age clock (`base/age_clock.py`): a step of the system clock moves none while control runs.
+2. Neither a restart nor a takeover gives an end more time. At a start, all stored ends move together: by the difference
+   of both appliances' clocks, or back by the time that a killed process had not saved.
+3. A right may end too early, and never too late: a long time off, which the age clock counts only later, counts at
+   once for it. An end that is `late`, as that of a block, is never too early.
+4. `passed` is exact. The owner of a kind is called soon after an end, and again until it forgets or sets the end.
+
+The names of kinds are stored, so a kind keeps its name.
+"""
+
+import asyncio
+import contextlib
+import math
+import sqlite3
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import msgspec
+import structlog
+
+from appliance.base import clock
+from appliance.base.age_clock import AgeClock
+from appliance.store.earlier_ends import earlier_ends
+from appliance.store.state_file import EndRow, StateStore
+from appliance.store.writer_thread import StoreError
+
+_READING = "reading of the clocks"
+_IMPORTED = "ends"  # this setting exists once the ends of versions up to 0.3.0 are in the table
+_SECOND = 1_000_000_000
+_NOTE_SECONDS = 30.0
+PAIRED_NOTE_SECONDS = 5.0
+LOOK_SECONDS = 5.0
+"""The longest time between two checks: timers do not count while the machine is suspended, the age clock does."""
+_SAME_DATE = _SECOND  # a smaller difference of the clocks moves no date that people see
+
+_log = structlog.get_logger()
+
+
+@dataclass(frozen=True, slots=True)
+class EndKind:
+    """A kind of things that end; each has a name that is unique in its kind."""
+
+    name: str
+    late: bool = False
+    """Whether it may end too late, and never too early: it protects. All others give a right, or lift a protection."""
+    stored: bool = True
+    """Whether it survives a restart of control."""
+
+
+class _Reading(msgspec.Struct, frozen=True):
+    """The system clock (seconds since the epoch) and the age clock (nanoseconds) of an appliance."""
+
+    appliance: str
+    wall: float
+    age: int
+
+
+class _End(NamedTuple):
+    at: int
+    since: int
+    late: bool
+    stored: bool
+
+
+class Ends:
+    """All ends. Make it before any part reads them.
+
+    `appliance` is the name of one of two appliances. `away_seconds` is for a takeover: the time since this appliance
+    followed the other one; None: it did not.
+    """
+
+    def __init__(
+        self, store: StateStore, age: AgeClock, *, appliance: str = "", away_seconds: float | None = None
+    ) -> None:
+        self._store = store
+        self._age = age
+        self._appliance = appliance
+        self._calls: dict[str, Callable[[list[str]], object]] = {}
+        self._changed = asyncio.Event()
+        self._noted = -math.inf
+        self._offset: int | None = None  # the system clock minus the age clock
+        self.read_clock()
+        self._ends: dict[str, dict[str, _End]] = {}
+        with store.database.together():
+            self._begin(away_seconds)
+
+    # --- setting ends ---
+
+    def set(self, kind: EndKind, name: str, seconds: float) -> None:
+        now = self._now()
+        self._put(kind.name, name, _End(now + int(seconds * _SECOND), now, kind.late, kind.stored))
+
+    def forget(self, kind: EndKind, *names: str) -> None:
+        for name in names:
+            end = self._ends.get(kind.name, {}).pop(name, None)
+            if end is not None and end.stored:
+                self._store.forget_end(kind.name, name)
+
+    # --- reading ends ---
+
+    def passed(self, kind: EndKind, name: str) -> bool:
+        """Whether the end has passed; also if none is set, so that nothing outlasts a lost end."""
+        end = self._ends.get(kind.name, {}).get(name)
+        return end is None or self._left(end) <= 0
+
+    def left(self, kind: EndKind, name: str) -> float | None:
+        """Return the seconds until the end, 0 after it, or None if none is set."""
+        end = self._ends.get(kind.name, {}).get(name)
+        return None if end is None else max(0.0, self._left(end) / _SECOND)
+
+    def date(self, kind: EndKind, name: str) -> float | None:
+        """Return the end in seconds since the epoch by the present system clock, for people."""
+        end = self._ends.get(kind.name, {}).get(name)
+        return None if end is None or self._offset is None else (end.at + self._offset) / _SECOND
+
+    def names(self, kind: EndKind) -> list[str]:
+        return list(self._ends.get(kind.name, {}))
+
+    def next_due(self) -> float | None:
+        """Return the seconds until the next end, or None without one."""
+        left = [left for end in self._all() if (left := self._left(end)) > 0]
+        return min(left) / _SECOND if left else None
+
+    # --- calling the owners ---
+
+    def when_due(self, kind: EndKind, call: Callable[[list[str]], object]) -> None:
+        """Call `call(names)` when ends have passed. It must not wait."""
+        self._calls[kind.name] = call
+
+    async def run(self) -> None:
+        while True:
+            self._changed.clear()
+            await asyncio.to_thread(self.read_clock)
+            self.look()
+            left = self.next_due()
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(LOOK_SECONDS if left is None else min(left, LOOK_SECONDS)):
+                    await self._changed.wait()
+
+    def read_clock(self) -> None:
+        """Read the age clock, which may write a file. Only one thread at a time may call this."""
+        age, wall, boot = self._age(), clock.wall_ns(), clock.since_boot_ns()
+        self._age_at_boot = age - boot
+        if self._offset is None or abs(wall - age - self._offset) > _SAME_DATE:
+            self._offset = wall - age
+
+    def look(self) -> None:
+        """Call the owners of all ends that have passed, and note the clocks from time to time."""
+        self._count_time_off()
+        for kind, call in self._calls.items():
+            due = [name for name, end in self._ends.get(kind, {}).items() if self._left(end) <= 0]
+            try:
+                if due:
+                    call(due)
+            except Exception as error:  # noqa: BLE001  a defect of one kind must not keep others from ending
+                _log.critical("fault at an end", kind=kind, names=due[:20], exc_info=error)
+        if clock.since_boot() - self._noted >= (PAIRED_NOTE_SECONDS if self._appliance else _NOTE_SECONDS):
+            self._noted = clock.since_boot()
+            with contextlib.suppress(StoreError):  # a full disk: a queued row each time would only grow
+                self._store.database.require_room()
+                self._note()
+
+    # --- inside ---
+
+    def _now(self) -> int:
+        return self._age_at_boot + clock.since_boot_ns()
+
+    def _left(self, end: _End) -> int:
+        uncounted = 0 if end.late else self._age.uncounted(end.since)
+        return end.at - self._now() - uncounted
+
+    def _all(self) -> Iterator[_End]:
+        return (end for ends in self._ends.values() for end in ends.values())
+
+    def _put(self, kind: str, name: str, end: _End) -> None:
+        self._ends.setdefault(kind, {})[name] = end
+        if end.stored:
+            self._store.save_end(_row(kind, name, end))
+        self._changed.set()
+
+    def _count_time_off(self) -> None:
+        """Move the ends that were set while a long time off did not count yet: they began after it."""
+        for kind, ends in self._ends.items():
+            for name, end in list(ends.items()):
+                if added := self._age.dated(end.since) - end.since:
+                    self._put(kind, name, end._replace(at=end.at + added, since=self._now()))
+
+    def _begin(self, away_seconds: float | None) -> None:
+        settings, now = self._store.settings(), self._now()
+        text = settings.get(_READING)
+        last = None if text is None else msgspec.json.decode(text, type=_Reading)
+        taken_over = (
+            last is not None and bool(self._appliance) and last.appliance not in ("", self._appliance)
+        )
+        imported: list[EndRow] = []
+        if _IMPORTED not in settings:
+            wall, age = (last.wall, last.age) if last is not None and taken_over else (clock.wall(), now)
+            imported = earlier_ends(self._store, wall, age)
+            self._store.save_setting(_IMPORTED, "1")
+            self._store.forget_time_left()
+        for row in [*self._store.ends(), *imported]:
+            end = _End(row.at, row.since, bool(row.late), stored=True)
+            if last is not None and taken_over:
+                end = _inherited(end, now - last.age, away_seconds, now)
+            elif last is not None and now < last.age:
+                end = end._replace(at=end.at + now - last.age, since=end.since + now - last.age)
+            self._ends.setdefault(row.kind, {})[row.name] = end
+            if row in imported or row != _row(row.kind, row.name, end):
+                self._store.save_end(_row(row.kind, row.name, end))
+        self._note()
+
+    def _note(self) -> None:
+        reading = _Reading(self._appliance, clock.wall(), self._now())
+        self._store.save_setting(_READING, msgspec.json.encode(reading).decode())
+
+
+def replicated_ends(connection: sqlite3.Connection, kind: EndKind) -> dict[str, tuple[int, float]] | None:
+    """Return the stored end of each name, and the seconds that it had left at the active appliance's last reading.
+
+    None: the active appliance has an earlier version, whose ends `Ends` imports at a takeover.
+    """
+    settings = dict(
+        connection.execute("SELECT name, value FROM setting WHERE name IN (?, ?)", (_READING, _IMPORTED))
+    )
+    if _IMPORTED not in settings:
+        return None
+    age = msgspec.json.decode(settings[_READING], type=_Reading).age
+    rows = connection.execute("SELECT name, at FROM ends WHERE kind = ?", (kind.name,))
+    return {name: (at, (at - age) / _SECOND) for name, at in rows}
+
+
+def _row(kind: str, name: str, end: _End) -> EndRow:
+    return EndRow(kind, name, end.at, end.since, int(end.late))
+
+
+def _inherited(end: _End, ahead: int, away_seconds: float | None, now: int) -> _End:
+    """Return the end of another appliance by this one's clock, which is `ahead` of the other's last reading.
+
+    If this appliance did not follow the other one before, `ahead` may include time off. Then an end that may be late
+    continues from the last reading, and a right has no more time than by either clock.
+    """
+    if away_seconds is not None:
+        return end._replace(at=end.at + ahead - int(away_seconds * _SECOND), since=now)
+    if end.late:
+        return end._replace(at=end.at + ahead, since=now)
+    moved = min(ahead, 0)
+    return end._replace(at=end.at + moved, since=end.since + moved)
