@@ -141,7 +141,7 @@ class _Control:
             "the ends of own connections": listener_limits.own_connection_table.sweep,
             "the return of memory": return_spare_memory,
             "the check of the clock": operators.clock.watch,
-            "the ends of what ends by itself": base.ends.run,
+            "the ends of tokens, blocks and other things": base.ends.run,
             "the check of protection that is off": operators.switched_off.watch,
             "the storage of parameters": self._save_parameters,
             "the publications of monitors": partial(parts.publisher.run, parts.reconciler.ready),

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from appliance.policy.model import Address, Request
     from appliance.policy.policy import Approval
     from appliance.specifications.specification_manager import SpecificationManager
-    from appliance.store.ends import Ends
+    from appliance.store.ends import EndTable
     from appliance.store.state_file import StateStore
     from appliance.supervisor.service_gate import Pairing
     from appliance.telemetry.audit_trail import AuditTrail, RecordDetails
@@ -83,7 +83,7 @@ class OperatorContext:
     appliance: str
     """The name of one of two appliances; empty on a single one."""
     store: "StateStore"
-    ends: "Ends"
+    ends: "EndTable"
     policies: "Policies"
     monitors: "SpecificationManager"
     hosts: "TunnelHosts"

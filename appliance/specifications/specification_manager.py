@@ -57,7 +57,7 @@ from appliance.specifications.specification_revisions import (
 )
 from appliance.specifications.switches import SWITCHES, Switches, require_whole
 from appliance.specifications.timed_switches import LONGEST, TimedSwitches
-from appliance.store.ends import EndKind, Ends
+from appliance.store.ends import EndKind, EndTable
 from appliance.store.revisions import Revisions, reloaded_by
 from appliance.store.state_file import MonitorRevisionRow, StateStore
 from appliance.telemetry.audit_trail import AuditTrail
@@ -128,7 +128,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         folder: Path | None,
         enable: str,
         store: StateStore,
-        ends: Ends,
+        ends: EndTable,
         trail: AuditTrail,
         *,
         on_fault: Literal["drop", "pass"],

@@ -12,7 +12,7 @@ import structlog
 
 from appliance.specifications.rollout import Switch
 from appliance.specifications.specification_files import SpecificationsRefusedError
-from appliance.store.ends import EndKind, Ends
+from appliance.store.ends import EndKind, EndTable
 from appliance.store.state_file import StateStore
 from appliance.store.writer_thread import StoreError
 
@@ -37,7 +37,7 @@ class TimedSwitches:
     def __init__(
         self,
         store: StateStore,
-        ends: Ends,
+        ends: EndTable,
         come_back: Callable[[Mapping[str, Switch]], Awaitable[None]],
     ) -> None:
         self._store = store

@@ -26,7 +26,7 @@ class BadTokenNameError(ValueError):
 
 
 class TokenRow(NamedTuple):
-    """A stored token. Times are seconds since the epoch; `Ends` decides when it ends, and `expires` is for people."""
+    """A stored token. Times are seconds since the epoch; its end is in `EndTable`; `expires` is for people."""
 
     id: str
     name: str

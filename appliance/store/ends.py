@@ -65,7 +65,7 @@ class _End(NamedTuple):
     stored: bool
 
 
-class Ends:
+class EndTable:
     """All ends. Make it before any part reads them.
 
     `appliance` is the name of one of two appliances. `away_seconds` is for a takeover: the time since this appliance
@@ -102,7 +102,7 @@ class Ends:
     # --- reading ends ---
 
     def passed(self, kind: EndKind, name: str) -> bool:
-        """Whether the end has passed; also if none is set, so that nothing outlasts a lost end."""
+        """Whether the end has passed, or none is set: a thing whose end is lost is over."""
         end = self._ends.get(kind.name, {}).get(name)
         return end is None or self._left(end) <= 0
 
@@ -220,7 +220,7 @@ class Ends:
 def replicated_ends(connection: sqlite3.Connection, kind: EndKind) -> dict[str, tuple[int, float]] | None:
     """Return the stored end of each name, and the seconds that it had left at the active appliance's last reading.
 
-    None: the active appliance has an earlier version, whose ends `Ends` imports at a takeover.
+    None: the active appliance has an earlier version, whose ends `EndTable` imports at a takeover.
     """
     settings = dict(
         connection.execute("SELECT name, value FROM setting WHERE name IN (?, ?)", (_READING, _IMPORTED))

@@ -101,7 +101,7 @@ class RevokedCertificateRow(NamedTuple):
 
 
 class HostBlockRow(NamedTuple):
-    """A host that an operator blocks; `since` is seconds since the epoch. Its end is in `Ends`, if it has one."""
+    """A host that an operator blocks; `since` is seconds since the epoch. Its end is in `EndTable`, if it has one."""
 
     address: str
     since: float

@@ -10,7 +10,7 @@ import structlog
 
 from appliance.base.actors import DISK
 from appliance.base.withdrawal import require_awaited
-from appliance.store.ends import EndKind, Ends
+from appliance.store.ends import EndKind, EndTable
 from appliance.store.state_file import StateStore
 from appliance.store.writer_thread import StoreError
 
@@ -55,7 +55,7 @@ class Revisions(ABC, Generic[R]):
     def __init__(
         self,
         store: StateStore,
-        ends: Ends,
+        ends: EndTable,
         rows: Callable[..., list[R]],
         save: Callable[[R], None],
         nothing: R,
@@ -162,7 +162,7 @@ class Revisions(ABC, Generic[R]):
         except (self.refusal, StoreError) as error:
             if self.confirm_by is None:  # the rollback was complete before the error
                 _log.error("an unconfirmed change was rolled back, but this is not saved", reason=str(error))
-            else:  # `Ends` calls again
+            else:  # `EndTable` calls again
                 _log.error(
                     "an unconfirmed change cannot be rolled back yet", revision=back_to, error=str(error)
                 )

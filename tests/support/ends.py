@@ -11,16 +11,16 @@ from typing import Any, ClassVar
 import pytest
 
 from appliance.base.age_clock import AgeClock
-from appliance.store.ends import EndKind, Ends
+from appliance.store.ends import EndKind, EndTable
 from appliance.store.state_file import StateStore
 from tests.support.engines import InlineDatabase
 
 
-def ends_of(store: StateStore, folder: Path, **role: Any) -> Ends:
-    return Ends(store, AgeClock(folder / "age"), **role)
+def ends_of(store: StateStore, folder: Path, **role: Any) -> EndTable:
+    return EndTable(store, AgeClock(folder / "age"), **role)
 
 
-def ends_in(folder: Path) -> Ends:
+def ends_in(folder: Path) -> EndTable:
     """Return ends over a new state."""
     return ends_of(StateStore(folder, failed=pytest.fail, kind=InlineDatabase), folder)
 
@@ -30,7 +30,7 @@ class Ending(ABC):
 
     kind: ClassVar[EndKind]
 
-    def __init__(self, store: StateStore, ends: Ends) -> None:
+    def __init__(self, store: StateStore, ends: EndTable) -> None:
         self.store = store
         self.ends = ends
 

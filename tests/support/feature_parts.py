@@ -11,14 +11,14 @@ from appliance.features.feature import Feature, FeatureContext
 from appliance.features.parts import FeatureParts
 from appliance.features.table import FEATURES
 from appliance.specifications.specification_manager import SpecificationManager
-from appliance.store.ends import Ends
+from appliance.store.ends import EndTable
 from appliance.store.state_file import StateStore
 from appliance.telemetry.audit_trail import AuditTrail
 from tests.support.idle import idle
 
 
 def idle_parts() -> FeatureParts:
-    store, monitors, ends = idle(StateStore), idle(SpecificationManager), idle(Ends)
+    store, monitors, ends = idle(StateStore), idle(SpecificationManager), idle(EndTable)
     store.settings = dict  # type: ignore[method-assign]  # an idle store has no settings
     early = FeatureContext(
         DEFAULTS, idle(AuditTrail), idle(AuditLog), "", charged_to=lambda host: host, in_force=lambda: (0, 0)

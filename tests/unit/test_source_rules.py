@@ -287,7 +287,7 @@ WALL_CLOCK = {
         "specifications/specification_manager.py", "supervisor/process_handle.py", "supervisor/monitor_memory.py",
         "supervisor/supervisor.py",
     ],
-    "the date of an end of `Ends`, for people and for the api": [
+    "the date of an end of `EndTable`, for people and for the api": [
         "api/front/access.py", "control/operators/handled_alarms.py", "control/operators/token_orders.py",
         "features/blocks/block_orders.py", "features/sso/sessions.py", "features/tunnels/enrolment_tokens.py",
         "features/standby/passive_rest.py",

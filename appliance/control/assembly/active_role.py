@@ -5,6 +5,7 @@ from collections.abc import Awaitable, Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from appliance.base.age_clock import AgeClock
 from appliance.channel.channel import Channel
 from appliance.channel.link import Link
 from appliance.configuration.settings import Settings
@@ -17,6 +18,7 @@ from appliance.hosts.host_table import HostTable
 from appliance.hosts.tunnel_state import Tunnels
 from appliance.specifications.compiler_link import SpecificationCompiler
 from appliance.specifications.specification_files import SpecificationsRefusedError
+from appliance.store.ends import EndTable
 from appliance.store.state_file import StateStore
 from appliance.store.writer_thread import StoreError
 from appliance.telemetry.audit_trail import AuditTrail
@@ -50,6 +52,10 @@ class ActiveRole:
 
     def inherit(self, store: StateStore) -> None:
         """Take over the state, before any part reads or changes it."""
+
+    def ends(self, store: StateStore, age: Path) -> EndTable:
+        """Return the ends by the clock with the file `age`. Call it after `inherit`."""
+        return EndTable(store, AgeClock(age), appliance=self.name, away_seconds=self.away_seconds)
 
     def host_authority(
         self, signer: Link, store: StateStore, trail: AuditTrail, table: HostTable

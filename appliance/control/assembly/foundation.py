@@ -9,7 +9,6 @@ from typing import NamedTuple
 import structlog
 
 from appliance.audit.log.log import AuditLog
-from appliance.base.age_clock import AgeClock
 from appliance.configuration.settings import Settings
 from appliance.control.assembly.active_role import ActiveRole
 from appliance.control.assembly.current import Current
@@ -31,7 +30,7 @@ from appliance.policy.policy import CurrentPolicy, Policy
 from appliance.rpc.server import listen
 from appliance.specifications.compiler_link import SpecificationCompiler
 from appliance.specifications.specification_manager import SpecificationManager
-from appliance.store.ends import Ends
+from appliance.store.ends import EndTable
 from appliance.store.state_file import StateStore
 from appliance.telemetry.audit_trail import AuditTrail
 
@@ -56,7 +55,7 @@ class Foundation:
     features: FeatureParts
     monitors: Current[SpecificationManager]
     store: StateStore
-    ends: Ends
+    ends: EndTable
     blocks: BlockTable
     table: HostTable
     tunnels: Tunnels
@@ -104,8 +103,7 @@ async def make_foundation(
         settings.state / "control", failed=lambda reason: _log.error("state is not written", reason=reason)
     )
     role.inherit(store)
-    age = AgeClock(settings.state / "control" / "age")
-    ends = Ends(store, age, appliance=role.name, away_seconds=role.away_seconds)
+    ends = role.ends(store, settings.state / "control" / "age")
     blocks = BlockTable(store, ends)
     await features.keep(store, lifeline)
     # The policy names hosts by address. These addresses are reliable only once clear text from them is blocked, so

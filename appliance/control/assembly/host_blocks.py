@@ -11,7 +11,7 @@ from datetime import UTC, datetime
 from appliance.base import clock
 from appliance.channel.answers.status import BlocksState
 from appliance.policy.model import Address, address_of
-from appliance.store.ends import EndKind, Ends
+from appliance.store.ends import EndKind, EndTable
 from appliance.store.host_tables import HostBlockRow
 from appliance.store.state_file import StateStore
 
@@ -38,7 +38,7 @@ class HostUses:
 class BlockTable:
     """All blocks, by canonical address."""
 
-    def __init__(self, store: StateStore, ends: Ends) -> None:
+    def __init__(self, store: StateStore, ends: EndTable) -> None:
         self._store = store
         self._ends = ends
         self._rows = {address_of(row.address): row for row in store.hosts.blocks()}

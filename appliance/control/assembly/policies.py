@@ -37,7 +37,7 @@ from appliance.policy.model import Address
 from appliance.policy.policy import Approval, CurrentPolicy, Policy
 from appliance.signing.fingerprints import fingerprint
 from appliance.signing.site_keys import signer
-from appliance.store.ends import EndKind, Ends
+from appliance.store.ends import EndKind, EndTable
 from appliance.store.revisions import Revisions, reloaded_by
 from appliance.store.state_file import RevisionRow, StateStore
 from appliance.telemetry.audit_trail import AuditTrail
@@ -76,7 +76,7 @@ class Policies(Revisions[RevisionRow]):
         self,
         file: Path,
         store: StateStore,
-        ends: Ends,
+        ends: EndTable,
         trail: AuditTrail,
         policy: CurrentPolicy,
         *,

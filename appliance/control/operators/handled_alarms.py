@@ -9,7 +9,7 @@ import msgspec
 from appliance.base import clock
 from appliance.channel.alarms import activity, open_alarms
 from appliance.channel.answers.status import HandledAlarm, Status
-from appliance.store.ends import EndKind, Ends
+from appliance.store.ends import EndKind, EndTable
 from appliance.store.state_file import StateStore
 
 _SETTING = "handled alarms"
@@ -19,7 +19,7 @@ SILENCES = EndKind("silence")
 class HandledAlarms:
     """The alarms that an operator has acknowledged or silenced, by kind."""
 
-    def __init__(self, store: StateStore, ends: Ends) -> None:
+    def __init__(self, store: StateStore, ends: EndTable) -> None:
         self._store = store
         self._ends = ends
         self._rows = msgspec.json.decode(store.settings().get(_SETTING, "{}"), type=dict[str, HandledAlarm])

@@ -15,7 +15,7 @@ from appliance.channel.messages.api import TokenKept
 from appliance.control.errors import TokenRefusedError
 from appliance.control.operators.sessions import Sessions
 from appliance.store.access_tokens import BadTokenNameError, TokenRow, make_token
-from appliance.store.ends import EndKind, Ends
+from appliance.store.ends import EndKind, EndTable
 from appliance.store.state_file import StateStore
 from appliance.store.writer_thread import StoreError
 from appliance.telemetry.audit_trail import AuditTrail
@@ -38,7 +38,7 @@ class TokenOrders:
         self,
         store: StateStore,
         trail: AuditTrail,
-        ends: Ends,
+        ends: EndTable,
         changed: Callable[[], None],
         *,
         sessions: Callable[[], Sessions | None] = lambda: None,

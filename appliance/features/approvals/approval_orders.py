@@ -33,7 +33,7 @@ from appliance.master.endpoints.host_signs import HostSigns
 from appliance.policy.model import Address, Category, Decision, Request, address_of
 from appliance.policy.policy import Policy
 from appliance.policy.rights import Right, decide_right
-from appliance.store.ends import Ends
+from appliance.store.ends import EndTable
 from appliance.telemetry.audit_trail import NOT_RECORDED, Asker, AuditTrail
 
 CHECK_SECONDS = 0.25
@@ -56,7 +56,7 @@ class ApprovalOrders:
         trail: AuditTrail,
         signs: HostSigns,
         stop: MotionStop,
-        ends: Ends,
+        ends: EndTable,
         *,
         first: int,
         decide_again: Callable[[], int],

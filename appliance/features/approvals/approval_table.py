@@ -17,7 +17,7 @@ from appliance.features.approvals.quotas import APPROVALS
 from appliance.policy.model import Address, Category
 from appliance.policy.policy import Approval, Policy
 from appliance.quotas.pool import Pool, QuotaClass
-from appliance.store.ends import EndKind, Ends
+from appliance.store.ends import EndKind, EndTable
 
 _MOST_UNANSWERED = 256
 APPROVING = EndKind("approval", stored=False)
@@ -89,7 +89,7 @@ class ApprovalEntry:
 class ApprovalTable:
     """The held calls and approvals; the first entry has the number `first`."""
 
-    def __init__(self, first: int, ends: Ends) -> None:
+    def __init__(self, first: int, ends: EndTable) -> None:
         self._next = first
         self._ends = ends
         self._entries: dict[int, ApprovalEntry] = {}

@@ -31,7 +31,7 @@ from appliance.policy.host_names import HostNames, UnknownHostNameError
 from appliance.policy.live_rights import LiveRight
 from appliance.policy.model import Address, address_of
 from appliance.rpc.front import plain_address
-from appliance.store.ends import Ends
+from appliance.store.ends import EndTable
 from appliance.store.host_tables import HostBlockRow
 from appliance.store.state_file import StateStore
 from appliance.store.writer_thread import StoreError
@@ -85,7 +85,7 @@ class BlockOrders:
         policies: Policies,
         store: StateStore,
         trail: AuditTrail,
-        ends: Ends,
+        ends: EndTable,
         *,
         live: Callable[[], list[LiveRight]],  # the rights that a change of the policy may end
         connected: Callable[[], Iterable[Collection[str]]],  # the two hosts of each connection

@@ -14,7 +14,7 @@ from appliance.base import clock
 from appliance.base.actors import OPERATOR
 from appliance.control.errors import SenselessError
 from appliance.store.door_tables import TicketRow
-from appliance.store.ends import EndKind, Ends
+from appliance.store.ends import EndKind, EndTable
 from appliance.store.state_file import StateStore
 
 _FORM = re.compile(r"([0-9a-f]{12})\.([A-Za-z0-9_-]{43})", re.ASCII)
@@ -26,7 +26,7 @@ LONGEST_SECONDS = 30 * 86_400.0
 class DoorTickets:
     """All tickets that have not ended."""
 
-    def __init__(self, store: StateStore, ends: Ends) -> None:
+    def __init__(self, store: StateStore, ends: EndTable) -> None:
         self._store = store
         self._ends = ends
         self._rows = {row.id: row for row in store.doors.tickets()}

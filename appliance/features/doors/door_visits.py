@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from appliance.features.doors.door_tickets import new_ticket, shown
 from appliance.store.door_tables import TicketRow
-from appliance.store.ends import EndKind, Ends
+from appliance.store.ends import EndKind, EndTable
 
 _OPEN_SECONDS = 60.0
 VISITS = EndKind("door visit", stored=False)
@@ -28,7 +28,7 @@ class _Visit:
 class DoorVisits:
     """All visits. `bearers()` returns the names of the usable tokens and sessions by their ids."""
 
-    def __init__(self, ends: Ends, bearers: Callable[[], Mapping[str, str]]) -> None:
+    def __init__(self, ends: EndTable, bearers: Callable[[], Mapping[str, str]]) -> None:
         self._ends = ends
         self._bearers = bearers
         self._visits: dict[str, _Visit] = {}

@@ -17,7 +17,7 @@ from appliance.features.sso.link import (
     SignOnWanted,
 )
 from appliance.features.sso.sessions import SessionTable
-from appliance.store.ends import Ends
+from appliance.store.ends import EndTable
 from appliance.telemetry.audit_trail import AuditTrail
 
 M = TypeVar("M", bound=messages.Message)
@@ -28,7 +28,7 @@ class SsoOrders:
     """Answers operators and browsers. `changed()` is called when the usable sessions have changed."""
 
     def __init__(
-        self, trail: AuditTrail, ends: Ends, changed: Callable[[], None], *, configured: bool
+        self, trail: AuditTrail, ends: EndTable, changed: Callable[[], None], *, configured: bool
     ) -> None:
         self.link = Link(self._received)
         self.sessions = SessionTable(ends, changed)

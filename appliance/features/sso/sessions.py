@@ -16,7 +16,7 @@ from appliance.features.sso.link import SessionKeys, SignedInPerson
 from appliance.features.sso.quotas import SESSIONS
 from appliance.signing.request_signing import TokenKeys
 from appliance.store.access_tokens import TokenRow
-from appliance.store.ends import EndKind, Ends
+from appliance.store.ends import EndKind, EndTable
 
 ONLINE = EndKind("session", stored=False)
 _PREFIX = "sso:"  # no token has such a name
@@ -29,9 +29,9 @@ class _Kept(NamedTuple):
 
 
 class SessionTable:
-    """All sessions, oldest first. `changed()` is called when some have ended by themselves."""
+    """All sessions, oldest first. `changed()` is called when some have reached their end."""
 
-    def __init__(self, ends: Ends, changed: Callable[[], None]) -> None:
+    def __init__(self, ends: EndTable, changed: Callable[[], None]) -> None:
         self._ends = ends
         self._changed = changed
         ends.when_due(ONLINE, self._due)

@@ -54,7 +54,7 @@ class ReplicatedTokens:
         return self._rows is not None
 
     def read(self) -> bool:
-        """Read the replica; return whether the api must be told."""
+        """Read the replica; return whether the tokens or blocks for the api have changed."""
         with suppress(sqlite3.Error):  # no state yet
             with closing(sqlite3.connect(f"file:{self._path}?mode=ro", uri=True)) as connection:
                 connection.execute("BEGIN")  # one snapshot: keys and tokens of the same time

@@ -22,7 +22,7 @@ from appliance.hosts.certificate_requests import AuthorityError
 from appliance.hosts.host_table import HostForbiddenError, HostRefusedError, HostTable
 from appliance.hosts.stored_authority import StoredAuthority
 from appliance.hosts.tunnel_state import Tunnels
-from appliance.store.ends import Ends
+from appliance.store.ends import EndTable
 from appliance.store.state_file import StateStore
 from appliance.store.writer_thread import StoreError
 from appliance.telemetry.audit_trail import AuditTrail
@@ -44,7 +44,7 @@ class Certification:
         appliances: Appliances,
         master_port: int,
         rest: RestAddress,
-        ends: Ends,
+        ends: EndTable,
         changed: Callable[[], int],
     ) -> None:
         self.store = store

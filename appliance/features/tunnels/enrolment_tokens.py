@@ -10,7 +10,7 @@ import re
 import secrets
 
 from appliance.base import clock
-from appliance.store.ends import EndKind, Ends
+from appliance.store.ends import EndKind, EndTable
 from appliance.store.host_tables import EnrolmentTokenRow, HostTables
 
 _FORM = re.compile(r"rosrv-enrol_([0-9a-f]{12})_([A-Za-z0-9_-]{43})")
@@ -26,7 +26,7 @@ class BadEnrolmentTokenError(Exception):
 class EnrolmentTokens:
     """All tokens that have not expired."""
 
-    def __init__(self, tables: HostTables, ends: Ends) -> None:
+    def __init__(self, tables: HostTables, ends: EndTable) -> None:
         self._tables = tables
         self._ends = ends
         self._rows = {row.name: row for row in tables.awaited()}

@@ -3,7 +3,7 @@ from collections.abc import Mapping
 from appliance.specifications.rollout import Switch
 from appliance.specifications.specification_manager import SpecificationManager
 from appliance.specifications.timed_switches import TIMED, TimedSwitches
-from appliance.store.ends import Ends
+from appliance.store.ends import EndTable
 from appliance.store.state_file import StateStore
 from tests.support.ends import Ending
 from tests.unit.store.unconfirmed import Unconfirmed
@@ -12,7 +12,7 @@ from tests.unit.store.unconfirmed import Unconfirmed
 class DisabledMonitor(Ending):
     kind = TIMED
 
-    def __init__(self, store: StateStore, ends: Ends) -> None:
+    def __init__(self, store: StateStore, ends: EndTable) -> None:
         super().__init__(store, ends)
         self.switches = TimedSwitches(store, ends, self._come_back)
         self.switches.start({"gun": False})

@@ -12,7 +12,7 @@ from appliance.base import age_clock, clock
 from appliance.base.age_clock import AgeClock
 from appliance.store import access_tokens
 from appliance.store import ends as ends_module
-from appliance.store.ends import EndKind, Ends
+from appliance.store.ends import EndKind, EndTable
 from appliance.store.state_file import SCHEMA, StateStore
 from appliance.store.writer_thread import StoreError
 from tests.support.ends import Ending
@@ -49,9 +49,10 @@ DATES = {
     "the end of a certificate, which is a date": "host.expires host_certificate.next_expires revocation.expires"
     " appliance.expires",
     "the date of an end, for people": "token.expires door_ticket.expires enrolment_token.expires",
-    "the past": "policy_revision.loaded monitor_revision.loaded token.created token.revoked token_use.used host.enrolled"
-    " host.revoked host_certificate.made host_ports.checked enrolment_token.created revoked_certificate.moment"
-    " revocation.moment host_block.since door.added door.removed door_ticket.created authority.signed",
+    "the past": "policy_revision.loaded monitor_revision.loaded token.created token.revoked token_use.used"
+    " host.enrolled host.revoked host_certificate.made host_ports.checked enrolment_token.created"
+    " revoked_certificate.moment revocation.moment host_block.since door.added door.removed door_ticket.created"
+    " authority.signed",
     "monotonic seconds, for the order": "incarnation.changed",
     "a length": "enrolment_token.days token_left.seconds",
 }
@@ -75,7 +76,7 @@ class Site:
         with clock.using(self.clocks[self.active]):
             age = AgeClock(self.home / self.active / "age")
             appliance = self.active if paired else ""
-            self.ends = Ends(self.store, age, appliance=appliance, away_seconds=away)
+            self.ends = EndTable(self.store, age, appliance=appliance, away_seconds=away)
             self.things = {owner.kind: owner(self.store, self.ends) for owner in OWNERS}
 
     def off(self, seconds: float, ahead: float = 0.0) -> None:
@@ -237,7 +238,7 @@ async def test_a_fault_of_one_owner_keeps_no_other_end(site: Site) -> None:
 
 async def test_the_owner_is_called_at_the_end(tmp_path: Path) -> None:
     store = StateStore(tmp_path, failed=pytest.fail, kind=InlineDatabase)
-    ends, kind, called = Ends(store, AgeClock(tmp_path / "age")), EndKind("test"), asyncio.Queue[float]()
+    ends, kind, called = EndTable(store, AgeClock(tmp_path / "age")), EndKind("test"), asyncio.Queue[float]()
 
     def due(names: list[str]) -> None:
         ends.forget(kind, *names)

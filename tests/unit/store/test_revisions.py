@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 
 from appliance.base import clock
-from appliance.store.ends import EndKind, Ends
+from appliance.store.ends import EndKind, EndTable
 from appliance.store.revisions import Revisions
 from appliance.store.state_file import MonitorRevisionRow, StateStore
 from appliance.store.writer_thread import StoreError
@@ -31,7 +31,7 @@ class Keeper(Revisions[MonitorRevisionRow]):
     outdated = ChangedError
     unconfirmed = EndKind("limit")
 
-    def __init__(self, store: StateStore, ends: Ends) -> None:
+    def __init__(self, store: StateStore, ends: EndTable) -> None:
         super().__init__(store, ends, store.monitor_revisions, store.save_monitor_revision, row(0))
 
     async def _go_back(self, revision: int) -> None:

@@ -1,6 +1,6 @@
 from collections.abc import Callable
 
-from appliance.store.ends import Ends
+from appliance.store.ends import EndTable
 from appliance.store.revisions import Revisions
 from appliance.store.state_file import MonitorRevisionRow, StateStore
 from tests.support.ends import Ending
@@ -15,9 +15,9 @@ def row(revision: int) -> MonitorRevisionRow:
 
 
 class Unconfirmed(Ending):
-    """A change that nobody confirms: revision 8 goes back to 7."""
+    """A change that is not confirmed: revision 8 goes back to 7."""
 
-    def __init__(self, store: StateStore, ends: Ends) -> None:
+    def __init__(self, store: StateStore, ends: EndTable) -> None:
         super().__init__(store, ends)
         kind = self.kind
 

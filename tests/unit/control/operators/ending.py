@@ -5,7 +5,7 @@ from appliance.channel.admin import TokenAdd
 from appliance.channel.answers.status import Status
 from appliance.control.operators.handled_alarms import SILENCES, HandledAlarms
 from appliance.control.operators.token_orders import TOKENS, TokenOrders
-from appliance.store.ends import Ends
+from appliance.store.ends import EndTable
 from appliance.store.state_file import StateStore
 from tests.support.answers import example
 from tests.support.ends import Ending
@@ -14,7 +14,7 @@ from tests.support.ends import Ending
 class Token(Ending):
     kind = TOKENS
 
-    def __init__(self, store: StateStore, ends: Ends) -> None:
+    def __init__(self, store: StateStore, ends: EndTable) -> None:
         super().__init__(store, ends)
         trail = SimpleNamespace(happened=lambda *_args, **_more: "")
         self.tokens = TokenOrders(store, cast(Any, trail), ends, lambda: None)
@@ -29,7 +29,7 @@ class Token(Ending):
 class Silence(Ending):
     kind = SILENCES
 
-    def __init__(self, store: StateStore, ends: Ends) -> None:
+    def __init__(self, store: StateStore, ends: EndTable) -> None:
         super().__init__(store, ends)
         self.handled = HandledAlarms(store, ends)
 

@@ -7,7 +7,7 @@ from appliance.features.approvals.approval_table import (
     HeldCall,
 )
 from appliance.policy.model import Category, address_of
-from appliance.store.ends import Ends
+from appliance.store.ends import EndTable
 from appliance.store.state_file import StateStore
 from tests.support.ends import Ending
 
@@ -17,7 +17,7 @@ CALL = HeldCall(address_of("10.0.0.7"), Category.PUBLISH, "/cmd_vel")
 class ApprovedLease(Ending):
     kind = APPROVING
 
-    def __init__(self, store: StateStore, ends: Ends) -> None:
+    def __init__(self, store: StateStore, ends: EndTable) -> None:
         super().__init__(store, ends)
         self.table = ApprovalTable(17, ends)
 

@@ -23,7 +23,7 @@ from appliance.policy.model import Address, Category, Request, address_of
 from appliance.policy.policy import Policy
 from appliance.policy.policy_compiler import compile_policy
 from appliance.policy.rights import Right, decide_right
-from appliance.store.ends import Ends
+from appliance.store.ends import EndTable
 from tests.support.ends import ends_in
 from tests.support.virtual_clock import VirtualClock
 
@@ -49,7 +49,7 @@ def bearer(number: str, name: str, role: str = "operator") -> TokenKept:
 
 
 class Site:
-    def __init__(self, time: VirtualClock, ends: Ends) -> None:
+    def __init__(self, time: VirtualClock, ends: EndTable) -> None:
         self.time = time
         self.text = compile_policy(TEXT, file="site.ini")
         self.policy: Policy

@@ -27,7 +27,7 @@ from appliance.hosts.host_table import HostRefusedError
 from appliance.master.graph.registry import Kind
 from appliance.policy.model import Category, Request, address_of
 from appliance.policy.policy import CurrentPolicy, Policy
-from appliance.store.ends import Ends
+from appliance.store.ends import EndTable
 from appliance.store.state_file import StateStore
 from appliance.store.writer_thread import StoreError
 from tests.support.control_parts import OPEN, ControlParts
@@ -72,7 +72,7 @@ class Control(ControlParts):
         (state / "policy.ini").write_text(text)
         self.state = StateStore(state, failed=print, kind=InlineDatabase)
         self.clock = clock
-        self.ends = Ends(self.state, cast(AgeClock, clock))
+        self.ends = EndTable(self.state, cast(AgeClock, clock))
         self.blocks = host_blocks.BlockTable(self.state, self.ends)
         self.remotes: dict[str, str] = {}
         self.uses: list[str] = []

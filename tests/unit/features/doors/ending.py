@@ -1,6 +1,6 @@
 from appliance.features.doors.door_tickets import TICKETS, DoorTickets
 from appliance.features.doors.door_visits import VISITS, DoorVisits
-from appliance.store.ends import Ends
+from appliance.store.ends import EndTable
 from appliance.store.state_file import StateStore
 from tests.support.ends import Ending
 
@@ -8,7 +8,7 @@ from tests.support.ends import Ending
 class Ticket(Ending):
     kind = TICKETS
 
-    def __init__(self, store: StateStore, ends: Ends) -> None:
+    def __init__(self, store: StateStore, ends: EndTable) -> None:
         super().__init__(store, ends)
         self.tickets = DoorTickets(store, ends)
 
@@ -23,7 +23,7 @@ class Visit(Ending):
     kind = VISITS
     text = ""
 
-    def __init__(self, store: StateStore, ends: Ends) -> None:
+    def __init__(self, store: StateStore, ends: EndTable) -> None:
         super().__init__(store, ends)
         self.visits = DoorVisits(ends, lambda: {"1": "ann"})
 

@@ -1,7 +1,7 @@
 from appliance.base import clock
 from appliance.features.sso.link import SessionKeys, SignedInPerson
 from appliance.features.sso.sessions import ONLINE, SessionTable
-from appliance.store.ends import Ends
+from appliance.store.ends import EndTable
 from appliance.store.state_file import StateStore
 from tests.support.ends import Ending
 
@@ -11,7 +11,7 @@ ID = "0123456789ab"
 class PersonsSession(Ending):
     kind = ONLINE
 
-    def __init__(self, store: StateStore, ends: Ends) -> None:
+    def __init__(self, store: StateStore, ends: EndTable) -> None:
         super().__init__(store, ends)
         self.sessions = SessionTable(ends, lambda: None)
 

@@ -1,5 +1,5 @@
 from appliance.features.tunnels.enrolment_tokens import ENROLMENT, EnrolmentTokens
-from appliance.store.ends import Ends
+from appliance.store.ends import EndTable
 from appliance.store.state_file import StateStore
 from tests.support.ends import Ending
 
@@ -7,7 +7,7 @@ from tests.support.ends import Ending
 class AwaitedHost(Ending):
     kind = ENROLMENT
 
-    def __init__(self, store: StateStore, ends: Ends) -> None:
+    def __init__(self, store: StateStore, ends: EndTable) -> None:
         super().__init__(store, ends)
         self.tokens = EnrolmentTokens(store.hosts, ends)
 
