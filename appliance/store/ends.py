@@ -31,7 +31,7 @@ _READING = "reading of the clocks"
 _IMPORTED = "ends"  # this setting exists once the ends of versions up to 0.3.0 are in the table
 _SECOND = 1_000_000_000
 _NOTE_SECONDS = 30.0
-PAIRED_NOTE_SECONDS = 5.0
+_PAIRED_NOTE_SECONDS = 1.0  # at each look, unless many come together
 LOOK_SECONDS = 5.0
 """The longest time between two checks: timers do not count while the machine is suspended, the age clock does."""
 _SAME_DATE = _SECOND  # a smaller difference of the clocks moves no date that people see
@@ -157,7 +157,7 @@ class EndTable:
                     call(due)
             except Exception as error:  # noqa: BLE001  a defect of one kind must not keep others from ending
                 _log.critical("fault at an end", kind=kind, names=due[:20], exc_info=error)
-        if clock.since_boot() - self._noted >= (PAIRED_NOTE_SECONDS if self._appliance else _NOTE_SECONDS):
+        if clock.since_boot() - self._noted >= (_PAIRED_NOTE_SECONDS if self._appliance else _NOTE_SECONDS):
             self._noted = clock.since_boot()
             with contextlib.suppress(StoreError):  # a full disk: a queued row each time would only grow
                 self._store.database.require_room()

@@ -11,7 +11,6 @@ import pytest
 from appliance.base import age_clock, clock
 from appliance.base.age_clock import AgeClock
 from appliance.store import access_tokens
-from appliance.store import ends as ends_module
 from appliance.store.ends import EndKind, EndTable
 from appliance.store.state_file import SCHEMA, StateStore
 from appliance.store.writer_thread import StoreError
@@ -266,5 +265,11 @@ def test_no_other_column_of_the_state_is_an_end() -> None:
     assert columns == {column for group in DATES.values() for column in group.split()}
 
 
-def test_the_clocks_are_noted_more_often_in_a_pair() -> None:
-    assert ends_module.PAIRED_NOTE_SECONDS <= ends_module.LOOK_SECONDS
+@pytest.mark.parametrize(("paired", "notes"), [(True, 12), (False, 2)])
+async def test_the_clocks_are_noted_more_often_in_a_pair(site: Site, paired: bool, notes: int) -> None:
+    site.start(paired=paired)
+    assert site.store is not None
+    before = site.store.database.number
+    for _ in range(12):
+        site.run(5.0)
+    assert site.store.database.number - before == notes
