@@ -14,21 +14,12 @@ from tests.support.engines import InlineDatabase
 pytestmark = pytest.mark.anyio
 
 
-class RefusedError(Exception):
-    pass
-
-
-class ChangedError(Exception):
-    pass
-
-
 def row(revision: int, who: str = "eve") -> MonitorRevisionRow:
     return MonitorRevisionRow(revision, "{}", float(revision), who, "")
 
 
 class Keeper(Revisions[MonitorRevisionRow]):
-    refusal = RefusedError
-    outdated = ChangedError
+    refusal = outdated = LookupError
     unconfirmed = EndKind("limit")
 
     def __init__(self, store: StateStore, ends: EndTable) -> None:
@@ -72,7 +63,7 @@ async def test_the_error_names_the_missing_and_the_stored_revisions(
     keeper: Keeper, asked: int | None, said: str
 ) -> None:
     keeper.in_force = row(4)
-    with pytest.raises(RefusedError) as caught:
+    with pytest.raises(LookupError) as caught:
         await keeper.wanted(asked)
     assert caught.value.args == ([f"there is no revision {said}; kept are: 4, 5, 7"],)
 

@@ -6,10 +6,6 @@ from appliance.store.state_file import MonitorRevisionRow, StateStore
 from tests.support.ends import Ending
 
 
-class NoRefusalError(Exception):
-    pass
-
-
 def row(revision: int) -> MonitorRevisionRow:
     return MonitorRevisionRow(revision, "{}", float(revision), "ann", "")
 
@@ -22,7 +18,7 @@ class Unconfirmed(Ending):
         kind = self.kind
 
         class Kept(Revisions[MonitorRevisionRow]):
-            refusal = outdated = NoRefusalError
+            refusal = outdated = LookupError
             unconfirmed = kind
 
             async def _go_back(self, revision: int) -> None:
