@@ -3,6 +3,8 @@
 The supervisor writes the result to `run/config.json` in the state directory for the other processes.
 """
 
+import dataclasses
+import hashlib
 import ipaddress
 import os
 import re
@@ -475,6 +477,11 @@ class Settings:
     @property
     def sections(self) -> Sections:
         return Sections({kind: self.of(kind) for kind in SECTIONS})
+
+    def fingerprints(self) -> dict[str, str]:
+        """Return the start of the SHA-256 of each setting, so that records show which of them changed, not to what."""
+        values = ((field.name, getattr(self, field.name)) for field in dataclasses.fields(self))
+        return {name: hashlib.sha256(repr(value).encode()).hexdigest()[:16] for name, value in values}
 
     @property
     def listen_address(self) -> tuple[str, int]:

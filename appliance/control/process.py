@@ -15,6 +15,7 @@ from pathlib import Path
 import structlog
 import uvloop
 
+from appliance import __version__
 from appliance.base.background import run_always
 from appliance.channel import messages
 from appliance.configuration.settings import Settings, load_resolved
@@ -159,7 +160,8 @@ class _Control:
         base.lifeline.surroundings.master = uri.rstrip("/")
         if not restarted:
             name = {"robot": settings.name} if settings.name else {}
-            base.trail.happened("appliance started", f"nodes may connect at {uri}", more=name)
+            more = {**name, "version": __version__, "configuration": settings.fingerprints()}
+            base.trail.happened("appliance started", f"nodes may connect at {uri}", more=more)
         detail = {
             "master": uri.rstrip("/"),
             "revision": base.policies.revision,

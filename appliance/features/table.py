@@ -23,6 +23,7 @@ from appliance.features.fleet.feature import FLEET
 from appliance.features.guards.feature import GUARDS
 from appliance.features.limits.feature import LIMITS
 from appliance.features.live.feature import LIVE
+from appliance.features.logbook.feature import LOGBOOK
 from appliance.features.metrics.feature import METRICS
 from appliance.features.monitor_tools.feature import MONITOR_TOOLS
 from appliance.features.policy_tools.feature import POLICY_TOOLS
@@ -63,6 +64,7 @@ FEATURES: tuple[Feature, ...] = (
     SELFTEST,
     DEMO,
     SURVEY,
+    LOGBOOK,
     SSO,
     AUTHORITY,
     APPROVALS,

@@ -11,7 +11,8 @@ EVENTS: dict[str, str] = {
     "node returned": "A lost node answers again.",
     "replaced": "A node registered again under its name from the same host; the earlier node got a shutdown call.",
     "takeover": "A node registered under a name that another host holds.",
-    "policy loaded": "A policy came into force; `detail` has who loaded it, its source, and the hash of its text.",
+    "policy loaded": "A policy came into force; `detail` has who loaded it, its source, the hash of its text, and its"
+    " changed lines in `diff` (at most 32,768 characters).",
     "policy confirmed": "A policy that was loaded with commit-confirm was confirmed and stays in force.",
     "policy refused": "A new policy has errors and was rejected as a whole; the previous policy stays in force.",
     "policy file refused": "The appliance started, and the policy's file has errors or fails its tests; the revision"
@@ -144,7 +145,8 @@ EVENTS: dict[str, str] = {
     "process died": "A process of the appliance ended unexpectedly.",
     "process failing": "A process of the appliance ends soon after every start; `reason` says why, `detail.output` has"
     " the last lines that it printed. It is restarted at growing intervals of up to a minute.",
-    "appliance started": "The appliance is in service; `detail.robot` is the `name` of the robot in `appliance.yaml`.",
+    "appliance started": "The appliance is in service; `detail` has its version, the robot's `name` of"
+    " `appliance.yaml`, and the start of the SHA-256 of each setting.",
     "appliance stopped": "The appliance was shut down in an orderly way.",
     "took over": "This appliance of a pair became the active one; `detail` has the epoch, both names, the last"
     " checkpoint of the other appliance's log that was replicated (null without one), and the takeover before.",

@@ -41,6 +41,7 @@ from appliance.store.ends import EndKind, EndTable
 from appliance.store.revisions import Revisions, reloaded_by
 from appliance.store.state_file import RevisionRow, StateStore
 from appliance.telemetry.audit_trail import AuditTrail
+from appliance.telemetry.text_changes import changed_lines
 
 _REFUSED = "policy file refused"
 _log = structlog.get_logger()
@@ -351,6 +352,7 @@ class Policies(Revisions[RevisionRow]):
         before = self.revision
         row = RevisionRow(before + 1, policy.text, policy.file, clock.wall(), who, note, signature)
         lost = _losses(self._completed(policy), self.policy(), self._live()) if self.policy else []
+        earlier = {"policy": self.policy().text} if self.policy else {}
         self._put_in_force(row, within)
         revoked = self._enforce(policy)
         self._trail.happened(
@@ -359,6 +361,7 @@ class Policies(Revisions[RevisionRow]):
             who=by or who,
             file=policy.file,
             sha256=fingerprint(policy.text),
+            diff=changed_lines(earlier, {"policy": policy.text}),
             signed_by=signer(self._site_keys, policy.text, signature),
             revoked=revoked,
             warnings=[*lost, *map(str, policy.warnings)][:100],

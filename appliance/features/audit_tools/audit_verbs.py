@@ -20,12 +20,14 @@ from appliance.audit.proof.copies import SignedCheckpoint, read_copies
 from appliance.audit.search.filter_options import FILTER
 from appliance.audit.search.query import Filter, FilterError
 from appliance.audit.search.search import LARGEST_PAGE
+from appliance.base import clock
 from appliance.base.counted import counted
 from appliance.channel.admin import PolicyWanted
 from appliance.channel.answers.policy_answers import PolicyKnown
 from appliance.cli.audit.audit_errors import Errors, fail, note
 from appliance.cli.audit.record_argument import RecordArgument
 from appliance.cli.audit.verification_text import print_verification, write
+from appliance.cli.audit.verified import keep_verification
 from appliance.cli.connection.admin_client import AccessDeniedError, NotRunningError
 from appliance.cli.connection.audit_file import FileLog
 from appliance.cli.connection.audit_over_rest import RestLog
@@ -190,8 +192,12 @@ def _files(source: FileLog | RestLog, other: Path) -> tuple[FileLog, FileLog]:
 def _verified(source: FileLog | RestLog, key: Path | None, checkpoints: Path | None) -> Verification:
     copies = None if checkpoints is None else read_copies(checkpoints)
     public_key = None if key is None else read_public_key(key)
+    began = clock.now()
     with progress("checking the chain", source.last) as report:
-        return source.verify(public_key, copies, report)
+        result = source.verify(public_key, copies, report)
+    if isinstance(source, FileLog):
+        keep_verification(source.path, result, clock.now() - began)
+    return result
 
 
 def _print_result(result: Any, printed: Callable[[Any], None], *, as_json_lines: bool) -> None:

@@ -1,37 +1,17 @@
 """Make the HTML page of a bundle. The same input gives the same page."""
 
-import html
 import json
 from collections import Counter
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
-from appliance.audit.log.record_format import printable, rfc3339
+from appliance.audit.log.record_format import rfc3339
 from appliance.features.evidence.recorded import RecordingSummary
+from appliance.formats.html_page import head, text
 
 _MOST_ROWS = 2000
 _SEVERE = ("notice", "warning", "alarm")
-_HEAD = """\
-<!doctype html>
-<html lang="en">
-<meta charset="utf-8">
-<meta http-equiv="Content-Security-Policy" content="default-src 'none'; style-src 'unsafe-inline'">
-<meta name="viewport" content="width=device-width">
-<title>Evidence of a ROSRV appliance</title>
-<style>
-body { font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 75rem; padding: 0 1rem;
-  color-scheme: light dark }
-table { border-collapse: collapse; width: 100% }
-td, th { text-align: left; vertical-align: top; padding: .15rem .6rem .15rem 0 }
-tr { border-top: 1px solid #8884 }
-td { overflow-wrap: anywhere }
-code, .time { font-family: ui-monospace, monospace }
-.time { white-space: nowrap }
-.warning, .deny { color: #b50 }
-.alarm { color: #d00; font-weight: 600 }
-</style>
-<h1>Evidence of a ROSRV appliance</h1>
-"""
+_TITLE = "Evidence of a ROSRV appliance"
 _PROOF = """\
 <h2>Verify it</h2>
 <p>This page proves nothing. On any machine with Python 3.8 and OpenSSL 3.0, in the folder of the bundle:</p>
@@ -74,7 +54,7 @@ class Page:
         who = " ".join(filter(None, (host, record["caller_id"], _who(record["detail"]))))
         cells = [str(record["sequence"]), record["event"], record["decision"] or "", who, record["resource"] or "",
                  record["reason"]]  # fmt: skip
-        shown = "".join(f"<td>{_text(cell)}" for cell in cells)
+        shown = "".join(f"<td>{text(cell)}" for cell in cells)
         self._rows.append(f'<tr class="{kind}"><td class="time">{rfc3339(record["time"])}{shown}\n')
 
     def html(self, manifest: dict[str, Any]) -> bytes:
@@ -85,8 +65,8 @@ class Page:
             "log": manifest["log"],
             "records": runs,
         }
-        parts = [_HEAD, "<table>\n"]
-        parts += [f"<tr><th>{name}<td>{_text(value)}\n" for name, value in facts.items() if value]
+        parts = [head(_TITLE), f"<h1>{_TITLE}</h1>\n<table>\n"]
+        parts += [f"<tr><th>{name}<td>{text(value)}\n" for name, value in facts.items() if value]
         parts += ["</table>\n", *_recorded(self._recording), _PROOF, "<h2>Events</h2>\n<table>\n"]
         parts += [
             "<tr><th>time<th>record<th>event<th>decision<th>who<th>what<th>reason\n",
@@ -96,16 +76,16 @@ class Page:
         if self._left_out:
             parts.append(f"<p>{self._left_out} more of this kind are in records.ndjson only.</p>\n")
         parts.append("<h2>All records by event</h2>\n<table>\n")
-        parts += [f"<tr><td>{_text(event)}<td>{count}\n" for event, count in sorted(self._events.items())]
+        parts += [f"<tr><td>{text(event)}<td>{count}\n" for event, count in sorted(self._events.items())]
         parts.append("</table>\n<h2>Contents of the bundle</h2>\n<table>\n")
         parts += [
-            f'<tr><td><a href="{_text(name).replace("%", "%25")}">{_text(name)}</a><td>{about["bytes"]} bytes'
+            f'<tr><td><a href="{text(name).replace("%", "%25")}">{text(name)}</a><td>{about["bytes"]} bytes'
             f"<td><code>{about['sha256']}</code>\n"
             for name, about in manifest["members"].items()
             if name != "index.html"
         ]
         parts += [
-            f"<tr><td>{_text(place)}<td>the appliance does not have it\n" for place in manifest["missing"]
+            f"<tr><td>{text(place)}<td>the appliance does not have it\n" for place in manifest["missing"]
         ]
         return "".join([*parts, "</table>\n"]).encode()
 
@@ -117,14 +97,14 @@ def _recorded(recording: RecordingSummary | None) -> Iterator[str]:
     yield "for rosbag, rqt_bag, Foxglove or PlotJuggler, contains the messages as sent, before monitors\n"
     yield "changed or dropped them.</p>\n"
     if not recording.complete:
-        yield f'<p class="alarm">Not complete: {_text(recording.why_not)}</p>\n'
+        yield f'<p class="alarm">Not complete: {text(recording.why_not)}</p>\n'
     yield "<table>\n<tr><th>time<th>trigger<th>record<th>what\n"
     for trigger in recording.triggers:
         cells = (trigger.what, trigger.record, trigger.text)
-        yield f'<tr><td class="time">{rfc3339(trigger.time)}{"".join(f"<td>{_text(cell)}" for cell in cells)}\n'
+        yield f'<tr><td class="time">{rfc3339(trigger.time)}{"".join(f"<td>{text(cell)}" for cell in cells)}\n'
     yield "</table>\n<table>\n<tr><th>topic<th>type<th>messages<th>missed\n"
     for topic in recording.topics:
-        yield f"<tr><td>{_text(topic.topic)}<td>{_text(topic.type)}<td>{topic.messages}<td>{topic.missed}\n"
+        yield f"<tr><td>{text(topic.topic)}<td>{text(topic.type)}<td>{topic.messages}<td>{topic.missed}\n"
     yield "</table>\n"
 
 
@@ -134,7 +114,3 @@ def _who(detail: str) -> str:
     except ValueError:  # the record was damaged
         return ""
     return str(found) if found else ""
-
-
-def _text(text: str) -> str:
-    return html.escape(printable(text).encode("utf-8", "replace").decode())

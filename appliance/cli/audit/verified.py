@@ -1,0 +1,48 @@
+"""Keep the last result of `rosrv audit verify` beside the log, for reports that do not verify it themselves.
+
+The file proves nothing: who can change the log's folder can change it. A report says so.
+"""
+
+import contextlib
+from pathlib import Path
+
+import msgspec
+
+from appliance.audit.log.record_format import rfc3339
+from appliance.audit.proof.chain_findings import Verification
+from appliance.base import clock
+from appliance.base.atomic_files import write_whole
+
+_NAME = "verified.json"
+_MODE = 0o640
+
+
+class LastVerification(msgspec.Struct, frozen=True, kw_only=True):
+    """A result with its date; `complete` if nothing was wrong."""
+
+    time_utc: str
+    complete: bool
+    records: int
+    text: str
+
+
+def keep_verification(log: Path, result: Verification, seconds: float) -> None:
+    """Store a result beside the log, if this user may write there."""
+    parts = [
+        f"records {result.first} to {result.last}, signed through {result.signed_through}, in {seconds:.0f} s"
+    ]
+    parts += [finding.message for finding in result.findings[:3]]
+    kept = LastVerification(
+        time_utc=rfc3339(clock.wall_ns()), complete=result.ok, records=result.records, text="; ".join(parts)
+    )
+    with contextlib.suppress(OSError):
+        owner = log.parent.stat()
+        write_whole(log.parent / _NAME, msgspec.json.encode(kept), _MODE, (owner.st_uid, owner.st_gid))
+
+
+def last_verification(log: Path) -> LastVerification | None:
+    """Return the stored result, or null without a readable one."""
+    try:
+        return msgspec.json.decode((log.parent / _NAME).read_bytes(), type=LastVerification)
+    except (OSError, msgspec.MsgspecError):
+        return None

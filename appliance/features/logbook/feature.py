@@ -1,0 +1,18 @@
+"""Define the feature logbook: `rosrv report interventions` and `rosrv who-drove`."""
+
+from appliance.cli.verb_table import Group, Verb
+from appliance.features.feature import Feature
+
+_PLACE = "appliance.features.logbook."
+
+LOGBOOK = Feature(
+    "logbook",
+    verbs={
+        "report": Group(
+            "Print the machine's logbook: interventions in its safety settings.",
+            {"interventions": Verb(f"{_PLACE}report_verb:report_interventions")},
+            after="audit",
+        ),
+        "who-drove": Verb(f"{_PLACE}who_drove_verb:who_drove", after="report"),
+    },
+)

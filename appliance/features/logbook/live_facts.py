@@ -1,0 +1,92 @@
+"""Say which interfaces the running appliance has, what protects each, and who may act on it. No I/O."""
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from appliance.base.counted import counted
+from appliance.channel.answers.policy_answers import PolicyInForce
+from appliance.channel.answers.token_answers import Tokens
+from appliance.features.logbook.machine_report import Interface
+from appliance.policy.model import Category
+from appliance.policy.policy import Policy
+from appliance.policy.sections import BY_CATEGORY
+
+_ACTS = (Category.PUBLISH, Category.CALL, Category.WRITE)
+
+
+def interfaces(status: Mapping[str, Any], policy: PolicyInForce, tokens: Tokens) -> Iterator[Interface]:
+    """Yield the ways in. `status` is the answer of `rosrv status --json`."""
+    rules = f"policy revision {policy.revision} decides each call by the sender's address"
+    lenient = status["policy"]["audit_only"]
+    if lenient:
+        rules += f"; audit-only, so only recorded: {', '.join(lenient)}"
+    blocked = status["blocks"]["hosts"]
+    yield Interface(
+        name="ROS Master API", where=str(status["master"]), commands="registrations, parameters",
+        protection=f"{rules}; {counted(blocked, 'host')} blocked",
+    )  # fmt: skip
+    yield Interface(
+        name="topics and services (relay)", where="ports of [Ports] in the policy",
+        commands="messages and service calls",
+        protection=f"{rules}; {status['monitors']['enabled']} of {status['monitors']['loaded']} monitors act;"
+        f" relaying: {status['relaying']}, isolation: {status['isolation']}",
+    )  # fmt: skip
+    usable = [token for token in tokens.tokens if token.valid and token.revoked is None]
+    by_role = ", ".join(
+        f"{sum(token.role == role for token in usable)} {role}"
+        for role in ("viewer", "investigator", "operator", "admin")
+    )
+    yield Interface(
+        name="REST and console", where="api of appliance.yaml", commands="orders of the token's or person's role",
+        protection=f"TLS; tokens: {by_role}; single sign-on, where it is configured",
+    )  # fmt: skip
+    yield Interface(
+        name="admin socket", where="the appliance's machine", commands="all orders",
+        protection="permissions of the file: root and the appliance's group",
+    )  # fmt: skip
+    for door in (status.get("doors") or {}).get("doors", ()):
+        yield Interface(
+            name=f"door {door['name']}", where="its port, or /door/ of the console's port",
+            commands="what the policy grants its name", protection="a ticket; the policy; monitors of its topics",
+        )  # fmt: skip
+    tunnels = status["ipsec"]
+    if tunnels["esp"] is not None:
+        yield Interface(
+            name="IPsec tunnels", where="UDP 500 and 4500, ESP", commands="none of their own: they carry the others",
+            protection=f"certificates of {counted(tunnels['enrolled'], 'host')}; {' '.join(tunnels['key_exchange'])}",
+        )  # fmt: skip
+    if status.get("standby") is not None:
+        yield Interface(
+            name="the other appliance and the witness", where="TCP and UDP 7411 and 7412",
+            commands="the state, and who serves", protection="mutual TLS; signed datagrams",
+        )  # fmt: skip
+
+
+def rights(policy: Policy, in_force: PolicyInForce, tokens: Tokens) -> Iterator[str]:
+    """Yield a sentence for each way to act on the machine, or to change its safety settings."""
+    usable = [token for token in tokens.tokens if token.valid and token.revoked is None]
+    for role, may in (
+        ("admin", "change policies, monitors and guards"),
+        (
+            "operator",
+            "load policies and guards that exist already, set guards, switch monitors, block hosts, approve",
+        ),
+    ):
+        names = sorted({token.name for token in usable if token.role == role})
+        yield f"{role} tokens ({may}): {', '.join(names) or 'none'}"
+    keys = in_force.site_keys
+    yield (
+        f"policies and monitors must be signed by one of {counted(len(keys), 'site key')}"
+        if keys
+        else "policies and monitors need no signature of the site: root and admin tokens can change them"
+    )
+    yield "on the appliance's machine, root and its group can give every order"
+    for category in _ACTS:
+        for rule in policy.rules(category):
+            section = BY_CATEGORY[category].name
+            verb = f" {category.value}" if len(BY_CATEGORY[category].categories) > 1 else ""
+            yield f"[{section}]{verb} {rule.key.text if rule.key is not None else 'default'}: {rule.shown}"
+    for name in ("shutdown",):
+        for rule in policy.rules(Category.COMMAND):
+            if rule.key is None or rule.key.text == name:
+                yield f"end a node (shutdown): {rule.shown}, by {rule.place}"

@@ -1,0 +1,173 @@
+"""The command `rosrv report interventions`."""
+
+import os
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+import typer
+
+from appliance import __version__
+from appliance.audit.log.record_format import rfc3339
+from appliance.audit.search.filter_options import Since, Until
+from appliance.audit.search.query import Filter
+from appliance.base import clock
+from appliance.base.timestamps import parse_timestamp
+from appliance.channel.admin import PolicyWanted, StatusWanted, TokenList
+from appliance.cli.audit.audit_errors import Errors
+from appliance.cli.audit.verified import last_verification
+from appliance.cli.connection.admin_client import NotRunningError
+from appliance.cli.connection.audit_file import FileLog
+from appliance.cli.connection.target import Appliance, speaks_with
+from appliance.cli.output import say_json, usage_error
+from appliance.features.logbook import live_facts
+from appliance.features.logbook.interventions import GAPS, SUBJECT_OF, Interventions
+from appliance.features.logbook.log_source import Log, entries_of, with_origin
+from appliance.features.logbook.machine_report import (
+    BLOCKED,
+    OFF,
+    RUNS,
+    Interface,
+    MachineReport,
+    Period,
+    VerificationResult,
+    driver_spans,
+    gaps_of,
+    pauses,
+    spans,
+)
+from appliance.features.logbook.report_words import page, report_lines
+from appliance.policy.policy_compiler import compile_policy
+from appliance.policy.policy_findings import PolicyError
+from rosmop.tool.terminal import say
+
+_VERB = "rosrv report"
+
+
+@speaks_with("One JSON object: the whole report")
+def report_interventions(
+    appliance: Appliance,
+    *,
+    since: Since = None,
+    until: Until = None,
+    after: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="From the end of an earlier report on (its --json output)"),
+    ] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "--output", "-o", metavar="FILE", help="Write one HTML page without scripts; must not exist"
+        ),
+    ] = None,
+) -> None:
+    """Report who changed which safety setting of the machine, from what to what, and what limits the proof.
+
+    The report has all changes of the policy, guards, monitors, driving rights, approvals, blocks, doors, tokens, hosts,
+    alarms and software, what was off or blocked and for how long, who drove, the interfaces of now, and the gaps of the
+    log. It contains no secret and no value of a parameter. It does not verify the log: `rosrv audit verify` does, and
+    the report names its last result on this machine. Each appliance of a pair reports its own log.
+
+    Example: rosrv report interventions --since 2026-03-01 --until 2026-04-01 --output march.html
+    """
+    with Errors():
+        now = clock.wall_ns()
+        if since is not None and after is not None:
+            raise usage_error("give --since or --after, not both", verb=_VERB)
+        begin = (
+            _end_of(after) if after is not None else None if since is None else parse_timestamp(since, now)
+        )
+        end = now if until is None else parse_timestamp(until, now)
+        found = _report(appliance, begin, end)
+    if output is not None:
+        _write(output, page(found, appliance.host_in_words))
+    if appliance.as_json:
+        say_json(found)
+    elif output is None:
+        for line in report_lines(found, appliance.host_in_words):
+            say(line)
+
+
+def _report(appliance: Appliance, since: int | None, end: int) -> MachineReport:
+    log = appliance.audit()
+    first = next(iter(log.export(Filter())), None)
+    begins = end if first is None else first.record.time
+    period = Period(begins if since is None else since, end)
+    read = Interventions()
+    read.add(entries_of(log, SUBJECT_OF))
+    rows = [with_origin(log, row) for row in read.rows if period.has(row.time)]
+    starts = [row for row in read.rows if row.event in ("appliance started", "appliance stopped")]
+    gaps = sorted(
+        [*gaps_of(entries_of(log, GAPS), period), *pauses(starts, period)], key=lambda gap: gap.time_utc
+    )
+    facts = _Live.of(appliance)
+    return MachineReport(
+        robot=facts.robot, logs=_names(log), since_utc=rfc3339(period.since), until_utc=rfc3339(end),
+        made_utc=rfc3339(clock.wall_ns()), version=__version__,
+        log_begins_utc="" if first is None else rfc3339(begins), interventions=rows,
+        switched_off=spans(read.rows, OFF, period), blocks=spans(read.rows, BLOCKED, period),
+        software=spans(read.rows, RUNS, period, one=True), drivers=driver_spans(read.rows, period),
+        interfaces=facts.interfaces, rights=facts.rights, live_reason=facts.reason, gaps=gaps,
+        verification=_verification(log),
+    )  # fmt: skip
+
+
+class _Live(msgspec.Struct):
+    robot: str = ""
+    interfaces: list[Interface] = []
+    rights: list[str] = []
+    reason: str = ""
+
+    @classmethod
+    def of(cls, appliance: Appliance) -> "_Live":
+        try:
+            status, policy, tokens = (
+                appliance.ask(request) for request in (StatusWanted(), PolicyWanted(), TokenList())
+            )
+        except NotRunningError as error:
+            return cls(reason=f"not known: {error}")
+        for answer in (status, policy, tokens):
+            if not answer.ok:
+                return cls(reason=f"not known: {answer.error}")
+        state, text, made = msgspec.to_builtins(status.given()), policy.given(), tokens.given()
+        try:
+            compiled = compile_policy(text.text, file=text.file)
+        except PolicyError as error:
+            return cls(
+                reason=f"not known: this program's version does not read the policy in force: {error.findings[0]}"
+            )
+        return cls(
+            str(state["name"]),
+            list(live_facts.interfaces(state, text, made)),
+            list(live_facts.rights(compiled, text, made)),
+        )
+
+
+def _names(log: Log) -> list[str]:
+    return [log.present()] if isinstance(log, FileLog) else []
+
+
+def _verification(log: Log) -> VerificationResult | None:
+    stored = last_verification(log.path) if isinstance(log, FileLog) else None
+    return None if stored is None else msgspec.convert(msgspec.to_builtins(stored), VerificationResult)
+
+
+def _end_of(file: Path) -> int:
+    try:
+        text = str(msgspec.json.decode(file.read_bytes())["until_utc"])
+        return parse_timestamp(text, clock.wall_ns())
+    except (OSError, msgspec.DecodeError, KeyError, TypeError) as error:
+        raise usage_error(
+            f"{file}: not a report of `rosrv report interventions --json`: {error}", verb=_VERB
+        ) from error
+
+
+def _write(file: Path, text: str) -> None:
+    try:
+        descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644)
+    except OSError as error:
+        raise usage_error(f"cannot write {file}: {error.strerror}", verb=_VERB) from error
+    with os.fdopen(descriptor, "w", encoding="utf-8") as made:
+        made.write(text)
+    sys.stderr.write(f"rosrv: written to {file}\n")

@@ -1,0 +1,66 @@
+"""The command `rosrv who-drove`."""
+
+from typing import Annotated
+
+import msgspec
+import typer
+
+from appliance.audit.log.record_format import rfc3339
+from appliance.base import clock
+from appliance.base.timestamps import parse_timestamp
+from appliance.cli.audit.audit_errors import Errors
+from appliance.cli.connection.target import Appliance, speaks_with
+from appliance.cli.output import say_json, usage_error
+from appliance.features.logbook.interventions import Interventions
+from appliance.features.logbook.log_source import entries_of
+from appliance.features.logbook.machine_report import Period, driver_spans
+from rosmop.tool.terminal import say
+
+_EVENTS = ("authority handed over", "appliance started", "appliance stopped")
+
+
+@speaks_with("One JSON object for each time that a host held a group")
+def who_drove(
+    appliance: Appliance,
+    *,
+    at: Annotated[
+        str | None, typer.Option("--at", metavar="TIME", help="At this time: 5m (ago), 14:03, a date")
+    ] = None,
+    between: Annotated[
+        tuple[str, str] | None,
+        typer.Option("--between", metavar="TIME TIME", help="From the first to the second time"),
+    ] = None,
+) -> None:
+    """List the hosts that held a group of [Authority] at a time, since when, and by whose order.
+
+    Without a group in [Authority] the log does not say who drove: every host that may publish may drive. Exit status 1
+    if no host held a group then.
+
+    Example: rosrv who-drove --at 14:03
+    """
+    with Errors():
+        now = clock.wall_ns()
+        if (at is None) == (between is None):
+            raise usage_error("give --at TIME or --between TIME TIME", verb="rosrv who-drove")
+        first, last = between or (at or "", at or "")
+        begin, end = parse_timestamp(first, now), parse_timestamp(last, now)
+        if begin > end:
+            raise usage_error(f"--between: {first} is after {last}", verb="rosrv who-drove")
+        read = Interventions()
+        read.add(entries_of(appliance.audit(), _EVENTS))
+        # A span that ends at that very moment does not include it.
+        rows = [
+            row for row in driver_spans(read.rows, Period(begin, end + 1)) if row.until_utc != rfc3339(begin)
+        ]
+    for row in rows:
+        if appliance.as_json:
+            say_json(msgspec.to_builtins(row))
+            continue
+        until = f"until {row.until_utc} ({row.ended_by})" if row.until_utc else "and holds it now"
+        order = f" by {row.by}" if row.by else ""
+        say(
+            f"{row.what}: {appliance.host_in_words(row.state)} since {row.since_utc}{order}, {until}: {row.reason}"
+        )
+    if not rows and not appliance.as_json:
+        say("the log has no record that a host held a group then", "yellow")
+    raise typer.Exit(0 if rows else 1)
