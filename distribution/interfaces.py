@@ -226,7 +226,7 @@ def uses_of_any() -> list[str]:
 
 
 COUNTS = (
-    Count("imported", "core modules that features import", 221, 15, modules_that_features_import),
+    Count("imported", "core modules that features import", 224, 15, modules_that_features_import),
     Count("names", "names of `Feature` and of its part", 36, 10, names_of_a_feature),
     Count("phases", "phases of a feature in control", 5, 1, phases_of_a_feature),
     Count("late", "late imports in product code", 97, 10, late_imports),
@@ -234,7 +234,7 @@ COUNTS = (
     Count("walkers", "modules with SQL of their own that reads the audit log", 10, 3, walkers_of_the_audit_log),
     Count("registration", "files of one registerPublisher", 50, 48, files_of_a_registration),
     Count("wide", "classes with 15 attributes or more", 48, 36, classes_with_many_attributes),
-    Count("any", "uses of `Any` in product code", 1361, 900, uses_of_any),
+    Count("any", "uses of `Any` in product code", 1362, 900, uses_of_any),
 )  # fmt: skip
 
 

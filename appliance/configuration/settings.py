@@ -480,7 +480,7 @@ class Settings:
 
     def fingerprints(self) -> dict[str, str]:
         """Return the start of the SHA-256 of each setting, so that records show which of them changed, not to what."""
-        values = ((field.name, getattr(self, field.name)) for field in dataclasses.fields(self))
+        values = dataclasses.asdict(self).items()
         return {name: hashlib.sha256(repr(value).encode()).hexdigest()[:16] for name, value in values}
 
     @property

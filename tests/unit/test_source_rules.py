@@ -271,6 +271,7 @@ def unfilled(seen: Sequence[Seen]) -> Iterator[str]:
 WALL_CLOCK = {
     "a moment that people are shown, or that stands in a file": [
         "api/front/history.py", "audit/log/ids.py", "audit/log/log.py", "telemetry/audit_trail.py", "backup/create.py",
+        "cli/audit/verified.py",
         "features/fleet/poller.py", "features/fleet/bundle_gate.py",
         "features/standby/second_join.py", "cli/status_watch.py", "features/fleet/connection.py",
         "control/assembly/host_blocks.py", "features/standby/passive.py", "cli/connection/audit_file.py",
@@ -309,7 +310,7 @@ WALL_CLOCK = {
     ],
     "a moment that people ask for (`--since 1h`), or a page that is shown once": [
         "api/front/moments.py", "audit/search/filter_options.py",
-        "features/evidence/evidence_verbs.py",
+        "features/evidence/evidence_verbs.py", "features/logbook/report_verb.py", "features/logbook/who_drove_verb.py",
         "features/monitor_tools/offline.py", "features/policy_tools/recorded_requests.py",
         "features/tunnels/protect_verb.py",
         "base/timestamps.py",

@@ -44,5 +44,5 @@ def last_verification(log: Path) -> LastVerification | None:
     """Return the stored result, or null without a readable one."""
     try:
         return msgspec.json.decode((log.parent / _NAME).read_bytes(), type=LastVerification)
-    except (OSError, msgspec.MsgspecError):
+    except (OSError, ValueError):
         return None

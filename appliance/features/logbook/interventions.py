@@ -4,7 +4,6 @@ Each event of the log belongs to a subject here, or to `NO_INTERVENTION`: a test
 """
 
 from collections.abc import Iterable, Mapping
-from typing import Any
 
 import msgspec
 
@@ -125,7 +124,7 @@ class Interventions:
             diff=[*map(str, detail.get("diff") or ()), *self._changed_settings(detail)],
         )  # fmt: skip
 
-    def _values(self, event: str, what: str, detail: Mapping[str, Any]) -> tuple[str, str]:
+    def _values(self, event: str, what: str, detail: Mapping[str, object]) -> tuple[str, str]:
         match event:
             case "monitor set":
                 return _pairs(detail.get("before")), _pairs(detail.get("values"))
@@ -140,7 +139,7 @@ class Interventions:
                 return self._state("version", str(detail.get("version", "")))
         return "", ""
 
-    def _changed_settings(self, detail: Mapping[str, Any]) -> list[str]:
+    def _changed_settings(self, detail: Mapping[str, object]) -> list[str]:
         now, before = detail.get("configuration"), self._settings
         if not isinstance(now, Mapping):
             return []
@@ -158,7 +157,7 @@ class Interventions:
         return before, now
 
 
-def _hash_of(detail: Mapping[str, Any]) -> str:
+def _hash_of(detail: Mapping[str, object]) -> str:
     found = detail.get(_TEXT)
     if isinstance(found, Mapping):  # one for each file of specifications
         return " ".join(f"{name}:{value}" for name, value in sorted(found.items()))

@@ -6,7 +6,7 @@ from typing import Any
 from appliance.base.counted import counted
 from appliance.channel.answers.policy_answers import PolicyInForce
 from appliance.channel.answers.token_answers import Tokens
-from appliance.features.logbook.machine_report import Interface
+from appliance.features.logbook.machine_report import MachineInterface
 from appliance.policy.model import Category
 from appliance.policy.policy import Policy
 from appliance.policy.sections import BY_CATEGORY
@@ -14,21 +14,24 @@ from appliance.policy.sections import BY_CATEGORY
 _ACTS = (Category.PUBLISH, Category.CALL, Category.WRITE)
 
 
-def interfaces(status: Mapping[str, Any], policy: PolicyInForce, tokens: Tokens) -> Iterator[Interface]:
+def interfaces(
+    status: Mapping[str, Any], policy: PolicyInForce, tokens: Tokens
+) -> Iterator[MachineInterface]:
     """Yield the ways in. `status` is the answer of `rosrv status --json`."""
     rules = f"policy revision {policy.revision} decides each call by the sender's address"
     lenient = status["policy"]["audit_only"]
     if lenient:
         rules += f"; audit-only, so only recorded: {', '.join(lenient)}"
     blocked = status["blocks"]["hosts"]
-    yield Interface(
+    yield MachineInterface(
         name="ROS Master API", where=str(status["master"]), commands="registrations, parameters",
         protection=f"{rules}; {counted(blocked, 'host')} blocked",
     )  # fmt: skip
-    yield Interface(
+    monitors = status["monitors"]
+    yield MachineInterface(
         name="topics and services (relay)", where="ports of [Ports] in the policy",
         commands="messages and service calls",
-        protection=f"{rules}; {status['monitors']['enabled']} of {status['monitors']['loaded']} monitors act;"
+        protection=f"{rules}; {monitors['enabled']} of {counted(monitors['loaded'], 'monitor')} enabled;"
         f" relaying: {status['relaying']}, isolation: {status['isolation']}",
     )  # fmt: skip
     usable = [token for token in tokens.tokens if token.valid and token.revoked is None]
@@ -36,27 +39,27 @@ def interfaces(status: Mapping[str, Any], policy: PolicyInForce, tokens: Tokens)
         f"{sum(token.role == role for token in usable)} {role}"
         for role in ("viewer", "investigator", "operator", "admin")
     )
-    yield Interface(
+    yield MachineInterface(
         name="REST and console", where="api of appliance.yaml", commands="orders of the token's or person's role",
         protection=f"TLS; tokens: {by_role}; single sign-on, where it is configured",
     )  # fmt: skip
-    yield Interface(
+    yield MachineInterface(
         name="admin socket", where="the appliance's machine", commands="all orders",
         protection="permissions of the file: root and the appliance's group",
     )  # fmt: skip
     for door in (status.get("doors") or {}).get("doors", ()):
-        yield Interface(
+        yield MachineInterface(
             name=f"door {door['name']}", where="its port, or /door/ of the console's port",
             commands="what the policy grants its name", protection="a ticket; the policy; monitors of its topics",
         )  # fmt: skip
     tunnels = status["ipsec"]
     if tunnels["esp"] is not None:
-        yield Interface(
+        yield MachineInterface(
             name="IPsec tunnels", where="UDP 500 and 4500, ESP", commands="none of their own: they carry the others",
             protection=f"certificates of {counted(tunnels['enrolled'], 'host')}; {' '.join(tunnels['key_exchange'])}",
         )  # fmt: skip
     if status.get("standby") is not None:
-        yield Interface(
+        yield MachineInterface(
             name="the other appliance and the witness", where="TCP and UDP 7411 and 7412",
             commands="the state, and who serves", protection="mutual TLS; signed datagrams",
         )  # fmt: skip

@@ -14,7 +14,7 @@ from appliance.features.logbook.interventions import Intervention
 _SECOND = 1_000_000_000
 
 
-class Span(msgspec.Struct, frozen=True, kw_only=True):
+class LastingState(msgspec.Struct, frozen=True, kw_only=True):
     """A state that lasted. An empty `until_utc`: it lasts; an empty `since_utc`: it began before the log."""
 
     what: str
@@ -34,7 +34,7 @@ class Gap(msgspec.Struct, frozen=True, kw_only=True):
     reason: str
 
 
-class Interface(msgspec.Struct, frozen=True, kw_only=True):
+class MachineInterface(msgspec.Struct, frozen=True, kw_only=True):
     """A way into the machine, whether commands come in by it, and what protects it."""
 
     name: str
@@ -63,11 +63,11 @@ class MachineReport(msgspec.Struct, frozen=True, kw_only=True):
     version: str
     log_begins_utc: str
     interventions: list[Intervention]
-    switched_off: list[Span]
-    blocks: list[Span]
-    software: list[Span]
-    drivers: list[Span]
-    interfaces: list[Interface]
+    switched_off: list[LastingState]
+    blocks: list[LastingState]
+    software: list[LastingState]
+    drivers: list[LastingState]
+    interfaces: list[MachineInterface]
     rights: list[str]
     live_reason: str
     gaps: list[Gap]
@@ -94,13 +94,13 @@ class _Open(msgspec.Struct, frozen=True):
 
 def spans(
     rows: Iterable[Intervention], states: Mapping[str, str], period: Period, *, one: bool = False
-) -> list[Span]:
+) -> list[LastingState]:
     """Return what lasted within a period. `states` has the state that each event begins; an empty one ends it.
 
     With `one`, all rows are about the same thing, such as the version of the software.
     """
     opened: dict[str, _Open] = {}
-    found: list[tuple[int, Span]] = []
+    found: list[tuple[int, LastingState]] = []
 
     def close(key: str, row: Intervention | None) -> None:
         start = opened.pop(key, None)
@@ -119,18 +119,18 @@ def spans(
     return [span for _, span in sorted(found, key=lambda pair: pair[0])]
 
 
-def _span(start: _Open, end: Intervention | None) -> Span:
-    return Span(
+def _span(start: _Open, end: Intervention | None) -> LastingState:
+    return LastingState(
         what=start.row.what, state=start.state, since_utc=start.row.time_utc,
         until_utc="" if end is None else end.time_utc, by=start.row.who,
         ended_by="" if end is None else end.who or end.event, reason=start.row.reason,
     )  # fmt: skip
 
 
-def driver_spans(rows: Iterable[Intervention], period: Period) -> list[Span]:
+def driver_spans(rows: Iterable[Intervention], period: Period) -> list[LastingState]:
     """Return who drove each group of [Authority]; the appliance's end ends it."""
     opened: dict[str, Intervention] = {}
-    found: list[tuple[int, Span]] = []
+    found: list[tuple[int, LastingState]] = []
 
     def close(group: str, end: Intervention) -> None:
         start = opened.pop(group, None)

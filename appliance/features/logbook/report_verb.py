@@ -28,7 +28,7 @@ from appliance.features.logbook.machine_report import (
     BLOCKED,
     OFF,
     RUNS,
-    Interface,
+    MachineInterface,
     MachineReport,
     Period,
     VerificationResult,
@@ -115,7 +115,7 @@ def _report(appliance: Appliance, since: int | None, end: int) -> MachineReport:
 
 class _Live(msgspec.Struct):
     robot: str = ""
-    interfaces: list[Interface] = []
+    interfaces: list[MachineInterface] = []
     rights: list[str] = []
     reason: str = ""
 
@@ -157,7 +157,7 @@ def _end_of(file: Path) -> int:
     try:
         text = str(msgspec.json.decode(file.read_bytes())["until_utc"])
         return parse_timestamp(text, clock.wall_ns())
-    except (OSError, msgspec.DecodeError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError) as error:
         raise usage_error(
             f"{file}: not a report of `rosrv report interventions --json`: {error}", verb=_VERB
         ) from error

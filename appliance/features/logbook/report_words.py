@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 
 from appliance.base.counted import counted
 from appliance.features.logbook.interventions import SUBJECTS, Intervention
-from appliance.features.logbook.machine_report import MachineReport, Span
+from appliance.features.logbook.machine_report import LastingState, MachineReport
 from appliance.formats.html_page import Cells, head, lines, section, text
 
 _TITLE = "Interventions in the safety settings of a machine"
@@ -92,11 +92,11 @@ def _facts(report: MachineReport) -> Iterator[tuple[str, str]]:
     yield "interventions", str(len(report.interventions))
 
 
-def _spans(report: MachineReport) -> Iterable[tuple[str, Sequence[Span], str]]:
+def _spans(report: MachineReport) -> Iterable[tuple[str, Sequence[LastingState], str]]:
     return (
         ("Guards and monitors that were off", report.switched_off, "none in this period"),
         ("Hosts that were blocked", report.blocks, "none in this period"),
-        ("Who drove", report.drivers, "no record that a host held a group of [Authority] in this period"),
+        ("Drivers", report.drivers, "no record that a host held a group of [Authority] in this period"),
         ("Software that ran", report.software, "no start in the log"),
     )
 
@@ -118,7 +118,7 @@ def _cells(row: Intervention, in_words: Callable[[str], str]) -> Cells:
     )
 
 
-def _span(span: Span, in_words: Callable[[str], str]) -> Cells:
+def _span(span: LastingState, in_words: Callable[[str], str]) -> Cells:
     until = span.until_utc or "lasts"
     return (
         in_words(span.what),

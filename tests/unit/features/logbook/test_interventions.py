@@ -16,10 +16,10 @@ from appliance.features.logbook.machine_report import (
     BLOCKED,
     OFF,
     RUNS,
-    Interface,
+    LastingState,
+    MachineInterface,
     MachineReport,
     Period,
-    Span,
     driver_spans,
     pauses,
     spans,
@@ -103,7 +103,7 @@ def test_a_span_is_in_a_period_that_it_meets(since: float, until: float, seen: b
     assert bool(spans(rows, BLOCKED, period)) is seen
 
 
-def test_the_software_that_ran_is_told_by_the_starts() -> None:
+def test_each_start_begins_the_time_of_a_version() -> None:
     rows = read(
         entry(1, "appliance started", version="0.3.0"), entry(5, "appliance started", version="0.4.0")
     ).rows
@@ -113,7 +113,7 @@ def test_the_software_that_ran_is_told_by_the_starts() -> None:
     ]
 
 
-def drove(*entries: LogEntry, at: float) -> list[Span]:
+def drove(*entries: LogEntry, at: float) -> list[LastingState]:
     moment = round(at * HOUR)
     return driver_spans(read(*entries).rows, Period(moment, moment + 1))
 
@@ -128,7 +128,7 @@ _HANDED = (
 @pytest.mark.parametrize(
     ("at", "host"), [(0.5, None), (1, "10.0.0.5"), (1.5, "10.0.0.5"), (2.5, "10.0.0.6"), (3.5, None)]
 )
-def test_who_drove_at_a_time(at: float, host: str | None) -> None:
+def test_the_driver_at_a_time(at: float, host: str | None) -> None:
     assert [span.state for span in drove(*_HANDED, at=at)] == ([] if host is None else [host])
 
 
@@ -161,7 +161,7 @@ def report(**changes: Any) -> MachineReport:
         "version": "1", "log_begins_utc": rfc3339(HOUR),
         "interventions": read(entry(2, "policy loaded", EVIL, EVIL, who=EVIL, sha256=EVIL, diff=[EVIL])).rows,
         "switched_off": [], "blocks": [], "software": [], "drivers": [],
-        "interfaces": [Interface(name=EVIL, where=EVIL, commands=EVIL, protection=EVIL)], "rights": [EVIL],
+        "interfaces": [MachineInterface(name=EVIL, where=EVIL, commands=EVIL, protection=EVIL)], "rights": [EVIL],
         "live_reason": "", "gaps": [], "verification": None,
     }  # fmt: skip
     return MachineReport(**fields | changes)
