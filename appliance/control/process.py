@@ -34,6 +34,7 @@ from appliance.hosts.tunnel_state import Tunnels
 from appliance.master.endpoints.node_ports import NoPortError
 from appliance.master.graph.registry import Life
 from appliance.master.reconcile.sinks import restore
+from appliance.specifications.compiled_store import CompiledStore
 from appliance.specifications.compiler_link import SpecificationCompiler
 from roswire.uris import node_uri
 
@@ -58,7 +59,9 @@ def main(lifeline_fd: int, config_path: Path) -> None:
 async def _run(settings: Settings, lifeline_fd: int, config: Path) -> None:
     stopping, tunnels = asyncio.Event(), Current[Tunnels]()
     gate: StartGate = start_gate() or StartGate()
-    compiler = SpecificationCompiler(lambda: lifeline.say(messages.CompilerWanted()))
+    compiler = SpecificationCompiler(
+        lambda: lifeline.say(messages.CompilerWanted()), CompiledStore(settings.state / "control/compiled")
+    )
     lifeline = ControlLifeline(
         lifeline_fd,
         stopping,
@@ -90,7 +93,7 @@ async def _start(
     gate: StartGate,
 ) -> "_Control":
     if settings.monitors is not None:
-        compiler.call()  # the compiler starts while the policy is read
+        compiler.call_early()  # the compiler starts while the policy is read
     restarted = RVMASTER in lifeline.sockets
     base = await make_foundation(settings, lifeline, compiler, tunnels, role, restarted=restarted)
     parts = assemble(base)

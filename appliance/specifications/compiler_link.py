@@ -1,13 +1,14 @@
 """Control's link to the compiler process, which parses specifications for it.
 
-Specifications that exceed the compiler's limits end it, and are refused. A new order ends a dry run. The last answer
-for a start is kept, so a standby that has checked its start compiles nothing while the robot waits for its takeover.
+Specifications that exceed the compiler's limits end it, and are refused. A new order ends a dry run. The answers for a
+start are kept, so that a restart compiles nothing that is unchanged, and neither does a standby that has checked its
+start, while the robot waits for its takeover.
 """
 
 import asyncio
 import contextlib
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 
@@ -15,6 +16,7 @@ from appliance.base.withdrawal import require_awaited
 from appliance.channel import messages
 from appliance.channel.channel import Channel, ChannelClosedError
 from appliance.channel.link import Link
+from appliance.specifications.compiled_store import CompiledStore
 from appliance.specifications.specification_files import (
     CheckedSpecifications,
     Sources,
@@ -28,6 +30,7 @@ _WORK_SECONDS = 180.0  # on a busy machine; the compiler bounds its processor ti
 _LOOK_SECONDS = 1.0  # between two checks that the client of the order still waits
 _ENDED = "the compiler exited while it read them, possibly at its limit of memory or time; check the log"
 _ENDED_BY_ORDER = "the dry run was stopped, because a change needed the compiler: try again"
+M = TypeVar("M", bound=messages.Message)
 _TRIES = 2  # an idle compiler may end just when a question is sent
 
 
@@ -37,8 +40,10 @@ class SpecificationCompiler:
     Compilations raise `SpecificationsRefusedError`, even without an answer.
     """
 
-    def __init__(self, wanted: Callable[[], None]) -> None:
+    def __init__(self, wanted: Callable[[], None], store: CompiledStore | None = None) -> None:
+        """Without a `store`, answers are kept until control ends."""
         self._wanted = wanted
+        self._store = store
         self._link = Link(self._heard)
         self._there = asyncio.Event()
         self._called = False
@@ -47,12 +52,15 @@ class SpecificationCompiler:
         self._no_order.set()
         self._one_dry_run = asyncio.Lock()
         self._dry_run = False  # whether a dry run is being compiled
-        self._kept: dict[
-            type, tuple[messages.Message, Any]
-        ] = {}  # the last question of each kind, and its answer
+        # the last question for each kind of answer, and the answer
+        self._kept: dict[type, tuple[messages.Message, messages.Message]] = {}
+
+    def call_early(self) -> None:
+        """Start the compiler before the first question, unless answers are kept from an earlier start."""
+        if not self._store:
+            self.call()
 
     def call(self) -> None:
-        """Start the compiler early."""
         if self._link.channel is None and not self._called:
             self._there.clear()
             self._called = True
@@ -90,8 +98,11 @@ class SpecificationCompiler:
         if not sources.files:
             return CheckedSpecifications()
         require_bounded(sources)
-        ask = self._asked_once if at_start else self._ordered
-        answer = await ask(_wanted(sources, broken, at_start=at_start, lints=lints))
+        question = _wanted(sources, broken, at_start=at_start, lints=lints)
+        if at_start:
+            answer = await self._asked_once(question, messages.ContentsFound)
+        else:
+            answer = await self._ordered(question)
         return checked(answer.contents, sources, site_keys)
 
     async def try_out(
@@ -113,17 +124,33 @@ class SpecificationCompiler:
         return checked(answer.contents, sources, site_keys)
 
     async def parts(self, compiled: bytes, wanted: list[messages.PartNames]) -> list[bytes]:
-        answer = await self._asked_once(lambda number: messages.PartsWanted(number, compiled, wanted))
+        answer = await self._asked_once(
+            lambda number: messages.PartsWanted(number, compiled, wanted), messages.PartsMade
+        )
         parts: list[bytes] = answer.parts
         return parts
 
-    async def _asked_once(self, question: Callable[[int], messages.Message]) -> Any:
+    async def _asked_once(self, question: Callable[[int], messages.Message], kind: type[M]) -> M:
         wanted = question(0)
-        last, answer = self._kept.get(type(wanted), (None, None))
-        if last != wanted:
-            answer = await self._ordered(question)
-            self._kept[type(wanted)] = wanted, answer
-        return answer
+        last, answer = self._kept.get(kind, (None, None))
+        if last == wanted and isinstance(answer, kind):
+            return answer
+        found = await asyncio.to_thread(self._find, wanted, kind)
+        if found is None:
+            found = await self._ordered(question)
+            if self._store is not None:
+                await asyncio.to_thread(self._store.keep, wanted, found)
+        self._kept[kind] = wanted, found
+        return found
+
+    def _find(self, wanted: messages.Message, kind: type[M]) -> M | None:
+        if self._store is None:
+            return None
+        found = self._store.find(wanted, kind)
+        if found is None and isinstance(wanted, messages.ContentsWanted) and not wanted.lints:
+            # The first start with these specifications also looked for warnings.
+            found = self._store.find(msgspec.structs.replace(wanted, lints=True), kind)
+        return found
 
     async def _ordered(self, question: Callable[[int], messages.Message]) -> Any:
         with self._order():

@@ -1,6 +1,7 @@
 import asyncio
 import socket
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -9,6 +10,7 @@ from appliance.base.withdrawal import WithdrawnError, awaited
 from appliance.channel import messages
 from appliance.channel.channel import Channel
 from appliance.specifications import compiler_link as module
+from appliance.specifications.compiled_store import CompiledStore
 from appliance.specifications.compiler_link import SpecificationCompiler
 from appliance.specifications.specification_files import Sources, SpecificationsRefusedError
 
@@ -19,11 +21,11 @@ pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
 
 
 class Scene:
-    def __init__(self, *acts: Callable[[Channel, Any], None]) -> None:
+    def __init__(self, *acts: Callable[[Channel, Any], None], store: CompiledStore | None = None) -> None:
         self.calls = 0
         self._acts = list(acts)
         self._channels: list[Channel] = []
-        self.compiler = SpecificationCompiler(self.called)
+        self.compiler = SpecificationCompiler(self.called, store)
 
     def called(self) -> None:
         self.calls += 1
@@ -168,3 +170,18 @@ async def test_a_compilation_ends_when_its_order_is_withdrawn(monkeypatch: pytes
     assert (await scene.compiler.check(SOURCES, ())).monitors == {"a": "a.rv"}
     assert scene.calls == 2
     scene.close()
+
+
+async def test_a_start_asks_nothing_that_an_earlier_one_asked(tmp_path: Path) -> None:
+    store = CompiledStore(tmp_path / "compiled", "toolchain")
+    first = Scene(finds, store=store)
+    assert (await first.compiler.check_at_start(SOURCES, ())).monitors == {"a": "a.rv"}
+    first.close()
+    second = Scene(store=store)
+    second.compiler.call_early()
+    assert (await second.compiler.check_at_start(SOURCES, (), known=("w",))).warnings == ("w",)
+    assert second.calls == 0
+    changed = Scene(finds, store=store)
+    await changed.compiler.check_at_start(Sources({"a.rv": "other"}), ())
+    assert changed.calls == 1
+    changed.close()
