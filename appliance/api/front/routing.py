@@ -206,8 +206,7 @@ async def _only_known(request: Request) -> None:
     given = request.query_params.keys()
     if not given:
         return
-    operations = request.app.openapi()["paths"].get(request.scope["route"].path, {})
-    operation = operations.get(request.method.lower())
+    operation = _operations_at(request).get(request.method.lower())
     if operation is None:
         return
     known = [parameter["name"] for parameter in operation.get("parameters", []) if parameter["in"] == "query"]
@@ -219,6 +218,15 @@ async def _only_known(request: Request) -> None:
             for name in unknown
         ]
         raise bad_input(bad, besides=f"; {there_are}")
+
+
+def _operations_at(request: Request) -> dict[str, Any]:
+    """Return the contract's operations of a route, whose own path lacks the prefix of the router that includes it."""
+    paths: dict[str, dict[str, Any]] = request.app.openapi()["paths"]
+    own = request.scope["route"].path
+    prefixes = [path.removesuffix(own) for path in paths if path.endswith(own)]
+    fitting = [prefix for prefix in prefixes if request.url.path.startswith(prefix)]
+    return paths[max(fitting, key=len) + own] if fitting else {}
 
 
 def _encoded(endpoint: Callable[..., Awaitable[Any]]) -> Callable[..., Awaitable[Response]]:
