@@ -45,7 +45,7 @@ test: setup ## check, all tests that chance cannot fail, and at most 100 cases w
 
 # The real cases wait half of their time: what computes has the processors then, and after them, for it is nice.
 units:
-	nice $(PYTEST) $(DETERMINISTIC) -n logical --dist loadfile --no-loadscope-reorder --quiet --durations=10
+	nice $(PYTEST) $(DETERMINISTIC) -n $$(nproc) --dist loadfile --no-loadscope-reorder --quiet --durations=10
 
 real:
 	$(PYTEST) -m real $(REAL) -n $$(nproc) --dist loadfile --no-loadscope-reorder --quiet --durations=10

@@ -1,5 +1,6 @@
 """The state of a property outlives its process (for whole monitors: `relay/monitors/test_state_keeper.py`)."""
 
+from functools import cache
 from itertools import count
 from random import Random
 from typing import Any
@@ -12,6 +13,7 @@ from rosmop.run import state_of_runs
 from rosmop.run.engine import MonitorSet
 from rosmop.run.state import states_of
 from rosmop.run.state_of_runs import MOST_PARTS, StateTooLargeError, kept, run_of
+from rosmop.tests.examples import examples
 from roswire.standard import standard_definitions
 
 FORMULAS = {
@@ -35,6 +37,7 @@ FORMULAS = {
 }
 
 
+@cache
 def compiled(formula: str) -> MonitorSet:
     events = " ".join(f"event e{n}() /e{n} std_msgs/Empty '{{}}' {{ }}" for n in range(3))
     if formula.startswith("ptcaret"):
@@ -44,7 +47,7 @@ def compiled(formula: str) -> MonitorSet:
 
 
 @pytest.mark.parametrize("name", FORMULAS)
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(examples(42)))
 def test_a_run_goes_on_where_it_was(name: str, seed: int) -> None:
     random = Random(seed)  # noqa: S311  draws examples, not keys
     [declared] = compiled(FORMULAS[name]).compiled.specifications[0].properties

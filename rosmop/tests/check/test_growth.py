@@ -43,6 +43,6 @@ def lines_run(number: int) -> Counter[str]:
 
 def test_twice_as_many_specifications_take_twice_as_long() -> None:
     lines_run(1)  # made once for all specifications
-    few, some, many = (lines_run(number) for number in (10, 20, 40))
+    few, some, many = (lines_run(number) for number in (4, 8, 16))
     for file in many:
         assert many[file] - some[file] <= 2.1 * (some[file] - few[file]) + 20, file

@@ -9,6 +9,7 @@ import pytest
 from rosmop.check.sources import compiled_from
 from rosmop.run.engine import MonitorSet
 from rosmop.tests.acting import definitions, load, message
+from rosmop.tests.examples import examples
 from rosmop.types import value_types
 from rosmop.types.messages import MessageTypes
 from roswire.definitions import Definitions
@@ -66,7 +67,7 @@ def change(kind: value_types.Type, name: str) -> str:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(examples(6)))
 def test_every_field_of_a_random_message(kind: str, seed: int) -> None:
     random = Random(f"{kind} {seed}")  # noqa: S311  draws examples, not keys
     value = content(random, value_types.RecordType(kind))

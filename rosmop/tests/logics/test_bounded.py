@@ -248,7 +248,7 @@ def test_the_cost_of_a_step_does_not_grow_with_waiting_events(text: str, events:
         sys.settrace(before)
         return counted / each_second
 
-    assert lines_run(400) < 1.2 * lines_run(100) + 10
+    assert lines_run(160) < 1.2 * lines_run(40) + 10
 
 
 def test_deadlines_bring_no_verdict_that_may_drop() -> None:

@@ -1,6 +1,7 @@
 import pytest
 
 from rosmop.logics import past_monitors
+from rosmop.tests.examples import examples
 from rosmop.tests.verdicts import differing
 
 PROPERTIES = {
@@ -12,7 +13,7 @@ SHORT = {"fsm": 120, "ere": 120, "cfg": 39, "ltl": 39, "pattern": 5}
 
 @pytest.mark.parametrize("logic", PROPERTIES)
 def test_verdicts_of_random_properties_are_those_of_the_definition(logic: str) -> None:
-    judged = [*differing(logic, 2 * PROPERTIES[logic], seed=11, each=2, short=SHORT.get(logic, 20))]
+    judged = [*differing(logic, examples(6 * PROPERTIES[logic]), seed=11, each=2, short=SHORT.get(logic, 20))]
     assert [difference for _, difference in judged if difference] == []
 
 

@@ -5,8 +5,8 @@ from tests.support.examples import ALL
 from tests.world.closed_loop.planted import FAULTS, WITHIN, no_guard, stops_everything
 from tests.world.closed_loop.worlds import NOT_MODELLED, WORLDS, replay, run_many, run_one
 
-AT_GATE = {"separation": 25, "fence": 25}
-"""Worlds at the gate of presets whose worlds cost 0.2 s; the others cost 5 to 30 ms, and have 50."""
+AT_GATE = {"separation": 10, "fence": 10}
+"""Worlds at the gate of presets whose worlds cost 0.2 s; the others cost 5 to 30 ms, and have 30."""
 AT_NIGHT = {"separation": 2500, "fence": 2500}
 
 
@@ -19,7 +19,7 @@ def judge(preset: str, first: int, worlds: int) -> None:
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize("preset", WORLDS)
 def test_no_world_breaks_a_law(preset: str) -> None:
-    judge(preset, 0, AT_GATE.get(preset, 50))
+    judge(preset, 0, AT_GATE.get(preset, 30))
 
 
 @pytest.mark.nightly

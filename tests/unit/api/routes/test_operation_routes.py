@@ -193,6 +193,13 @@ def role_for(target: str) -> str:
     return "investigator" if target == "/v1/recordings/memory" else "admin"
 
 
+@functools.cache
+def orders() -> dict[type[AdminRequest[Any]], AdminRequest[Any]]:
+    """Return a request of each type."""
+    requests = (ordered(method, target, body).request for method, target, body in REQUESTS)
+    return {type(request): request for request in requests}
+
+
 def ordered(method: str, target: str, body: Any, tag: str = "*") -> RequestMade:
     role = role_for(target)
     answer = world().asked(method, target, body, role, tag)
@@ -258,11 +265,7 @@ def test_role_dry_run_and_etag_decide_what_an_operation_does(operation: Operatio
 
 @pytest.mark.parametrize("request_type", sorted(CHANGES, key=str), ids=lambda one: one.__name__)
 def test_control_itself_denies_what_the_api_should_have_denied(request_type: type[AdminRequest[Any]]) -> None:
-    made = next(
-        made.request
-        for made in (ordered(method, target, body) for method, target, body in REQUESTS)
-        if type(made.request) is request_type
-    )
+    made = orders()[request_type]
     another: tuple[str, str, Any] = (
         ("POST", "/v1/policy/confirm", None)
         if "Policy" not in request_type.__name__

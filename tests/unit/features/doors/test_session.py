@@ -815,7 +815,8 @@ async def test_a_client_that_goes_through_a_thousand_topics_a_second_takes_none_
         flooding, other = await world.client(), await world.client()
         registered = world.master.subscribers if begin == "subscribe" else world.master.publishers
         other.send({"op": begin, "topic": "/own", "type": "std_msgs/String"})
-        for second in range(5):
+        seconds = range(2)
+        for second in seconds:
             for number in range(1000):
                 topic = f"/t{second}_{number}"
                 flooding.send({"op": begin, "topic": topic, "type": "std_msgs/String"})
@@ -827,7 +828,7 @@ async def test_a_client_that_goes_through_a_thousand_topics_a_second_takes_none_
             assert len(present) <= 50 and {"/own", f"/own{second}"} <= present
         assert other.frames.empty() and flooding.frames.empty()
         await asyncio.sleep(11)
-        assert {t for t, nodes in registered.items() if nodes} == {"/own", *(f"/own{n}" for n in range(5))}
+        assert {t for t, nodes in registered.items() if nodes} == {"/own", *(f"/own{n}" for n in seconds)}
 
 
 async def test_a_thousand_calls_that_get_no_answer_leave_calls_for_other_hosts() -> None:

@@ -6,7 +6,7 @@ import pytest
 
 from tests.unit.features.guards import evidence_oracles, limit_oracles, oracles, place_oracles
 
-AT_GATE = 40
+AT_GATE = 15
 AT_NIGHT = 10_000
 ORACLES: tuple[Callable[[int], None], ...] = (
     oracles.watchdog, oracles.enabling_device, oracles.stop_button, oracles.two_hands, oracles.operating_mode,

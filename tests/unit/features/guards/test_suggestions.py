@@ -10,6 +10,7 @@ from appliance.features.guards.presets import PRESETS, GuardError, text_of
 from appliance.features.guards.robot_graph import MOST_COMMANDS, TopicFacts
 from appliance.features.guards.suggestions import NOT_SUGGESTED, Advice, LoadedGuard, Proposal, advice
 from rosmop.check.sources import compiled_from
+from tests.support.examples import sample
 from tests.support.features.guards.running_guard import DEFINITIONS
 from tests.unit.features.guards.guarding import seeded
 
@@ -46,6 +47,8 @@ def test_a_robot_is_guarded_without_editing_a_file(robot: str) -> None:
     assert [*printed(found)] == ROBOTS[robot]["proposal"].splitlines()
     sources = {f"{one.name}.rv": text(one, graph) for one in found.proposals}
     assert len(sources) == len(found.proposals)
+    if robot not in sample(ROBOTS, 4):
+        return
     assert len(compiled_from(sources, DEFINITIONS, lints=False).specifications) == len(found.proposals)
 
 

@@ -2,18 +2,19 @@ from pathlib import Path
 
 import pytest
 
+from tests.support.examples import examples
 from tests.unit.features.standby.mutants import MUTANTS, product_of
 from tests.unit.features.standby.simulation import History, Violation
 
 
-@pytest.mark.parametrize("first", range(0, 300, 50))
+@pytest.mark.parametrize("first", range(0, examples(600), 50))
 def test_no_history_breaks_a_promise(first: int) -> None:
     for seed in range(first, first + 50):
         History(seed).run()
 
 
 @pytest.mark.parametrize("slow", [0.3, 1.1])
-@pytest.mark.parametrize("first", range(0, 40, 10))
+@pytest.mark.parametrize("first", range(0, examples(120), 10))
 def test_no_history_with_a_slow_firewall_breaks_a_promise(first: int, slow: float) -> None:
     for seed in range(first, first + 10):
         History(seed, slow=slow).run()

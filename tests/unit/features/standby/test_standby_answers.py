@@ -43,7 +43,7 @@ class Standby(ControlLink):
         return on_standby(STATE)
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def gate() -> RequestGate:
     door, control, journal = (
         TokenAuthenticator(10, lambda _token: None),

@@ -200,7 +200,7 @@ HARD = {
 @pytest.mark.parametrize("name", HARD)
 @pytest.mark.parametrize("on_fault", ["drop", "pass"])
 def test_hard_cases_are_the_same_together(name: str, on_fault: str) -> None:
-    for seed in range(examples(18)):
+    for seed in range(examples(12)):
         messages = Messages(seed)
         agree({"x.rv": HARD[name]}, definitions(), [messages.traffic() for _ in range(10)], on_fault)
 

@@ -208,7 +208,7 @@ PROPERTIES = (
 
 
 @pytest.mark.parametrize("shown", PROPERTIES)
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", range(examples(24)))
 def test_slices_go_on_where_a_killed_process_had_them(shown: str, seed: int) -> None:
     random = Random(seed)  # noqa: S311  draws examples, not keys
     monitors = MonitorSet.of(
