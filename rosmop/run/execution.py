@@ -109,7 +109,8 @@ class MonitorExecution:
         self._turn.now, self._turn.source = outcome.time, sender.source
         if not published:
             self._turn.begin()
-        self._sender = sender
+        # An explanation names the source of a message, however the message was changed on its way.
+        self._sender = sender._replace(altered=False) if sender.altered else sender
         self._taking_back.clear()
         self._trailed.clear()
         message = WireMessage(
