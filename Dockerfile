@@ -86,7 +86,8 @@ RUN apt-get update -q \
  # One user for each process (appliance/supervisor/users.py); the numbers are the same everywhere.
  && for user in rosrv:61011 rosmaster:61012 rosrv-relay:61013 rosrv-api:61014 rosrv-signer:61015 rosrv-ipsec:61016 \
         rosrv-syslog:61017 rosrv-rosout:61018 rosrv-recorder:61019 rosrv-compiler:61020 rosrv-lease:61021 \
-        rosrv-bundles:61022 rosrv-fleet:61023 rosrv-doors:61024 rosrv-sso:61025; do \
+        rosrv-bundles:61022 rosrv-fleet:61023 rosrv-doors:61024 rosrv-sso:61025 \
+        rosrv-hook:61026; do \
         printf '%s:x:%s:%s::/nonexistent:/usr/sbin/nologin\n' "${user%:*}" "${user#*:}" "${user#*:}" >> /etc/passwd; \
         printf '%s:x:%s:\n' "${user%:*}" "${user#*:}" >> /etc/group; \
     done \

@@ -23,6 +23,7 @@ NUMERIC_IDS = {
     "rosrv-fleet": 61023,
     "rosrv-doors": 61024,
     "rosrv-sso": 61025,
+    "rosrv-hook": 61026,
 }
 
 

@@ -193,6 +193,7 @@ ROLES = {
     "compiler": "- only control reaches it",
     "rosout": "node API",
     "syslog": "- it only sends",
+    "hook": "- it only sends",
     "recorder": "- no network",
     "fleet": "- it only sends",
     "bundles": "- it fetches signed files only",

@@ -8,6 +8,10 @@ from appliance.control.motion_stop import Commands, MotionStop, published_before
 from appliance.control.operators.request_method import RequestMethod
 from appliance.features.approvals import approval_requests as requests
 from appliance.features.approvals.approval_orders import ApprovalOrders
+from appliance.features.approvals.feature import HOOK
+from appliance.features.approvals.hook import Hook
+from appliance.features.approvals.hook_link import HookLink
+from appliance.features.approvals.settings import ApprovalHook
 from appliance.features.feature import FeaturePart
 from appliance.master.endpoints.host_signs import host_signs
 from appliance.policy.model import Address, Category, Request
@@ -28,6 +32,7 @@ async def inherit(base: "Foundation", parts: "Parts") -> FeaturePart:
     lost: Commands = set()
     if any(rule.asked for rule in policy().rules(Category.PUBLISH)):
         lost = published_before(base.store, lambda host, topic: _asks(policy(), host, topic))
+    hook = Hook(wanted=base.settings.of(ApprovalHook).url is not None)
     orders = ApprovalOrders(
         policy,
         base.trail,
@@ -39,9 +44,11 @@ async def inherit(base: "Foundation", parts: "Parts") -> FeaturePart:
         carried_out=relay.carried_out,
         bearers=lambda: base.features.bearers()(),  # noqa: PLW0108  set later
         guards=relay.taps.guards,
+        hook=hook,
     )
 
     return FeaturePart(
+        {HOOK: (hook.link, HookLink)},
         methods=(
             RequestMethod(requests.ApprovalsWanted, orders.listed),
             RequestMethod(requests.ApproveCall, orders.approve, who=True, full_disk=True),

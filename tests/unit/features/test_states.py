@@ -33,8 +33,8 @@ BAD: dict[str, tuple[dict[str, Any], list[tuple[str, str]]]] = {
         [("doors-down", "warning"), ("doors-restarting", "warning"), ("doors-full", "warning")],
     ),
     "approvals": (
-        {"waiting": 1, "oldest_seconds": 2.5, "leases": 3, "unanswered": 4},
-        [("approval-unanswered", "warning")],
+        {"waiting": 1, "oldest_seconds": 2.5, "leases": 3, "unanswered": 4, "untold": 5, "untold_why": "away"},
+        [("approval-unanswered", "warning"), ("approval-hook", "warning")],
     ),
     "guards": (
         {"loaded": 2, "acting": [{"name": "fence", "since": 1.5}]},

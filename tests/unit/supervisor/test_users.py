@@ -30,6 +30,7 @@ def test_without_a_user_of_that_name_the_numeric_id_is_used(monkeypatch: pytest.
         "rosrv-fleet": (61023, 61023),
         "rosrv-doors": (61024, 61024),
         "rosrv-sso": (61025, 61025),
+        "rosrv-hook": (61026, 61026),
     }
 
 

@@ -1,0 +1,26 @@
+"""The messages between control and the process `hook`."""
+
+from appliance.channel.messages.message import Message
+
+
+class CallWaits(Message, frozen=True):
+    """A call began to wait for an approval."""
+
+    number: int
+    host: str
+    caller_id: str
+    category: str
+    resource: str
+    type: str
+    seconds: float
+    """Until it expires."""
+
+
+class CallTold(Message, frozen=True):
+    """The web hook was told of a call, or `trouble` says why not."""
+
+    number: int
+    trouble: str
+
+
+HookLink = CallWaits | CallTold

@@ -1,0 +1,121 @@
+"""Tell the web hook of calls that wait, as a process of the appliance.
+
+1. It can only tell: control gets nothing from it but whether a call was told. It reads no answer of the receiver: the
+   first byte, or the end, shows that the request arrived, and is discarded. So no redirect is followed.
+2. The firewall and the sandbox let it reach the receiver, and nothing else.
+3. A slow receiver delays no call and no order: the queue has a bound, and each POST a deadline.
+"""
+
+import asyncio
+import socket
+import ssl
+from pathlib import Path
+from typing import Any
+
+import structlog
+
+from appliance.base import clock
+from appliance.base.input_files import path_for_library, read_given
+from appliance.channel import messages
+from appliance.channel.channel import Channel
+from appliance.channel.child_process import Child
+from appliance.configuration.settings import Settings, load_resolved
+from appliance.features.approvals.hook_link import CallTold, CallWaits, HookLink
+from appliance.features.approvals.hook_request import LEAST_SECRET, body_of, request_of
+from appliance.features.approvals.settings import ApprovalHook
+
+_log = structlog.get_logger()
+MOST_WAITING = 64
+_AT_ONCE = 4
+_SECONDS = 5.0
+_LONGEST_SECRET = 4096
+
+
+def main(lifeline_fd: int, config: Path) -> None:
+    asyncio.run(_Process(load_resolved(config), lifeline_fd).run())
+
+
+class _Process:
+    def __init__(self, settings: Settings, lifeline_fd: int) -> None:
+        lifeline = Channel(socket.socket(fileno=lifeline_fd), messages.Lifeline)
+        self._child = Child(lifeline, HookLink, said=self._said)
+        self._sender = HookSender(settings.of(ApprovalHook), settings.name)
+        self._queue: asyncio.Queue[tuple[CallWaits, float]] = asyncio.Queue(MOST_WAITING)
+
+    async def run(self) -> None:
+        workers = [asyncio.create_task(self._work()) for _ in range(_AT_ONCE)]
+        self._child.attach(messages.Ready())
+        await self._child.ended.wait()
+        for worker in workers:
+            worker.cancel()
+
+    def _said(self, message: Any) -> None:
+        if not isinstance(message, CallWaits):
+            raise TypeError(f"control sent {type(message).__name__}, which is not for hook")
+        try:
+            self._queue.put_nowait((message, clock.now() + message.seconds))
+        except asyncio.QueueFull:
+            self._child.tell(CallTold(message.number, f"{MOST_WAITING} calls are already waiting to be told"))
+
+    async def _work(self) -> None:
+        while True:
+            call, ends = await self._queue.get()
+            trouble = await self._sender.tell(call, ends)
+            if trouble:
+                _log.warning("the web hook was not told of a call", number=call.number, reason=trouble)
+            self._child.tell(CallTold(call.number, trouble))
+
+
+class HookSender:
+    """Sends the POST for a call."""
+
+    def __init__(self, wanted: ApprovalHook, robot: str) -> None:
+        self._wanted, self._robot = wanted, robot
+
+    async def tell(self, call: CallWaits, ends: float) -> str:
+        """Return why the call was not told, or an empty string; `ends` is monotonic."""
+        left = ends - clock.now()
+        if left <= 0:
+            return "it expired before it could be told"
+        try:
+            body = body_of(call, left, self._robot, self._wanted.console)
+            await self._post(request_of(self._wanted, body, self._secret(), int(clock.wall())))
+        except TimeoutError:
+            return f"no answer within {_SECONDS:g} s"
+        except (OSError, ValueError) as error:
+            return str(error) or type(error).__name__
+        except Exception as error:  # noqa: BLE001  a defect affects only this call
+            _log.exception("a call was not told")
+            return f"a defect of rosrv: {type(error).__name__}"
+        return ""
+
+    async def _post(self, request: bytes) -> None:
+        async with asyncio.timeout(_SECONDS):
+            reader, writer = await asyncio.open_connection(
+                *self._wanted.destination,
+                ssl=self._context(),
+                server_hostname=self._wanted.host[0],
+                limit=1024,
+            )
+            try:
+                writer.write(request)
+                await writer.drain()
+                await reader.read(1)
+            finally:
+                writer.transport.abort()
+
+    def _context(self) -> ssl.SSLContext:
+        if self._wanted.ca is None:
+            return ssl.create_default_context()
+        with path_for_library(self._wanted.ca) as path:
+            return ssl.create_default_context(cafile=path)
+
+    def _secret(self) -> bytes:
+        """Read the secret for each call, so that a replaced file applies."""
+        assert self._wanted.secret_file is not None  # noqa: S101  the role runs only with it
+        lines = read_given(self._wanted.secret_file, _LONGEST_SECRET).splitlines()
+        if not lines or len(lines[0]) < LEAST_SECRET:
+            raise ValueError(
+                f"the first line of {self._wanted.secret_file} has fewer than {LEAST_SECRET} characters"
+            )
+        return lines[0]

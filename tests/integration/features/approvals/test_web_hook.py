@@ -1,0 +1,102 @@
+"""The web hook: a real receiver with TLS, which answers with a redirect to another one."""
+
+import contextlib
+import hashlib
+import hmac
+import http.server
+import json
+import threading
+import xmlrpc.client
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from tests.support.appliance import Appliance
+from tests.support.certificates import Certificates, make_certificates
+from tests.support.waiting import eventually
+
+SECRET = "a secret of this site"  # noqa: S105  of this test
+POLICY = """
+[Nodes]
+default = *
+[Publishers]
+default = *
+/goal = 10.9.9.9 ask 127.0.0.1
+[Subscribers]
+default = *
+[Commands]
+default = *
+"""
+
+
+class _Receiver(http.server.BaseHTTPRequestHandler):
+    def do_POST(self) -> None:
+        body = self.rfile.read(int(self.headers["Content-Length"]))
+        self.server.got.append((self.path, dict(self.headers), body))  # type: ignore[attr-defined]
+        self.send_response(307)
+        self.send_header("Location", "/elsewhere")
+        self.end_headers()
+
+    def log_message(self, *_words: Any) -> None:
+        pass
+
+
+@contextlib.contextmanager
+def receiver(made: Certificates) -> Iterator[Any]:
+    import ssl  # noqa: PLC0415
+
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.load_cert_chain(made.certificate, made.key)
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), _Receiver) as server:
+        server.got = []  # type: ignore[attr-defined]
+        server.socket = context.wrap_socket(server.socket, server_side=True)
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        try:
+            yield server
+        finally:
+            server.shutdown()
+            thread.join()
+
+
+def test_a_waiting_call_is_told_once_and_a_dead_receiver_is_a_warning(tmp_path: Path) -> None:
+    made = make_certificates(tmp_path / "certificates")
+    (tmp_path / "secret").write_text(f"{SECRET}\n")
+    with receiver(made) as server:
+        port = server.server_port
+        settings = json.dumps({
+            "name": "lift-7",
+            "approval_hook": {
+                "url": f"https://127.0.0.1:{port}/hook", "address": f"127.0.0.1:{port}", "ca": str(made.ca),
+                "secret_file": str(tmp_path / "secret"), "console": "https://lift-7:8443",
+            },
+        })  # fmt: skip
+        with Appliance(policy=POLICY, settings=settings) as appliance:
+
+            def wants(node: str) -> str:
+                with xmlrpc.client.ServerProxy(appliance.master_uri) as master:
+                    answer: Any = master.registerPublisher(
+                        node, "/goal", "std_msgs/String", "http://127.0.0.1:1/"
+                    )
+                return str(answer[1])
+
+            assert "held for approval" in wants("/agent")
+            eventually(lambda: server.got, "the receiver is told")
+            wants("/agent")
+            [(path, headers, body)] = server.got
+            assert path == "/hook", "no redirect is followed"
+            time, signature = (word.partition("=")[2] for word in headers["ROSRV-Signature"].split(","))
+            assert (
+                signature == hmac.new(SECRET.encode(), f"{time}.".encode() + body, hashlib.sha256).hexdigest()
+            )
+            told = json.loads(body)
+            [row] = appliance.rest().get("/v1/approvals").json["approvals"]
+            assert (told["number"], told["resource"], told["robot"]) == (row["number"], "/goal", "lift-7")
+            assert told["console"] == "https://lift-7:8443/console/robot"
+            assert appliance.status()["approvals"]["untold"] == 0
+            server.shutdown()
+            server.server_close()
+            appliance.rosrv("approve", str(row["number"]), "--for", "1s")
+            eventually(lambda: "held for approval" in wants("/agent"), "it waits again")
+            eventually(lambda: appliance.status()["approvals"]["untold"], "the failure is counted")
+            assert "the web hook was not told" in appliance.rosrv("status", check=False).stdout
