@@ -293,6 +293,7 @@ WALL_CLOCK = {
         "features/blocks/block_orders.py", "features/sso/sessions.py", "features/tunnels/enrolment_tokens.py",
         "features/standby/passive_rest.py",
     ],
+    "the time of a signature, for a receiver on another machine": ["features/approvals/hook_process.py"],
     "an end that is a date: of a certificate or a revocation": [
         "features/sso/sign_on.py",
         "features/metrics/metrics_route.py", "features/fleet/view.py", "api/process.py",

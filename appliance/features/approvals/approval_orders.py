@@ -27,7 +27,6 @@ from appliance.features.approvals.approval_table import (
     ChargedHost,
     HeldCall,
 )
-from appliance.features.approvals.hook import Hook
 from appliance.features.approvals.view import ApprovalCounts
 from appliance.master.calls.call import denial_text
 from appliance.master.endpoints.host_signs import HostSigns
@@ -65,7 +64,7 @@ class ApprovalOrders:
         bearers: Callable[[], Iterable[TokenKept]],  # the usable tokens and sessions
         # The monitors that have a safe message for a topic; None: its relay does not answer.
         guards: Callable[[str], Awaitable[list[str] | None]],
-        hook: Hook,
+        held: Callable[[ApprovalEntry, float], None],  # gets each call that begins to wait, with its seconds
     ) -> None:
         self._policy = policy
         self._trail = trail
@@ -75,8 +74,7 @@ class ApprovalOrders:
         self._carried_out = carried_out
         self._bearers = bearers
         self._guards = guards
-        self._hook = hook
-        self._table = ApprovalTable(first, ends)
+        self._table = ApprovalTable(first, ends, held)
         self._unanswered: list[float] = []
         self._cut_off: list[ApprovalEntry] = []  # by a change of the policy
         self._moved: dict[int, float] = {}  # of leases: the last message, even after its publisher ended
@@ -141,7 +139,6 @@ class ApprovalOrders:
                 return f"not held: {held}; ask the operator about those first"
             entry = held
             self._record("approval wanted", entry, f"waits for approval {entry.number}")
-            self._hook.tell(entry, self._table.seconds_left(entry))
         left = max(1, round(self._table.seconds_left(entry)))
         if entry.state is ApprovalState.REFUSED:
             return f"an operator refused approval {entry.number}; ask again in {left} s"
@@ -319,9 +316,7 @@ class ApprovalOrders:
         waiting = [entry for entry in entries if entry.state is ApprovalState.WAITS]
         oldest = max((clock.now() - entry.since for entry in waiting), default=0.0)
         leases = sum(entry.lease for entry in entries)
-        return ApprovalCounts(
-            len(waiting), round(oldest, 1), leases, len(self._unanswered), *self._hook.untold()
-        )
+        return ApprovalCounts(len(waiting), round(oldest, 1), leases, len(self._unanswered))
 
     def limits(self) -> tuple[LimitUse, ...]:
         pool = self._table.pool

@@ -89,9 +89,12 @@ class ApprovalEntry:
 class ApprovalTable:
     """The held calls and approvals; the first entry has the number `first`."""
 
-    def __init__(self, first: int, ends: EndTable) -> None:
+    def __init__(
+        self, first: int, ends: EndTable, held: Callable[[ApprovalEntry, float], None] = lambda *_entry: None
+    ) -> None:
         self._next = first
         self._ends = ends
+        self._held = held
         self._entries: dict[int, ApprovalEntry] = {}
         self._by_call: dict[HeldCall, int] = {}
         self._unanswered: OrderedDict[HeldCall, int] = OrderedDict()  # their numbers, oldest first
@@ -129,6 +132,7 @@ class ApprovalTable:
         number = self._unanswered.pop(call, 0) or self._next
         entry = ApprovalEntry(number, call, charged, caller_id, type_, arguments, size, now)
         self._next = max(self._next, number + 1)
+        self._held(entry, WAIT_SECONDS)
         return self._put(entry, WAIT_SECONDS)
 
     def approve(

@@ -9,7 +9,7 @@ from appliance.control.operators.request_method import RequestMethod
 from appliance.features.approvals import approval_requests as requests
 from appliance.features.approvals.approval_orders import ApprovalOrders
 from appliance.features.approvals.feature import HOOK
-from appliance.features.approvals.hook import Hook
+from appliance.features.approvals.hook import WebHook, with_hook
 from appliance.features.approvals.hook_link import HookLink
 from appliance.features.approvals.settings import ApprovalHook
 from appliance.features.feature import FeaturePart
@@ -32,7 +32,7 @@ async def inherit(base: "Foundation", parts: "Parts") -> FeaturePart:
     lost: Commands = set()
     if any(rule.asked for rule in policy().rules(Category.PUBLISH)):
         lost = published_before(base.store, lambda host, topic: _asks(policy(), host, topic))
-    hook = Hook(wanted=base.settings.of(ApprovalHook).url is not None)
+    hook = WebHook(wanted=base.settings.of(ApprovalHook).url is not None)
     orders = ApprovalOrders(
         policy,
         base.trail,
@@ -44,7 +44,7 @@ async def inherit(base: "Foundation", parts: "Parts") -> FeaturePart:
         carried_out=relay.carried_out,
         bearers=lambda: base.features.bearers()(),  # noqa: PLW0108  set later
         guards=relay.taps.guards,
-        hook=hook,
+        held=hook.notify,
     )
 
     return FeaturePart(
@@ -54,7 +54,7 @@ async def inherit(base: "Foundation", parts: "Parts") -> FeaturePart:
             RequestMethod(requests.ApproveCall, orders.approve, who=True, full_disk=True),
             RequestMethod(requests.RefuseCall, orders.refuse, who=True, full_disk=True),
         ),
-        status_fields=lambda: {"approvals": orders.state()},
+        status_fields=lambda: {"approvals": with_hook(orders.state(), hook)},
         limits=orders.limits,
         approved=orders.approved,
         policy_changed=orders.policy_changed,

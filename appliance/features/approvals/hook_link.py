@@ -16,11 +16,11 @@ class CallWaits(Message, frozen=True):
     """Until it expires."""
 
 
-class CallTold(Message, frozen=True):
-    """The web hook was told of a call, or `trouble` says why not."""
+class CallSent(Message, frozen=True):
+    """The web hook got a call; otherwise `trouble` is the reason."""
 
     number: int
     trouble: str
 
 
-HookLink = CallWaits | CallTold
+HookLink = CallWaits | CallSent

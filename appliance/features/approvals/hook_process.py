@@ -1,7 +1,7 @@
-"""Tell the web hook of calls that wait, as a process of the appliance.
+"""Send the web hook calls that wait, as a process of the appliance.
 
-1. It can only tell: control gets nothing from it but whether a call was told. It reads no answer of the receiver: the
-   first byte, or the end, shows that the request arrived, and is discarded. So no redirect is followed.
+1. It only sends: control learns from it whether a call was sent, and nothing else. It reads no answer of the
+   receiver: the first byte, or the end, shows that the request arrived, and is discarded. So no redirect is followed.
 2. The firewall and the sandbox let it reach the receiver, and nothing else.
 3. A slow receiver delays no call and no order: the queue has a bound, and each POST a deadline.
 """
@@ -10,7 +10,6 @@ import asyncio
 import socket
 import ssl
 from pathlib import Path
-from typing import Any
 
 import structlog
 
@@ -20,7 +19,7 @@ from appliance.channel import messages
 from appliance.channel.channel import Channel
 from appliance.channel.child_process import Child
 from appliance.configuration.settings import Settings, load_resolved
-from appliance.features.approvals.hook_link import CallTold, CallWaits, HookLink
+from appliance.features.approvals.hook_link import CallSent, CallWaits, HookLink
 from appliance.features.approvals.hook_request import LEAST_SECRET, body_of, request_of
 from appliance.features.approvals.settings import ApprovalHook
 
@@ -49,21 +48,21 @@ class _Process:
         for worker in workers:
             worker.cancel()
 
-    def _said(self, message: Any) -> None:
+    def _said(self, message: object) -> None:
         if not isinstance(message, CallWaits):
             raise TypeError(f"control sent {type(message).__name__}, which is not for hook")
         try:
             self._queue.put_nowait((message, clock.now() + message.seconds))
         except asyncio.QueueFull:
-            self._child.tell(CallTold(message.number, f"{MOST_WAITING} calls are already waiting to be told"))
+            self._child.tell(CallSent(message.number, f"{MOST_WAITING} calls are already in the queue"))
 
     async def _work(self) -> None:
         while True:
             call, ends = await self._queue.get()
-            trouble = await self._sender.tell(call, ends)
+            trouble = await self._sender.send(call, ends)
             if trouble:
-                _log.warning("the web hook was not told of a call", number=call.number, reason=trouble)
-            self._child.tell(CallTold(call.number, trouble))
+                _log.warning("the web hook did not get a call", number=call.number, reason=trouble)
+            self._child.tell(CallSent(call.number, trouble))
 
 
 class HookSender:
@@ -72,20 +71,20 @@ class HookSender:
     def __init__(self, wanted: ApprovalHook, robot: str) -> None:
         self._wanted, self._robot = wanted, robot
 
-    async def tell(self, call: CallWaits, ends: float) -> str:
-        """Return why the call was not told, or an empty string; `ends` is monotonic."""
+    async def send(self, call: CallWaits, ends: float) -> str:
+        """Return why the call was not sent, or an empty string; `ends` is monotonic."""
         left = ends - clock.now()
         if left <= 0:
-            return "it expired before it could be told"
+            return "it expired before it could be sent"
         try:
             body = body_of(call, left, self._robot, self._wanted.console)
             await self._post(request_of(self._wanted, body, self._secret(), int(clock.wall())))
         except TimeoutError:
             return f"no answer within {_SECONDS:g} s"
         except (OSError, ValueError) as error:
-            return str(error) or type(error).__name__
+            return f"{type(error).__name__}: {error}"
         except Exception as error:  # noqa: BLE001  a defect affects only this call
-            _log.exception("a call was not told")
+            _log.exception("a call was not sent")
             return f"a defect of rosrv: {type(error).__name__}"
         return ""
 

@@ -15,7 +15,7 @@ _METRICS = (
     gauge("rosrv_approvals_oldest_wait_seconds", "how long the oldest of these calls has waited"),
     gauge("rosrv_approvals_leases", "approvals that let a host publish, call or write for some time"),
     gauge("rosrv_approvals_unanswered", "calls that no operator answered in time, in the last ten minutes"),
-    gauge("rosrv_approvals_untold", "calls of which the web hook was not told, in the last ten minutes"),
+    gauge("rosrv_approvals_unsent", "calls that the web hook did not get, in the last ten minutes"),
 )
 
 
@@ -26,11 +26,11 @@ class ApprovalCounts(msgspec.Struct, frozen=True):
     oldest_seconds: Annotated[float, doc("how long the oldest of them has waited")]
     leases: Annotated[int, doc("approvals that last for some time")]
     unanswered: Annotated[int, doc("calls that no operator answered in time, in the last ten minutes")]
-    untold: Annotated[
+    unsent: Annotated[
         int,
-        doc("calls of which the web hook was not told, in the last ten minutes, since the last that it was"),
+        doc("calls that the web hook did not get, in the last ten minutes, since the last that it got"),
     ] = 0
-    untold_why: Annotated[str, doc("why the last of them was not told, or empty")] = ""
+    unsent_why: Annotated[str, doc("why the last of them was not sent, or empty")] = ""
 
 
 def _alarms(state: ApprovalCounts) -> Iterator[Trouble]:
@@ -40,8 +40,8 @@ def _alarms(state: ApprovalCounts) -> Iterator[Trouble]:
             " rosrv approve"
         )
         yield Trouble("warning", "approval-unanswered", text)
-    if state.untold:
-        text = f"the web hook was not told of {counted(state.untold, 'waiting call')}: {state.untold_why}"
+    if state.unsent:
+        text = f"the web hook did not get {counted(state.unsent, 'waiting call')}: {state.unsent_why}"
         yield Trouble("warning", "approval-hook", text)
 
 
@@ -68,7 +68,7 @@ APPROVALS_VIEW = FeatureView(
                 "rosrv_approvals_oldest_wait_seconds": [((), state.oldest_seconds)],
                 "rosrv_approvals_leases": [((), state.leases)],
                 "rosrv_approvals_unanswered": [((), state.unanswered)],
-                "rosrv_approvals_untold": [((), state.untold)],
+                "rosrv_approvals_unsent": [((), state.unsent)],
             },
         ),
     ),

@@ -33,7 +33,7 @@ BAD: dict[str, tuple[dict[str, Any], list[tuple[str, str]]]] = {
         [("doors-down", "warning"), ("doors-restarting", "warning"), ("doors-full", "warning")],
     ),
     "approvals": (
-        {"waiting": 1, "oldest_seconds": 2.5, "leases": 3, "unanswered": 4, "untold": 5, "untold_why": "away"},
+        {"waiting": 1, "oldest_seconds": 2.5, "leases": 3, "unanswered": 4, "unsent": 5, "unsent_why": "away"},
         [("approval-unanswered", "warning"), ("approval-hook", "warning")],
     ),
     "guards": (

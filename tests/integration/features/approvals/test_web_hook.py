@@ -5,6 +5,7 @@ import hashlib
 import hmac
 import http.server
 import json
+import ssl
 import threading
 import xmlrpc.client
 from collections.abc import Iterator
@@ -29,25 +30,26 @@ default = *
 """
 
 
-class _Receiver(http.server.BaseHTTPRequestHandler):
-    def do_POST(self) -> None:
-        body = self.rfile.read(int(self.headers["Content-Length"]))
-        self.server.got.append((self.path, dict(self.headers), body))  # type: ignore[attr-defined]
-        self.send_response(307)
-        self.send_header("Location", "/elsewhere")
-        self.end_headers()
+def _redirect(request: Any) -> None:
+    body = request.rfile.read(int(request.headers["Content-Length"]))
+    request.server.got.append((request.path, dict(request.headers), body))
+    request.send_response(307)
+    request.send_header("Location", "/elsewhere")
+    request.end_headers()
 
-    def log_message(self, *_words: Any) -> None:
-        pass
+
+_RECEIVER = type(
+    "Receiver",
+    (http.server.BaseHTTPRequestHandler,),
+    {"do_POST": _redirect, "log_message": lambda *_words: None},
+)
 
 
 @contextlib.contextmanager
 def receiver(made: Certificates) -> Iterator[Any]:
-    import ssl  # noqa: PLC0415
-
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.load_cert_chain(made.certificate, made.key)
-    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), _Receiver) as server:
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), _RECEIVER) as server:
         server.got = []  # type: ignore[attr-defined]
         server.socket = context.wrap_socket(server.socket, server_side=True)
         thread = threading.Thread(target=server.serve_forever)
@@ -59,7 +61,7 @@ def receiver(made: Certificates) -> Iterator[Any]:
             thread.join()
 
 
-def test_a_waiting_call_is_told_once_and_a_dead_receiver_is_a_warning(tmp_path: Path) -> None:
+def test_a_waiting_call_is_sent_once_and_a_dead_receiver_is_a_warning(tmp_path: Path) -> None:
     made = make_certificates(tmp_path / "certificates")
     (tmp_path / "secret").write_text(f"{SECRET}\n")
     with receiver(made) as server:
@@ -81,7 +83,7 @@ def test_a_waiting_call_is_told_once_and_a_dead_receiver_is_a_warning(tmp_path: 
                 return str(answer[1])
 
             assert "held for approval" in wants("/agent")
-            eventually(lambda: server.got, "the receiver is told")
+            eventually(lambda: server.got, "the receiver gets the call")
             wants("/agent")
             [(path, headers, body)] = server.got
             assert path == "/hook", "no redirect is followed"
@@ -89,14 +91,14 @@ def test_a_waiting_call_is_told_once_and_a_dead_receiver_is_a_warning(tmp_path: 
             assert (
                 signature == hmac.new(SECRET.encode(), f"{time}.".encode() + body, hashlib.sha256).hexdigest()
             )
-            told = json.loads(body)
+            sent = json.loads(body)
             [row] = appliance.rest().get("/v1/approvals").json["approvals"]
-            assert (told["number"], told["resource"], told["robot"]) == (row["number"], "/goal", "lift-7")
-            assert told["console"] == "https://lift-7:8443/console/robot"
-            assert appliance.status()["approvals"]["untold"] == 0
+            assert (sent["number"], sent["resource"], sent["robot"]) == (row["number"], "/goal", "lift-7")
+            assert sent["console"] == "https://lift-7:8443/console/robot"
+            assert appliance.status()["approvals"]["unsent"] == 0
             server.shutdown()
             server.server_close()
             appliance.rosrv("approve", str(row["number"]), "--for", "1s")
             eventually(lambda: "held for approval" in wants("/agent"), "it waits again")
-            eventually(lambda: appliance.status()["approvals"]["untold"], "the failure is counted")
-            assert "the web hook was not told" in appliance.rosrv("status", check=False).stdout
+            eventually(lambda: appliance.status()["approvals"]["unsent"], "the failure is counted")
+            assert "the web hook did not get" in appliance.rosrv("status", check=False).stdout

@@ -17,7 +17,6 @@ from appliance.control.errors import SenselessError, UnknownThingError
 from appliance.features.approvals.approval_orders import CHECK_SECONDS, LEASE_SECONDS, ApprovalOrders
 from appliance.features.approvals.approval_requests import Approval, ApprovalsWanted, ApproveCall, RefuseCall
 from appliance.features.approvals.approval_table import WAIT_SECONDS
-from appliance.features.approvals.hook import Hook
 from appliance.features.approvals.view import APPROVALS_VIEW
 from appliance.master.endpoints.host_signs import HostSigns
 from appliance.policy.model import Address, Category, Request, address_of
@@ -75,7 +74,7 @@ class Site:
             carried_out=self.carried_out,
             bearers=lambda: self.bearers,
             guards=self.guards,
-            hook=Hook(wanted=False),
+            held=lambda *_entry: None,
         )
         self.decide_again()
 

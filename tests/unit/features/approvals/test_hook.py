@@ -2,7 +2,8 @@ import hashlib
 import hmac
 import json
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 from pydantic import TypeAdapter, ValidationError
@@ -10,8 +11,8 @@ from pydantic import TypeAdapter, ValidationError
 from appliance.base import clock
 from appliance.channel.channel import ChannelFullError
 from appliance.features.approvals.approval_table import ApprovalEntry, HeldCall
-from appliance.features.approvals.hook import UNTOLD_SECONDS, Hook
-from appliance.features.approvals.hook_link import CallTold, CallWaits
+from appliance.features.approvals.hook import UNSENT_SECONDS, WebHook
+from appliance.features.approvals.hook_link import CallSent, CallWaits
 from appliance.features.approvals.hook_process import HookSender
 from appliance.features.approvals.hook_request import body_of, request_of
 from appliance.features.approvals.settings import ApprovalHook
@@ -75,18 +76,8 @@ def test_a_hook_needs_https_an_address_and_a_secret(given: dict[str, Any], error
         TypeAdapter(ApprovalHook).validate_python(fields)
 
 
-class _Link:
-    def __init__(self, *, full: bool = False, connected: bool = True) -> None:
-        self.full, self.connected, self.sent = full, connected, []  # type: ignore[var-annotated]
-
-    def send(self, message: object) -> bool:
-        if self.full:
-            raise ChannelFullError
-        self.sent.append(message)
-        return self.connected
-
-    def close(self) -> None:
-        self.connected = False
+def _full(_message: object) -> bool:
+    raise ChannelFullError
 
 
 def _entry() -> ApprovalEntry:
@@ -94,37 +85,38 @@ def _entry() -> ApprovalEntry:
     return ApprovalEntry(7, call, None, "/agent", "", b"", 0, clock.now())  # type: ignore[arg-type]
 
 
-def test_a_call_that_could_not_be_told_is_counted_until_one_is_told_or_ten_minutes_have_passed() -> None:
+def test_an_unsent_call_is_counted_until_one_is_sent_or_ten_minutes_have_passed() -> None:
     with clock.using(time := VirtualClock()):
-        hook = Hook(wanted=True)
-        hook.tell(_entry(), 120.0)
-        assert hook.untold() == (1, "its process is not running")
-        hook.link = _Link()  # type: ignore[assignment]
-        hook.tell(_entry(), 120.0)
-        assert hook.link.sent == [CALL]  # type: ignore[attr-defined]
-        told = hook.heard
-        told(CallTold(7, "no answer within 5 s"))
-        assert hook.untold() == (2, "no answer within 5 s")
-        told(CallTold(8, ""))
-        assert hook.untold() == (0, "")
-        hook.link = _Link(full=True)  # type: ignore[assignment]
-        hook.tell(_entry(), 120.0)
-        assert hook.untold() == (1, "its process does not read")
-        time.advance(UNTOLD_SECONDS)
-        assert hook.untold() == (0, "")
-        quiet = Hook(wanted=False)
-        quiet.tell(_entry(), 120.0)
-        assert quiet.untold() == (0, "")
+        hook = WebHook(wanted=True)
+        hook.notify(_entry(), 120.0)
+        assert hook.unsent() == (1, "its process is not running")
+        sent: list[object] = []
+        hook.link = cast(Any, SimpleNamespace(send=lambda one: not sent.append(one)))  # type: ignore[func-returns-value]
+        hook.notify(_entry(), 120.0)
+        assert sent == [CALL]
+        heard = hook.heard
+        heard(CallSent(7, "no answer within 5 s"))
+        assert hook.unsent() == (2, "no answer within 5 s")
+        heard(CallSent(8, ""))
+        assert hook.unsent() == (0, "")
+        hook.link = cast(Any, SimpleNamespace(send=_full, close=lambda: None))
+        hook.notify(_entry(), 120.0)
+        assert hook.unsent() == (1, "its process does not read")
+        time.advance(UNSENT_SECONDS)
+        assert hook.unsent() == (0, "")
+        quiet = WebHook(wanted=False)
+        quiet.notify(_entry(), 120.0)
+        assert quiet.unsent() == (0, "")
 
 
 @pytest.mark.anyio
-async def test_a_call_that_expired_in_the_queue_is_not_told() -> None:
+async def test_a_call_that_expired_in_the_queue_is_not_sent() -> None:
     sender = HookSender(ApprovalHook(**GIVEN), "lift-7")
-    assert await sender.tell(CALL, clock.now() - 1) == "it expired before it could be told"
+    assert await sender.send(CALL, clock.now() - 1) == "it expired before it could be sent"
 
 
 @pytest.mark.anyio
 async def test_a_short_secret_is_not_used(tmp_path: Path) -> None:
     (tmp_path / "secret").write_text("short\n")
     sender = HookSender(ApprovalHook(**GIVEN | {"secret_file": tmp_path / "secret"}), "")
-    assert "fewer than 16 characters" in await sender.tell(CALL, clock.now() + 10)
+    assert "fewer than 16 characters" in await sender.send(CALL, clock.now() + 10)
