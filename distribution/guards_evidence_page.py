@@ -14,7 +14,7 @@ from typing import Any
 
 from appliance.features.guards.evidence import text_digest
 from appliance.features.guards.presets import PRESETS, Preset
-from tests.world.closed_loop.worlds import NOT_MODELLED, WORLDS
+from tests.world.closed_loop.worlds import NOT_MODELLED, PAIRS, WORLDS
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "tests/world/closed_loop/results.json"
@@ -255,6 +255,7 @@ level.
   and operators, within the assumptions that are listed for each preset. **Left out of the worlds** are events at which
   the preset may break a law: the guard is disabled and enabled (*switch*), is held and resumed (*hold*), gets bytes
   that are not a message (*cut*), or its process is replaced (*restart*).
+- **Pairs** are worlds with two guards of different presets on one topic: {pairs}.
 - **Tested in the engine** names tests of the preset's text. With real nodes, the stops of the engine are tested by a
   guard that is written for the test, not by each preset: `test_a_restart_sends_stops_until_a_command_comes`,
   `test_the_base_gets_stops_and_nothing_else`.
@@ -288,7 +289,9 @@ _COMMON = (
 
 
 def page() -> str:
-    return "\n".join((_HEAD.format(relay=RELAY_MS) + "".join(_times()), *_presets(), *_common()))
+    return "\n".join(
+        (_HEAD.format(relay=RELAY_MS, pairs=_pairs()) + "".join(_times()), *_presets(), *_common())
+    )
 
 
 def _common() -> Iterator[str]:
@@ -366,6 +369,12 @@ def _left_out(name: str) -> str:
     return "; ".join(f"{', '.join(events)}: {why}" for why, events in by_reason.items())
 
 
+def _pairs() -> str:
+    results = _results()
+    found = results.get(PAIRS)
+    return _run(found, results) if found else "no long run yet"
+
+
 def _simulated(name: str, results: Mapping[str, Any]) -> str:
     if not results:
         return "no long run yet"
@@ -376,6 +385,10 @@ def _simulated(name: str, results: Mapping[str, Any]) -> str:
         return "no long run yet"
     if one["digest"] != text_digest(PRESETS[name].text):
         return f"not since its text changed ({results['date']}, commit `{results['commit']}`)"
+    return _run(one, results)
+
+
+def _run(one: Mapping[str, Any], results: Mapping[str, Any]) -> str:
     near = "" if one["closest"] is None else f", closest {one['closest'] * 100:.1f} cm"
     broken = sum(one["violations"].values())
     laws = f"{broken} broke a law" if broken else "none broke a law"

@@ -593,13 +593,17 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         )
 
     async def resume(self, request: admin.MonitorResume, who: str) -> Switched:
-        """Release the topics that monitors hold; return the monitors that held any.
+        """Release the topics that monitors hold, and let them await no node; return the monitors that held any.
 
         A relay that is not running is refused, because the next process will hold the topics again.
         """
         async with self._changing(request.expected):
             self._all_known(request.names)
-            held = [name for name in dict.fromkeys(request.names) if name in self.rollout.held]
+            rows = self.rollout.rows
+            held = [
+                name for name in dict.fromkeys(request.names)
+                if name in self.rollout.held or (name in rows and rows[name].awaits)
+            ]  # fmt: skip
             take_effect()
             if held:
                 await self._count()

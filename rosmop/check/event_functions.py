@@ -27,6 +27,8 @@ from rosmop.types.resolve import resolve
 from rosmop.types.value_types import Type
 from roswire.errors import DefinitionError
 
+_NAMES = value_types.VectorType(value_types.STRING)
+
 
 def compile_event(
     shared: CompilationContext,
@@ -62,7 +64,13 @@ def compile_event(
         creates=creates(specification, event),
         plain=not event.action.statements and trigger.when is None and not is_noted,
         acts=acts(whole, shared),
+        each_node=trigger.when is None and _lists_nodes(names, whole),
     )
+
+
+def _lists_nodes(names: SpecificationNames, function: nodes.Function) -> bool:
+    lists = any(one.type == _NAMES for one in names.variables.values())
+    return lists and any(isinstance(one, nodes.SenderName) for one in nodes.walk(function.body))
 
 
 def _key(

@@ -298,11 +298,13 @@ class WasmLane:
 
     def ready(self) -> bool:
         for monitor in self._monitors:
-            if monitor.enabled and (not monitor.seen or self._topic in monitor.starting or monitor.held):
+            if monitor.enabled and (not monitor.seen or self._topic in monitor.starting or monitor.blocks):
                 if monitor.seen and self._topic not in (*monitor.starting, *monitor.held_channels):
                     continue  # it only observes this topic, and goes on to
                 return False
-        return not any(source.waits and monitor.enabled for monitor, source in self._sources)
+        return not any(
+            (source.waits or source.speakers) and monitor.enabled for monitor, source in self._sources
+        )
 
     def prepare(
         self,

@@ -37,6 +37,9 @@ class EventCode:
     plain: bool = False
     """The key alone decides: there is neither an action nor a `when`."""
     acts: bool = False
+    each_node: bool = False
+    """It happens with the message of any node, and its action asks which one, in a specification that lists names: each
+    node has a say of its own."""
 
     @property
     def channel(self) -> str | None:

@@ -319,13 +319,13 @@ class MonitorSet:
         return tuple(
             network
             for monitor, one in self._withheld.get(topic, ())
-            if self._is_true(monitor, one.condition)
+            if monitor.blocks or self._is_true(monitor, one.condition)
             for network in one.networks
         )
 
     def withholds(self, monitor: MonitorInstance) -> bool:
         return monitor.enabled and any(
-            self._is_true(monitor, one.condition) for one in monitor.code.withholdings
+            monitor.blocks or self._is_true(monitor, one.condition) for one in monitor.code.withholdings
         )
 
     def _is_true(self, monitor: MonitorInstance, variable: str) -> bool:

@@ -125,12 +125,12 @@ class MonitorExecution:
                 monitor.context.begin()
                 monitor.starting.discard(message.channel or "")
                 source = monitor.sources.get(message.channel or "")
-                if source is not None and source.waits:
+                if source is not None and (source.waits or source.speakers):
                     if not source.hears(self._node()):
                         passing = monitor
                         continue
                     heard = (*heard, (monitor, source))
-                if (not monitor.seen or monitor.held) and self._first(monitor, message, outcome):
+                if (not monitor.seen or monitor.blocks) and self._first(monitor, message, outcome):
                     if not message.dropped:
                         passing = monitor
                         continue
@@ -618,6 +618,8 @@ class MonitorExecution:
         elif monitor.held:
             why = f" ({monitor.why_held})" if monitor.why_held else ""
             outcome.reason = f"{monitor.name} holds its topics until it is resumed{why}"
+        elif monitor.blocks:
+            outcome.reason = f"{monitor.name} holds its topics until it has heard {monitor.awaits}"
         elif broken:
             outcome.reason = f"{monitor.name} could not start: its initial values or `init` faulted"
         if outcome.reason is not None:

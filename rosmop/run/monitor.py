@@ -209,6 +209,8 @@ class MonitorInstance:
 
     def resume(self) -> None:
         self.held, self.why_held = False, ""
+        for source in self.sources.values() if self.awaits else ():
+            source.forget()
 
     def sending(self, *, passes: bool) -> list[SafeSender]:
         """Return the senders that send now: all while no message can be judged, else those of `starting` topics.
@@ -217,7 +219,7 @@ class MonitorInstance:
         """
         if not self.safes or not self.enabled:
             return []
-        blocks = self.held or (self.broken and not passes)
+        blocks = self.blocks or (self.broken and not passes)
         return [sender for topic, sender in self.safes.items() if blocks or topic in self.starting]
 
     def start_anew(self) -> None:
@@ -225,7 +227,20 @@ class MonitorInstance:
 
     def await_sources(self) -> None:
         for source in self.sources.values():
-            source.waits = True
+            source.begin_again()
+
+    @property
+    def awaits(self) -> str:
+        """Return the nodes, with their topics, without whose messages it does not go on, or an empty text."""
+        rows = ((topic, one.awaited) for topic, one in self.sources.items())
+        return "; ".join(
+            f"{', '.join(nodes).replace(chr(0), '…')} on {topic}" for topic, nodes in rows if nodes
+        )
+
+    @property
+    def blocks(self) -> bool:
+        """Whether it cannot judge, and so holds its topics, until an operator resumes it or until nodes speak."""
+        return self.held or (bool(self.sources) and any(one.blocks for one in self.sources.values()))
 
     def touch(self) -> None:
         if self.group is not None:
@@ -279,8 +294,10 @@ def _monitor(
     ]
     monitor.steps = tuple(step for step in steps if step.event.period_ns is None)
     if code.begins and code.slicing is None:
-        topics = (event.topic for event in code.events if event.topic and event.part is None)
-        monitor.sources = {topic: Origin() for topic in topics if topic not in code.acts_on}
+        events = [event for event in code.events if event.topic and event.part is None]
+        each = {event.topic for event in events if event.each_node}
+        topics = dict.fromkeys(event.topic or "" for event in events if event.topic not in code.acts_on)
+        monitor.sources = {topic: Origin(speakers=topic in each) for topic in topics}
     monitor.timers = tuple(
         Timer(step, step.event.period_ns) for step in steps if step.event.period_ns is not None
     )

@@ -54,8 +54,9 @@ class MonitorSnapshot(msgspec.Struct, frozen=True, array_like=True):
     variables: dict[str, Any]
     first: tuple[list[Any], list[Any]] = ([], [])
     """The initial values of parameters, and of the slices' own variables."""
-    sources: dict[str, tuple[str | None, list[str], bool]] = {}
-    """By topic: the first node, the nodes whose last bytes were not a message, and whether it awaits the first."""
+    sources: dict[str, tuple[str | None, list[str], bool, list[str]]] = {}
+    """By topic: the first node, the nodes whose last bytes were not a message, whether it awaits the first, and the
+    nodes that have a say of their own."""
 
 
 def encoded(states: Sequence[MonitorSnapshot]) -> bytes:
@@ -146,7 +147,10 @@ def kept_monitor(monitor: MonitorInstance, variables: Mapping[str, Any], types: 
         [kept(running.run) for running in monitor.properties] if slices is None else [],
         {name: variables[code] for name, code in monitor.code.variables.items()},
         first,
-        {topic: (one.first, sorted(one.unreadable), one.waits) for topic, one in monitor.sources.items()},
+        {
+            topic: (one.first, sorted(one.unreadable), one.waits, sorted(one.known))
+            for topic, one in monitor.sources.items()
+        },
     )
 
 
@@ -198,8 +202,8 @@ def restore(
     monitor.held, monitor.why_held = state.held, state.why_held
     for topic, source in monitor.sources.items():
         if topic in state.sources:
-            first, unreadable, waits = state.sources[topic]
-            source.follow(Origin(first, set(unreadable), waits))
+            first, unreadable, waits, known = state.sources[topic]
+            source.follow(Origin(first, set(unreadable), waits, known=set(known)))
 
 
 _HELD: Mapping[type, type | tuple[type, ...]] = MappingProxyType(

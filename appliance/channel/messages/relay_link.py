@@ -556,7 +556,8 @@ class MonitorRow(msgspec.Struct, frozen=True, array_like=True):
     """A monitor's counters since it was loaded, or the relay started.
 
     In shadow mode, drops and changes are those that it would have made, and `missed` counts messages that it would
-    have received if it were in force. `withholds`: it withholds a topic from hosts now.
+    have received if it were in force. `withholds`: it withholds a topic from hosts now. `awaits`: the nodes without
+    whose messages it does not go on.
     """
 
     name: str
@@ -574,6 +575,7 @@ class MonitorRow(msgspec.Struct, frozen=True, array_like=True):
     slices: int = 0
     slice_limit: int = 0
     withholds: bool = False
+    awaits: str = ""
 
 
 class MonitorsCounted(Message):

@@ -87,6 +87,12 @@ class GuardRow(msgspec.Struct, frozen=True):
     below: Annotated[
         list[str], doc("its values that are less safe than the standard asks for, each with the safe ones")
     ] = []
+    awaits: Annotated[
+        str,
+        doc(
+            "the nodes, with their topics, that it must hear before a motion passes, or empty if there are none"
+        ),
+    ] = ""
 
 
 class GuardList(msgspec.Struct, frozen=True):

@@ -321,4 +321,5 @@ class GuardOrders:
             version=preset.version,
             origin=origin_of(text),
             below=below_the_standard(preset, values_of(given)),
+            awaits=row.awaits if (row := monitors.rollout.rows.get(name)) is not None else "",
         )

@@ -498,6 +498,9 @@ def _state(row: GuardRow) -> str:
             return f"in shadow mode, {acts} only recorded"
         case "off":
             return f"disabled: rosrv monitor enable {row.name}"
+    if row.awaits:
+        resume = f"rosrv monitor resume {row.name}"
+        return f"in force, stops until it hears {row.awaits}; if that has another name now: {resume}"
     end = (
         ""
         if row.confirm_by is None

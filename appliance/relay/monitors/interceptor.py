@@ -223,7 +223,7 @@ class Interceptor:
         self.invalidate_prepared()
         if self.monitors is None:
             return frozenset()
-        held = [monitor for monitor in self.monitors.monitors if monitor.name == name and monitor.held]
+        held = [one for one in self.monitors.monitors if one.name == name and (one.held or one.awaits)]
         for monitor in held:
             self.monitors.resume(monitor.name)
         self.keep_all()

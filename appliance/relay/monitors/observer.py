@@ -414,6 +414,7 @@ class Observer:
                 monitor.slices.live if monitor.slices is not None else 0,
                 monitor.slices.limit if monitor.slices is not None else 0,
                 not self._prefix and monitors.withholds(monitor),
+                monitor.awaits,
             )
             for monitor in (monitors.shadowed if self._prefix else monitors.monitors)
         ]

@@ -1,6 +1,6 @@
 """Run guards in simulated worlds, and report each law that is broken.
 
-python -m tests.world.closed_loop --worlds 100000 --seed 1 --jobs 2    run many worlds, the same number for each preset
+python -m tests.world.closed_loop --worlds 100000 --seed 1 --jobs 2    run many worlds, as many for each preset
 python -m tests.world.closed_loop --replay PRESET SEED                 run one world, with everything that happens in it
 """
 
@@ -15,7 +15,7 @@ from pathlib import Path
 
 from appliance.features.guards.evidence import text_digest
 from appliance.features.guards.presets import PRESETS
-from tests.world.closed_loop.worlds import WORLDS, Summary, replay, run_chunk, run_one
+from tests.world.closed_loop.worlds import PAIRS, WORLDS, Summary, replay, run_chunk, run_one
 
 _AT_ONCE = 50
 
@@ -40,15 +40,19 @@ def _as_data(first: int, summaries: dict[str, Summary]) -> dict[str, object]:
         "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
         "first_seed": first,
         "presets": {
-            preset: {
-                "digest": text_digest(PRESETS[preset].text),
-                "worlds": one.worlds,
-                "seconds": round(one.seconds),
-                "closest": round(one.clearance, 4) if one.clearance < float("inf") else None,
-                "violations": dict(one.violations),
-            }
-            for preset, one in summaries.items()
+            preset: {"digest": text_digest(PRESETS[preset].text), **_result(one)}
+            for preset, one in summaries.items() if preset != PAIRS
         },
+        PAIRS: _result(summaries[PAIRS]) if PAIRS in summaries else None,
+    }  # fmt: skip
+
+
+def _result(one: Summary) -> dict[str, object]:
+    return {
+        "worlds": one.worlds,
+        "seconds": round(one.seconds),
+        "closest": round(one.clearance, 4) if one.clearance < float("inf") else None,
+        "violations": dict(one.violations),
     }
 
 
@@ -61,7 +65,9 @@ def main(arguments: list[str]) -> int:
     )
     parser.add_argument("--seed", type=int, default=1, help="the first seed (default: %(default)s)")
     parser.add_argument("--jobs", type=int, default=1, help="the number of processes (default: %(default)s)")
-    parser.add_argument("--preset", action="append", choices=WORLDS, help="only this preset; may be repeated")
+    parser.add_argument(
+        "--preset", action="append", choices=[*WORLDS, PAIRS], help="only this preset; may be repeated"
+    )
     parser.add_argument("--json", type=Path, help="write the summary to this file")
     parser.add_argument(
         "--replay", nargs=2, metavar=("PRESET", "SEED"), help="run one world, and print all that happens"
@@ -71,7 +77,7 @@ def main(arguments: list[str]) -> int:
         preset, seed = chosen.replay
         report = run_one(preset, int(seed), trace=_print)
         return 1 if report.violations else 0
-    presets = chosen.preset or list(WORLDS)
+    presets = chosen.preset or [*WORLDS, PAIRS]
     summaries = {preset: Summary() for preset in presets}
     with multiprocessing.get_context("spawn").Pool(chosen.jobs) as pool:
         for preset, found in pool.imap_unordered(run_chunk, _chunks(presets, chosen.worlds, chosen.seed)):

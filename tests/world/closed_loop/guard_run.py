@@ -2,9 +2,11 @@
 
 import functools
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 
 from appliance.features.guards.presets import preset_named
 from rosmop.run.engine import MonitorSet
+from rosmop.run.fast_path import BatchOptions, FastLane
 from rosmop.run.outcomes import MessageSender, Outcome
 from tests.support.features.guards.running_guard import Change, Value, on_its_module, part_with, unchanged
 from tests.world.closed_loop.messages import EPOCH
@@ -18,6 +20,16 @@ def parameters_of(preset: str) -> frozenset[str]:
     return frozenset(one.name for one in preset_named(preset).parameters)
 
 
+@dataclass(frozen=True)
+class Beside:
+    """A second guard of the same topic, before or behind the one of the world, unless its text has an order."""
+
+    name: str
+    text: str
+    given: Mapping[str, Value]
+    first: bool
+
+
 def _ns(at: int) -> int:
     return EPOCH * 10**9 + at * MS
 
@@ -26,9 +38,17 @@ class RunningGuard:
     """A guard of a preset with these values; `change` makes another text of it. Times are ms."""
 
     def __init__(
-        self, preset: str, types: Mapping[str, str], values: Mapping[str, Value], change: Change = unchanged
+        self,
+        preset: str,
+        types: Mapping[str, str],
+        values: Mapping[str, Value],
+        change: Change = unchanged,
+        beside: Beside | None = None,
     ) -> None:
-        self._part, self._given = part_with(preset, types, values, change)
+        before = () if beside is None or not beside.first else (beside.text,)
+        behind = () if beside is None or beside.first else (beside.text,)
+        self._part, given = part_with(preset, types, values, change, before=before, behind=behind)
+        self._given = {"guard": given, **({} if beside is None else {beside.name: dict(beside.given)})}
         self.topics = preset_named(preset).given_topics
         self._monitors = self._set()
         self.now = 0
@@ -37,7 +57,7 @@ class RunningGuard:
     def _set(self) -> MonitorSet:
         monitors = on_its_module(self._part)
         monitors.name_senders(lambda source: (f"10.0.0.{source}", NODES[source]))
-        monitors.give({"guard": self._given})
+        monitors.give(self._given)
         return monitors
 
     def advance(self, at: int) -> Iterator[tuple[int, str, bytes]]:
@@ -52,10 +72,19 @@ class RunningGuard:
         self, topic: str, data: bytes, at: int, node: int
     ) -> tuple[bytes | None, list[tuple[int, str, bytes]]]:
         """Return the message as it goes on, or None if it was dropped, and the messages that the guard sends."""
-        outcome = self._monitors.judge(topic, bytearray(data), _ns(at), MessageSender(node))
+        outcome = self._judged(topic, bytearray(data), _ns(at), MessageSender(node))
         sent = [one for before in outcome.before for one in self._sent(before)]
         passed = None if outcome.result == "dropped" else bytes(outcome.buffer)
         return passed, [*sent, *self._sent(outcome)]
+
+    def _judged(self, topic: str, data: bytearray, now: int, sender: MessageSender) -> Outcome:
+        """Process a message as a relay does once it has reported the first changes: also changes stay in the module."""
+        found = self._monitors.process_fast(topic, data, now, lambda lane: self._options(lane, sender.source))
+        return self._monitors.process(topic, data, now, sender) if found is None else found
+
+    @staticmethod
+    def _options(lane: FastLane, source: int) -> BatchOptions:
+        return lane.prepare(loud=False, told=[True] * len(lane.events), source=source)
 
     @staticmethod
     def _sent(outcome: Outcome) -> Iterator[tuple[int, str, bytes]]:

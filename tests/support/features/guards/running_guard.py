@@ -1,7 +1,7 @@
 """Guards that run in the product's own engine. Each text is compiled once for a process: that takes 0.1 s."""
 
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 from rosbags.typesys import get_types_from_msg
 
@@ -40,20 +40,24 @@ def part_with(
     types: Mapping[str, str],
     values: Mapping[str, Value],
     change: Change = unchanged,
+    *,
+    before: Sequence[str] = (),
+    behind: Sequence[str] = (),
 ) -> tuple[SetPart, dict[str, Value]]:
     """Return the part of a guard with the name `guard`, and the values that the running guard has to be given.
 
     The other values are in its text. So guards that differ only in given values share one compilation. `change` makes
-    another text of it.
+    another text of it. The part also has the guards of the texts `before` and `behind` it.
     """
     in_text = tuple(
         (name, str(value).lower()) for name, value in values.items() if name in _loaded_values(preset)
     )
     given = {name: value for name, value in values.items() if name not in _loaded_values(preset)}
-    return part_of(change(_text(preset, tuple(types.items()), in_text))), given
+    text = change(_text(preset, tuple(types.items()), in_text))
+    return part_of(*before, text, *behind), given
 
 
-@functools.lru_cache(maxsize=256)
+@functools.lru_cache(maxsize=512)
 def part_of(*texts: str) -> SetPart:
     """Return the part with the guards of these texts, in this order."""
     sources = {f"guard{number or ''}.rv": text for number, text in enumerate(texts)}

@@ -59,6 +59,24 @@ def seen(metres: float, blind: int = 0) -> bytes:
                    angle_min=-math.pi, angle_increment=math.pi / 36)  # fmt: skip
 
 
+def misses_a_base_that_moves(ordered: bool) -> bool:
+    """The scanner falls silent, so the sensor stops the base once; the base drives on."""
+    guards = Together("sensor", "standstill", ordered=ordered)
+    guards.topics["measure"] = "/odom"
+
+    def measured(speed: float, at: int) -> None:
+        guards.tell("measure", message("nav_msgs/Odometry", twist__twist__linear__x=speed), at)
+
+    for at in range(100, 1000, 50):
+        guards.tell("by", seen(at), at)
+        measured(0, at)
+        guards.drive(twist(0.5 if at > 500 else 0), at)
+    assert guards.got[-1] == (950, twist(0.5))
+    for at in range(1000, 4000, 50):
+        measured(1, at)
+    return sum(at > 2500 for at, _data in guards.got) < 10
+
+
 def passes_a_part(ordered: bool) -> bool:
     guards = Together("sane", "separation", ordered=ordered)
     guards.tell("by", seen(1.0), 1)
@@ -136,9 +154,14 @@ def twist_legs(x: float) -> tuple[float, ...]:
 
 
 CONSEQUENCES: list[Callable[[bool], bool]] = [
-    jumps, passes_a_part, leaves_the_fence, stops_a_node_that_commands, ignores_a_command_that_is_not_a_number,
+    jumps,
+    misses_a_base_that_moves,
+    passes_a_part,
+    leaves_the_fence,
+    stops_a_node_that_commands,
+    ignores_a_command_that_is_not_a_number,
     cancels_a_dropped_goal,
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize("happens", CONSEQUENCES, ids=[one.__name__ for one in CONSEQUENCES])

@@ -130,8 +130,13 @@ async def test_a_guard_has_its_last_stop(manager: Manager, orders: GuardOrders) 
 
 
 async def test_a_guard_is_withholding_while_its_relay_says_so(manager: Manager, orders: GuardOrders) -> None:
-    manager.rollout.rows["fence"] = SimpleNamespace(withholds=True)
+    manager.rollout.rows["fence"] = SimpleNamespace(withholds=True, awaits="")
     assert (await row(orders)).state == "withholding"
+
+
+async def test_a_guard_names_the_nodes_that_it_awaits(manager: Manager, orders: GuardOrders) -> None:
+    manager.rollout.rows["fence"] = SimpleNamespace(withholds=False, awaits="/lidar on /scan")
+    assert (await row(orders)).awaits == "/lidar on /scan"
 
 
 async def test_a_guard_is_shown_with_the_values_in_its_text(orders: GuardOrders) -> None:

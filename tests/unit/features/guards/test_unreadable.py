@@ -38,6 +38,8 @@ GOOD = {
 }  # fmt: skip
 """For each preset with a safe velocity that observes topics: messages after which the base may move."""
 VALUES = {"zone": {"clear": "0"}, "arm": {"needFix": "true", "needCheck": "true"}}
+SPEAKERS = {"enable": ("by",), "mode": ("by",)}
+"""Topics on which each node has a say, so that the guard holds its topics until each has spoken again."""
 BEFORE = {"enable": {"by": message("std_msgs/Bool")}}
 """Messages that come once before these."""
 SEND_NOTHING = {
@@ -97,7 +99,7 @@ def test_a_moving_base_is_stopped_by_an_unreadable_observation(
     sent = [one.data for each in monitors.advance(now + 2) for one in each.sent()]
     assert sent == [bytes(48)]
     driven = monitors.judge("/cmd_vel", bytearray(DRIVE), now + 3)
-    assert driven.result == ("dropped" if name == "estop" else "changed")
+    assert driven.result == ("dropped" if name == "estop" or damaged in SPEAKERS.get(name, ()) else "changed")
     assert bytes(driven.buffer) != DRIVE or driven.result == "dropped"
     for topic, data in GOOD[name].items():
         if topic != damaged:
@@ -157,7 +159,8 @@ def test_no_other_node_takes_the_place_of_one_whose_bytes_are_unreadable(
             for topic, data in BEFORE.get(name, {}).items():
                 monitors.judge(PRESETS[name].given_topics[topic], bytearray(data), now, MessageSender(2))
             result = told(monitors, name, now, {"": 1, damaged: 2})
-            assert result == "changed" or (name, damaged) == ("zone", "mute")
+            wanted = "dropped" if damaged in SPEAKERS.get(name, ()) else "changed"
+            assert result == wanted or (name, damaged) == ("zone", "mute")
     for topic, data in BEFORE.get(name, {}).items():
         monitors.judge(PRESETS[name].given_topics[topic], bytearray(data), now, MessageSender(1))
     results = [told(monitors, name, now := now + SECOND // 100, {"": 1}) for _ in range(12)]
@@ -175,6 +178,102 @@ def test_a_node_that_is_not_the_first_keeps_the_guard_in_doubt_and_never_takes_i
         source.doubt(f"/{number}")
     assert len(source.unreadable) == MOST + 1
     assert not any(map(source.read, [f"/{number}" for number in range(20)])) and not source.hears("/a")
+
+
+def test_speakers_are_all_heard_and_all_awaited() -> None:
+    source = Origin(speakers=True)
+    assert all(source.hears(node) and source.read(node) for node in ("/a", "/b"))
+    assert source.awaited == []
+    source.doubt("/b")
+    source.begin_again()
+    assert source.awaited == ["/a", "/b"]
+    assert source.hears("/c") and source.read("/c") and source.read("/b") and source.awaited == ["/a"]
+    assert source.read("/a") and source.awaited == []
+    for number in range(20):
+        source.read(f"/{number}")
+    source.begin_again()
+    assert len(source.unreadable) == MOST + 1
+    assert all(map(source.read, [f"/{number}" for number in range(20)])) and source.blocks
+    source.forget()
+    assert source.awaited == [] and source.hears("/z")
+
+
+@MADE
+@pytest.mark.parametrize("how", ["unreadable", "enabled again", "restarted"])
+@pytest.mark.parametrize(("name", "permits", "forbids"), [("enable", b"\1", b"\0"), ("mode", b"\0", b"\1")])
+def test_what_a_node_said_is_not_forgotten_when_the_guard_begins_again(
+    name: str, permits: bytes, forbids: bytes, how: str, made: Callable[[SetPart], MonitorSet]
+) -> None:
+    """One of two nodes forbids the motion, and says nothing more; the guard must not go on with the other alone."""
+    text = text_of(Guard(name, PRESETS[name], values={"silent": "0"} if name == "mode" else {}))
+
+    def named() -> MonitorSet:
+        monitors = made(part_of(text))
+        monitors.start(0)
+        monitors.name_senders(lambda source: ("10.0.0.1", NODES[source]))
+        return monitors
+
+    monitors, now, topic = named(), SECOND, PRESETS[name].given_topics["by"]
+
+    def moves(node: int, said: bytes) -> bool:
+        nonlocal now
+        now += SECOND // 100
+        monitors.judge(topic, bytearray(said), now, MessageSender(node))
+        monitors.judge("/cmd_vel", bytearray(STILL), now, MessageSender(3))
+        return monitors.judge("/cmd_vel", bytearray(DRIVE), now, MessageSender(3)).result == "passed"
+
+    for said in (b"\0", permits):
+        for node in (1, 2):
+            moving = moves(node, said)
+    assert moving and not moves(2, forbids)
+    if how == "enabled again":
+        monitors.switch({name: False}, now)
+        monitors.switch({name: True}, now)
+    else:
+        monitors.judge(topic, bytearray(b"\0\0"), now, MessageSender(1))
+    if how == "restarted":
+        groups = [(one.names, one.layout, one.base(), one.cells() or None) for one in monitors.kept_groups()]
+        monitors = named()
+        monitors.recover(groups, {}, now, restarted=True)
+    assert not any(moves(1, said) for said in (b"\0", permits) * 10)
+    assert monitors.monitor(name).awaits == f"/other on {topic}"
+    monitors.resume(name)
+    assert any(moves(1, said) for said in (b"\0", permits))
+
+
+@MADE
+def test_the_topic_is_withheld_until_each_known_switch_has_spoken(
+    made: Callable[[SetPart], MonitorSet],
+) -> None:
+    monitors = started("withhold", made)
+    monitors.name_senders(lambda source: ("10.0.0.1", NODES[source]))
+    for node in (1, 2):
+        monitors.judge("/privacy", bytearray(b"\0"), node, MessageSender(node))
+    assert monitors.withheld_from("/camera/image_raw") == ()
+    monitors.judge("/privacy", bytearray(b""), 3, MessageSender(1))
+    for node, withheld in ((1, True), (2, False)):
+        monitors.judge("/privacy", bytearray(b"\0"), 3 + node, MessageSender(node))
+        assert bool(monitors.withheld_from("/camera/image_raw")) == withheld
+
+
+@MADE
+def test_a_person_lets_a_guard_hear_a_sensor_with_another_name(
+    made: Callable[[SetPart], MonitorSet],
+) -> None:
+    monitors, now = started("sensor", made), SECOND
+    monitors.name_senders(lambda source: ("10.0.0.1", NODES[source]))
+    for _ in range(4):
+        result = told(monitors, "sensor", now := now + SECOND // 100, {"": 1})
+    assert result == "passed"
+    told(monitors, "sensor", now := now + SECOND // 100, {"": 1}, "by")
+    for _ in range(200):
+        result = told(monitors, "sensor", now := now + SECOND // 100, {"": 2})
+    assert result == "changed" and monitors.monitor("sensor").awaits == "/sensor on /scan"
+    monitors.resume("sensor")
+    assert not monitors.monitor("sensor").awaits
+    for _ in range(4):
+        result = told(monitors, "sensor", now := now + SECOND // 100, {"": 2})
+    assert result == "passed"
 
 
 def test_a_goal_is_cancelled_in_time_despite_an_unreadable_result() -> None:

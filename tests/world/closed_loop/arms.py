@@ -1,0 +1,237 @@
+"""Worlds of `joints`: an arm that executes trajectories, and nodes that report the positions of its joints."""
+
+import math
+import struct
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+from tests.world.closed_loop.messages import header
+from tests.world.closed_loop.streams import NEVER
+from tests.world.closed_loop.world import World
+
+JOINTS: Sequence[str] = ("shoulder", "elbow", "wrist")
+TRAJECTORY = "trajectory_msgs/JointTrajectory"
+_NEAR = 1e-6
+
+
+@dataclass(frozen=True)
+class Point:
+    at: float
+    """Seconds from the start."""
+    positions: tuple[float, ...]
+    velocities: tuple[float, ...] = ()
+    accelerations: tuple[float, ...] = ()
+
+
+def _texts(names: Sequence[str]) -> bytes:
+    parts = [name.encode() for name in names]
+    return struct.pack("<I", len(parts)) + b"".join(struct.pack("<I", len(one)) + one for one in parts)
+
+
+def _numbers(values: Sequence[float]) -> bytes:
+    return struct.pack(f"<I{len(values)}d", len(values), *values)
+
+
+def trajectory(at: float, names: Sequence[str], points: Sequence[Point]) -> bytes:
+    data = header(at) + _texts(names) + struct.pack("<I", len(points))
+    for one in points:
+        seconds = math.floor(one.at)
+        data += (
+            _numbers(one.positions) + _numbers(one.velocities) + _numbers(one.accelerations) + _numbers(())
+        )
+        data += struct.pack("<ii", seconds, round((one.at - seconds) * 1e9))
+    return data
+
+
+def states(at: float, names: Sequence[str], positions: Sequence[float]) -> bytes:
+    return header(at) + _texts(names) + _numbers(positions) + _numbers(()) + _numbers(())
+
+
+class JointsWorld(World):
+    """Trajectories that are good, too fast, out of limits, malformed, or that begin at another place."""
+
+    preset: ClassVar[str] = "joints"
+    span = 8000
+
+    def plan(self) -> None:
+        r = self.random
+        self.live = r.random() < 0.2
+        self.fastest, self.most = round(r.uniform(0.5, 3), 2), round(r.uniform(1, 3), 2)
+        self.jump, self.silent = round(r.uniform(0.02, 0.2), 2), round(r.uniform(0.1, 0.6), 2)
+        self.growth = 20.0
+        self.place = [0.0] * len(JOINTS)
+        self.way: tuple[int, list[float], tuple[Point, ...]] = (0, [0.0] * len(JOINTS), ())
+        """When the trajectory in force began, the position then, and its points."""
+        self.heard: dict[int, int] = {}
+        """When each node that reports positions did so last with numbers."""
+        self.fault = ""
+        self.sent = self.passing = 0
+        limits = " ".join(f"{name}:{-self.most}..{self.most}" for name in JOINTS) if r.random() < 0.5 else ""
+        values = {"vMax": self.fastest, "aMax": self.growth, "jump": self.jump, "silent": self.silent}
+        bounds = {"limits": limits} if limits else {"low": -self.most, "high": self.most}
+        self.guarded({**values, **bounds}, {"command": TRAJECTORY})
+        halves = r.random() < 0.4
+        self.reports = {3: JOINTS[:1], 4: JOINTS[1:]} if halves else {3: JOINTS}
+        for node, names in self.reports.items():
+            period = r.uniform(15, 50 if self.live else self.silent * 800)
+            self.every(
+                lambda period=period: period * r.uniform(0.7, 1),  # type: ignore[misc]  # bound now
+                lambda node=node, names=names: self._report(node, names),  # type: ignore[misc]  # as above
+                first=r.uniform(0, 200),
+            )
+        self.every(lambda: r.uniform(300, 1200), self._command, first=600)
+        if not self.live:
+            self.after(r.uniform(1000, 6000), self._fails)
+            self.interrupt("hold restart switch", 0.3)
+
+    def _fails(self) -> None:
+        self.fault = self.random.choice(("dead", "NaN", "cut", "no names"))
+        self.trace(f"the positions fail: {self.fault}")
+        if self.random.random() < 0.5:
+            self.after(self.now + self.random.uniform(300, 2000), lambda: setattr(self, "fault", ""))
+
+    def _report(self, node: int, names: Sequence[str]) -> None:
+        places = [self.place[JOINTS.index(name)] for name in names]
+        match self.fault:
+            case "dead":
+                return
+            case "NaN":
+                places = [math.nan] * len(places)
+            case "no names":
+                names = ()
+            case "cut":
+                self.heard[node] = NEVER
+                self.say("state", states(self.now, names, places)[:20], node, whole=False)
+                return
+        self.heard[node] = NEVER if self.fault else self.now
+        self.say("state", states(self.now, names, places), node)
+
+    # Commands
+
+    def _good(self) -> list[Point]:
+        r, points = self.random, []
+        at, place = 0.0, [*self.place]
+        for _point in range(r.choice((1, 2, 5))):
+            seconds = r.uniform(0.2, 0.8)
+            step = 0.8 * self.fastest * seconds
+            place = [
+                max(-0.95 * self.most, min(0.95 * self.most, one + r.uniform(-step, step))) for one in place
+            ]
+            at += seconds
+            points.append(Point(at, tuple(place)))
+        return points
+
+    def _command(self) -> None:
+        r = self.random
+        bad = "" if self.live else r.choice(("", "", "", *DAMAGE))
+        names, points = DAMAGE[bad](self, self._good()) if bad else (JOINTS, self._good())
+        if r.random() < 0.05:
+            names, points, bad = JOINTS, [], "empty"
+        self.trace(f"a trajectory of {len(points)} points: {bad or 'good'}")
+        data = trajectory(self.now, names, points)
+        passed, sent = self.guard.tell(self.guard.topics["command"], data, self.now, 1)
+        for one in sent:
+            self._receive(*one)
+        self._judge(bad, points, passes=passed == data)
+        if passed is not None:
+            self._receive(
+                self.now, self.guard.topics["command"], passed, points if passed == data and not bad else ()
+            )
+
+    def _judge(self, bad: str, points: Sequence[Point], *, passes: bool) -> None:
+        honest = not bad and self.live and self.now > 1000
+        self.sent, self.passing = self.sent + honest, self.passing + (honest and passes)
+        if self.switched_off or not passes or not points:
+            return
+        if self.holding or self.guard.holds:
+            self.broken("L5", "a trajectory passes a guard that holds")
+        law = {"NaN": "L2", "infinite": "L2", "jump": "L3"}.get(bad, "L1")
+        if bad:
+            self.broken(law, f"a trajectory passes that is wrong: {bad}")
+        for node in self.reports:
+            if self.now > self.heard.get(node, NEVER) + self.silent * 1000 and self.now > self.fresh_from:
+                self.broken(
+                    "L2", f"a trajectory passes, and node {node} does not report where the joints are"
+                )
+
+    def _receive(self, at: int, topic: str, data: bytes, points: Sequence[Point] = ()) -> None:
+        """Take a trajectory; one of the guard is empty, and stops the arm where it is."""
+        if topic != self.guard.topics["command"]:
+            return
+        now = max(at, self.now)
+        if points and not self.switched_off:
+            first = points[0]
+            for one, place in zip(first.positions, self.place, strict=False):
+                if not abs(one - place) <= self.jump + self.fastest * first.at + _NEAR:
+                    self.broken("L3", f"a joint jumps from {place:.3f} to {one:.3f} rad in {first.at:.2f} s")
+        self.way = (now, [*self.place], tuple(points))
+        self.force = (now, self.force[1])
+
+    def move(self, until: int) -> None:
+        began, before, points = self.way
+        passed, last = (until - began) / 1000, 0.0
+        for one in points:
+            if passed <= one.at:
+                part = 1.0 if one.at == last else (passed - last) / (one.at - last)
+                self.place = [a + (b - a) * part for a, b in zip(before, one.positions, strict=True)]
+                return
+            before, last = [*one.positions], one.at
+        self.place = [*before]
+
+    def watch(self) -> None:
+        if not self.switched_off and any(not abs(one) <= self.most + _NEAR for one in self.place):
+            self.broken("L1", f"a joint is out of its limits: {self.place}")
+
+    def ended(self) -> None:
+        if self.live and self.passing < 0.95 * self.sent:
+            self.broken("live", f"of {self.sent} good trajectories {self.passing} pass")
+
+
+Damaged = tuple[Sequence[str], list[Point]]
+
+
+def _first(points: list[Point], **change: object) -> Damaged:
+    return JOINTS, [replace(points[0], **change), *points[1:]]  # type: ignore[arg-type]  # fields of a point
+
+
+def _far(world: JointsWorld, points: list[Point]) -> Damaged:
+    return JOINTS, [
+        *points[:-1],
+        replace(points[-1], positions=(1.01 * world.most, *points[-1].positions[1:])),
+    ]
+
+
+def _jumping(world: JointsWorld, points: list[Point]) -> Damaged:
+    return JOINTS, [Point(0.0, tuple(one + 1.5 * world.jump for one in world.place)), *points]
+
+
+def _fast(world: JointsWorld, points: list[Point]) -> Damaged:
+    last = points[-1]
+    return JOINTS, [
+        *points,
+        Point(last.at + 0.01, tuple(0.5 * one - 0.4 * world.most for one in last.positions)),
+    ]
+
+
+DAMAGE: Mapping[str, Callable[[JointsWorld, list[Point]], Damaged]] = {
+    "far": _far,
+    "jump": _jumping,
+    "fast": _fast,
+    "velocity": lambda world, points: _first(points, velocities=(1.01 * world.fastest, 0.0, 0.0)),
+    "acceleration": lambda world, points: _first(points, accelerations=(0.0, -1.01 * world.growth, 0.0)),
+    "NaN": lambda _world, points: (
+        JOINTS,
+        [*points[:-1], replace(points[-1], positions=(math.nan, 0.0, 0.0))],
+    ),
+    "infinite": lambda _world, points: _first(points, positions=(math.inf, 0.0, 0.0)),
+    "names": lambda _world, points: (JOINTS[:2], points),
+    "unknown": lambda _world, points: ((*JOINTS[:2], "gripper"), points),
+    "twice": lambda _world, points: ((*JOINTS[:2], JOINTS[0]), points),
+    "backwards": lambda _world, points: (JOINTS, [*points, points[-1]]),
+    "minus": lambda _world, points: _first(points, at=-0.5),
+    "short": lambda _world, points: _first(points, positions=points[0].positions[:2]),
+    "long velocities": lambda _world, points: _first(points, velocities=(0.0,) * 4),
+    "no names": lambda _world, points: ((), points),
+}
+"""Wrong trajectories, made of a good one."""

@@ -1,0 +1,170 @@
+"""Worlds of `zone`: a base with a square zone around it, which covers its way until it stands."""
+
+import math
+from typing import ClassVar
+
+import numpy as np
+
+from tests.support.features.guards.running_guard import Value
+from tests.world.closed_loop import geometry
+from tests.world.closed_loop.bases import DIFFERENTIAL, OMNIDIRECTIONAL, STEERED
+from tests.world.closed_loop.messages import SCAN, STILL, Legs, boolean
+from tests.world.closed_loop.motion import WHOLE, Person, SeparationWorld
+from tests.world.closed_loop.streams import NEVER, straight
+from tests.world.closed_loop.world import SLACK, void
+
+MUTED = 2.0
+"""Seconds of the longest muting."""
+
+
+class ZoneWorld(SeparationWorld):
+    """Walls and persons around a base that stops, or slows, while something is in its zone."""
+
+    preset: ClassVar[str] = "zone"
+
+    def plan(self) -> None:
+        r = self.random
+        self.walls, self.persons = [], []
+        self.live = r.random() < 0.15
+        self.sector, self.speed = WHOLE, 0.0 if self.live else r.choice((0.0, 1.6))
+        self.silent = 0.3 if self.live else round(r.uniform(0.15, 0.5), 2)
+        self.clear = 0.5 if self.live else round(r.uniform(0, 1), 2)
+        self.slow = 0.0 if self.live or r.random() < 0.7 else 0.2
+        self.points = r.choice((1, 2, 3))
+        lag, braking, top = r.randrange(10, 120), r.uniform(1, 3), r.choice((0.3, 0.6, 1.0))
+        self.built(
+            (DIFFERENTIAL,) if self.live else (DIFFERENTIAL, OMNIDIRECTIONAL, STEERED), lag, braking, top
+        )
+        self.radius, delay = r.uniform(0.15, 0.3), r.uniform(0, 100)
+        seconds = self.silent + (delay + lag + self.tick) / 1000 + 0.02
+        self.half = self.radius + 0.08 + (top + self.speed) * seconds + (self.speed + top / 2) * top / braking
+        """Half a side of the zone."""
+        self.muted_from, self.muted_until = -NEVER, NEVER
+        self.occupied_at, self.occupied = NEVER, False
+        self.scan_occupied = False
+        """Whether the scan that is made now surely has something in the zone."""
+        self.ready: set[int] = set()
+        if self.live:
+            self.half, self.honest, self.span = 1.0, (0.3, 1.2), 6000
+            self.walls = geometry.edges([(-5, -5), (9, -5), (9, 5), (-5, 5)])
+            self.base.heading = 0.0
+        else:
+            self._around()
+        mutes = not self.live and r.random() < 0.2
+        values: dict[str, Value] = {
+            "slow": self.slow, "points": self.points, "silent": self.silent, "clear": self.clear,
+            "muteFor": MUTED if mutes else 0.0, "polygon": self._square(),
+        }  # fmt: skip
+        self.guarded(values, {"by": SCAN})
+        self._scanner(r.uniform(25, self.silent * 850), delay)
+        if self.live:
+            self.every(
+                lambda: 100, lambda: void(self.drive(straight(self.honest[0] * (self.now > 1200)))), first=50
+            )
+            return
+        self.driven(tuple((one.x, one.y) for one in self.persons) + tuple((w[0], w[1]) for w in self.walls))
+        self.every(lambda: r.uniform(300, 1500), lambda: void(self.drive(STILL)), first=r.uniform(0, 1000))
+        if mutes:
+            self.after(r.uniform(500, 4000), self._mute)
+        if r.random() < 0.4:
+            self.after(r.uniform(300, 6000), self._fail)
+        self.another(lambda: self.say("by", self._elsewhere(), 4))
+        self.interrupt("hold restart switch", 0.25)
+
+    def _square(self) -> str:
+        far = round(self.half, 2)
+        self.half = far
+        return " ".join(f"{x},{y}" for x, y in ((far, -far), (far, far), (-far, far), (-far, -far)))
+
+    def _around(self) -> None:
+        """Place walls and persons; the zone is free at first in most worlds."""
+        r = self.random
+        for _wall in range(r.choice((1, 2))):
+            away, angle = self.half + r.uniform(-0.1, 2), r.uniform(-math.pi, math.pi)
+            cos, sin, length = math.cos(angle), math.sin(angle), r.choice((0.5, 10))
+            x, y = away * cos * 1.45, away * sin * 1.45
+            self.walls.append((x - length * sin, y + length * cos, x + length * sin, y - length * cos))
+        for _person in range(r.choice((0, 1, 2)) if self.speed else 0):
+            away, angle = 1.45 * self.half + r.uniform(0.3, 5), r.uniform(-math.pi, math.pi)
+            self.persons.append(
+                Person(
+                    away * math.cos(angle), away * math.sin(angle), r.choice((0.5, 1.6)), r.randrange(4000)
+                )
+            )
+
+    def _scanner(self, period: float, delay: float) -> None:
+        super()._scanner(period, delay)
+        self.far, self.angles = max(self.far, 1.5 * self.half), np.linspace(-math.pi, math.pi, 360)
+
+    def _mute(self) -> None:
+        self.trace("the zone is to be muted")
+        self.say("mute", boolean(False), 6)
+        self.muted_from, self.muted_until = self.now, self.now + int(MUTED * 1000) + self.tick + SLACK
+        for at in range(self.now + 50, self.now + 4000, 200):
+            self.after(at, lambda: void(self.say("mute", boolean(True), 6)))
+
+    @property
+    def muted(self) -> bool:
+        return self.muted_from <= self.now <= self.muted_until
+
+    def _scan(self, found: "np.ndarray") -> "tuple[bytes, bool | None]":
+        near = self.half - 0.01
+        x, y = found * np.cos(self.angles), found * np.sin(self.angles)
+        inside = np.isfinite(found) & (np.abs(x) < near) & (np.abs(y) < near)
+        self.scan_occupied = int(inside.sum()) >= self.points
+        occupied, (data, valid) = self.scan_occupied, super()._scan(found)
+        return data + bytes([occupied]), valid
+
+    def _arrive(self, data: bytes, valid: "bool | None") -> None:
+        occupied = bool(data[-1]) and bool(valid)
+        self.occupied = occupied
+        if occupied:
+            self.occupied_at = self.now
+        if occupied and not self.muted:
+            self.ready.clear()
+        super()._arrive(data[:-1], valid)
+        if (
+            occupied
+            and not self.switched_off
+            and not self.muted
+            and not self.foreign
+            and self._fast(self.force[1])
+        ):
+            self.broken("L3", "something is in the zone, and the base is not stopped at once")
+
+    def _fast(self, legs: Legs) -> bool:
+        return not math.hypot(*legs[:3]) <= self.slow * (1 + 1e-6)
+
+    def _law(self) -> str:
+        return "L6" if self.muted_until > NEVER else self.law("L3")
+
+    def passed(self, node: int, wanted: Legs, got: "Legs | None") -> None:
+        if not self.moves(wanted) and not self.occupied:
+            self.ready.add(node)
+        if self.muted or self.guard.holds:
+            return
+        if got is None or not self._fast(got):
+            return
+        if self.now < self.occupied_at + self.clear * 1000 and self.now > self.fresh_from:
+            self.broken(
+                self._law(), f"a motion passes, though something was in the zone at {self.occupied_at} ms"
+            )
+        if node not in self.ready and not self.slow:
+            self.broken("L6", "a motion passes of a node that has not stood since something was in the zone")
+
+    def enable_guard(self) -> None:
+        super().enable_guard()
+        self.ready.clear()
+        self.heard, self.blind_from = -1, None
+
+    def _follow(self, person: Person) -> None:
+        """Every direction is in the zone, so no person steps into the way beside it."""
+
+    def watch(self) -> None:
+        self.only_fresh()
+        if self.muted or self.switched_off or self.now <= self.fresh_from + 100 + SLACK:
+            return
+        if not self.slow and self.muted_until == NEVER and self.fresh_from == 0:
+            self._touch()
+        if self._fast(self.force[1]):
+            self.evidence(self.silent)
