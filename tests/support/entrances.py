@@ -57,7 +57,8 @@ CELLS: dict[str, dict[str, str]] = {
         f" {_RELAY}test_a_connection_ends_with_its_grant_publication_or_node",
         "end of a right": f"{_RELAY}test_a_connection_ends_with_its_grant_publication_or_node",
         "unknown": f"{_RELAY}test_unknown_hosts_make_room_for_each_other_and_never_fill_the_relay"
-        " unit/relay/test_loop.py::test_all_unknown_hosts_together_are_one_payer",
+        " unit/relay/test_loop.py::test_all_unknown_hosts_together_are_one_payer"
+        f" {_GRANTS}test_hosts_that_only_a_star_names_pay_as_one",
         "folding": f"{_RELAY}test_equal_refusals_are_folded",
         "share": "unit/relay/test_shares.py::test_unfinished_messages_of_a_guest_stop_no_other_host"
         " unit/relay/test_shares.py::test_latched_messages_of_a_guest_stop_no_other_host",

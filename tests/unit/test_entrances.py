@@ -12,6 +12,7 @@ from appliance.api.front.request_gate import PUBLIC
 from appliance.features.feature import FeaturePart
 from appliance.supervisor.roles import ROLES as PROCESSES
 from tests.support import entrances
+from tests.support.entrance_mutants import MUTANTS, WHOLE
 from tests.support.entrances import CELLS, RULES
 
 ROOT = Path(__file__).parents[2]
@@ -112,3 +113,17 @@ def test_the_tests_of_the_cells_exist(entrance: str) -> None:
                 one.name for one in ast.walk(tree) if isinstance(one, ast.FunctionDef | ast.AsyncFunctionDef)
             )
             assert name in functions, f"{entrance}, {rule}: {file} has no {name}"
+
+
+def test_each_rule_of_these_entrances_is_taken_out_once() -> None:
+    cells = {
+        (entrance, rule) for entrance in WHOLE for rule, cell in CELLS[entrance].items() if _named_tests(cell)
+    }
+    assert cells <= MUTANTS.keys()
+    assert all(_named_tests(CELLS[entrance][rule]) for entrance, rule in MUTANTS)
+
+
+@pytest.mark.parametrize("rule", MUTANTS)
+def test_each_rule_that_is_taken_out_is_in_the_code(rule: tuple[str, str]) -> None:
+    file, old, _new = MUTANTS[rule]
+    assert (ROOT / file).read_text(encoding="utf-8").count(old) == 1
