@@ -2,6 +2,7 @@
 
 import asyncio
 import socket
+from collections.abc import Coroutine
 from typing import Any
 
 import structlog
@@ -33,7 +34,7 @@ class SupervisorMessages:
         self._base = base
         self._parts = parts
         self._operators = operators
-        self._reloading: set[asyncio.Task[None]] = set()
+        self._tasks: set[asyncio.Task[None]] = set()
         self._one_reload = asyncio.Lock()
         self._failing: frozenset[str] = frozenset()  # the roles of processes that keep ending
 
@@ -45,9 +46,9 @@ class SupervisorMessages:
                 self._note_failing(processes)
                 self._parts.reconciler.wake()
             case messages.PolicyReloadRequested():
-                task = asyncio.get_running_loop().create_task(self._reload())
-                self._reloading.add(task)  # keep a reference until the task is done
-                task.add_done_callback(self._reloading.discard)
+                self._spawn(self._reload())
+            case messages.EndAnnounced():
+                self._spawn(self._agree_to_end())
             case messages.Announced():
                 self._operators.tokens.first_token_shown()
             case messages.ClockRead(synchronised):
@@ -63,6 +64,17 @@ class SupervisorMessages:
                 _log.error(
                     "the supervisor sent a message that is not for control", message=type(message).__name__
                 )
+
+    def _spawn(self, work: Coroutine[None, None, None]) -> None:
+        task = asyncio.get_running_loop().create_task(work)
+        self._tasks.add(task)  # keep a reference until the task is done
+        task.add_done_callback(self._tasks.discard)
+
+    async def _agree_to_end(self) -> None:
+        try:
+            await self._base.features.before_end()
+        finally:
+            self._base.lifeline.say(messages.EndAgreed())
 
     def _note_failing(self, processes: list[ProcessInfo]) -> None:
         failing = {process.role: process for process in processes if process.failing}

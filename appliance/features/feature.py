@@ -130,6 +130,8 @@ class FeaturePart:
     """Holds a call that needs an approval, and returns the text for the denied caller."""
     approve: "Callable[[ApprovalWanted], Awaitable[ApprovalAnswered]] | None" = None
     """Decides about one request to a service that needs approvals."""
+    before_end: "Callable[[], Awaitable[None]] | None" = None
+    """Finishes what must be done before an ordered end of the appliance."""
     work: Mapping[str, Callable[[], Awaitable[None]]] = field(default_factory=dict)
     """Runs until control ends. The names go into error messages."""
     connected: "Callable[[str, str, str, int], tuple[int, str]] | None" = None
@@ -186,6 +188,8 @@ class Feature:
     pairing: "Callable[[Path], Pairing | None] | None" = None
     """Returns what the start of one of two appliances needs, or raises `StartError`. The path is the state directory.
     """
+    machine: str | None = None
+    """Hook: `machine(state)` returns the feature's `MachineWork` in the supervisor."""
     state_files: tuple[str, ...] = ()
     """Files in the state directory that may exist before the first start."""
     may_start: str | None = None

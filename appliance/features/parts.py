@@ -133,5 +133,10 @@ class FeatureParts:
     def hosts(self) -> TunnelHosts:
         return next((part.hosts for part in self._parts if part.hosts is not None), self._no_hosts)
 
+    async def before_end(self) -> None:
+        for part in self._parts:
+            if part.before_end is not None:
+                await part.before_end()
+
     def work(self) -> dict[str, Callable[[], Awaitable[None]]]:
         return {what: one for part in self._parts for what, one in part.work.items()}

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from appliance.cli.verb_table import Group, Verb
 from appliance.configuration.sections import Sections
+from appliance.features.adopt.feature import ADOPT
 from appliance.features.alarms.feature import ALARMS
 from appliance.features.approvals.feature import APPROVALS
 from appliance.features.audit_tools.feature import AUDIT_TOOLS
@@ -40,6 +41,7 @@ from appliance.features.tunnels.feature import TUNNELS
 from appliance.supervisor.role import SharedMemory
 
 if TYPE_CHECKING:
+    from appliance.supervisor.machine_work import MachineWork
     from appliance.supervisor.service_gate import Pairing
 
 FEATURES: tuple[Feature, ...] = (
@@ -65,6 +67,7 @@ FEATURES: tuple[Feature, ...] = (
     DEMO,
     SURVEY,
     LOGBOOK,
+    ADOPT,
     SSO,
     AUTHORITY,
     APPROVALS,
@@ -91,6 +94,11 @@ def verb_function(group: str, name: str) -> Any:
 def pairing_in(state: Path) -> "Pairing | None":
     found = (feature.pairing(state) for feature in FEATURES if feature.pairing is not None)
     return next(filter(None, found), None)
+
+
+def machine_work_in(state: Path) -> "MachineWork | None":
+    named = (feature.machine for feature in FEATURES if feature.machine is not None)
+    return next((pkgutil.resolve_name(name)(state) for name in named), None)
 
 
 def start_gate() -> Any:

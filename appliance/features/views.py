@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import msgspec
 
 from appliance.channel.answers.field_docs import doc
+from appliance.features.adopt.view import ADOPT_VIEW
 from appliance.features.approvals.view import APPROVALS_VIEW
 from appliance.features.doors.view import DOORS_VIEW
 from appliance.features.fleet.view import FLEET_VIEW
@@ -19,6 +20,7 @@ from appliance.features.view import FeatureView, PairView, StateView
 
 VIEWS: tuple[FeatureView, ...] = (
     SYSLOG_VIEW, STANDBY_VIEW, FLEET_VIEW, RECORDER_VIEW, DOORS_VIEW, APPROVALS_VIEW, GUARDS_VIEW,
+    ADOPT_VIEW,
 )  # fmt: skip
 STATES: tuple[StateView[Any], ...] = tuple(state for view in VIEWS for state in view.states)
 

@@ -16,15 +16,16 @@ import ipaddress
 import itertools
 import json
 import os
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Literal
 
 from appliance.base.atomic_files import write_whole
 from appliance.channel.answers.status import FirewallRule
-from appliance.network import interfaces
+from appliance.network import interfaces, vendor_masters
+from appliance.network.cut import close_port, open_port, refuse_no_port
 from appliance.network.firewall import iptables
 from appliance.network.firewall.firewall import statuses
 from appliance.network.firewall.firewall_rules import (
@@ -61,6 +62,9 @@ class IsolationSettings:
     datagrams: tuple[PortRange, ...] = ()  # UDP
     name: str = "rosrv"
     directory: Path = Path("/run/rosrv")  # for the record and the lock; shared by all appliances of a host
+    takes_over: Callable[[], bool] = lambda: False  # whether a ROS master of the robot may listen on `master`
+    holds: Callable[[], bool] = lambda: False  # whether nodes must not reach that master, even after a crash
+    left_alone: Callable[[], tuple[str, ...]] = tuple  # control groups of the robot's own masters
 
     def __post_init__(self) -> None:
         if not self.ports:
@@ -151,6 +155,7 @@ class Isolation:
         require_privileges("isolation netns")
         self._take_lock()
         try:
+            self._close_master()
             self._clear_leftovers()
             self._refuse_foreign()
             self._choose_subnets()
@@ -164,6 +169,7 @@ class Isolation:
         if self._lock is None:
             return
         try:
+            self._close_master()
             self._clear_leftovers()
             if self._rules:
                 self._forget_tunnels()
@@ -174,6 +180,22 @@ class Isolation:
             self._serves_nodes = False
             os.close(self._lock)
             self._lock = None
+
+    def clear(self) -> None:
+        """Remove what a crashed appliance left. Raises `NetworkError`, for example while an appliance runs."""
+        require_privileges("isolation netns")
+        self._take_lock()
+        try:
+            self._clear_leftovers()
+            open_port(self._host)
+        finally:
+            assert self._lock is not None  # noqa: S101  it was taken
+            os.close(self._lock)
+            self._lock = None
+
+    @property
+    def host(self) -> Namespace:
+        return self._host
 
     def host_address_for(self, peer: str) -> str:
         return interfaces.source_address_for(self._host, peer)
@@ -232,14 +254,30 @@ class Isolation:
         """Forward the port of RVMaster, which answers now. Raises `PortsInUseError`."""
         if self.settings.master is None or self._serves_nodes:
             return
-        self._refuse_listeners((PortRange.one(self.settings.master),))
+        self._refuse_listeners(self._own_master())
         self._serves_nodes = True
         self._install(self._wanted())
+
+    def _close_master(self) -> None:
+        """Refuse the robot's own master while there are no rules, if a crash or a failure left its graph taken over."""
+        if self.settings.master is not None and self.settings.holds():
+            close_port(self._host, self.settings.link, self.settings.master)
+
+    def withdraw_master(self) -> None:
+        """End what `forward_master` began: the port is again that of the robot's own master."""
+        if self._serves_nodes:
+            self._serves_nodes = False
+            self._install(self._wanted())
+
+    def _own_master(self) -> tuple[PortRange, ...]:
+        """Return RVMaster's port if no other master may listen on it."""
+        master = self.settings.master
+        return () if master is None or self.settings.takes_over() else (PortRange.one(master),)
 
     def _wanted(self) -> tuple[PacketRule, ...]:
         master = (PortRange.one(self.settings.master),) if self.settings.master and self._serves_nodes else ()
         return isolation_rules(
-            self.settings, self.ends, self._routers, tcp=(*self._tcp, *master), udp=self._udp
+            self.settings, self.ends, self._routers, tcp=self._tcp, udp=self._udp, master=master
         )
 
     def put_rules_back(self) -> None:
@@ -252,6 +290,8 @@ class Isolation:
     def _install(self, rules: tuple[PacketRule, ...]) -> None:
         self._backend.install(rules)
         self._rules = rules
+        if self.settings.takes_over():
+            vendor_masters.leave_alone(self._host, self.settings.left_alone())
         self._forget_tunnels()
 
     def _forget_tunnels(self) -> None:
@@ -275,8 +315,10 @@ class Isolation:
                 self._host.sysctl(f"net/ipv4/conf/{settings.link}/route_localnet", "1")
         routers = tuple(family for family in self.ends if self._forwarding.before(family))
         self._routers = routers
-        self._install(isolation_rules(settings, self.ends, routers))  # before forwarding is enabled
+        self._serves_nodes = settings.holds()
+        self._install(self._wanted())  # before forwarding is enabled
         self._forwarding.enable(tuple(self.ends))
+        open_port(self._host)
 
     def _choose_subnets(self) -> None:
         taken = [ipaddress.ip_network(text) for text in interfaces.networks(self._host)]
@@ -295,8 +337,7 @@ class Isolation:
             raise NetworkError(
                 f"the interface {link} already exists, and this appliance did not create it: `ip link delete {link}`"
             )
-        master = () if self.settings.master is None else (PortRange.one(self.settings.master),)
-        self._refuse_listeners((*master, *self.settings.ports))
+        self._refuse_listeners((*self._own_master(), *self.settings.ports))
 
     def _refuse_listeners(self, ranges: tuple[PortRange, ...]) -> None:
         """Raise `PortsInUseError` if a program of the host listens in `ranges`; it is named by the first of them."""
@@ -353,6 +394,7 @@ class Isolation:
             raise NetworkError(f"{self._record} cannot be read ({error}): check it and delete it") from error
         self._forwarding.restore(settings)  # first: without ROSRV-FWD the host would route
         self._backend.remove()
+        refuse_no_port(self._host)
         interfaces.delete_link(self._host, link)
         end_processes(leftover.processes())
         leftover.delete()
@@ -367,6 +409,7 @@ def isolation_rules(
     *,
     tcp: tuple[PortRange, ...] = (),
     udp: tuple[PortRange, ...] = (),
+    master: tuple[PortRange, ...] = (),
 ) -> tuple[PacketRule, ...]:
     inward, outward = Interface(settings.link), Interface(settings.link, other=True)
     forwarded = partial(PacketRule, chain=Chain.FORWARD)
@@ -400,6 +443,9 @@ def isolation_rules(
             rules.append(no_router(f"the host is not an IPv{family} router", PacketVerdict.DROP))
         rules += [_loopback(family, inward), *_true_sources(family, end, inward)]
         rules += [_forward("TCP", ports, end, outward) for ports in (*settings.ports, *tcp)]
+        # A node's old connection to its own master may be new to the connection tracker: its packets stay there, so
+        # that the node sees it end, and not a reset, after which roscpp looks a service up only once.
+        rules += [replace(_forward("TCP", ports, end, outward), opening=True) for ports in master]
         rules += [_forward("UDP", ports, end, outward) for ports in (*settings.datagrams, *udp)]
         masqueraded = partial(PacketRule, chain=Chain.SOURCE_NAT, source=end.network, leaves_on=outward)
         rules.append(masqueraded(f"the appliance's own connections, IPv{family}", PacketVerdict.MASQUERADE))

@@ -1,4 +1,4 @@
-"""Read the kernel's tables of listening sockets in the calling thread's network namespace."""
+"""Read the kernel's tables of sockets in the calling thread's network namespace."""
 
 import ipaddress
 import sys
@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-_TCP_LISTEN = "0A"
+_TCP_ESTABLISHED, _TCP_LISTEN = "01", "0A"
 
 
 def listening_addresses(port: int) -> tuple[str, ...]:
@@ -25,9 +25,44 @@ def udp_ports_in_use() -> set[int]:
     return {row.port for row in _rows("udp", "udp6")}
 
 
+class TcpSocket(NamedTuple):
+    """A TCP socket. `version` is that of its family, so a socket for both has an IPv4 address mapped into IPv6."""
+
+    version: int
+    address: str
+    port: int
+    peer: str
+    peer_port: int
+    listens: bool
+    established: bool
+    inode: str
+
+    @property
+    def peer_address(self) -> str:
+        """The peer's address, as IPv4 if it is mapped into IPv6."""
+        return _unmapped(self.peer)
+
+    @property
+    def local_address(self) -> str:
+        return _unmapped(self.address)
+
+
+def tcp_sockets() -> list[TcpSocket]:
+    return [
+        TcpSocket(
+            6 if name == "tcp6" else 4, _address(row.address), row.port, _address(peer), int(peer_port, 16),
+            row.state == _TCP_LISTEN, row.state == _TCP_ESTABLISHED, row.inode,
+        )
+        for name in ("tcp", "tcp6")
+        for row in _rows(name)
+        for peer, _, peer_port in [row.peer.partition(":")]
+    ]  # fmt: skip
+
+
 class _Row(NamedTuple):
     address: str
     port: int
+    peer: str
     state: str
     inode: str
 
@@ -43,10 +78,16 @@ def _rows(*names: str) -> Iterator[_Row]:
             for line in table.read_text(encoding="ascii").splitlines()[1:]:
                 fields = line.split()
                 address, _, port = fields[1].partition(":")
-                yield _Row(address, int(port, 16), fields[3], fields[9])
+                yield _Row(address, int(port, 16), fields[2], fields[3], fields[9])
 
 
 def _address(text: str) -> str:
     """Return an address of /proc/net/tcp, which has words of 32 bits in the machine's byte order."""
     words = [text[index : index + 8] for index in range(0, len(text), 8)]
     return str(ipaddress.ip_address(b"".join(int(word, 16).to_bytes(4, sys.byteorder) for word in words)))
+
+
+def _unmapped(text: str) -> str:
+    address = ipaddress.ip_address(text)
+    mapped = address.ipv4_mapped if isinstance(address, ipaddress.IPv6Address) else None
+    return str(mapped or address)

@@ -252,6 +252,11 @@ class Policy:
         """Return whether a rule names the host; `*` does not name hosts, and a blocked host does not count."""
         return self.standing(address).named
 
+    @property
+    def all_audit_only(self) -> bool:
+        """Whether no section denies anything."""
+        return all(table.audit_only for table in self.tables.values())
+
     def audit_only(self, category: Category) -> bool:
         return self.tables[category].audit_only
 

@@ -47,6 +47,7 @@ from appliance.network.port_holders import PortsInUseError
 from appliance.network.probe import probe_port
 from appliance.network.public_address import PublicAddress, only_address
 from appliance.supervisor.errors import PortInUseError, StartError
+from appliance.supervisor.machine_work import Found, MachineWork, NoMachineWork, Terms
 from appliance.supervisor.role import RemoteReceiver
 from appliance.supervisor.users import account_of
 
@@ -124,6 +125,10 @@ class NoIsolation:
     def endpoint(self) -> PublicAddress:
         """Return the address at which other networks reach the appliance. Raises `NetworkError` if it is unknown."""
         raise NetworkError(f"isolation {self.kind} has no tunnels: use isolation netns or container")
+
+    def carry_out(self, work: MachineWork, name: str, terms: Terms) -> Found:  # noqa: ARG002  the same everywhere
+        """Carry out a feature's work on the robot's side of the isolation. Raises `NetworkError`, `ValueError`."""
+        raise NetworkError(f"isolation {self.kind} has no robot's side: use isolation netns")
 
     def report(self) -> FirewallState:
         return FirewallState()
@@ -384,8 +389,10 @@ class NetnsIsolation(ContainerIsolation):
         ports: AppliancePorts,
         backend: Literal["auto", "iptables", "nft"],
         isolation: Isolation | None = None,
+        work: MachineWork | None = None,
     ) -> None:
         super().__init__(ports, backend)
+        work = work or NoMachineWork()
         nodes = PortRange(ports.nodes.start, ports.nodes.stop - 1)
         forwarded = [nodes]
         if ports.api is not None:
@@ -396,11 +403,22 @@ class NetnsIsolation(ContainerIsolation):
             forwarded += datagrams
         self._isolation = isolation or Isolation(
             Namespace.own(),
-            IsolationSettings(ports=tuple(forwarded), master=ports.master, datagrams=datagrams),
+            IsolationSettings(
+                ports=tuple(forwarded),
+                master=ports.master,
+                datagrams=datagrams,
+                takes_over=work.takes_over,
+                holds=work.holds,
+                left_alone=work.left_alone,
+            ),
         )
         self._namespace = self._isolation.namespace
         self.link = self._isolation.settings.link
         self._others: dict[str, list[str]] = {}  # the last logged rules of other programs
+
+    def carry_out(self, work: MachineWork, name: str, terms: Terms) -> Found:
+        with self._standing():
+            return work.carry_out(self._isolation, name, terms)
 
     @contextlib.contextmanager
     def inside(self) -> Iterator[None]:
@@ -422,7 +440,8 @@ class NetnsIsolation(ContainerIsolation):
     def control_ready(self, inner_port: int, own_port: int) -> None:
         with self._standing():
             super().control_ready(inner_port, own_port)
-            self._isolation.forward_master()
+            if not self._isolation.settings.takes_over():  # else control orders it, with the graph taken over
+                self._isolation.forward_master()
 
     def build(self) -> None:
         try:
@@ -509,11 +528,14 @@ class NetnsIsolation(ContainerIsolation):
 
 
 def isolation_for(
-    isolation: str, ports: AppliancePorts, backend: Literal["auto", "iptables", "nft"]
+    isolation: str,
+    ports: AppliancePorts,
+    backend: Literal["auto", "iptables", "nft"],
+    work: MachineWork | None = None,
 ) -> NoIsolation:
     if isolation == "container":
         return ContainerIsolation(ports, backend)
-    return NetnsIsolation(ports, backend) if isolation == "netns" else NoIsolation()
+    return NetnsIsolation(ports, backend, work=work) if isolation == "netns" else NoIsolation()
 
 
 def _require_own_network() -> None:

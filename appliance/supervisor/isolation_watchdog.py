@@ -18,6 +18,7 @@ from appliance.network.namespaces import NetworkError
 from appliance.network.port_holders import PortsInUseError
 from appliance.supervisor import signals
 from appliance.supervisor.isolation_lifecycle import NoIsolation
+from appliance.supervisor.machine_work import MachineWork, Terms
 
 PROBE_SECONDS = 60.0
 _ROUTES_AT_ONCE = 4
@@ -123,6 +124,16 @@ class IsolationWatchdog:
         self._report = messages.FirewallReported(isolation=self.isolation.kind, report=report)
         self._tell(self._report)
         return ""
+
+    async def carry_out(
+        self, work: MachineWork, number: int, name: str, terms: Terms
+    ) -> messages.MachineWorkDone:
+        try:
+            async with self._one_at_a_time:
+                found = await in_thread(lambda: self.isolation.carry_out(work, name, terms))
+        except Exception as error:  # noqa: BLE001  see the invariant
+            return messages.MachineWorkDone(number, {}, _words(error))
+        return messages.MachineWorkDone(number, found)
 
     async def clear_tunnels(self, passive: Callable[[], bool]) -> None:
         try:

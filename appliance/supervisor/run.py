@@ -13,7 +13,7 @@ import structlog
 
 from appliance.configuration.config_sources import plain
 from appliance.configuration.settings import Settings, Unasked
-from appliance.features.table import memories
+from appliance.features.table import machine_work_in, memories
 from appliance.network.close_ports import local_port_range
 from appliance.network.firewall.firewall_rules import PeerAccess
 from appliance.network.firewall.iptables import load_modules
@@ -22,6 +22,7 @@ from appliance.supervisor import signals
 from appliance.supervisor.boot_hold_lifecycle import HoldAround
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.isolation_lifecycle import AppliancePorts, NoIsolation, isolation_for
+from appliance.supervisor.machine_work import MachineWork
 from appliance.supervisor.monitor_memory import MonitorMemory
 from appliance.supervisor.port_check import free_port, require_free, spare_ports
 from appliance.supervisor.port_wait import built_when_free
@@ -125,7 +126,8 @@ def _run(
             peer=PeerAccess(pairing.other, pairing.port) if pairing is not None else None,
         )
         view = require_view(view_of(program_folders(), state.path), may_mount=has_privileges())
-        isolation = isolation_for(settings.isolation, ports, settings.firewall.backend)
+        work = machine_work_in(settings.state)
+        isolation = isolation_for(settings.isolation, ports, settings.firewall.backend, work)
         state.prepare(roles)
         state.write_config(json.dumps(plain(settings)))
         state.write_files(pairing.files if pairing is not None else ())
@@ -147,6 +149,7 @@ def _run(
                     admin=admin,
                     hold=hold,
                     listeners=listeners,
+                    work=work,
                     view=view,
                     manager=manager,
                     rosout_ports=ports.own_node,
@@ -249,6 +252,7 @@ def _supervise(
     admin: socket.socket,
     hold: HoldAround,
     listeners: dict[str, socket.socket],
+    work: MachineWork | None,
     view: PrivateView | None,
     manager: ServiceManager,
     rosout_ports: range,
@@ -291,6 +295,7 @@ def _supervise(
             memory=MonitorMemory(state.path, settings.relays),
             stands_by=say_standing_by,
             gate=pairing.gate if pairing is not None else ServiceGate,
+            work=work,
         )
         async with manager.watched():
             try:

@@ -36,6 +36,7 @@ from appliance.supervisor.input_lender import lend_inputs
 from appliance.supervisor.isolation_lifecycle import NoIsolation
 from appliance.supervisor.isolation_watchdog import IsolationWatchdog
 from appliance.supervisor.lapse_answers import answer_for_control
+from appliance.supervisor.machine_work import MachineWork, NoMachineWork, Terms
 from appliance.supervisor.monitor_memory import MonitorMemory
 from appliance.supervisor.process_handle import (
     ANSWER_SECONDS,
@@ -58,6 +59,7 @@ _LOOK_SECONDS = 10.0
 OUTPUT_LINES = 40  # last lines kept of a failing process
 _LONGEST_LINE = 500  # characters
 _SUSPENDED_SECONDS = 0.2  # until a start is tried again that a pause delays
+_AGREED_SECONDS = 10.0  # that an ordered end waits for control
 _MOST_UNANSWERED = 4096  # requests of control at once
 
 _FROM_ANY: tuple[type[messages.Message], ...] = (
@@ -78,6 +80,8 @@ _FROM_CONTROL: tuple[type[messages.Message], ...] = (
     messages.ProcessWanted,
     messages.ProcessOverdue,
     messages.OwnNetworkWanted,
+    messages.MachineWorkWanted,
+    messages.EndAgreed,
 )
 
 log = structlog.get_logger()
@@ -112,6 +116,7 @@ class Supervisor:
         memory: MonitorMemory | None = None,
         stands_by: Callable[[], None] = lambda: None,
         gate: Callable[[RoleChanges], ServiceGate] = ServiceGate,
+        work: MachineWork | None = None,
     ) -> None:
         """`ready` and `stands_by` are called at most once; `ready` may raise `StartError`.
 
@@ -137,7 +142,9 @@ class Supervisor:
         self._answers: asyncio.Task[None] | None = None  # to operators, instead of control
         self._watchdog = IsolationWatchdog(isolation or NoIsolation(), self._tell_control)
         self.reports = ProcessCallbacks(self._received, self._violated, self.died)
+        self._work = work or NoMachineWork()
         self.stopping = asyncio.Event()
+        self._end_agreed = asyncio.Event()
         self._process_died = asyncio.Event()
         self._lacking: set[tuple[str, ...]] = set()
         self.failure: str | None = None
@@ -165,6 +172,7 @@ class Supervisor:
             await self._start()
             self._spawn(self._watchdog.run())
             await self.stopping.wait()
+            await self._announce_end()
         finally:
             await self.end()
             self.kept.close()
@@ -179,6 +187,15 @@ class Supervisor:
         if not self.stopping.is_set():
             self.failure = failure
             self.stopping.set()
+
+    async def _announce_end(self) -> None:
+        """Let control give a graph back that it took over, unless the appliance ends because of a failure."""
+        if self.failure is not None or not self.is_ready or not self._work.takes_over():
+            return
+        self._tell_control(messages.EndAnnounced())
+        with suppress(TimeoutError):
+            async with asyncio.timeout(_AGREED_SECONDS):
+                await self._end_agreed.wait()
 
     # --- starting -----------------------------------------------------------------------------------------
 
@@ -360,11 +377,21 @@ class Supervisor:
                 self._demand(role, index)
             case messages.ProcessOverdue(role, index):
                 self._dismiss(role, index)
-            case messages.OwnNetworkWanted(network, ports):
-                self._answer(process, self._open_own_network(process, network, ports))
             case messages.ApplianceStopRequested(reason):
                 log.warning("control requests the shutdown of the appliance", reason=reason)
                 self.stop()
+            case _:
+                self._feature_said(process, message)
+
+    def _feature_said(self, process: ProcessHandle, message: messages.Message) -> None:
+        match message:
+            case messages.MachineWorkWanted(number, feature, work, terms):
+                log.info("control orders work", feature=_printable(feature), work=_printable(work))
+                self._answer(process, self._carry_out(process, number, work, terms))
+            case messages.OwnNetworkWanted(network, ports):
+                self._answer(process, self._open_own_network(process, network, ports))
+            case messages.EndAgreed():
+                self._end_agreed.set()
 
     def _free_log(self, processes: list[int]) -> None:
         """Kill the readers that hold a writer's lock of the audit log; a correct reader never holds one.
@@ -533,6 +560,9 @@ class Supervisor:
 
     async def _open_own_network(self, process: ProcessHandle, network: str, ports: list[int]) -> None:
         process.send(messages.OwnNetworkOpened(await self._watchdog.open_own_network(network, ports)))
+
+    async def _carry_out(self, process: ProcessHandle, number: int, work: str, terms: Terms) -> None:
+        process.send(await self._watchdog.carry_out(self._work, number, work, terms))
 
     def _demand(self, role: str, index: int = 0) -> None:
         for slot in self.slots:

@@ -402,6 +402,7 @@ class ControlParts:
             cast(Any, self.deliveries),
             lambda: self.parameters.tree,
             may_read_value=rights.may_read_value,
+            may_know_value=rights.may_know_value,
         )
         self.revocation = Revocation(
             self.registry, self.grants, self.graph, lambda: self.current, lambda: self.parameters.tree

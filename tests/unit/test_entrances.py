@@ -31,6 +31,7 @@ _NO_WAY_IN = frozenset(
         "holders",
         "approved",
         "policy_changed",
+        "before_end",
         "work",
     }
 )

@@ -160,6 +160,7 @@ LOOKUPS = {
     "appliance/formats/bundle_verifier.py ": _LIBRARY,
     "appliance/formats/bundle_verifier.py regular": _LIBRARY,
     "appliance/features/syslog/log_forwarder.py step": _TEXT,
+    "appliance/features/table.py machine_work_in": _IMPORTED,
     "appliance/features/table.py start_gate": _IMPORTED,
     "appliance/features/table.py verb_function": "a feature uses a verb of another feature, which it may not import",
     "appliance/features/parts.py keep": _OF_FEATURES,
@@ -272,7 +273,7 @@ WALL_CLOCK = {
     "a moment that people are shown, or that stands in a file": [
         "api/front/history.py", "audit/log/ids.py", "audit/log/log.py", "telemetry/audit_trail.py", "backup/create.py",
         "cli/audit/verified.py",
-        "features/fleet/poller.py", "features/fleet/bundle_gate.py",
+        "features/fleet/poller.py", "features/fleet/bundle_gate.py", "features/adopt/machine_side.py",
         "features/standby/second_join.py", "cli/status_watch.py", "features/fleet/connection.py",
         "control/assembly/host_blocks.py", "features/standby/passive.py", "cli/connection/audit_file.py",
         "control/assembly/policies.py", "control/operators/queries.py", "features/standby/replication.py",

@@ -196,6 +196,10 @@ EVENTS: dict[str, str] = {
     "clock set back": "The machine's clock is earlier than the last record; `detail` has by how many seconds.",
     "protection forgotten": "A monitor is disabled or in shadow mode, or a section of the policy audit-only, for"
     " longer than `forgotten_after`; `resource` names it, `reason` says how to enable it again.",
+    "adopted": "A registration was taken over from the robot's own master by an operator's order (`rosrv adopt`).",
+    "graph adopted": "The robot's graph was taken over from its own master; `detail` has the numbers.",
+    "graph released": "The robot's graph was given back to its own master; `detail` has the numbers.",
+    "adoption failed": "The robot's graph cannot be taken over or given back; `reason` says why. It is tried again.",
     "log failed": "The log could not be written for some time and is written again; `reason` says why.",
 }
 
@@ -217,6 +221,7 @@ SEVERITIES: dict[str, Severity] = {
             "recording closed", "door added", "door removed", "door ticket made", "signed off", "signed on",
             "recording ordered", "recording fetched", "recording read", "recording removed", "specifications loaded",
             "switchover ordered", "token added", "token revoked", "token rotated", "took over", "topic looked into",
+            "graph adopted", "graph released",
             "tunnel down", "tunnel moved", "tunnel up", "probe passed",
         ),
         Severity.WARNING: (
@@ -229,7 +234,8 @@ SEVERITIES: dict[str, Severity] = {
             "tunnel refused",
         ),
         Severity.ALARM: (
-            "fleet not joined", "forwarding gap", "monitor not built", "monitors restarted", "policy file refused",
+            "adoption failed", "fleet not joined", "forwarding gap", "monitor not built", "monitors restarted",
+            "policy file refused",
             "probe failed", "process failing", "protection forgotten", "publication refused", "records lost",
             "topics held",
         ),

@@ -209,6 +209,31 @@ class OwnNetworkOpened(Message):
     reason: str = ""
 
 
+class MachineWorkWanted(Message):
+    """Control asks for a piece of a feature's work on the machine, which only the supervisor may do."""
+
+    number: int
+    feature: str
+    work: str
+    terms: dict[str, object]
+
+
+class MachineWorkDone(Message):
+    """The result of the work; with a `reason`, it failed."""
+
+    number: int
+    found: dict[str, object]
+    reason: str = ""
+
+
+class EndAnnounced(Message):
+    """The appliance ends by order. Features first finish what cannot be done later; then control sends `EndAgreed`."""
+
+
+class EndAgreed(Message):
+    """Control has done what must be done before the appliance ends."""
+
+
 class ApplianceStopRequested(Message):
     """Sent after a granted `shutdown` call of the Master API."""
 
@@ -219,7 +244,7 @@ class MemoryGiven(Message):
     """Shared memory of a feature, with the feature's `terms` for `used_by` (`module:function`) in a relay."""
 
     descriptors: ClassVar[int] = 1
-    terms: dict[str, Any]
+    terms: dict[str, object]
     used_by: str = ""
 
 
@@ -266,6 +291,7 @@ Lifeline = (
     | ProbePassed | PolicyReloadRequested | RouteWanted | EndpointWanted | EndpointFound
     | TunnelsWanted | TunnelsEnclosed | ProcessWanted | ProcessOverdue
     | OwnNetworkWanted | OwnNetworkOpened
+    | MachineWorkWanted | MachineWorkDone | EndAnnounced | EndAgreed
     | MemoryGiven | StateGiven | RouteFound | LogHeld | CompilerWanted | ApplianceStopRequested
     | SignatureWanted | SignatureMade
     | LeaseHeld | LeaseEnded | Activated | ServicePaused

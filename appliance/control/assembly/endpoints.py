@@ -75,6 +75,7 @@ def make_endpoints(base: Foundation, core: Core) -> Endpoints:
         delivery,
         lambda: core.parameters.tree,
         may_read_value=core.rights.may_read_value,
+        may_know_value=core.rights.may_know_value,
     )
     stored = StoredGraph(core.grants, base.store)
     sinks = Sinks(core.registry, (stored, subscribers, entries, relay, faces))

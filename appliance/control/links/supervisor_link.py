@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import ipaddress
+import itertools
 import os
 import socket
 from collections.abc import Callable, Mapping
@@ -25,6 +26,10 @@ Enclosed = Callable[[messages.TunnelsEnclosed], object]
 """A handler of the supervisor's answer to `TunnelsWanted`."""
 
 _log = structlog.get_logger()
+
+
+class MachineWorkFailedError(Exception):
+    """The supervisor could not do the work; the message gives the reason."""
 
 
 class Surroundings:
@@ -70,6 +75,8 @@ class ControlLifeline:
         self._free_questions = asyncio.Semaphore(ROUTES_AT_ONCE)
         self._endpoints: list[asyncio.Future[messages.EndpointFound]] = []
         self._own_networks: list[asyncio.Future[str]] = []
+        self._machine_work: dict[int, asyncio.Future[messages.MachineWorkDone]] = {}
+        self._numbers = itertools.count(1)
         self._early: dict[tuple[object, ...], tuple[Any, tuple[int, ...]]] = {}
         self._heard: Heard = self.queue
 
@@ -144,6 +151,20 @@ class ControlLifeline:
         self.say(messages.OwnNetworkWanted(network, ports))
         return await future
 
+    async def machine_work(self, feature: str, work: str, **terms: object) -> dict[str, object]:
+        """Have the supervisor do a piece of a feature's work. Raises `MachineWorkFailedError` with its reason."""
+        number = next(self._numbers)
+        done: asyncio.Future[messages.MachineWorkDone] = asyncio.get_running_loop().create_future()
+        self._machine_work[number] = done
+        self.say(messages.MachineWorkWanted(number, feature, work, terms))
+        try:
+            answer = await done
+        finally:
+            self._machine_work.pop(number, None)
+        if answer.reason:
+            raise MachineWorkFailedError(answer.reason)
+        return answer.found
+
     def _send(self, message: messages.Message, descriptors: tuple[int, ...]) -> None:
         try:
             self.channel.send(message, descriptors)
@@ -173,7 +194,12 @@ class ControlLifeline:
                 self.activated.set()
             case messages.FirewallReported():
                 self.surroundings.firewall = message
-            case messages.TunnelsEnclosed() | messages.EndpointFound() | messages.RouteFound():
+            case (
+                messages.TunnelsEnclosed()
+                | messages.EndpointFound()
+                | messages.RouteFound()
+                | messages.MachineWorkDone()
+            ):
                 self._answered(message)
             case messages.OwnNetworkOpened(reason):
                 if self._own_networks and not (waiter := self._own_networks.pop(0)).done():
@@ -194,9 +220,16 @@ class ControlLifeline:
                 self.surroundings.probe = "passed"
 
     def _answered(
-        self, message: messages.TunnelsEnclosed | messages.EndpointFound | messages.RouteFound
+        self,
+        message: messages.TunnelsEnclosed
+        | messages.EndpointFound
+        | messages.RouteFound
+        | messages.MachineWorkDone,
     ) -> None:
         match message:
+            case messages.MachineWorkDone(number):
+                if (asked := self._machine_work.get(number)) is not None and not asked.done():
+                    asked.set_result(message)
             case messages.TunnelsEnclosed():
                 self._enclosed(message)
             case messages.EndpointFound():

@@ -17,9 +17,9 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from appliance.features.survey.inventory import GraphInventory
 from appliance.policy.cases import run_cases
 from appliance.policy.policy_compiler import compile_policy
+from appliance.rpc.graph_inventory import GraphInventory
 from roswire.names import is_global_name
 
 ROBOT = "robot"

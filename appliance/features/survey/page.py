@@ -4,7 +4,8 @@ from collections.abc import Iterator
 
 from appliance.base.counted import counted
 from appliance.features.survey.draft import PolicyDraft
-from appliance.features.survey.inventory import (
+from appliance.formats.html_page import Cells, head, lines, section, text
+from appliance.rpc.graph_inventory import (
     GraphInventory,
     SurveyedTopic,
     acting_services,
@@ -13,7 +14,6 @@ from appliance.features.survey.inventory import (
     problems,
     telling_parameters,
 )
-from appliance.formats.html_page import Cells, head, lines, section, text
 
 
 def page(inventory: GraphInventory, draft: PolicyDraft | None) -> str:

@@ -11,11 +11,11 @@ import typer
 from appliance.base.input_files import names_of_hosts
 from appliance.cli.output import Json, say_json, usage_error
 from appliance.features.survey.draft import DraftError, PolicyDraft, draft
-from appliance.features.survey.inventory import GraphInventory, problems
 from appliance.features.survey.page import page, report
-from appliance.features.survey.reader import SurveyError, SurveyLimits
-from appliance.features.survey.reader import survey as read_graph
 from appliance.policy.policy_findings import PolicyError
+from appliance.rpc.graph_inventory import GraphInventory, problems
+from appliance.rpc.graph_reader import SurveyError, SurveyLimits
+from appliance.rpc.graph_reader import survey as read_graph
 from rosmop.tool.terminal import say
 
 

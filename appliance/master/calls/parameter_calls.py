@@ -62,6 +62,9 @@ class ParameterRights:
             self.recorded(Caller(peer, incarnation.name, clock.now_ns()), "paramUpdate", key, decision)
         return decision.allowed
 
+    def may_know_value(self, incarnation: Incarnation, key: str, value: Value) -> bool:
+        return incarnation.own or self._to_read(incarnation.host, incarnation.name, key, value).allowed
+
     def to_find(self, caller: Caller, key: str) -> Decision:
         request = Request(caller.peer.host, caller.caller_id, Category.READ, key)
         return decide_right(self.policy(), right_to_find(request))

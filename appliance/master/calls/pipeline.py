@@ -15,7 +15,7 @@ from appliance.master.graph.registry import Incarnation
 from appliance.policy.model import Address, Category
 from appliance.rpc.fair_queue import Bulk, Turns, weigh
 from appliance.rpc.processor_time import ProcessorTime
-from appliance.rpc.server import Handler, HttpRequest
+from appliance.rpc.server import Handler, HttpRequest, Peer
 from appliance.telemetry.audit_trail import AuditTrail
 from roswire.errors import EncodingError, LimitExceededError, PeerError
 from roswire.xmlrpc import MethodCall, Value, XmlRpcLimits, build_fault, build_response, parse_call
@@ -53,6 +53,16 @@ class Pipeline:
             return answer
 
         return handle
+
+    async def ordered(self, table: Table, peer: Peer, call: MethodCall) -> Value:
+        """Carry out a call of a node that an operator orders, with policy, quotas and records as for the node's own."""
+        await self.addresses.learn(peer)
+        caller = Caller(peer, "", clock.now_ns())
+        with Bulk(self.bulk, peer.host, self.processor) as bulk:
+            answer = await self._answer(ServedRequest(table, caller, bulk), call)
+        if self.before_answer is not None:
+            await self.before_answer()
+        return answer
 
     async def _serve(self, visit: ServedRequest, body: bytes) -> bytes:
         try:

@@ -240,6 +240,7 @@ class Delivery:
         )
         self._turns = Turns(at_once, quota_class)
         self._tries = tries
+        self._silent = False
         self._queues: dict[str, _Queue] = {}
         self._workers: dict[str, asyncio.Task[None]] = {}
         self._lists: dict[str, dict[str, _List]] = {}  # by node and topic
@@ -252,7 +253,21 @@ class Delivery:
     def weight(self) -> int:
         return self._held.total
 
+    def silence(self) -> None:
+        """Send nothing more, and forget what waits, until `speak`: nodes get the lists of another master."""
+        self._silent = True
+        self.close()
+        for queue in self._queues.values():
+            self._held.give_back(queue.incarnation.host, queue.weight)
+        self._queues.clear()
+        self._lists.clear()
+
+    def speak(self) -> None:
+        self._silent = False
+
     def push(self, incarnation: Incarnation, call: NodeCall) -> None:
+        if self._silent:
+            return
         queue = self._queue(incarnation)
         queue.calls.append(call)
         self._weigh(queue, call.weight)
@@ -264,6 +279,8 @@ class Delivery:
         return None if one is None else one.wanted
 
     def push_list(self, incarnation: Incarnation, topic: str, publishers: tuple[str, ...]) -> None:
+        if self._silent:
+            return
         one = self._list(incarnation, topic)
         one.want(publishers)
         self._put(self._queue(incarnation), one)

@@ -9,6 +9,7 @@ a value:
 2. Subscribers to a key below it get their part of the new value, or `{}`, unless the value is not a namespace.
 """
 
+import itertools
 import sys
 from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass, field
@@ -17,12 +18,14 @@ from typing import NamedTuple
 from appliance.master.endpoints.delivery import Delivery, NodeCall
 from appliance.master.endpoints.relay_control import RelayControl
 from appliance.master.graph.graph import Grants
-from appliance.master.graph.registry import Change, Incarnation, Kind, Life, RegistrationKey, Registry
+from appliance.master.graph.registry import ENDED, Change, Incarnation, Kind, Life, RegistrationKey, Registry
 from appliance.rpc.fair_queue import weigh
 from appliance.specifications.allocation import TOPIC
 from appliance.store.state_file import PermissionRow
 from roswire.parameter_tree import Tree, standing_at
 from roswire.xmlrpc import Value
+
+_MOST_PARTS = 1000  # of a namespace, for a node whose subscriptions are unknown
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,8 +38,12 @@ class Subscribers:
     delivery: Delivery
     tree: Callable[[], Tree]
     may_read_value: Callable[[Incarnation, str, Value], bool]
+    may_know_value: Callable[[Incarnation, str, Value], bool]
+    """Like `may_read_value`, for a node that has perhaps never asked: without a record."""
     _valued: dict[Incarnation, set[str]] = field(default_factory=dict, init=False)
     """The parameters whose value each node has; `delivery` keeps the lists."""
+    unasked: set[Incarnation] = field(default_factory=set, init=False)
+    """Nodes whose subscriptions to parameters are unknown, because another master had them: they get each change."""
 
     def flush(self, changed: Iterable[Change]) -> None:
         topics: dict[str, None] = {}
@@ -158,6 +165,8 @@ class Subscribers:
 
     def parameter_set(self, key: str, value: Value, caller_id: str | None) -> None:
         """Send a value to the subscribers. The node that set it gets no update of the same key."""
+        if self.unasked:
+            self._tell_unasked(key, value, caller_id)
         if not self.registry.tells_parameters:
             return
         calls: dict[str, NodeCall] = {}
@@ -169,6 +178,19 @@ class Subscribers:
                     calls[update.key] = _param_update(update.key, settled(update.value))
                 if self.may_read_value(subscriber, update.key, update.value):
                     self.delivery.push(subscriber, calls[update.key])
+
+    def _tell_unasked(self, key: str, value: Value, caller_id: str | None) -> None:
+        """Send a change, and each part of a namespace, because roscpp caches the parts by their own keys."""
+        updates = [(key, value), *itertools.islice(_parts_of(key, value), _MOST_PARTS)]
+        for node in [*self.unasked]:
+            if node.life in ENDED:
+                self.unasked.discard(node)
+            if node.life is not Life.LIVE or node.name == caller_id:
+                continue
+            for changed, part in updates:
+                told = (Kind.PARAMETER, changed) in node.registrations
+                if not told and self.may_know_value(node, changed, part):
+                    self.delivery.push(node, _param_update(changed, settled(part)))
 
     def tell_parameters(self, subscriber: Incarnation) -> None:
         for key in subscriber.resources(Kind.PARAMETER):
@@ -209,6 +231,14 @@ def updates_of(key: str, value: Value, below: Iterable[str]) -> Iterator[Paramet
 def settled(value: Value) -> Value:
     """Copy the namespaces of a value, because later calls change them in place."""
     return {name: settled(member) for name, member in value.items()} if isinstance(value, dict) else value
+
+
+def _parts_of(key: str, value: Value) -> Iterator[tuple[str, Value]]:
+    if isinstance(value, dict):
+        for name, member in value.items():
+            below = f"{key.rstrip('/')}/{name}"
+            yield below, member
+            yield from _parts_of(below, member)
 
 
 def _upwards(key: str) -> Iterator[str]:

@@ -12,7 +12,7 @@ AUDIT = "lag_records lag_seconds failed on_failure degraded replaced forwarding 
 STATUS = (
     "version since master processes isolation relaying mediation firewall probe policy ipsec monitors rosmaster relay"
     " nodes shadows topics services connections messages dropped audit clock recorder switched_off blocks last_minute"
-    " name standby bundles doors handled_alarms approvals guards"
+    " name standby bundles doors adopt handled_alarms approvals guards"
 )
 TO: dict[str, Any] = {"to": "tls://log:6514", "behind": 7}
 DOOR = {
@@ -39,6 +39,13 @@ BAD: dict[str, tuple[dict[str, Any], list[tuple[str, str]]]] = {
     "guards": (
         {"loaded": 2, "acting": [{"name": "fence", "since": 1.5}]},
         [("guard-acts:fence", "notice")],
+    ),
+    "adopt": (
+        {
+            "phase": "free", "wanted": True, "since_utc": "2026-11-28T12:00:00Z", "master": "/usr/bin/rosmaster",
+            "present": True, "obstacle": "another master", "nodes": 0, "not_started": 0, "denied": {}, "missing": {},
+        },
+        [("adoption", "alarm")],
     ),
     "bundles": (
         {"refused": "a/b/2.tar", "reason": "no", "trouble": "bad", "rejected": True, "changed": True},

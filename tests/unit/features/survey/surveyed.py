@@ -1,6 +1,6 @@
 """A graph of three computers, as a survey reads it."""
 
-from appliance.features.survey.inventory import (
+from appliance.rpc.graph_inventory import (
     GraphInventory,
     NodeConnection,
     OpenPort,

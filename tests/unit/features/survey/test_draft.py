@@ -3,9 +3,9 @@ import ipaddress
 import pytest
 
 from appliance.features.survey.draft import draft, keys_of
-from appliance.features.survey.inventory import SurveyedNode, SurveyedTopic
 from appliance.policy.cases import run_cases
 from appliance.policy.policy_compiler import compile_policy
+from appliance.rpc.graph_inventory import SurveyedNode, SurveyedTopic
 from tests.unit.features.survey.surveyed import ARM, BASE, NODES, TABLET, inventory, node
 
 NAMES = {BASE: "base", ARM: "arm.lan", TABLET: "tablet"}

@@ -1,6 +1,6 @@
 from appliance.features.survey.draft import draft
-from appliance.features.survey.inventory import NodeConnection, SurveyedService, SurveyedTopic, problems
 from appliance.features.survey.page import page, report
+from appliance.rpc.graph_inventory import NodeConnection, SurveyedService, SurveyedTopic, problems
 from tests.unit.features.survey.surveyed import BASE, NODES, TABLET, inventory, node
 
 EVIL = "/<script>alert(1)</script>\x1b[2J"

@@ -3,9 +3,9 @@ from typing import Any
 
 import pytest
 
-from appliance.features.survey import reader
-from appliance.features.survey.inventory import GraphInventory
-from appliance.features.survey.reader import SurveyError, SurveyLimits, survey
+from appliance.rpc import graph_reader as reader
+from appliance.rpc.graph_inventory import GraphInventory
+from appliance.rpc.graph_reader import SurveyError, SurveyLimits, survey
 from appliance.rpc.xmlrpc_client import UnansweredError
 from roswire.uris import NodeUri
 

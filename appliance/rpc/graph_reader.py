@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 from appliance.base import clock
 from appliance.base.counted import counted
-from appliance.features.survey.inventory import (
+from appliance.rpc.graph_inventory import (
     LISTENERS,
     MASTER_PORT,
     GraphInventory,

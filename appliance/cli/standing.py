@@ -1,0 +1,143 @@
+"""Wait until a robot stands: before its protection is changed, a person wants to see that it does not move.
+
+1. A robot stands if its last command was zero, and, where it measures its own speed, that was zero too, both for some
+   seconds. All commands and all odometry count.
+2. Silence is not standing: without a commanded zero, or while odometry is silent, the robot is not known to stand.
+3. The wait has an end, with a reason.
+"""
+
+import asyncio
+import functools
+import math
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass, field
+
+from appliance.base import clock
+from appliance.base.counted import counted
+from appliance.rpc.master_reader import PUBLICATION, SUBSCRIPTION, MasterGraph, MasterReader, MasterReadError
+from roswire.definitions import Definitions
+from roswire.errors import RosError
+from roswire.message_view import read_fields
+from roswire.node.network import SourceNetwork
+from roswire.node.ros_node import RosNode
+from roswire.node.tcpros_streams import NodeLimits
+from roswire.node.topics import Received
+from roswire.standard import standard_definitions
+from roswire.tcpros import Body
+from roswire.uris import parse_node_uri
+
+STILL_SECONDS = 3.0
+_NAME = "/rosrv_standing"
+_SPEED = 0.01  # m/s, rad/s
+_LOOK_SECONDS = 0.2
+_MOST = 16  # topics of each kind
+_COMMANDS: Mapping[str, tuple[str, ...]] = {
+    "geometry_msgs/Twist": (),
+    "geometry_msgs/TwistStamped": ("twist",),
+}
+_ODOMETRY: Mapping[str, tuple[str, ...]] = {"nav_msgs/Odometry": ("twist", "twist")}
+"""The fields above the twist, by the type of the topic."""
+
+
+class NotStandingError(Exception):
+    """The robot did not stop before the end of the wait, or its topics cannot be heard; the message says why."""
+
+
+@dataclass
+class StandingJudge:
+    """Decides whether a robot stands, by the speeds that its topics say. Times are in seconds of one clock."""
+
+    commands: frozenset[str]
+    odometry: frozenset[str]
+    seconds: float = STILL_SECONDS
+    _moved: dict[str, float] = field(default_factory=dict, init=False)
+    _still_since: dict[str, float] = field(default_factory=dict, init=False)
+    _heard: dict[str, float] = field(default_factory=dict, init=False)
+
+    def hear(self, topic: str, speed: float, now: float) -> None:
+        self._heard[topic] = now
+        if speed <= _SPEED:  # a speed that is not a number moves
+            self._still_since.setdefault(topic, now)
+        else:
+            self._moved[topic] = now
+            self._still_since.pop(topic, None)
+
+    def why_not(self, now: float) -> str:
+        """Return why the robot is not known to stand; empty if it stands."""
+        if not self.commands:
+            return "no topic commands a base (geometry_msgs/Twist)"
+        for topic in sorted((self.commands | self.odometry) & self._moved.keys()):
+            if topic not in self._still_since:
+                return f"{topic} says that it moves"
+        commanded = [topic for topic in self.commands if topic in self._still_since]
+        if not commanded:
+            return f"no zero was commanded on {', '.join(sorted(self.commands))}"
+        for topic in sorted(self.odometry):
+            if now - self._heard.get(topic, -math.inf) > self.seconds:
+                return f"{topic} is silent"
+        still = max(self._still_since[topic] for topic in {*commanded, *self.odometry})
+        left = self.seconds - (now - still)
+        return f"it stands for less than {self.seconds:g} s" if left > 0 else ""
+
+
+async def wait_until_standing(master: str, longest: float, source: str = "127.0.0.1") -> str:
+    """Return what was seen when the robot at this master stands. Raises `NotStandingError` after `longest` seconds.
+
+    `source` is an address of this machine that the robot's nodes reach.
+    """
+    try:
+        graph = await MasterReader(parse_node_uri(master)).read()
+    except (MasterReadError, RosError) as error:
+        raise NotStandingError(f"the topics at {master} cannot be read: {error}") from None
+    commands = _topics(graph, _COMMANDS, SUBSCRIPTION)
+    odometry = _topics(graph, _ODOMETRY, PUBLICATION)
+    judge = StandingJudge(frozenset(commands), frozenset(odometry))
+    node = RosNode(_NAME, master, SourceNetwork(source), limits=NodeLimits(), shut_down=lambda _reason: None)
+    await node.start()
+    try:
+        for topic in (*commands, *odometry):
+            await node.subscribe(topic, _listener(judge, topic, graph.types[topic]))
+        until = clock.now() + longest
+        while why := judge.why_not(clock.now()):
+            if clock.now() > until or not commands:
+                raise NotStandingError(f"the robot is not known to stand: {why}")
+            await asyncio.sleep(_LOOK_SECONDS)
+    except RosError as error:
+        raise NotStandingError(f"the topics cannot be heard: {error}") from None
+    finally:
+        await node.close()
+    seen = f" and {counted(len(odometry), 'odometry topic')}" if odometry else ""
+    return f"the robot stands: zero for {judge.seconds:g} s on {', '.join(commands)}{seen}"
+
+
+def _topics(graph: MasterGraph, kinds: Collection[str], end: str) -> list[str]:
+    used = {resource for kind, resource, _name in graph.entries if kind == end}
+    return sorted(topic for topic in used if graph.types.get(topic) in kinds)[:_MOST]
+
+
+def _listener(judge: StandingJudge, topic: str, kind: str) -> Received:
+    path = _COMMANDS.get(kind, _ODOMETRY.get(kind, ()))
+
+    def heard(data: Body, _header: Mapping[str, str]) -> None:
+        judge.hear(topic, speed_in(kind, path, bytes(data)), clock.now())
+
+    return heard
+
+
+def speed_in(kind: str, path: Iterable[str], data: bytes) -> float:
+    """Return the largest component of a message's twist; infinity for a message that cannot be read."""
+    fields: object = read_fields(_definitions(), kind, data)
+    for name in path:
+        fields = fields.get(name) if isinstance(fields, dict) else None
+    if not isinstance(fields, dict):
+        return math.inf
+    parts = [fields.get(part) for part in ("linear", "angular")]
+    values = [value for part in parts if isinstance(part, dict) for value in part.values()]
+    if not values or any(not isinstance(value, float) or math.isnan(value) for value in values):
+        return math.inf
+    return float(max(map(abs, values)))
+
+
+@functools.cache
+def _definitions() -> Definitions:
+    return standard_definitions()

@@ -1,0 +1,243 @@
+"""The command `rosrv adopt`."""
+
+import asyncio
+import os
+import threading
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+import typer
+
+from appliance.base import clock
+from appliance.base.counted import counted
+from appliance.channel.admin import PolicyReload
+from appliance.cli.connection.admin_client import AdminSocket, NotRunningError
+from appliance.cli.connection.target import Appliance, speaks_here
+from appliance.cli.output import say_json, usage_error
+from appliance.cli.standing import NotStandingError, wait_until_standing
+from appliance.features.adopt.adopt_answers import AdoptState, TakeOverReport
+from appliance.features.adopt.adopt_check import CheckedRobot, CheckLine, check_lines
+from appliance.features.adopt.adopt_record import load_record, save_record
+from appliance.features.adopt.adopt_requests import AdoptOrder, AdoptStatus
+from appliance.features.adopt.machine_side import wanted_record
+from appliance.features.adopt.robot_side import (
+    link_address,
+    make_audit_only,
+    robot_state,
+    running_settings,
+    write_drop_in,
+)
+from appliance.network.namespaces import Namespace, NetworkError
+from rosmop.tool.terminal import say
+
+_VERB = "rosrv adopt"
+_START_SECONDS = 180.0
+_LOOK_SECONDS = 0.5
+_WAITS = "waits: "
+_STANDING_SECONDS = 120.0
+
+
+@speaks_here
+def adopt(
+    appliance: Appliance,
+    *,
+    check: Annotated[
+        bool, typer.Option("--check", help="Only show what would change, and what would stop it")
+    ] = False,
+    status: Annotated[bool, typer.Option("--status", help="Show the adoption")] = False,
+    audit_only: Annotated[
+        bool,
+        typer.Option(
+            "--audit-only",
+            help="Deny nothing at first: needs a policy with `audit-only`, or the shipped policy, which gets it",
+        ),
+    ] = False,
+    when_standing: Annotated[
+        bool,
+        typer.Option(
+            "--when-standing", help="Wait until the robot was commanded to stand and its odometry is zero"
+        ),
+    ] = False,
+    within: Annotated[
+        float,
+        typer.Option("--within", min=1, max=3600, metavar="N", help="Seconds that --when-standing waits"),
+    ] = _STANDING_SECONDS,
+) -> None:
+    """Take over the graph of a running robot from its own ROS master, without restarting a node. Needs root.
+
+    The robot's nodes are registered with the appliance, and their connections are cut, so that they come through it.
+    Each start of the appliance does this again; `rosrv release` gives the graph back. Exit status 1 if something
+    stops it.
+
+    Example: rosrv adopt --check
+    """
+    state = _state_of(appliance)
+    if os.geteuid() != 0:
+        raise usage_error("the rules and sockets of this machine need root: run it with sudo", verb=_VERB)
+    try:
+        if status:
+            _show_status(appliance)
+            return
+        settings = running_settings(state)
+        if settings is not None and settings.isolation != "netns":
+            raise usage_error("it needs `isolation: netns`, on the robot's own computer", verb=_VERB)
+        robot = robot_state(state, settings)
+        lines = check_lines(robot, Namespace.own())
+        stopped = any(line.level == "stop" for line in lines)
+        if check or stopped:
+            _show_lines(lines, as_json=appliance.as_json)
+            raise typer.Exit(1 if stopped else 0)
+        if audit_only:
+            _first_audit_only(appliance, robot, None if settings is None else settings.policy)
+        if when_standing:
+            _wait(robot.port, within)
+        _adopt(appliance, state)
+    except NetworkError as error:
+        typer.echo(f"{_VERB}: {error}", err=True)
+        raise typer.Exit(1) from None
+
+
+def _state_of(appliance: Appliance) -> Path:
+    assert isinstance(appliance.way, AdminSocket)  # noqa: S101  `speaks_here` offers no other way
+    return appliance.way.state
+
+
+def _first_audit_only(appliance: Appliance, robot: CheckedRobot, policy: Path | None) -> None:
+    if robot.policy is not None and robot.policy.all_audit_only:
+        return
+    if policy is None:
+        raise usage_error(
+            "the policy is not known: start the appliance first (systemctl start rosrv)", verb=_VERB
+        )
+    try:
+        lowered = make_audit_only(policy)
+    except OSError as error:
+        raise usage_error(f"{policy} cannot be changed: {error.strerror}", verb=_VERB) from None
+    if not lowered:
+        text = (
+            f"{policy} is not the shipped policy, and is never weakened: put `audit-only = all` below [Options] in"
+            " it, or leave out --audit-only"
+        )
+        raise usage_error(text, verb=_VERB)
+    say(f"{policy} now has `audit-only = all`: denials are recorded and pass; an alarm reminds of it")
+    try:
+        answer = appliance.ask(PolicyReload())
+    except NotRunningError:
+        return
+    if not answer.ok and not answer.error.startswith(_WAITS):
+        raise NetworkError(answer.error)
+
+
+def _wait(port: int, within: float) -> None:
+    source = link_address() or "127.0.0.1"
+    try:
+        say(asyncio.run(wait_until_standing(f"http://127.0.0.1:{port}", within, source)))
+    except NotStandingError as error:
+        raise NetworkError(f"{error}. Nothing was changed") from None
+
+
+def _adopt(appliance: Appliance, state: Path) -> None:
+    try:
+        answer = appliance.ask(AdoptOrder())
+    except NotRunningError:
+        _note(state)
+        say("noted: the next start takes the graph over: sudo systemctl start rosrv")
+        return
+    if answer.ok:
+        report = answer.given()
+        write_drop_in(load_record(state))
+        _show_report(report, as_json=appliance.as_json)
+        return
+    if not answer.error.startswith(_WAITS):
+        raise NetworkError(answer.error)
+    _note(state)
+    _show_started(_await_start(appliance), as_json=appliance.as_json)
+
+
+def _note(state: Path) -> None:
+    """Write the record while no supervisor does."""
+    robot = robot_state(state, running_settings(state))
+    record = wanted_record(load_record(state), robot.master)
+    save_record(state, record)
+    write_drop_in(record)
+
+
+def _await_start(appliance: Appliance) -> AdoptState:
+    until, last, pause = clock.now() + _START_SECONDS, "", threading.Event()
+    while clock.now() < until:
+        pause.wait(_LOOK_SECONDS)
+        try:
+            answer = appliance.ask(AdoptStatus())
+        except NotRunningError as error:
+            last = str(error)
+            continue
+        if answer.ok:
+            found = answer.given()
+            if found.phase == "taken":
+                return found
+            last = found.obstacle or last
+        else:
+            last = answer.error
+    raise NetworkError(f"noted, but not adopted within {_START_SECONDS:g} s: {last}. `rosrv adopt --status`")
+
+
+def _show_lines(lines: list[CheckLine], *, as_json: bool) -> None:
+    width = max(len(line.about) for line in lines)
+    for line in lines:
+        if as_json:
+            say_json({"level": line.level, "about": line.about, "text": line.text})
+        else:
+            say(f"{line.level:<4}  {line.about:<{width}}  {line.text}")
+
+
+def _show_report(report: TakeOverReport, *, as_json: bool) -> None:
+    if as_json:
+        say_json(msgspec.to_builtins(report))
+        return
+    say(
+        f"adopted in {report.seconds:g} s: {counted(report.nodes, 'node')} of {counted(len(report.hosts), 'host')},"
+        f" {counted(report.registrations, 'registration')}, {len(report.denied)} denied;"
+        f" {counted(report.cut, 'connection')} cut"
+    )
+    _show_left(report.denied, report.missing)
+    for left in report.left_out:
+        say(f"left out: {left}")
+    say("Next: rosrv status, and `rosrv protect` to close the nodes' own ports to other hosts")
+
+
+def _show_started(found: AdoptState, *, as_json: bool) -> None:
+    if as_json:
+        say_json(msgspec.to_builtins(found))
+        return
+    say(f"adopted: {counted(found.nodes, 'node')} of {found.master}")
+    _show_left(found.denied, found.missing)
+    say("Next: rosrv status, and `rosrv protect` to close the nodes' own ports to other hosts")
+
+
+def _show_left(denied: dict[str, str], missing: dict[str, str]) -> None:
+    for entry, why in denied.items():
+        say(f"denied: {entry}: {why}")
+    for name, why in missing.items():
+        say(f"not adopted: {name}: {why}")
+
+
+def _show_status(appliance: Appliance) -> None:
+    found = appliance.answer_or_exit(AdoptStatus())
+    if not found.wanted and found.phase == "free":
+        say("nothing is adopted: the robot's nodes use their own master, or were started with the appliance")
+        return
+    words = {
+        "taken": "the robot's nodes use the appliance",
+        "free": "the robot's nodes use their own master",
+        "taking": "the graph is being taken over",
+        "giving": "the graph is being given back",
+        "given": "the graph is being given back",
+    }
+    say(f"{words[found.phase]}; adopted since {found.since_utc}")
+    away = "" if found.present else ", away: a release starts another master"
+    say(f"own master: {found.master}{away}")
+    say(f"{counted(found.nodes, 'node')}, of which {found.not_started} were never seen to start")
+    if found.obstacle:
+        say(f"not as wanted: {found.obstacle}")
+    _show_left(found.denied, found.missing)

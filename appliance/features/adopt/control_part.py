@@ -1,0 +1,309 @@
+"""Keep the adoption in control: bring the graph to what the record wants, at the start and by orders."""
+
+import asyncio
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from typing import TYPE_CHECKING, NoReturn
+
+import msgspec
+import structlog
+
+from appliance.base import clock
+from appliance.control.errors import SenselessError, UnavailableError
+from appliance.control.links.supervisor_link import MachineWorkFailedError
+from appliance.control.operators.request_method import RequestMethod
+from appliance.features.adopt.adopt_answers import AdoptState, GiveBackReport, TakeOverReport
+from appliance.features.adopt.adopt_record import Phase
+from appliance.features.adopt.adopt_requests import AdoptOrder, AdoptStatus, ReleaseOrder
+from appliance.features.adopt.graph_side import AdoptedGraph
+from appliance.features.adopt.machine_facts import MachineFacts
+from appliance.features.adopt.takeover import AdoptError, AdoptOperation
+from appliance.features.feature import FeaturePart
+from appliance.master.calls.call import Caller
+from appliance.master.calls.parameter_calls import ParameterCalls, ParameterWrite
+from appliance.master.graph.registry import Life
+from appliance.master.graph.revocation import ROSOUT
+from appliance.policy.model import Address, address_of
+from appliance.rpc.master_reader import MasterReader
+from appliance.rpc.server import Peer
+from appliance.supervisor.machine_work import Found
+from roswire.uris import NodeUri
+from roswire.xmlrpc import MethodCall, Value
+
+if TYPE_CHECKING:
+    from appliance.control.assembly.assembly import Parts
+    from appliance.control.assembly.foundation import Foundation
+    from appliance.store.state_file import StateStore
+
+_SETTING = "adopt"
+_AGAIN_SECONDS = 5.0
+_READY_SECONDS = 0.05
+_NO_NETNS = "a graph is adopted only with `isolation: netns`, on the robot's own computer"
+_PAIRED = "a graph is not adopted by one of two appliances"
+
+log = structlog.get_logger()
+
+
+class AdoptMemory(msgspec.Struct):
+    """Keeps over a restart of control the keys of adopted nodes, and all that stays with the other master."""
+
+    nodes: list[str] = []
+    denied: dict[str, str] = {}
+    missing: dict[str, str] = {}
+
+
+async def inherit(base: "Foundation", parts: "Parts") -> FeaturePart:
+    obstacle = _NO_NETNS if base.settings.isolation != "netns" else _PAIRED if base.role.paired else ""
+    if obstacle:
+        refused = RefusedAdoption(obstacle)
+        return FeaturePart(methods=(
+            RequestMethod(AdoptStatus, refused.refuse, order=False),
+            RequestMethod(AdoptOrder, refused.refuse),
+            RequestMethod(ReleaseOrder, refused.refuse),
+        ))  # fmt: skip
+    part = AdoptPart(base, parts)
+    return FeaturePart(
+        methods=(
+            RequestMethod(AdoptStatus, part.status, order=False),
+            RequestMethod(AdoptOrder, part.adopt, full_disk=True),
+            RequestMethod(ReleaseOrder, part.release, full_disk=True),
+        ),
+        status_fields=part.status_fields,
+        before_end=part.before_end,
+        work={"the adoption of the robot's graph": part.run},
+    )
+
+
+class RefusedAdoption:
+    """Answers where the appliance cannot take a graph over."""
+
+    def __init__(self, reason: str) -> None:
+        self._reason = reason
+
+    async def refuse(self, _request: object) -> NoReturn:
+        raise SenselessError(self._reason)
+
+
+class AdoptPart:
+    """The adoption, one operation at a time."""
+
+    def __init__(self, base: "Foundation", parts: "Parts") -> None:
+        self._base, self._parts = base, parts
+        ends, core = parts.endpoints, parts.core
+        parameters = parts.table["setParam"].part
+        assert isinstance(parameters, ParameterCalls)  # noqa: S101  the table says so
+        self._graph = AdoptedGraph(
+            core.registry, core.graph, ends.subscribers, base.trail, self._order, ends.sinks.flush,
+            frozenset({ROSOUT, base.settings.publish_as}),
+        )  # fmt: skip
+        self._parameters = ParameterOrders(
+            parameters, lambda: self._facts.link if self._facts else "127.0.0.1"
+        )
+        self._operation = AdoptOperation(
+            self._machine,
+            self._reader,
+            self._graph,
+            self._parameters,
+            waiting=lambda: ends.subscribers.delivery.waiting,
+            silence=self._silence,
+            speak=self._speak,
+            passed=self._passed,
+        )
+        self._one = asyncio.Lock()
+        self._facts: MachineFacts | None = None
+        self._obstacle = ""
+        self._settled = False
+        self._missing: dict[str, str] = {}
+
+    # --- at the start, and while the appliance runs ---
+
+    async def run(self) -> None:
+        await self._parts.reconciler.ready.wait()
+        self._remember()
+        while self._parts.endpoints.relay.presence != "connected":
+            await asyncio.sleep(_READY_SECONDS)
+        while True:
+            async with self._one:
+                await self._settle()
+            await asyncio.sleep(_AGAIN_SECONDS)
+
+    async def _settle(self) -> None:
+        """Bring the graph to what the record wants; note the obstacle if that fails."""
+        try:
+            facts = self._facts = await self._operation.facts()
+            report = await self._operation.settle(facts, settled=self._settled)
+            if isinstance(report, TakeOverReport):
+                self._taken(report)
+            elif report is not None:
+                self._given()
+        except AdoptError as error:
+            self._note_obstacle(str(error))
+        else:
+            self._obstacle = ""
+            with suppress(AdoptError):
+                self._facts = await self._operation.facts()
+
+    def _note_obstacle(self, reason: str) -> None:
+        if reason != self._obstacle:
+            self._obstacle = reason
+            self._base.trail.happened("adoption failed", reason)
+
+    def _taken(self, report: TakeOverReport) -> None:
+        self._settled = True
+        self._missing = report.missing
+        self._save()
+        log.info("the robot's graph is adopted", nodes=report.nodes, seconds=report.seconds)
+
+    async def _give(self) -> GiveBackReport:
+        report = await self._operation.give()
+        self._given()
+        return report
+
+    def _given(self) -> None:
+        self._settled, self._missing = False, {}
+        self._save()
+
+    async def before_end(self) -> None:
+        """Give the graph back before an ordered end; the record still wants it, so the next start takes it again."""
+        async with self._one:
+            try:
+                facts = await self._operation.facts()
+                if facts.record.phase is not Phase.FREE:
+                    await self._give()
+            except AdoptError as error:
+                log.error("the graph is not given back", reason=str(error))
+
+    # --- orders ---
+
+    async def adopt(self, _request: AdoptOrder) -> TakeOverReport:
+        async with self._one:
+            try:
+                await self._machine("want", wanted=True)
+                report = await self._operation.take()
+            except AdoptError as error:
+                raise UnavailableError(str(error)) from None
+            self._taken(report)
+            self._obstacle = ""
+            return report
+
+    async def release(self, _request: ReleaseOrder) -> GiveBackReport:
+        async with self._one:
+            try:
+                await self._machine("want", wanted=False)
+                facts = await self._operation.facts()
+                if facts.record.phase is Phase.FREE:
+                    raise SenselessError("nothing is adopted: the robot's nodes use their own master")
+                return await self._give()
+            except AdoptError as error:
+                raise UnavailableError(
+                    f"{error}. The release is tried again while the appliance runs"
+                ) from None
+
+    async def status(self, _request: AdoptStatus) -> AdoptState:
+        async with self._one:
+            try:
+                self._facts = await self._operation.facts()
+            except AdoptError as error:
+                raise UnavailableError(str(error)) from None
+        return self._state(self._facts)
+
+    def status_fields(self) -> Mapping[str, object]:
+        if self._facts is None or not (
+            self._facts.record.wanted or self._facts.record.phase is not Phase.FREE
+        ):
+            return {}
+        return {"adopt": self._state(self._facts)}
+
+    def _state(self, facts: MachineFacts) -> AdoptState:
+        record, unasked = facts.record, self._graph.subscribers.unasked
+        return AdoptState(
+            phase=record.phase.value,
+            wanted=record.wanted,
+            since_utc=record.since_utc,
+            master=f"{record.program} ({record.unit or f'user {record.user}'})" if record.program else "",
+            present=facts.master is not None,
+            obstacle=self._obstacle or facts.foreign_master,
+            nodes=len(self._graph.nodes()),
+            not_started=sum(node.life is Life.LIVE for node in unasked),
+            denied={" ".join(entry): why for entry, why in sorted(self._graph.denied.items())},
+            missing=self._missing,
+        )
+
+    # --- what the operation uses ---
+
+    async def _machine(self, work: str, /, **terms: object) -> Found:
+        try:
+            return await self._base.lifeline.machine_work("adopt", work, **terms)
+        except MachineWorkFailedError as error:
+            raise AdoptError(str(error)) from None
+
+    def _reader(self, facts: MachineFacts) -> MasterReader:
+        _host, port = self._base.settings.listen_address
+        return MasterReader(NodeUri("http", facts.link, port, "/"))
+
+    async def _order(self, host: Address, method: str, /, *params: Value) -> list[Value]:
+        parts = self._parts
+        local = self._facts.appliance if self._facts is not None else str(host)
+        answer = await parts.pipeline.ordered(
+            parts.table, Peer(host, str(host), local), MethodCall(method, params)
+        )
+        return answer if isinstance(answer, list) else [0, "no answer", 0]
+
+    def _silence(self) -> None:
+        self._parts.reminders.close()
+        self._parts.endpoints.subscribers.delivery.silence()
+
+    def _speak(self) -> None:
+        ends = self._parts.endpoints
+        ends.subscribers.delivery.speak()
+        ends.subscribers.remind_all()
+
+    async def _passed(self, step: str) -> None:
+        log.info("adoption", step=step)
+        self._save()
+
+    # --- after a restart of control ---
+
+    def _remember(self) -> None:
+        """Restore what an earlier control knew, now that the registry is restored."""
+        memory = _memory(self._base.store)
+        self._missing = memory.missing
+        self._graph.denied.update({tuple(text.split(" ", 2)): why for text, why in memory.denied.items()})  # type: ignore[misc]  # three words
+        registry = self._parts.core.registry
+        self._graph.subscribers.unasked.update(filter(None, map(registry.by_key, memory.nodes)))
+
+    def _save(self) -> None:
+        memory = AdoptMemory(
+            sorted(node.key for node in self._graph.subscribers.unasked),
+            {" ".join(entry): why for entry, why in self._graph.denied.items()},
+            self._missing,
+        )
+        self._base.store.save_setting(_SETTING, msgspec.json.encode(memory).decode())
+
+
+class ParameterOrders:
+    """RVMaster's parameters for the operation; those of the robot are charged to the robot's host."""
+
+    def __init__(self, calls: ParameterCalls, link: Callable[[], str]) -> None:
+        self._calls, self._link = calls, link
+
+    def tree(self) -> Mapping[str, Value]:
+        return self._calls.mirror.tree
+
+    async def take(self, values: Mapping[str, Value]) -> list[str]:
+        host = address_of(self._link())
+        caller = Caller(Peer(host, str(host), str(host)), "/rosrv", clock.now_ns())
+        writes = [ParameterWrite(caller, f"/{name}", value) for name, value in values.items()]
+        outcomes = await self._calls.write(writes)
+        return [
+            f"parameter {write.key}: {outcome}"
+            for write, outcome in zip(writes, outcomes, strict=True)
+            if isinstance(outcome, Exception)
+        ]
+
+
+def _memory(store: "StateStore") -> AdoptMemory:
+    try:
+        return msgspec.json.decode(store.settings().get(_SETTING, "{}"), type=AdoptMemory)
+    except ValueError:
+        return AdoptMemory()

@@ -1,0 +1,49 @@
+"""Describe the machine of an adoption, as the supervisor sees it."""
+
+import ipaddress
+
+import msgspec
+
+from appliance.features.adopt.adopt_record import AdoptRecord
+
+
+class RobotMaster(msgspec.Struct, frozen=True):
+    """The program that listens on the port of the robot's own master. `group` is set if its unit has nothing else."""
+
+    pid: int
+    program: str
+    user: str
+    unit: str = ""
+    group: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.program} ({self.unit or f'user {self.user}'})"
+
+
+class MachineFacts(msgspec.Struct, frozen=True):
+    """The machine. `link` and `appliance` are the addresses of the link's ends.
+
+    By the port of a node's API on this machine, `reaches` has the address by which its process reaches its master, and
+    `sockets` all ports on which that process listens.
+    """
+
+    record: AdoptRecord
+    link: str
+    appliance: str
+    own: list[str] = []
+    master: RobotMaster | None = None
+    reaches: dict[int, str] = {}
+    sockets: dict[int, list[int]] = {}
+    resolved: dict[str, list[str]] = {}
+
+    @property
+    def foreign_master(self) -> str:
+        """Why the present master is not the recorded one; empty if it is, or if there is none."""
+        found, record = self.master, self.record
+        if found is None or not record.wanted or (found.unit, found.user) == (record.unit, record.user):
+            return ""
+        recorded = f"{record.program} ({record.unit or 'no unit'}, user {record.user})"
+        return f"{found.program} ({found.unit or 'no unit'}, user {found.user}) is not the recorded master {recorded}"
+
+    def is_here(self, address: str) -> bool:
+        return ipaddress.ip_address(address).is_loopback or address in self.own

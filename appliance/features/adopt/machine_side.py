@@ -1,0 +1,296 @@
+"""Do the supervisor's part of an adoption: the rules, the end of connections, the robot's own master.
+
+Each piece of work can be repeated: it brings the machine to a state, whatever was done before.
+"""
+
+import ipaddress
+import os
+import pwd
+import re
+import shutil
+import subprocess
+import threading
+from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from pathlib import Path
+
+import msgspec
+import structlog
+
+from appliance.base import clock
+from appliance.features.adopt.adopt_record import AdoptRecord, Phase, load_record, save_record
+from appliance.features.adopt.machine_facts import MachineFacts, RobotMaster
+from appliance.network import interfaces
+from appliance.network.cut import RemotePort, end_connections, refuse_no_port, refuse_ports
+from appliance.network.isolation import Isolation
+from appliance.network.listening_sockets import TcpSocket
+from appliance.network.namespaces import Namespace, NetworkError
+from appliance.network.port_holders import port_holder
+from appliance.network.socket_owners import node_sockets, programs_of_unit, user_of
+from appliance.supervisor.machine_work import Found, Terms
+from appliance.supervisor.users import account_of
+
+STAND_IN_UNIT = "rosrv-left-master"
+ROSMASTER = "/usr/bin/rosmaster"
+_SYSTEMD = Path("/run/systemd/system")
+_MOST_NAMES, _MOST_PORTS = 64, 20_000
+_NAME = re.compile(r"[A-Za-z0-9_.-]{1,253}")
+_RESOLVE_SECONDS = 2.0
+_LOOKUP_SECONDS = 0.1
+_CALL_SECONDS = 0.25  # of an ordinary service call under way, which is not cut
+_START_SECONDS = 10.0
+_LOOK_SECONDS = 0.05
+
+log = structlog.get_logger()
+
+
+def machine(state: Path) -> "AdoptWork":
+    return AdoptWork(state)
+
+
+class AdoptWork:
+    """The supervisor's part; see `MachineWork`."""
+
+    def __init__(self, state: Path) -> None:
+        self._state = state
+        self._took_over = False
+
+    def takes_over(self) -> bool:
+        """Return whether an adoption is wanted or not yet undone; then for the rest of this supervisor's life."""
+        record = load_record(self._state)
+        self._took_over = self._took_over or record.wanted or record.phase is not Phase.FREE
+        return self._took_over
+
+    def holds(self) -> bool:
+        """Return whether nodes must not reach their own master, even while the appliance starts again."""
+        return load_record(self._state).phase in {Phase.TAKING, Phase.TAKEN}
+
+    def left_alone(self) -> tuple[str, ...]:
+        group = load_record(self._state).group
+        return (group,) if group else ()
+
+    def carry_out(self, robot_side: Isolation, work: str, terms: Terms) -> Found:
+        steps = {
+            "look": self._look,
+            "want": self._want,
+            "phase": self._phase,
+            "forward": self._forward,
+            "cut": self._cut,
+            "stand in": self._stand_in,
+            "withdraw": self._withdraw,
+            "leave": self._leave,
+        }
+        if work not in steps:
+            raise ValueError(f"adopt does not do {work[:40]!r}")
+        return steps[work](robot_side, terms)
+
+    # --- facts ---
+
+    def _look(self, side: Isolation, terms: Terms) -> Found:
+        ports = _ports(terms.get("ports", []))
+        names = msgspec.convert(terms.get("names", []), list[str])[:_MOST_NAMES]
+        ends = side.ends[4]
+        found = node_sockets(side.host, ports, _master_port(side)) if ports else {}
+        facts = MachineFacts(
+            record=load_record(self._state),
+            link=ends.host,
+            appliance=ends.appliance,
+            own=[text.partition("/")[0] for text in interfaces.addresses(side.host)],
+            master=master_of(side.host, _master_port(side)),
+            reaches={port: one.master_address for port, one in found.items() if one.master_address},
+            sockets={port: sorted(one.listening) for port, one in found.items()},
+            resolved=resolved(side.host, names),
+        )
+        return dict(msgspec.to_builtins(facts))
+
+    # --- the record ---
+
+    def _want(self, side: Isolation, terms: Terms) -> Found:
+        wanted = msgspec.convert(terms["wanted"], bool)
+        record = load_record(self._state)
+        if wanted:
+            found = master_of(side.host, _master_port(side))
+            record = wanted_record(record, found)
+        else:
+            record = msgspec.structs.replace(record, wanted=False)
+        save_record(self._state, record)
+        self.takes_over()
+        return {}
+
+    def _phase(self, _side: Isolation, terms: Terms) -> Found:
+        self._note(msgspec.convert(terms["phase"], Phase))
+        return {}
+
+    def _note(self, phase: Phase) -> None:
+        record = load_record(self._state)
+        if record.phase is not phase:
+            save_record(self._state, msgspec.structs.replace(record, phase=phase))
+
+    # --- taking ---
+
+    def _forward(self, side: Isolation, _terms: Terms) -> Found:
+        self.takes_over()
+        side.forward_master()
+        return {}
+
+    def _cut(self, side: Isolation, terms: Terms) -> Found:
+        ports = set(_ports(terms.get("ports", [])))
+        remote = {
+            RemotePort(str(ipaddress.IPv4Address(address)), port)
+            for address, port in msgspec.convert(terms.get("remote", []), list[tuple[str, int]])[:_MOST_PORTS]
+        }
+        master, appliance = _master_port(side), side.ends[4].appliance
+        if ports & {master, 22}:
+            raise ValueError("a port of the machine itself is not a node's")
+
+        def of_master(one: TcpSocket) -> bool:
+            return one.port == master and one.peer_address != appliance
+
+        def of_nodes(one: TcpSocket) -> bool:
+            if one.port in ports:
+                return one.peer_address != appliance
+            return (one.peer_address, one.peer_port) in remote
+
+        calls = end_connections(side.host, of_master)
+        threading.Event().wait(
+            _LOOKUP_SECONDS
+        )  # a client of a service uses the address that it has looked up
+        refuse_ports(side.host, side.settings.link, ports, remote)
+        return {"master": calls, "nodes": end_connections(side.host, of_nodes, lasting=_CALL_SECONDS)}
+
+    # --- giving back ---
+
+    def _stand_in(self, side: Isolation, _terms: Terms) -> Found:
+        """Have a master on the robot's port: its own, or one that outlives the appliance."""
+        port = _master_port(side)
+        if master_of(side.host, port) is not None:
+            return {"started": False}
+        start_stand_in(side.host, port, load_record(self._state))
+        return {"started": True}
+
+    def _withdraw(self, side: Isolation, _terms: Terms) -> Found:
+        self._note(Phase.GIVING)
+        refuse_no_port(
+            side.host
+        )  # first: a node that asks its own master next gets an address that it may use
+        side.withdraw_master()
+        master = _master_port(side)
+        return {"master": end_connections(side.namespace, lambda one: one.port == master)}
+
+    def _leave(self, side: Isolation, _terms: Terms) -> Found:
+        ranges, robot = side.settings.ports, {ends.host for ends in side.ends.values()}
+
+        def of_nodes(one: TcpSocket) -> bool:
+            return any(span.first <= one.port <= span.last for span in ranges if span.first != span.last)
+
+        ended = end_connections(side.namespace, of_nodes, lasting=_CALL_SECONDS)
+        log.info("the graph is given back", connections=ended, robot=sorted(robot))
+        return {"nodes": ended}
+
+
+def wanted_record(record: AdoptRecord, found: RobotMaster | None) -> AdoptRecord:
+    """Return the record of a wanted adoption of the graph of `found`. Raises `NetworkError` without a master.
+
+    An adoption that is wanted already keeps the master that was recorded.
+    """
+    if record.wanted:
+        return record
+    if found is None:
+        raise NetworkError("no ROS master of the robot is running: start the robot first")
+    return msgspec.structs.replace(
+        record, wanted=True, since_utc=clock.utc_now().isoformat(timespec="seconds"), unit=found.unit, user=found.user,
+        program=found.program, group=found.group,
+    )  # fmt: skip
+
+
+def master_of(host: Namespace, port: int) -> RobotMaster | None:
+    """Return the program of the robot that listens on the port of the master; None without one."""
+    holder = host.run(lambda: port_holder(port))
+    if holder is None:
+        return None
+    lines = programs_of_unit(holder.unit) if holder.unit else []
+    group = f"system.slice/{holder.unit}" if lines and all(map(_of_roscore, lines)) else ""
+    return RobotMaster(holder.pid, holder.program, user_of(holder.pid), holder.unit, group)
+
+
+def _of_roscore(line: str) -> bool:
+    """Return whether a process belongs to roscore: roslaunch in its role, rosmaster, rosout."""
+    words = [os.path.basename(word) for word in line.split()]  # noqa: PTH119  words, not paths
+    return not words or any(word in {"roscore", "rosmaster", "rosout"} for word in words[:3])
+
+
+def start_stand_in(host: Namespace, port: int, record: AdoptRecord) -> None:
+    """Start a ROS master that outlives the appliance, and wait until it listens. Raises `NetworkError`."""
+    user, uid, gid = _stand_in_user(record.user)
+    command = [ROSMASTER, "--core", "-p", str(port)]
+    if _SYSTEMD.is_dir() and (run := shutil.which("systemd-run")):
+        unit = [run, "--quiet", "--collect", f"--unit={STAND_IN_UNIT}", f"--uid={uid}", f"--gid={gid}"]
+        started = subprocess.run(
+            [*unit, "--setenv=ROS_LOG_DIR=/tmp", "--", *command],
+            capture_output=True,
+            text=True,
+            timeout=_START_SECONDS,
+            check=False,
+        )
+        if started.returncode:
+            raise NetworkError(f"systemd-run started no ROS master: {started.stderr.strip()[:300]}")
+    else:
+        host.popen(
+            command, user=uid, group=gid, extra_groups=[], start_new_session=True,
+            env={"PATH": os.environ.get("PATH", "/usr/bin:/bin"), "ROS_LOG_DIR": "/tmp"}, cwd="/",  # noqa: S108  only a log
+            stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        )  # fmt: skip
+    until, pause = clock.now() + _START_SECONDS, threading.Event()
+    while host.run(lambda: port_holder(port)) is None:
+        if clock.now() > until:
+            raise NetworkError(f"{ROSMASTER} does not listen on TCP {port}")
+        pause.wait(_LOOK_SECONDS)
+    log.warning("a ROS master was started for the robot", unit=STAND_IN_UNIT, user=user, port=port)
+
+
+def _stand_in_user(recorded: str) -> tuple[str, int, int]:
+    """Return the user of the robot's own master, unless that is root or unknown: then that of the hidden one."""
+    with suppress(KeyError):
+        entry = pwd.getpwnam(recorded)
+        if entry.pw_uid:
+            return recorded, entry.pw_uid, entry.pw_gid
+    account = account_of("rosmaster")
+    return account.name, account.uid, account.gid
+
+
+def resolved(host: Namespace, names: Iterable[str]) -> dict[str, list[str]]:
+    """Return the addresses of host names, as the machine resolves them; an unknown name has none.
+
+    The names come from nodes. `getent` is killed after some seconds, so a slow name server costs no more.
+    """
+
+    def addresses(name: str) -> list[str]:
+        if not _NAME.fullmatch(name):
+            return []
+        with suppress(subprocess.TimeoutExpired, OSError):
+            with host.popen(
+                ["getent", "ahosts", "--", name], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+            ) as asked:
+                try:
+                    text, _ = asked.communicate(timeout=_RESOLVE_SECONDS)
+                finally:
+                    asked.kill()
+            return list(dict.fromkeys(line.split()[0] for line in text.splitlines() if line.split()))
+        return []
+
+    wanted = sorted(set(names))
+    with ThreadPoolExecutor(8, "resolver") as threads:
+        return dict(zip(wanted, threads.map(addresses, wanted), strict=True))
+
+
+def _master_port(side: Isolation) -> int:
+    assert side.settings.master is not None  # noqa: S101  the isolation of an appliance has it
+    return side.settings.master
+
+
+def _ports(given: object) -> list[int]:
+    ports = msgspec.convert(given, list[int])
+    if len(ports) > _MOST_PORTS or any(not 0 < port < 65_536 for port in ports):
+        raise ValueError("not a list of ports")
+    return ports

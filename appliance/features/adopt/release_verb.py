@@ -1,0 +1,116 @@
+"""The command `rosrv release`."""
+
+import asyncio
+import os
+from typing import Annotated
+
+import msgspec
+import typer
+
+from appliance.base.counted import counted
+from appliance.channel.admin import StatusWanted
+from appliance.cli.connection.admin_client import AdminSocket, NotRunningError
+from appliance.cli.connection.target import Appliance, speaks_here
+from appliance.cli.output import say_json, usage_error
+from appliance.cli.standing import NotStandingError, wait_until_standing
+from appliance.features.adopt.adopt_answers import GiveBackReport
+from appliance.features.adopt.adopt_record import load_record
+from appliance.features.adopt.adopt_requests import ReleaseOrder
+from appliance.features.adopt.dead_release import release_dead
+from appliance.features.adopt.robot_side import MASTER_PORT, link_address, remove_drop_in, running_settings
+from appliance.network.namespaces import NetworkError
+from rosmop.tool.terminal import say
+
+_VERB = "rosrv release"
+
+
+@speaks_here
+def release(
+    appliance: Appliance,
+    *,
+    dead: Annotated[
+        bool,
+        typer.Option(
+            "--dead",
+            help="Give the graph back from the stored state: the appliance has crashed, and stays off",
+        ),
+    ] = False,
+    moving: Annotated[
+        bool,
+        typer.Option(
+            "--moving", help="Release even if monitors are enabled and the robot is not known to stand"
+        ),
+    ] = False,
+    within: Annotated[
+        float,
+        typer.Option("--within", min=1, max=3600, metavar="N", help="Seconds to wait until the robot stands"),
+    ] = 120.0,
+) -> None:
+    """Give the graph of an adopted robot back to its own ROS master, without restarting a node. Needs root.
+
+    The appliance runs on, but the robot's nodes no longer use it. While monitors are enabled, it waits until the robot
+    stands, because their guards end with the release. Without a master of its own, the robot gets one.
+
+    Example: rosrv release
+    """
+    assert isinstance(appliance.way, AdminSocket)  # noqa: S101  `speaks_here` offers no other way
+    state = appliance.way.state
+    if os.geteuid() != 0:
+        raise usage_error("the rules and sockets of this machine need root: run it with sudo", verb=_VERB)
+    try:
+        record = load_record(state) if not dead else None
+        if dead:
+            report = asyncio.run(release_dead(state))
+        else:
+            if not moving:
+                _stand(appliance, within)
+            report = _ordered(appliance)
+        if record is not None:
+            remove_drop_in(record)
+    except NetworkError as error:
+        typer.echo(f"{_VERB}: {error}", err=True)
+        raise typer.Exit(1) from None
+    if appliance.as_json:
+        say_json(msgspec.to_builtins(report))
+        return
+    say(
+        f"released in {report.seconds:g} s: {counted(report.nodes, 'node')} use {report.master or 'their own master'}"
+        f" again; {counted(report.given, 'registration')} given back, {report.ended} ended"
+    )
+    if report.started:
+        say("the robot had no master of its own, so one was started: rosrv-left-master")
+    for name in report.failed:
+        say(f"not told: {name} did not answer")
+    if not dead:
+        say("The appliance runs on without them: sudo systemctl stop rosrv, or rosrv adopt")
+
+
+def _ordered(appliance: Appliance) -> GiveBackReport:
+    try:
+        answer = appliance.ask(ReleaseOrder())
+    except NotRunningError as error:
+        raise NetworkError(f"{error}. After a crash: rosrv release --dead") from None
+    if not answer.ok:
+        raise NetworkError(answer.error)
+    return answer.given()
+
+
+def _stand(appliance: Appliance, within: float) -> None:
+    try:
+        answer = appliance.ask(StatusWanted())
+    except NotRunningError:
+        return
+    if not answer.ok or not answer.given().monitors.enabled:
+        return
+    settings = running_settings(appliance.way.state) if isinstance(appliance.way, AdminSocket) else None
+    port = MASTER_PORT if settings is None else settings.listen_address[1]
+    try:
+        say(
+            asyncio.run(
+                wait_until_standing(f"http://127.0.0.1:{port}", within, link_address() or "127.0.0.1")
+            )
+        )
+    except NotStandingError as error:
+        raise NetworkError(
+            f"monitors are enabled, and {error}. Nothing was changed; --moving releases anyway"
+        ) from None

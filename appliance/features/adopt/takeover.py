@@ -1,0 +1,436 @@
+"""Take a graph over from the robot's own master, and give it back.
+
+Both are sequences of steps. Each step can be repeated, so a start after a kill runs the sequence again from its
+beginning. `passed` is called after each step.
+
+Taking: read, register, forward 11311, tell subscribers, cut, and read again until two readings are equal: a node that
+starts in the meantime registers at the master that it still finds.
+
+1. Publishers are registered before services, and services before subscribers.
+2. The rules come after the first registrations; before, calls of the robot would find an empty graph.
+3. Only ports of registered nodes are cut, and only ports on which the node's own process listens.
+
+Giving back: silence, a master, registrations, forward no more, registrations once more, tell subscribers, cut, forget.
+
+4. Nothing of RVMaster reaches a node after the silence: the other master's list is the last one that a node gets.
+5. A node that was registered with another URI is unregistered first, because `rosmaster` sends a shutdown request to
+   the earlier URI of a name.
+"""
+
+import asyncio
+from collections.abc import Awaitable, Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import msgspec
+
+from appliance.base import clock
+from appliance.base.counted import counted
+from appliance.features.adopt.adopt_answers import GiveBackReport, TakeOverReport
+from appliance.features.adopt.adopt_record import Phase
+from appliance.features.adopt.graph_side import AdoptedGraph, service_text
+from appliance.features.adopt.machine_facts import MachineFacts
+from appliance.features.adopt.places import (
+    NodeCaller,
+    NodePlace,
+    Places,
+    call_node,
+    find_places,
+    names_to_resolve,
+    parsed,
+)
+from appliance.master.graph.registry import Incarnation
+from appliance.rpc.master_reader import (
+    ORDER,
+    PUBLICATION,
+    SERVICE,
+    SUBSCRIPTION,
+    Entry,
+    MasterCall,
+    MasterGraph,
+    MasterReader,
+    MasterReadError,
+)
+from appliance.rpc.xmlrpc_client import CallFailedError
+from appliance.supervisor.machine_work import Found
+from roswire.uris import NodeUri
+from roswire.xmlrpc import Value
+
+MASTER_NAME = "/master"
+_READINGS = 5
+_LISTS_SECONDS = 2.0
+_PAUSE_SECONDS = 0.02
+_AT_ONCE = 50  # registrations without a pause for other callers
+_KEPT_PARAMETER = "run_id"
+_OWN_PARAMETERS = frozenset({"run_id", "rosdistro", "rosversion"})  # each master has its own, from roslaunch
+_REGISTER = {PUBLICATION: "registerPublisher", SUBSCRIPTION: "registerSubscriber", SERVICE: "registerService"}
+_UNREGISTER = {
+    PUBLICATION: "unregisterPublisher", SUBSCRIPTION: "unregisterSubscriber", SERVICE: "unregisterService",
+}  # fmt: skip
+
+
+class AdoptError(Exception):
+    """The graph cannot be taken over, or given back; the message says why."""
+
+
+class MachineOrders(Protocol):
+    """Does the supervisor's work. Raises `AdoptError`."""
+
+    async def __call__(self, work: str, /, **terms: object) -> Found: ...
+
+
+class ParameterSide(Protocol):
+    """RVMaster's parameters."""
+
+    def tree(self) -> Mapping[str, Value]: ...
+
+    async def take(self, values: Mapping[str, Value]) -> list[str]:
+        """Set parameters; return the names of those that a limit left out."""
+
+
+async def _nothing(_step: str) -> None: ...
+
+
+@dataclass
+class AdoptOperation:
+    """The sequences. `waiting()` counts the calls that wait for nodes; `own` are the appliance's nodes."""
+
+    machine: MachineOrders
+    reader: Callable[[MachineFacts], MasterReader]
+    graph: AdoptedGraph
+    parameters: ParameterSide
+    waiting: Callable[[], int]
+    silence: Callable[[], None]
+    speak: Callable[[], None]
+    call: NodeCaller = call_node
+    passed: Callable[[str], Awaitable[None]] = _nothing
+    _missing: dict[str, str] = field(default_factory=dict, init=False)
+
+    async def facts(self, nodes: Iterable[NodeUri] = ()) -> MachineFacts:
+        uris = list(nodes)
+        ports = sorted({uri.port for uri in uris})
+        found = await self.machine("look", ports=ports, names=names_to_resolve(uris))
+        return msgspec.convert(found, MachineFacts, strict=False)
+
+    async def settle(self, facts: MachineFacts, *, settled: bool) -> TakeOverReport | GiveBackReport | None:
+        """Bring the graph to what the record wants; `settled`: this process has done so already.
+
+        Raises `AdoptError`.
+        """
+        wanted, phase = facts.record.wanted, facts.record.phase
+        if wanted and (phase is not Phase.TAKEN or not settled):
+            return await self.take()
+        if not wanted and phase is not Phase.FREE:
+            return await self.give()
+        return None
+
+    # --- taking over ---
+
+    async def take(self) -> TakeOverReport:
+        """Take the graph over. Raises `AdoptError` if the present master is not the recorded one, or cannot be read."""
+        began, facts = clock.now(), await self.facts()
+        if facts.foreign_master:
+            raise AdoptError(facts.foreign_master)
+        warm = facts.record.phase is Phase.TAKEN
+        graph, places, cut, readings, parameters_left = MasterGraph(), Places(), 0, 0, list[str]()
+        reads = facts.master is not None and not warm
+        if reads:
+            graph, places = await self._read(facts)
+            await self.passed("read")
+            if facts.record.phase is Phase.FREE:
+                parameters_left = await self._take_parameters(facts)
+                await self.passed("parameters")
+            await self._register(graph, places, MasterGraph())
+            await self.passed("register")
+        if not warm:
+            await self.machine("phase", phase=Phase.TAKING)
+        await self.machine("forward")
+        await self.passed("forward")
+        if not reads and warm:
+            places = await self._known_places()
+        while True:
+            self.graph.tell(places.found)
+            await self._until_told()
+            await self.passed("tell")
+            cut += await self._cut(graph, places)
+            await self.passed("cut")
+            readings += 1
+            if not reads:
+                break
+            again, places = await self._read(facts)
+            same = again.registered == graph.registered
+            if not same:
+                await self._register(again, places, graph)
+            graph = again
+            await self.passed("read again")
+            if same:
+                break
+            if readings >= _READINGS:
+                raise AdoptError(f"the graph still changes after {readings} readings")
+        await self.machine("phase", phase=Phase.TAKEN)
+        report = self._report(places, cut, readings, [*graph.left_out, *parameters_left], clock.now() - began)
+        if reads:
+            self._record(report)
+        await self.passed("taken")
+        return report
+
+    async def _read(self, facts: MachineFacts) -> tuple[MasterGraph, Places]:
+        try:
+            graph = await self.reader(facts).read()
+        except MasterReadError as error:
+            raise AdoptError(f"the robot's master cannot be read: {error}") from None
+        nodes = {name: uri for name, uri in graph.nodes.items() if not self.graph.is_own(name)}
+        uris, _invalid = parsed(nodes)
+        places = await find_places(nodes, await self.facts(uris.values()), self.call)
+        self._missing = places.missing
+        return graph, places
+
+    async def _known_places(self) -> Places:
+        """Return the nodes that RVMaster has from before a restart."""
+        return Places({
+            node.name: NodePlace(node.api_text, node.api, node.host)
+            for node in self.graph.nodes() if node in self.graph.subscribers.unasked
+        })  # fmt: skip
+
+    async def _take_parameters(self, facts: MachineFacts) -> list[str]:
+        try:
+            values = await self.reader(facts).parameters()
+        except MasterReadError as error:
+            raise AdoptError(f"the robot's parameters cannot be read: {error}") from None
+        if self.graph.nodes():  # a node of RVMaster may have read its run_id
+            values = {name: value for name, value in values.items() if name != _KEPT_PARAMETER}
+        return await self.parameters.take(values)
+
+    async def _register(self, graph: MasterGraph, places: Places, before: MasterGraph) -> None:
+        for number, entry in enumerate(graph.in_order()):
+            place = places.found.get(entry[2])
+            if place is not None:
+                await self.graph.register(entry, place, graph)
+            if number % _AT_ONCE == 0:
+                await asyncio.sleep(0)
+        for entry in before.in_order():
+            place = places.found.get(entry[2])
+            if entry not in graph.entries and place is not None:
+                await self.graph.unregister(entry, place, before)
+
+    async def _until_told(self) -> None:
+        until = clock.now() + _LISTS_SECONDS
+        while self.waiting() and clock.now() < until:
+            await asyncio.sleep(_PAUSE_SECONDS)
+
+    async def _cut(self, graph: MasterGraph, places: Places) -> int:
+        nodes = {name: place for name, place in places.found.items() if self._registered(name, place)}
+        facts = await self.facts(place.uri for place in nodes.values())
+        served = await self._served_ports(graph, nodes)
+        apis = {place.uri.port for place in nodes.values()}
+        ports: set[int] = set()
+        remote: set[tuple[str, int]] = set()
+        for name, offered in served.items():
+            place = nodes[name]
+            if facts.is_here(str(place.host)) or str(place.host) == facts.link:
+                ports |= (offered & set(facts.sockets.get(place.uri.port, []))) - apis
+            elif place.host.version == 4:
+                remote |= {(str(place.host), port) for port in offered - {place.uri.port}}
+        ended = await self.machine("cut", ports=sorted(ports), remote=sorted(remote))
+        return sum(msgspec.convert(ended, dict[str, int]).values())
+
+    def _registered(self, name: str, place: NodePlace) -> bool:
+        node = self.graph.node_at(name, place)
+        return node is not None and bool(node.registrations)
+
+    async def _served_ports(self, graph: MasterGraph, nodes: Mapping[str, NodePlace]) -> dict[str, set[int]]:
+        """Return the ports of topics and services of each node."""
+        served: dict[str, set[int]] = {name: set() for name in nodes}
+        topics: dict[str, str] = {}
+        for kind, resource, name in self._entries(graph):
+            if name not in nodes:
+                continue
+            if kind == PUBLICATION:
+                topics.setdefault(name, resource)
+            elif kind == SERVICE and (port := self._service_port(graph, resource, name)):
+                served[name].add(port)
+
+        async def topic_port(name: str, topic: str) -> None:
+            try:
+                answer = await self.call(nodes[name].call_uri, "requestTopic", topic, [["TCPROS"]])
+            except CallFailedError:
+                return
+            match answer:
+                case [1, _, ["TCPROS", str(), int(port)]] if 0 < port < 65_536:
+                    served[name].add(port)
+
+        await asyncio.gather(*(topic_port(*row) for row in topics.items()))
+        return served
+
+    def _entries(self, graph: MasterGraph) -> Iterable[Entry]:
+        return graph.entries or [entry for entry, _node in self.graph.held()]
+
+    def _service_port(self, graph: MasterGraph, service: str, name: str) -> int:
+        uri = graph.services.get(service, "")
+        if not uri:
+            node = self.graph.registry.holder(name)
+            uri = service_text(node, service) if node is not None else ""
+        tail = uri.rstrip("/").rpartition(":")[2]
+        return int(tail) if tail.isascii() and tail.isdecimal() and int(tail) < 65_536 else 0
+
+    def _report(
+        self, places: Places, cut: int, readings: int, left_out: list[str], seconds: float
+    ) -> TakeOverReport:
+        nodes = [node for node in self.graph.nodes() if node.registrations]
+        return TakeOverReport(
+            nodes=len(nodes),
+            hosts=sorted({str(node.host) for node in nodes}),
+            registrations=sum(len(node.registrations) for node in nodes),
+            denied={" ".join(entry): why for entry, why in sorted(self.graph.denied.items())},
+            missing=dict(sorted(places.missing.items())),
+            cut=cut,
+            readings=readings,
+            left_out=left_out,
+            seconds=round(seconds, 2),
+        )
+
+    def _record(self, report: TakeOverReport) -> None:
+        self.graph.trail.happened(
+            "graph adopted",
+            f"{counted(report.nodes, 'node')}, {counted(report.registrations, 'registration')},"
+            f" {len(report.denied)} denied; {counted(report.cut, 'connection')} cut",
+            nodes=report.nodes, registrations=report.registrations, cut=report.cut,
+            denied=len(report.denied), missing=len(report.missing),
+        )  # fmt: skip
+
+    # --- giving back ---
+
+    async def give(self) -> GiveBackReport:
+        """Give the graph back. Raises `AdoptError`; RVMaster then serves on."""
+        began, facts = clock.now(), await self.facts()
+        self.silence()
+        if facts.record.phase is Phase.GIVEN:  # a kill came before the nodes were forgotten
+            return await self._forget(GiveBackReport(master=str(facts.master or "")), began)
+        try:
+            await self.passed("silence")
+            started = bool((await self.machine("stand in")).get("started"))
+            await self.passed("stand in")
+            facts = await self.facts()
+            if facts.foreign_master and not started:
+                raise AdoptError(f"the graph is not given to another master: {facts.foreign_master}")
+            reader = self.reader(facts)
+            given, ended = await self._give_registrations(reader)
+            parameters = await self._give_parameters(reader)
+            await self.passed("give")
+        except (AdoptError, MasterReadError) as error:
+            self.speak()
+            raise AdoptError(str(error)) from None
+        nodes = [
+            (node, {entry for entry, holder in self.graph.held() if holder is node})
+            for node in self.graph.nodes()
+        ]
+        await self.machine("withdraw")
+        await self.passed("withdraw")
+        more = await self._give_registrations(reader)  # of calls that were under way
+        await self.passed("give again")
+        failed = await self._last_word(reader, nodes)
+        await self.passed("tell")
+        report = GiveBackReport(
+            nodes=len(nodes), given=given + more[0], ended=ended + more[1], parameters=parameters,
+            master=str(facts.master or ""), started=started, failed=failed, seconds=round(clock.now() - began, 2),
+        )  # fmt: skip
+        return await self._forget(report, began)
+
+    async def _forget(self, report: GiveBackReport, began: float) -> GiveBackReport:
+        """Forget the nodes. The phase keeps a repetition from ending what the robot's own master has by now."""
+        await self.machine("phase", phase=Phase.GIVEN)
+        await self.passed("given")
+        await self.machine("leave")
+        self.graph.forget()
+        self.graph.denied.clear()
+        await self.passed("forget")
+        await self.machine("phase", phase=Phase.FREE)
+        report = msgspec.structs.replace(report, seconds=round(clock.now() - began, 2))
+        self.graph.trail.happened(
+            "graph released",
+            f"{counted(report.nodes, 'node')} use {report.master or 'their own master'} again",
+            nodes=report.nodes,
+            given=report.given,
+        )
+        self.speak()
+        await self.passed("released")
+        return report
+
+    async def _give_registrations(self, reader: MasterReader) -> tuple[int, int]:
+        """Register what the robot's master lacks, and unregister what is gone; return both numbers."""
+        there, held = await reader.read(), dict(self.graph.held())
+        gone = [entry for entry in there.in_order() if self._is_gone(entry, there, held)]
+        new = [entry for entry, node in held.items() if _is_new(entry, node, there)]
+        new.sort(key=lambda entry: (ORDER.index(entry[0]), entry))
+        calls: list[MasterCall] = []
+        for kind, resource, name in gone:
+            detail = there.services.get(resource, "") if kind == SERVICE else there.nodes.get(name, "")
+            calls.append((_UNREGISTER[kind], name, (resource, detail)))
+        for entry in new:
+            kind, resource, name = entry
+            node = held[entry]
+            detail = (
+                service_text(node, resource) if kind == SERVICE else self.graph.registry.type_of(resource)
+            )
+            calls.append((_REGISTER[kind], name, (resource, detail, node.api_text)))
+        await reader.ask_all(calls)
+        return len(new), len(gone)
+
+    def _is_gone(self, entry: Entry, there: MasterGraph, held: Mapping[Entry, Incarnation]) -> bool:
+        name = entry[2]
+        if self.graph.is_own(name) or entry in self.graph.denied or name in self._missing:
+            return False
+        node = held.get(entry)
+        return node is None or there.nodes.get(name) != node.api_text
+
+    async def _give_parameters(self, reader: MasterReader) -> int:
+        there, mine = await reader.parameters(), self.parameters.tree()
+        calls: list[MasterCall] = [
+            ("setParam", MASTER_NAME, (f"/{name}", value))
+            for name, value in mine.items()
+            if name not in _OWN_PARAMETERS and (name not in there or there[name] != value)
+        ]
+        calls += [
+            ("deleteParam", MASTER_NAME, (f"/{name}",))
+            for name in there
+            if name not in {*mine, *_OWN_PARAMETERS}
+        ]
+        await reader.ask_all(calls)
+        return len(calls)
+
+    async def _last_word(
+        self, reader: MasterReader, nodes: list[tuple[Incarnation, set[Entry]]]
+    ) -> list[str]:
+        """Send each subscriber the list of the robot's own master; return the nodes that did not take it."""
+        graph = await reader.read()
+        publishers: dict[str, list[str]] = {}
+        for kind, topic, name in sorted(graph.entries):
+            if kind == PUBLICATION and name in graph.nodes:
+                publishers.setdefault(topic, []).append(graph.nodes[name])
+        failed: set[str] = set()
+        turns = asyncio.Semaphore(16)
+
+        async def tell(node: Incarnation, topic: str) -> None:
+            async with turns:
+                try:
+                    uris: list[Value] = [*publishers.get(topic, [])]
+                    await self.call(node.call_uri, "publisherUpdate", topic, uris)
+                except CallFailedError:
+                    failed.add(node.name)
+
+        await asyncio.gather(*(
+            tell(node, topic) for node, entries in nodes for kind, topic, _name in sorted(entries)
+            if kind == SUBSCRIPTION
+        ))  # fmt: skip
+        return sorted(failed)
+
+
+def _is_new(entry: Entry, node: Incarnation, there: MasterGraph) -> bool:
+    kind, resource, name = entry
+    if entry not in there.entries or there.nodes.get(name) != node.api_text:
+        return True
+    return kind == SERVICE and _port(there.services.get(resource, "")) != _port(service_text(node, resource))
+
+
+def _port(uri: str) -> str:
+    return uri.rstrip("/").rpartition(":")[2]

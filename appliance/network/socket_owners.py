@@ -1,0 +1,90 @@
+"""Find the process behind each socket of a node. Only root sees the sockets of all processes."""
+
+import pwd
+from collections.abc import Iterable
+from contextlib import suppress
+from pathlib import Path
+from typing import NamedTuple
+
+from appliance.network.listening_sockets import TcpSocket, tcp_sockets
+from appliance.network.namespaces import Namespace
+
+
+class SocketOwner(NamedTuple):
+    """A process, and its descriptor of a socket."""
+
+    pid: int
+    descriptor: int
+
+
+class NodeSockets(NamedTuple):
+    """The sockets of the process that listens on a node's port."""
+
+    pid: int
+    listening: frozenset[int]
+    master_address: str
+    """The local address of its connection to a master's port; empty without a connection."""
+
+
+def node_sockets(namespace: Namespace, ports: Iterable[int], master_port: int) -> dict[int, NodeSockets]:
+    """Return the sockets of the processes that listen on `ports`, by port. A process that has ended is left out."""
+    wanted = set(ports)
+    relevant = [one for one in namespace.run(tcp_sockets) if one.listens or _calls(one, master_port)]
+    owners = {inode: owner.pid for inode, owner in owners_of(one.inode for one in relevant).items()}
+    found: dict[int, NodeSockets] = {}
+    for one in relevant:
+        pid = owners.get(one.inode)
+        if pid is None:
+            continue
+        so_far = found.get(pid, NodeSockets(pid, frozenset(), ""))
+        if one.listens:
+            found[pid] = so_far._replace(listening=so_far.listening | {one.port})
+        else:
+            found[pid] = so_far._replace(master_address=one.local_address)
+    return {port: one for one in found.values() for port in sorted(one.listening & wanted)}
+
+
+def user_of(pid: int) -> str:
+    """Return the name of a process's user, or its number; empty if the process has ended."""
+    try:
+        uid = Path("/proc", str(pid)).stat().st_uid
+    except OSError:
+        return ""
+    try:
+        return pwd.getpwuid(uid).pw_name
+    except KeyError:
+        return str(uid)
+
+
+def programs_of_unit(unit: str) -> list[str]:
+    """Return the command lines of the processes of a unit of the system's own slice."""
+    found = []
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdecimal():
+            with suppress(OSError):
+                groups = (entry / "cgroup").read_text(encoding="utf-8", errors="replace")
+                if any(line.endswith(f":/system.slice/{unit}") for line in groups.splitlines()):
+                    found.append(
+                        (entry / "cmdline").read_bytes().replace(b"\0", b" ").decode("utf-8", "replace")
+                    )
+    return found
+
+
+def _calls(one: TcpSocket, master_port: int) -> bool:
+    return one.established and one.peer_port == master_port
+
+
+def owners_of(inodes: Iterable[str]) -> dict[str, SocketOwner]:
+    """Return a process that has each socket open."""
+    found: dict[str, SocketOwner] = {}
+    wanted = {f"socket:[{inode}]": inode for inode in inodes}
+    for entry in Path("/proc").iterdir() if wanted else ():
+        if not entry.name.isdecimal():
+            continue
+        with suppress(OSError):
+            for descriptor in (entry / "fd").iterdir():
+                with suppress(OSError):
+                    inode = wanted.get(str(descriptor.readlink()))
+                    if inode is not None:
+                        found.setdefault(inode, SocketOwner(int(entry.name), int(descriptor.name)))
+    return found

@@ -1,0 +1,190 @@
+"""Adopt and release a running robot of unmodified nodes and its stock master, in a namespace, without a restart."""
+
+import itertools
+import json
+import os
+import subprocess
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from examples.landshark.lab import Host, Lab
+from tests.support.appliance import Appliance
+from tests.support.command import ROSRV
+from tests.support.nodes import RosSession, has_ros, numbers
+from tests.support.processes import LIMIT, Process
+from tests.support.requirements import needs
+from tests.support.rosmaster import PlainMaster, call_on
+from tests.support.waiting import eventually
+
+URI = "http://127.0.0.1:11311"
+CYCLES = int(os.environ.get("ROSRV_ADOPT_CYCLES", "20"))
+_RATE = 50
+
+
+@dataclass
+class Robot:
+    host: Host
+    ros: RosSession
+    listeners: dict[str, Process]
+    callers: dict[str, Process]
+
+    def graph(self) -> list[list[tuple[str, list[str]]]]:
+        state = call_on(self.host, URI, "getSystemState", "/test")[2]
+        return [sorted((resource, sorted(nodes)) for resource, nodes in part) for part in state]
+
+    def parameters(self) -> dict[str, Any]:
+        found = call_on(self.host, URI, "getParam", "/test", "/")[2]
+        return {name: value for name, value in found.items() if name not in {"rosdistro", "rosversion"}}
+
+    def lives(self) -> set[int]:
+        assert all(process.running for process in self.ros.processes), self.ros.story()
+        return {process.pid for process in self.ros.processes}
+
+    def hears(self) -> None:
+        for listener in self.listeners.values():
+            listener.wait_for_count(5, since=listener.mark(), event="received")
+
+    def calls(self) -> dict[str, tuple[int, int]]:
+        found = {}
+        for name, caller in self.callers.items():
+            since = caller.mark()
+            caller.send("")
+            event = caller.wait_for(since=since, event="counted")
+            found[name] = event["good"], event["bad"]
+        return found
+
+    def losses(self) -> dict[str, tuple[int, int, int]]:
+        """Return for each listener the messages lost, the longest gap, and the messages that came twice."""
+        found = {}
+        for name, listener in self.listeners.items():
+            heard = numbers(listener.seen(event="received"))
+            steps = [later - earlier for earlier, later in itertools.pairwise(heard)]
+            lost = len(set(range(heard[0], heard[-1] + 1)) - set(heard))
+            found[name] = lost, max(steps) - 1, len(heard) - len(set(heard))
+        return found
+
+
+@pytest.fixture
+def robot(lab: Lab, tmp_path: Path) -> Iterator[Robot]:
+    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    host = lab.host("robot", "10.77.0.10/24")
+    with PlainMaster(tmp_path, host), RosSession("http://localhost:11311", tmp_path, host) as ros:
+        for client in ("rospy", "roscpp"):
+            ros.talker(client, f"/{client}", "--rate", str(_RATE), name=f"{client}_talker")
+            ros.service_server(client, f"/{client}_go", name=f"{client}_server")
+        listeners = {
+            f"{client} of {topic}": ros.listener(client, f"/{topic}", name=f"{client}_of_{topic}")
+            for client in ("rospy", "roscpp")
+            for topic in ("rospy", "roscpp")
+        }
+        callers = {
+            f"{service}{' persistent' if kept else ''}": ros.node(
+                "rospy", "service_caller", f"/{service}_go", *(["--persistent"] if kept else []),
+                name=f"caller_{service}_{len(kept)}",
+            )
+            for service in ("rospy", "roscpp")
+            for kept in ("", "p")
+        }  # fmt: skip
+        yield Robot(host, ros, listeners, callers)
+
+
+@pytest.fixture
+def appliance(robot: Robot) -> Iterator[Appliance]:
+    appliance = Appliance(robot.host, isolation="netns")
+    try:
+        yield appliance
+    finally:
+        appliance.stop()
+        appliance.close()
+
+
+def rosrv(robot: Robot, appliance: Appliance, *arguments: str, check: bool = True) -> str:
+    command = [ROSRV, *arguments, "--state", str(appliance.state)]
+    with robot.host.popen(
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env=os.environ | {"NO_COLOR": "1"},
+    ) as done:
+        text, _ = done.communicate(timeout=2 * LIMIT)
+    assert not check or done.returncode == 0, f"{text}\n{appliance.story()}"
+    return str(text)
+
+
+def crash(appliance: Appliance) -> None:
+    """Kill the supervisor; its processes die with it."""
+    assert appliance.process is not None
+    appliance.process.kill()
+    appliance.process.stop()
+
+
+def until_taken(robot: Robot, appliance: Appliance) -> None:
+    def taken() -> bool:
+        return bool(json.loads(rosrv(robot, appliance, "adopt", "--status", "--json"))["phase"] == "taken")
+
+    eventually(taken, appliance.story)
+
+
+@pytest.mark.nightly
+def test_cycles_of_adopt_and_release_restart_nothing_and_lose_little(
+    robot: Robot, appliance: Appliance
+) -> None:
+    graph, parameters, lives = robot.graph(), robot.parameters(), robot.lives()
+    robot.hears()
+    checked = rosrv(robot, appliance, "adopt", "--check")
+    assert "stop" not in checked
+    assert robot.graph() == graph, "the check registers nothing"
+    assert "noted" in rosrv(robot, appliance, "adopt")
+    appliance.start()
+    until_taken(robot, appliance)
+    for cycle in range(CYCLES):
+        robot.hears()
+        assert robot.graph() == graph
+        print(cycle, rosrv(robot, appliance, "release").splitlines()[0])  # noqa: T201  shown by pytest -s
+        assert robot.graph() == graph
+        assert robot.parameters() == parameters
+        robot.hears()
+        if cycle + 1 < CYCLES:
+            print(cycle, rosrv(robot, appliance, "adopt").splitlines()[0])  # noqa: T201  shown by pytest -s
+    assert robot.lives() == lives
+    losses, calls = robot.losses(), robot.calls()
+    print(losses, calls)  # noqa: T201  shown by pytest -s
+    for name, (lost, longest, _twice) in losses.items():
+        if name.startswith("rospy"):
+            assert lost == 0, name
+        assert longest <= _RATE // 2, name
+    for name, (good, bad) in calls.items():
+        assert good > 100
+        assert bad <= (2 * CYCLES if name.endswith("persistent") else 0), name
+
+
+@pytest.mark.nightly
+def test_an_ordered_stop_gives_the_graph_back_and_a_crash_does_not(
+    robot: Robot, appliance: Appliance
+) -> None:
+    graph, lives = robot.graph(), robot.lives()
+    rosrv(robot, appliance, "adopt")
+    appliance.start()
+    until_taken(robot, appliance)
+    appliance.stop()
+    assert robot.graph() == graph
+    robot.hears()
+    appliance.start()
+    until_taken(robot, appliance)
+    crash(appliance)
+    with pytest.raises(OSError, match=r"refused|timed out|reset"):
+        robot.graph()
+    appliance.start()
+    until_taken(robot, appliance)
+    robot.hears()
+    assert robot.graph() == graph
+    crash(appliance)
+    assert "released" in rosrv(robot, appliance, "release", "--dead")
+    assert robot.graph() == graph
+    robot.hears()
+    assert robot.lives() == lives

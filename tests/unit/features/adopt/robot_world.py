@@ -1,0 +1,277 @@
+"""A robot of scripted nodes with a scripted master, beside RVMaster's own parts: no socket, no clock.
+
+A `KilledError` ends an operation after a step, as a kill of control does: the registry stays, because control stores
+it; all that the operation knew is lost.
+"""
+
+import ipaddress
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import msgspec
+
+from appliance.features.adopt.adopt_record import AdoptRecord, Phase
+from appliance.features.adopt.graph_side import AdoptedGraph
+from appliance.features.adopt.machine_facts import MachineFacts, RobotMaster
+from appliance.features.adopt.takeover import AdoptError, AdoptOperation
+from appliance.policy.model import Address
+from appliance.rpc.master_reader import Entry, MasterCall, MasterGraph, MasterReadError
+from appliance.rpc.xmlrpc_client import CallFailedError
+from roswire.errors import EncodingError
+from roswire.uris import NodeUri
+from roswire.xmlrpc import Value
+from tests.support.control_parts import ControlParts, Told
+
+LINK = "10.111.0.1"
+_KINDS = {"Publisher": "publication", "Subscriber": "subscription", "Service": "service"}
+
+
+class KilledError(BaseException):
+    """Control was killed."""
+
+
+@dataclass
+class RobotNode:
+    name: str
+    uri: str
+    port: int
+    publishes: tuple[str, ...] = ()
+    subscribes: tuple[str, ...] = ()
+    services: tuple[str, ...] = ()
+    alive: bool = True
+    lists: dict[str, list[str]] = field(default_factory=dict)
+    """The last list of publishers of each topic."""
+
+    def entries(self) -> set[Entry]:
+        return {
+            *(("publication", topic, self.name) for topic in self.publishes),
+            *(("subscription", topic, self.name) for topic in self.subscribes),
+            *(("service", service, self.name) for service in self.services),
+        }
+
+
+class ScriptedReader:
+    """The robot's own master. `before` is called before each reading and each written call."""
+
+    def __init__(self) -> None:
+        self.entries: set[Entry] = set()
+        self.nodes: dict[str, str] = {}
+        self.services: dict[str, str] = {}
+        self.tree: dict[str, Value] = {"run_id": "robot", "speed": 1.5}
+        self.shutdowns: list[str] = []
+        self.before: Callable[[], None] = lambda: None
+        self.alive = True
+
+    def _require(self) -> None:
+        self.before()
+        if not self.alive:
+            raise MasterReadError("nobody answers")
+
+    async def read(self) -> MasterGraph:
+        self._require()
+        types = {topic: "std_msgs/String" for kind, topic, _name in self.entries if kind != "service"}
+        nodes = {
+            name: uri for name, uri in self.nodes.items() if any(entry[2] == name for entry in self.entries)
+        }
+        return MasterGraph(frozenset(self.entries), types, nodes, dict(self.services))
+
+    async def parameters(self) -> dict[str, Value]:
+        self._require()
+        return dict(self.tree)
+
+    async def ask_all(self, calls: list[MasterCall]) -> list[Value]:
+        self._require()
+        return [self.carry_out(*call) for call in calls]
+
+    def carry_out(self, method: str, name: str, params: tuple[Value, ...]) -> Value:
+        """Change the graph as `rosmaster` does."""
+        if method == "setParam":
+            self.tree[str(params[0])[1:]] = params[1]
+        elif method == "deleteParam":
+            self.tree.pop(str(params[0])[1:], None)
+        else:
+            begins = "unregister" if method.startswith("unregister") else "register"
+            kind = _KINDS[method.removeprefix(begins)]
+            entry = kind, str(params[0]), name
+            if begins == "unregister":
+                self.entries.discard(entry)
+                return 1
+            uri = str(params[-1])
+            if name in self.nodes and self.nodes[name] != uri and any(one[2] == name for one in self.entries):
+                self.shutdowns.append(self.nodes[name])
+            self.entries.add(entry)
+            self.nodes[name] = uri
+            if kind == "service":
+                self.services[str(params[0])] = str(params[1])
+        return 1
+
+
+class RobotWorld:
+    def __init__(self, parts: ControlParts) -> None:
+        self.parts = parts
+        self.master = ScriptedReader()
+        self.robot: dict[str, RobotNode] = {}
+        self.record = AdoptRecord(
+            wanted=True, program="/usr/bin/rosmaster", user="robot", unit="roscore.service"
+        )
+        self.holder: RobotMaster | None = RobotMaster(7, "/usr/bin/rosmaster", "robot", "roscore.service")
+        self.resolved: dict[str, list[str]] = {}
+        self.forwarded = self.silent = False
+        self.cuts: list[set[int]] = []
+        self.steps: list[str] = []
+        self.killed_after = ""
+        self.told_while_silent: list[str] = []
+        self.began: list[str] = []  # the order of registrations at RVMaster
+        self.limit = ""
+        self.left = False
+        self.begin()
+
+    def begin(self) -> None:
+        """Start control: only the registry, the record and the memory of adopted nodes are as before."""
+        self.silent = False
+        parts = self.parts
+        records: Any = parts.records
+        master: Any = self.master
+        world: Any = self
+        self.graph = AdoptedGraph(
+            parts.registry,
+            parts.graph,
+            parts.subscribers,
+            records,
+            self._order,
+            parts.sinks.flush,
+        )
+        self.operation = AdoptOperation(
+            self._machine, lambda _facts: master, self.graph, world,
+            waiting=lambda: 0, silence=self._silence, speak=self._speak, call=self._call, passed=self._passed,
+        )  # fmt: skip
+
+    # --- the robot ---
+
+    def add(self, name: str, port: int, uri: str = "", **roles: Any) -> RobotNode:
+        node = self.robot[name] = RobotNode(name, uri or f"http://base:{port}/", port, **roles)
+        self.resolved.setdefault("base", ["127.0.1.1"])
+        self.register(node)
+        return node
+
+    def register(self, node: RobotNode) -> None:
+        self.master.entries |= node.entries()
+        self.master.nodes[node.name] = node.uri
+        self.master.services |= dict.fromkeys(node.services, f"rosrpc://base:{node.port + 1000}")
+
+    def truth(self) -> set[Entry]:
+        return {entry for node in self.robot.values() if node.alive for entry in node.entries()}
+
+    def adopted(self) -> set[Entry]:
+        return {entry for entry, _node in self.graph.held()}
+
+    # --- what the operation uses ---
+
+    def tree(self) -> Mapping[str, Value]:
+        return self.parts.parameters.tree
+
+    async def take(self, values: Mapping[str, Value]) -> list[str]:
+        for name, value in values.items():
+            if name != self.limit:
+                await self.parts.ask("setParam", "/rosrv", f"/{name}", value, host=LINK)
+        return [f"parameter /{self.limit}: too large"] if self.limit in values else []
+
+    async def _order(self, host: Address, method: str, /, *params: Value) -> list[Value]:
+        self.began.append(method)
+        try:
+            answer: Any = await self.parts.ask(method, *params, host=str(host))
+            return list(answer)
+        except EncodingError as error:  # only the test's own body has a notation
+            return [-1, str(error), 0]
+
+    async def _machine(self, work: str, /, **terms: Any) -> dict[str, Any]:
+        match work:
+            case "look":
+                return dict(msgspec.to_builtins(self._facts(terms["ports"])))
+            case "phase":
+                self.record = msgspec.structs.replace(self.record, phase=Phase(terms["phase"]))
+            case "forward":
+                self.forwarded = True
+            case "cut":
+                self.cuts.append(set(terms["ports"]))
+                return {"master": 1, "nodes": len(terms["ports"])}
+            case "stand in":
+                if self.holder is None:
+                    self.holder = RobotMaster(8, "/usr/bin/rosmaster", "robot", "rosrv-left-master.service")
+                    self.record = msgspec.structs.replace(self.record, unit="rosrv-left-master.service")
+                    self.master.entries.clear()
+                    self.master.alive = True
+                    return {"started": True}
+            case "withdraw":
+                self.record = msgspec.structs.replace(self.record, phase=Phase.GIVING)
+                self.forwarded = False
+            case "leave":
+                self.left = True
+            case _:
+                raise AdoptError(work)
+        return {}
+
+    def _facts(self, ports: list[int]) -> MachineFacts:
+        alive = {node.port: node for node in self.robot.values() if node.alive}
+        return MachineFacts(
+            self.record, LINK, "10.111.0.2", own=["127.0.0.1", "192.168.50.1"], master=self.holder,
+            sockets={port: [port, port + 1000] for port in ports if port in alive}, resolved=self.resolved,
+        )  # fmt: skip
+
+    async def _call(self, uri: NodeUri, method: str, /, *params: Value) -> Value:
+        node = next((one for one in self.robot.values() if one.alive and one.port == uri.port), None)
+        if node is None or ipaddress.ip_address(uri.host).is_loopback:
+            raise CallFailedError(f"{uri.host}:{uri.port} refuses")
+        if method == "requestTopic":
+            return [1, "", ["TCPROS", "base", uri.port + 1000]]
+        if method == "publisherUpdate":
+            node.lists[str(params[0])] = _texts(params[1])
+        return [1, "", node.port]
+
+    async def _passed(self, step: str) -> None:
+        await self.parts.settle()
+        self._hear()
+        self.steps.append(step)
+        if step == self.killed_after:
+            self.killed_after = ""
+            raise KilledError
+
+    def _silence(self) -> None:
+        self._hear()
+        self.silent = True
+
+    def _speak(self) -> None:
+        self.silent = False
+
+    def _hear(self) -> None:
+        """Give the nodes the lists that control has sent; a silent control sends none."""
+        for seen in self.parts.seen:
+            if isinstance(seen, Told) and seen.call.method == "publisherUpdate" and not self.silent:
+                node = self.robot.get(seen.node.name)
+                if node is not None and node.alive:
+                    node.lists[str(seen.call.parameters[0])] = _texts(seen.call.parameters[1])
+        self.parts.seen.clear()
+
+    async def until_settled(self) -> None:
+        """Do as control does at its start, and each time after it was killed."""
+        settled = False
+        for _ in range(4):
+            try:
+                facts = await self.operation.facts()
+                await self.operation.settle(facts, settled=settled)
+                settled = True
+                if not self._is_owed():
+                    return
+            except KilledError:
+                self.begin()
+                settled = False
+        raise AssertionError("it does not settle")
+
+    def _is_owed(self) -> bool:
+        return (self.record.phase is Phase.TAKEN) != self.record.wanted
+
+
+def _texts(value: Value) -> list[str]:
+    assert isinstance(value, list)
+    return [str(text) for text in value]

@@ -1,0 +1,373 @@
+import asyncio
+from collections.abc import Callable, Coroutine
+from typing import Any
+
+import msgspec
+import pytest
+
+from appliance.features.adopt.adopt_record import Phase
+from appliance.features.adopt.machine_facts import RobotMaster
+from appliance.features.adopt.takeover import AdoptError
+from appliance.master.graph.registry import Kind
+from tests.support.control_parts import ControlParts
+from tests.unit.features.adopt.robot_world import LINK, KilledError, RobotWorld
+
+MANY = 10_000
+TAKE = ("read", "parameters", "register", "forward", "tell", "cut", "read again", "taken")
+GIVE = ("silence", "stand in", "give", "withdraw", "give again", "tell", "given", "forget", "released")
+
+
+def run(story: Callable[[RobotWorld], Coroutine[Any, Any, None]], *, nodes: bool = True) -> RobotWorld:
+    async def told() -> RobotWorld:
+        world = RobotWorld(await ControlParts.begun())
+        if nodes:
+            world.add(
+                "/base", 4001, publishes=("/odom", "/rosout"), subscribes=("/cmd_vel",), services=("/reset",)
+            )
+            world.add("/teleop", 4002, publishes=("/cmd_vel", "/rosout"), subscribes=("/odom",))
+            world.add("/rviz", 4003, publishes=("/rosout",), subscribes=("/odom",))
+        await story(world)
+        return world
+
+    return asyncio.run(told())
+
+
+def require_taken(world: RobotWorld) -> None:
+    assert world.record.phase is Phase.TAKEN
+    assert world.forwarded
+    assert world.adopted() == world.truth()
+    assert {str(node.host) for node in world.graph.nodes()} == {LINK}
+    for node in world.robot.values():
+        for topic in node.subscribes:
+            assert node.lists[topic], f"{node.name} has no list of {topic}"
+            assert all("10.0.0.1" in uri for uri in node.lists[topic]), "the appliance's own address"
+
+
+def require_given(world: RobotWorld) -> None:
+    assert world.record.phase is Phase.FREE
+    assert not world.forwarded
+    assert world.graph.nodes() == []
+    assert world.master.entries == world.truth()
+    assert world.master.shutdowns == [], "no node gets a shutdown request"
+    for node in world.robot.values():
+        for topic in node.subscribes if node.alive else ():
+            expected = [one.uri for one in world.robot.values() if topic in one.publishes and one.alive]
+            assert sorted(node.lists[topic]) == sorted(expected), (
+                f"the last list of {node.name} is the master's own"
+            )
+
+
+async def adopt(world: RobotWorld) -> None:
+    await world.until_settled()
+
+
+async def adopt_and_release(world: RobotWorld) -> None:
+    await world.until_settled()
+    world.record = msgspec.structs.replace(world.record, wanted=False)
+    await world.until_settled()
+
+
+def test_a_running_graph_is_taken_over_and_given_back() -> None:
+    require_taken(run(adopt))
+    world = run(adopt_and_release)
+    require_given(world)
+    assert tuple(world.steps) == TAKE + GIVE
+
+
+def test_kills_in_the_middle_of_both_change_nothing_of_the_end() -> None:
+    async def story(world: RobotWorld) -> None:
+        world.killed_after = "cut"
+        await world.until_settled()
+        require_taken(world)
+        world.record = msgspec.structs.replace(world.record, wanted=False)
+        world.killed_after = "withdraw"
+        await world.until_settled()
+        require_given(world)
+
+    run(story)
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("step", TAKE)
+def test_a_kill_after_any_step_of_taking_ends_in_a_taken_graph(step: str) -> None:
+    async def story(world: RobotWorld) -> None:
+        world.killed_after = step
+        await world.until_settled()
+
+    require_taken(run(story))
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("step", TAKE)
+def test_a_kill_after_any_step_of_taking_can_be_released(step: str) -> None:
+    async def story(world: RobotWorld) -> None:
+        world.killed_after = step
+        with pytest.raises(KilledError):
+            await world.operation.take()
+        world.begin()
+        world.record = msgspec.structs.replace(world.record, wanted=False)
+        await world.until_settled()
+
+    world = run(story)
+    if step in {"read", "parameters", "register"}:  # the rules were never in force
+        assert not world.forwarded
+        assert world.master.entries == world.truth()
+    else:
+        require_given(world)
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("step", GIVE)
+@pytest.mark.parametrize("wanted", [False, True], ids=["release", "stop"])
+def test_a_kill_after_any_step_of_giving_back_ends_as_the_record_wants(step: str, wanted: bool) -> None:
+    async def story(world: RobotWorld) -> None:
+        await world.until_settled()
+        world.record = msgspec.structs.replace(world.record, wanted=wanted)
+        world.killed_after = step
+        with pytest.raises(KilledError):
+            await world.operation.give()
+        world.begin()
+        await world.until_settled()
+
+    world = run(story)
+    if wanted:
+        require_taken(world)
+    else:
+        require_given(world)
+
+
+def test_a_master_that_dies_while_it_is_read_leaves_the_robot_as_it_was() -> None:
+    async def story(world: RobotWorld) -> None:
+        world.master.alive = False
+        with pytest.raises(AdoptError, match="cannot be read"):
+            await world.operation.take()
+        assert not world.forwarded
+        assert world.cuts == []
+        world.master.alive = True
+        await world.until_settled()
+
+    require_taken(run(story))
+
+
+def test_a_master_that_dies_after_the_rules_came_does_not_open_them() -> None:
+    async def story(world: RobotWorld) -> None:
+        world.master.before = lambda: setattr(world.master, "alive", not world.forwarded)
+        with pytest.raises(AdoptError):
+            await world.operation.take()
+        assert world.forwarded
+        assert world.record.phase is Phase.TAKING
+
+    run(story)
+
+
+def test_a_node_that_starts_during_the_reading_is_taken_over() -> None:
+    async def story(world: RobotWorld) -> None:
+        def start() -> None:
+            if world.forwarded and "/late" not in world.robot:
+                world.add("/late", 4009, publishes=("/scan",), subscribes=("/odom",))
+
+        world.master.before = start
+        await world.until_settled()
+
+    world = run(story)
+    assert "/late" in world.robot
+    require_taken(world)
+
+
+def test_a_registration_that_ends_during_the_reading_is_forgotten() -> None:
+    async def story(world: RobotWorld) -> None:
+        def leave() -> None:
+            if world.forwarded and world.robot["/rviz"].subscribes:
+                world.robot["/rviz"].subscribes = ()
+                world.master.entries.discard(("subscription", "/odom", "/rviz"))
+
+        world.master.before = leave
+        await world.until_settled()
+
+    require_taken(run(story))
+
+
+def test_a_graph_that_never_rests_is_an_error_after_five_readings() -> None:
+    async def story(world: RobotWorld) -> None:
+        numbers = iter(range(100))
+        world.master.before = lambda: world.master.entries.add(("publication", f"/{next(numbers)}", "/base"))
+        with pytest.raises(AdoptError, match="still changes after 5"):
+            await world.operation.take()
+
+    run(story)
+
+
+def test_publishers_come_before_services_and_services_before_subscribers() -> None:
+    world = run(adopt)
+    order = ["registerPublisher", "registerService", "registerSubscriber"]
+    places = [order.index(method) for method in world.began if method in order]
+    assert places == sorted(places)
+    assert set(places) == {0, 1, 2}
+
+
+@pytest.mark.parametrize(
+    "uri", ["http://base:4001/", "http://192.168.50.1:4001/", "http://192.168.50.1:4001"]
+)
+def test_the_uri_of_a_node_stays_as_it_is(uri: str) -> None:
+    async def story(world: RobotWorld) -> None:
+        world.add("/node", 4001, uri=uri, publishes=("/odom",), subscribes=("/odom",))
+        await adopt_and_release(world)
+
+    world = run(story, nodes=False)
+    assert world.master.nodes == {"/node": uri}
+    require_given(world)
+
+
+def test_a_name_that_does_not_resolve_leaves_its_node_with_its_master() -> None:
+    async def story(world: RobotWorld) -> None:
+        world.add("/far", 4010, uri="http://nuc:4010/", publishes=("/scan",))
+        report = await world.operation.take()
+        assert "add it to /etc/hosts" in report.missing["/far"]
+        world.record = msgspec.structs.replace(world.record, wanted=False)
+        await world.until_settled()
+        assert ("publication", "/scan", "/far") in world.master.entries, "and it is never unregistered there"
+
+    run(story)
+
+
+def test_hostile_names_and_uris_cost_their_own_rows_only() -> None:
+    async def story(world: RobotWorld) -> None:
+        for number, uri in enumerate(
+            ["", "http://base:99999/", "rosrpc://base:1", "http://a\x00b:1/", "x" * 9000]
+        ):
+            world.master.nodes[f"/bad{number}"] = uri
+            world.master.entries.add(("publication", f"/bad{number}", f"/bad{number}"))
+        for name in ("/a b", "/\x1b[31m", "bad//", "/base\n", "~"):
+            world.master.nodes[name] = world.robot["/base"].uri
+            world.master.entries.add(("publication", name, name))
+            world.master.entries.add(("publication", name, "/base"))
+        report = await world.operation.take()
+        assert {f"/bad{number}" for number in range(1, 5)} <= report.missing.keys()
+        assert world.truth() <= world.adopted()
+        assert all(text.isprintable() for text in report.denied.values())
+
+    run(story)
+
+
+@pytest.mark.nightly
+def test_ten_thousand_registrations_are_taken_over() -> None:
+    async def story(world: RobotWorld) -> None:
+        world.add("/many", 4004, publishes=tuple(f"/t{number}" for number in range(MANY)))
+        report = await world.operation.take()
+        assert report.registrations == MANY
+
+    run(story, nodes=False)
+
+
+def test_a_denied_registration_is_reported_and_stays_with_the_own_master() -> None:
+    async def story(world: RobotWorld) -> None:
+        world.parts.reload(
+            "[Nodes]\ndefault=*\n[Publishers]\n/cmd_vel = 10.9.9.9\ndefault=*\n[Subscribers]\ndefault=*\n"
+            "[Commands]\ndefault=*\n"
+        )
+        report = await world.operation.take()
+        assert list(report.denied) == ["publication /cmd_vel /teleop"]
+        assert ("publication", "/cmd_vel", "/teleop") not in world.adopted()
+        world.record = msgspec.structs.replace(world.record, wanted=False)
+        await world.until_settled()
+        assert world.master.entries == world.truth()
+
+    run(story)
+
+
+def test_the_rosout_of_the_robot_is_skipped_silently() -> None:
+    async def story(world: RobotWorld) -> None:
+        world.add("/rosout", 4005, publishes=("/rosout_agg",), subscribes=("/rosout",))
+        report = await world.operation.take()
+        assert report.denied == {}
+        assert report.missing == {}
+        world.record = msgspec.structs.replace(world.record, wanted=False)
+        await world.until_settled()
+        assert world.master.entries == world.truth()
+
+    run(story)
+
+
+def test_another_master_than_the_recorded_one_is_refused() -> None:
+    async def story(world: RobotWorld) -> None:
+        world.holder = RobotMaster(9, "/tmp/rosmaster", "nobody")
+        with pytest.raises(AdoptError, match="is not the recorded master"):
+            await world.operation.take()
+        assert not world.forwarded
+        assert world.began == []
+
+    run(story)
+
+
+def test_each_change_of_a_parameter_reaches_every_adopted_node() -> None:
+    async def story(world: RobotWorld) -> None:
+        await world.until_settled()
+        assert world.tree()["speed"] == 1.5
+        world.parts.seen.clear()
+        world.parts.deliveries.told.clear()
+        await world.parts.ask("setParam", "/tool", "/limit", {"speed": 9.9}, host=LINK)
+        told = {
+            (name, params[0])
+            for name, method, params in world.parts.deliveries.told
+            if method == "paramUpdate"
+        }
+        assert told == {(name, key) for name in world.robot for key in ("/limit/", "/limit/speed/")}
+
+    run(story)
+
+
+def test_only_ports_of_the_nodes_own_processes_are_cut() -> None:
+    async def story(world: RobotWorld) -> None:
+        world.master.services["/reset"] = "rosrpc://base:22"
+        await world.until_settled()
+
+    assert run(story).cuts[0] == {5001, 5002, 5003}
+
+
+def test_a_robot_without_a_master_gets_one_with_its_whole_graph() -> None:
+    async def story(world: RobotWorld) -> None:
+        await world.until_settled()
+        world.holder = None  # robot_upstart's master ended with its launch
+        world.record = msgspec.structs.replace(world.record, wanted=False)
+        await world.until_settled()
+
+    require_given(run(story))
+
+
+def test_a_node_that_was_restarted_under_the_rules_is_given_back_with_its_new_uri() -> None:
+    async def story(world: RobotWorld) -> None:
+        await world.until_settled()
+        node = world.robot["/teleop"]
+        node.uri, node.port = "http://base:4022/", 4022
+        for topic in node.publishes:
+            await world.parts.ask(
+                "registerPublisher", node.name, topic, "std_msgs/String", node.uri, host=LINK
+            )
+        for topic in node.subscribes:
+            await world.parts.ask(
+                "registerSubscriber", node.name, topic, "std_msgs/String", node.uri, host=LINK
+            )
+        world.record = msgspec.structs.replace(world.record, wanted=False)
+        await world.until_settled()
+
+    require_given(run(story))
+
+
+def test_nothing_waits_for_a_master_that_is_not_there() -> None:
+    async def story(world: RobotWorld) -> None:
+        world.holder = None
+        await world.until_settled()
+        assert world.forwarded
+        assert world.record.phase is Phase.TAKEN
+        assert world.began == []
+
+    run(story)
+
+
+def test_a_name_held_by_the_appliance_is_never_taken() -> None:
+    async def story(world: RobotWorld) -> None:
+        await world.until_settled()
+        assert all(not node.own for node in world.graph.nodes())
+        assert not list(world.parts.registry.registered(Kind.PUBLICATION, "/rosout_agg"))
+
+    run(story)
