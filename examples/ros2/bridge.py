@@ -6,7 +6,7 @@
     services: [{service: /brake, type: std_srvs/SetBool}]    # offered in ROS 2, called at the door
 
 The appliance decides each of them for the door: its rights, limits, guards and approvals apply, and its log names the
-door. What it refuses is logged here and published on /rosrv/refusals. If the door goes away, the bridge ends with
+door. Its refusals are logged here and published on /rosrv/refusals. If the door goes away, the bridge ends with
 status 1: let its supervisor start it again.
 """
 

@@ -38,9 +38,7 @@ def page(report: MachineReport, in_words: Callable[[str], str] = str) -> str:
         "Interfaces now, and what protects each", ("interface", "where", "commands", "protection"),
         [(row.name, row.where, row.commands, row.protection) for row in report.interfaces], report.live_reason,
     )  # fmt: skip
-    parts += section(
-        "Who may act on the machine now", (), [(row,) for row in report.rights], report.live_reason
-    )
+    parts += section("Rights on the machine now", (), [(row,) for row in report.rights], report.live_reason)
     parts += section(
         "Completeness of the log", ("time (UTC)", "event", "reason"),
         [(row.time_utc, row.event, row.reason) for row in report.gaps],
