@@ -5,7 +5,7 @@ A value stays until its monitor is removed, or until a new text no longer declar
 
 import math
 from collections.abc import Mapping
-from types import MappingProxyType
+from dataclasses import dataclass, field
 
 from appliance.channel.answers.monitor_answers import GivenState
 from appliance.channel.messages import GivenDeclared, GivenValue
@@ -13,16 +13,20 @@ from appliance.specifications.specification_files import CheckedSpecifications, 
 
 Given = Mapping[str, Mapping[str, GivenValue]]
 
-NO_VALUES: Given = MappingProxyType({})
-
 _TOPIC = "topic"
 
 
+@dataclass(frozen=True, slots=True)
 class Givens:
     """The values given to monitors; `said` has them by monitor and name. Topics belong to a revision's sources."""
 
-    def __init__(self) -> None:
-        self.said: dict[str, dict[str, GivenValue]] = {}
+    said: Given = field(default_factory=dict)
+
+    def giving(self, values: Given) -> "Givens":
+        """Return these values with others in addition to them, or in place of those with the same name."""
+        return Givens(
+            {**self.said, **{name: {**self.said.get(name, {}), **new} for name, new in values.items()}}
+        )
 
     def in_force(self, checked: CheckedSpecifications) -> dict[str, dict[str, GivenValue]]:
         found = {
@@ -43,12 +47,6 @@ class Givens:
             for name, value in values.items()
             if monitor in checked.monitors and name not in kept.get(monitor, {})
         ]
-
-    def enforce(self, checked: CheckedSpecifications) -> list[str]:
-        """Drop values that these specifications do not allow, and return their texts."""
-        dropped = self.dropped(checked)
-        self.said = self.in_force(checked)
-        return dropped
 
     def states(self, checked: CheckedSpecifications, monitor: str) -> list[GivenState]:
         said = self.said.get(monitor, {})

@@ -8,7 +8,7 @@ its actions depend on that, it holds its topics.
 
 import asyncio
 import itertools
-from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Literal, Protocol
 
@@ -18,16 +18,9 @@ from appliance.base.withdrawal import WithdrawnError, take_effect
 from appliance.channel import messages
 from appliance.channel.messages import Message
 from appliance.specifications.allocation import Allocation, AllocationPlan, Move, Resource
-from appliance.specifications.specification_files import (
-    CheckedSpecifications,
-    Sources,
-    SpecificationsRefusedError,
-)
+from appliance.specifications.in_force import InForce
+from appliance.specifications.specification_files import CheckedSpecifications, SpecificationsRefusedError
 from appliance.telemetry.audit_trail import AuditTrail
-
-SHADOW: Literal["shadow"] = "shadow"
-Switch = bool | Literal["shadow"]
-"""Whether a monitor's actions take effect; in shadow mode they are only reported."""
 
 _RELAY_SECONDS = 15.0
 _TRIES = 5  # attempts, because affected nodes may come and go during each
@@ -53,16 +46,6 @@ class Relays(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class Revision:
-    """Specifications in force, or about to be."""
-
-    number: int = 0
-    sources: Sources = field(default_factory=Sources)
-    checked: CheckedSpecifications = field(default_factory=CheckedSpecifications)
-    shadows: frozenset[str] = frozenset()
-
-
-@dataclass(frozen=True, slots=True)
 class InheritedState:
     """The states that the other appliance's relays `left`, and why others are `lost`.
 
@@ -85,18 +68,16 @@ class Rollout:
     allocation: Allocation
     trail: AuditTrail
     on_fault: Literal["drop", "pass"]
-    states: Callable[[CheckedSpecifications], Mapping[str, Switch]]
     relays: Relays
     slices: int
     parts: Parts
-    given: Callable[[CheckedSpecifications], Mapping[str, dict[str, messages.GivenValue]]] = lambda _: {}
     rows: dict[str, messages.MonitorRow] = field(default_factory=dict)
-    _now: Revision = field(default_factory=Revision)
+    _now: InForce = field(default_factory=InForce)
     # The relays' parts of the specifications in force, and of specifications being tried.
     compiled_parts: dict[tuple[bytes, messages.PartNames], bytes] = field(default_factory=dict)
     _known: set[int] = field(default_factory=set)  # relays that have had specifications
     _fresh: set[int] = field(default_factory=set)  # relays that have not answered since they connected
-    _coming: tuple[Revision, AllocationPlan] | None = None  # the specifications being tried
+    _coming: tuple[InForce, AllocationPlan] | None = None  # the specifications being tried
     # Answers awaited from relays that gave something up.
     _answers: dict[int, asyncio.Future[list[str]]] = field(default_factory=dict)
     # Answers by relay and statement.
@@ -125,7 +106,7 @@ class Rollout:
     def why_held(self) -> dict[str, str]:
         return {name: why for names in self._held.values() for name, why in names.items()}
 
-    async def start(self, now: Revision, *, restarted: bool, kept: str) -> None:
+    async def start(self, now: InForce, *, restarted: bool, kept: str) -> None:
         """Begin with these specifications; after a crash of control (`restarted`), relays keep theirs."""
         self._now = now
         if restarted:
@@ -134,6 +115,10 @@ class Rollout:
         # control may have died during a change after storing its allocation: adapt the allocation as little as possible
         self.allocation.adopt(self.allocation.plan(now.checked, carried))
         await self._make(now, self.allocation.of_file)
+
+    def adopt(self, now: InForce) -> None:
+        """Let later statements be of this value, which differs only by what the relays got in messages of its own."""
+        self._now = now
 
     async def leave(self, seconds: float) -> list[bytes]:
         """Make all relays drop all messages. Raises `ConnectionError`, `TimeoutError`."""
@@ -197,7 +182,7 @@ class Rollout:
     def began(self, names: Iterable[str]) -> list[str]:
         return [name for name in names if name in self._began]
 
-    async def take(self, coming: Revision) -> list[str]:
+    async def take(self, coming: InForce) -> list[str]:
         """Roll out specifications; return the monitors that began again because they moved.
 
         After a `SpecificationsRefusedError`, nothing has changed.
@@ -227,7 +212,7 @@ class Rollout:
                 self._refusals[relay] = [_SILENT]
                 self._stop_waiting(relay)
 
-    async def _try(self, coming: Revision, plan: AllocationPlan) -> None:
+    async def _try(self, coming: InForce, plan: AllocationPlan) -> None:
         await self._make(coming, _of(plan))
         try:
             take_effect()  # from here on, relays that give nothing up use the new specifications
@@ -269,7 +254,7 @@ class Rollout:
             return [f"{_SILENT}; try again"]
         return [finding for findings in said for finding in findings]
 
-    def _settle(self, coming: Revision, plan: AllocationPlan) -> list[str]:
+    def _settle(self, coming: InForce, plan: AllocationPlan) -> list[str]:
         """Adopt a plan without `await`, so that no message of a relay is processed in between."""
         self._now = coming
         self.relays.withdraw(plan.moves)
@@ -314,7 +299,7 @@ class Rollout:
         for relay in range(self.allocation.relays):
             self.relays.send(self._statement(self._now, relay, self.allocation.of_file), relay)
 
-    async def _make(self, revision: Revision, of_file: Callable[[str], int]) -> None:
+    async def _make(self, revision: InForce, of_file: Callable[[str], int]) -> None:
         compiled = revision.checked.compiled
         wanted = parts_wanted(revision, self.allocation.relays, of_file)
         missing = [names for names in wanted if (compiled, names) not in self.compiled_parts]
@@ -331,7 +316,7 @@ class Rollout:
 
     def _statement(
         self,
-        revision: Revision,
+        revision: InForce,
         relay: int,
         of_file: Callable[[str], int],
         moved: frozenset[str] = frozenset(),
@@ -339,9 +324,9 @@ class Rollout:
         restarted: bool = False,
         ahead: bool = False,
     ) -> messages.SpecificationsStated:
-        states, files = self.states(revision.checked), revision.checked.monitors
+        states, files = revision.states, revision.checked.monitors
         inherited = self._inherited if relay in self._heirs else InheritedState()
-        names = _names(revision, relay, of_file)
+        names, given = _names(revision, relay, of_file), revision.givens.in_force(revision.checked)
         return messages.SpecificationsStated(
             revision.number,
             self.compiled_parts[revision.checked.compiled, names] if names.monitors else b"",
@@ -357,7 +342,7 @@ class Rollout:
             inherited.left,
             inherited.at,
             {name: why for name, why in revision.checked.unbuilt.items() if name in names.monitors},
-            {name: values for name, values in self.given(revision.checked).items() if name in names.monitors},
+            {name: values for name, values in given.items() if name in names.monitors},
         )
 
     # --- messages of the relays ---
@@ -438,13 +423,13 @@ class Rollout:
             waiting.set_result(findings)
 
 
-def _names(revision: Revision, relay: int, of_file: Callable[[str], int]) -> messages.PartNames:
+def _names(revision: InForce, relay: int, of_file: Callable[[str], int]) -> messages.PartNames:
     mine = tuple(name for name, file in revision.checked.monitors.items() if of_file(file) == relay)
-    return messages.PartNames(mine, tuple(name for name in mine if name in revision.shadows))
+    return messages.PartNames(mine, tuple(filter(revision.switches.in_shadow, mine)))
 
 
 def parts_wanted(
-    revision: Revision, relays: int, of_file: Callable[[str], int] | None = None
+    revision: InForce, relays: int, of_file: Callable[[str], int] | None = None
 ) -> list[messages.PartNames]:
     """Return the parts of all relays; without `of_file`, those of a start on another appliance."""
     if of_file is None:

@@ -1,6 +1,6 @@
 """The specifications in force: load, switch, roll back, and answer operators.
 
-This file is long because each of its short methods changes the same state, one change at a time.
+What is in force is one immutable value (`in_force.py`), which each change replaces once all relays have its successor.
 
 1. The appliance never writes to the folder of specifications. Changes are revisions in the store; revisions and
    switches survive a restart.
@@ -15,9 +15,9 @@ import asyncio
 import datetime
 import json
 from collections.abc import Awaitable, Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, Literal, NamedTuple
 
 import msgspec
@@ -26,16 +26,18 @@ import structlog
 from appliance.audit.log.record import Severity
 from appliance.base import clock
 from appliance.base.actors import DISK, UNCONFIRMED
-from appliance.base.withdrawal import WithdrawnError, take_effect
+from appliance.base.withdrawal import take_effect
 from appliance.channel import admin, messages
 from appliance.channel.answers import monitor_answers as answers
 from appliance.channel.answers.monitor_answers import Replacement, Switched
 from appliance.signing.fingerprints import fingerprint, fingerprint_of_all
+from appliance.specifications import in_force
 from appliance.specifications.allocation import Allocation
-from appliance.specifications.givens import NO_VALUES, Given, Givens, parsed, require_topics, split, with_unit
+from appliance.specifications.givens import Givens, parsed, split, with_unit
+from appliance.specifications.in_force import InForce, Wanted, unknown_monitors
 from appliance.specifications.live_topics import Published, TopicFindings, judge_holds, judge_topics
 from appliance.specifications.records import MonitorRecords
-from appliance.specifications.rollout import SHADOW, Parts, Relays, Revision, Rollout, Switch
+from appliance.specifications.rollout import Parts, Relays, Rollout
 from appliance.specifications.specification_files import (
     CheckedSpecifications,
     Sources,
@@ -53,9 +55,8 @@ from appliance.specifications.specification_revisions import (
     specifications_at_start,
     text_of,
     text_with_warnings,
-    unknown_monitors,
 )
-from appliance.specifications.switches import SWITCHES, Switches, require_whole
+from appliance.specifications.switches import SHADOW, SWITCHES, Switch, Switches
 from appliance.specifications.timed_switches import LONGEST, TimedSwitches
 from appliance.store.ends import EndKind, EndTable
 from appliance.store.revisions import Revisions, reloaded_by
@@ -108,8 +109,27 @@ class _Consent(NamedTuple):
     hold: bool = False
 
 
+_NO_CONSENT = _Consent()
 _ALL = _Consent(force=True, hold=True)
 """The consent of a rollback, which must never fail."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Order:
+    """Who orders a change, and how.
+
+    `within` is the time in which it must be confirmed. `author` is the author of the revision, unless it is `who`.
+    `kept` are files that are not in the folder, `loaded` those that the operator named.
+    """
+
+    who: str
+    note: str
+    within: float | None = None
+    consent: _Consent = _NO_CONSENT
+    author: str = ""
+    kept: Sequence[str] = ()
+    loaded: Collection[str] = ()
+    warnings: Sequence[str] = ()
 
 
 class SpecificationManager(Revisions[MonitorRevisionRow]):
@@ -157,17 +177,10 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         self._try_out = try_out
         self._live = live
         self._trail = trail
-        self.switches = Switches(enable)
-        self.givens = Givens()
-        self.rollout = Rollout(
-            allocation, trail, on_fault, self.switches.states_of, relays, slices=slices, parts=parts,
-            given=self.givens.in_force,
-        )  # fmt: skip
-        self._acts = 0  # number of all switches and resumptions so far
+        self.now = InForce(switches=Switches(enable))
+        self.rollout = Rollout(allocation, trail, on_fault, relays, slices=slices, parts=parts)
         self._attempting: set[str] = set()  # clients with a dry run under way
         self.returns = TimedSwitches(store, ends, self._come_back)
-        self.sources = Sources()
-        self.checked = CheckedSpecifications()
         self.records = MonitorRecords(
             trail,
             lambda topic, data: self.checked.fields(topic, data),  # noqa: PLW0108 - of whatever is in force then
@@ -186,10 +199,13 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         force. At the start of the appliance, they are the folder's, unless an operator's own revision was in force.
         """
         settings = self.store.settings()
-        self.switches.restore(settings.get(SWITCHES, "{}"))
-        self.givens.said = json.loads(settings.get(_GIVEN, "{}"))
+        said = InForce(
+            switches=self.switches.saying(json.loads(settings.get(SWITCHES, "{}"))),
+            givens=Givens(json.loads(settings.get(_GIVEN, "{}"))),
+            acts=int(settings.get(_ACTS, "0")),
+        )
+        self.now = said
         self.records.start(settings.get(_STOPS, "[]"))
-        self._acts = int(settings.get(_ACTS, "0"))
         last = self.in_force if self._find_last(restarted=restarted or taken_over) else None
         named = () if restarted else self.switches.named
         sources, checked, refused = await specifications_at_start(
@@ -200,17 +216,17 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             named=named,
             kept=self.in_force if self.revision else None,
         )
+        new = replace(said, number=self.revision, sources=sources, checked=checked)
         if last is not None or (self.revision and sources_of(self.in_force) == sources):
-            self._enforce(sources, checked)
+            self._enforce(new)
             self._keep_warnings()
         else:
             self._end_limit()
             if sources.files or self.revision:
-                self._keep(sources, checked, who=DISK, note="read at start")
+                self._keep(said, replace(new, number=self.revision + 1), _Order(DISK, "read at start"))
             else:
-                self._enforce(sources, checked)
-        now = self._revision(self.revision, self.sources, self.checked)
-        await self.rollout.start(now, restarted=restarted, kept=settings.get(ALLOCATION, ""))
+                self._enforce(new)
+        await self.rollout.start(self.now, restarted=restarted, kept=settings.get(ALLOCATION, ""))
         if refused:
             self._say_folder_refused(refused)
         for name, error in checked.unbuilt.items():
@@ -225,8 +241,24 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
     # --- queries ---
 
     @property
+    def sources(self) -> Sources:
+        return self.now.sources
+
+    @property
+    def checked(self) -> CheckedSpecifications:
+        return self.now.checked
+
+    @property
+    def switches(self) -> Switches:
+        return self.now.switches
+
+    @property
+    def givens(self) -> Givens:
+        return self.now.givens
+
+    @property
     def tag(self) -> str:
-        return f"{self.revision}.{self._acts}"
+        return self.now.tag
 
     @property
     def differs_from_folder(self) -> bool:
@@ -269,28 +301,19 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             topics, constants = split(request.given)
             new = Sources(request.files, request.definitions, request.signatures, topics)
             sources = self.sources.with_files(new)
-            shadow = frozenset(new.files) if request.shadow else frozenset()
-            asks = shadow or request.given or new.files.keys() & self._broken().keys()
+            asks = request.shadow or request.given or new.files.keys() & self._broken().keys()
             if self.in_force.who != DISK and sources == self.sources and not asks:
                 return self._replaced(
                     self.revision, _NO_FILES, loaded=new.files
                 )  # same texts: no new revision
-            note, within = request.note or "loaded", request.confirm_within
-            how = _Consent(request.force, request.hold)
-            return await self._change(
-                sources,
-                who,
-                who,
-                note,
-                within,
-                check=partial(self._beside_broken, self._check, loaded=new.files),
-                loaded=new.files,
-                shadow=shadow,
-                enable=frozenset(new.files) if enable else (),
-                consent=how,
-                topics=topics,
-                constants=constants,
-            )
+            files = frozenset(new.files)
+            shadow, enabled = files if request.shadow else (), files if enable else ()
+            order = _Order(
+                who, request.note or "loaded", request.confirm_within, _Consent(request.force, request.hold),
+                loaded=files,
+            )  # fmt: skip
+            check = partial(self._beside_broken, self._check, loaded=files)
+            return await self._change(Wanted(sources, shadow, enabled, topics, constants), check, order)
 
     async def attempt(self, request: admin.MonitorTry, who: str) -> answers.Tried:
         if who in self._attempting:
@@ -306,11 +329,14 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             new = Sources(request.files, request.definitions, request.signatures, topics)
             following = present.with_files(new)
             checked = await self._beside_broken(self._try_out, following, request.files)
-            self._check_given(topics, constants, checked)
+            in_force.constants_of(
+                Wanted(following, topics=topics, constants=constants), checked, signed=bool(self.site_keys)
+            )
         finally:
             self._attempting.discard(who)
-        shadow = self._in_shadow(checked, request.files if request.shadow else ())
-        warnings = self._judged(checked, shadow, _Consent(request.force, request.hold))
+        coming = replace(self.now, sources=following, checked=checked)
+        shadow = _in_shadow(coming, request.files if request.shadow else ())
+        warnings = self._judged(coming, shadow, _Consent(request.force, request.hold))
         files = following.difference(present)
         return answers.Tried(revision, tag, *files, [*checked.warnings, *warnings], [*checked.monitors])
 
@@ -342,19 +368,9 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             keeper = who if kept else DISK  # with `DISK`, the next start would read only the folder
             added, changed, _removed = sources.difference(self.sources)
             shadow = frozenset([*added, *changed]) if request.shadow else frozenset()
-            within, note = request.confirm_within, reloaded_by(who)
-            how = _Consent(request.force, request.hold)
-            return await self._change(
-                sources,
-                keeper,
-                who,
-                note,
-                within,
-                check=self._strictly,
-                kept=kept,
-                shadow=shadow,
-                consent=how,
-            )
+            consent = _Consent(request.force, request.hold)
+            order = _Order(who, reloaded_by(who), request.confirm_within, consent, author=keeper, kept=kept)
+            return await self._change(Wanted(sources, shadow), self._strictly, order)
 
     async def take_bundle(self, sources: Sources, who: str, note: str) -> Replacement:
         """Bring exactly these sources into force."""
@@ -362,16 +378,15 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             sources = sources.with_topics(self.sources.topics)
             if self.in_force.who != DISK and sources == self.sources:
                 return self._replaced(self.revision, _NO_FILES)  # same texts: no new revision
-            return await self._change(
-                sources, who, who, note, check=self._strictly, consent=_Consent(hold=True)
-            )
+            order = _Order(who, note, consent=_Consent(hold=True))
+            return await self._change(Wanted(sources), self._strictly, order)
 
     async def held_by_bundle(self, sources: Sources) -> list[str]:
         sources = sources.with_topics(self.sources.topics)
         if sources == self.sources:
             return []
-        checked = await self._strictly(sources)
-        return self._held(checked, self._in_shadow(checked), hold=False).conflicts
+        coming = replace(self.now, sources=sources, checked=await self._strictly(sources))
+        return self._held(coming, _in_shadow(coming), hold=False).conflicts
 
     async def remove(self, request: admin.MonitorRemove, who: str) -> Replacement:
         """Remove files, or the files of monitors, if no other monitor is in them or uses their variables."""
@@ -395,7 +410,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             if within is None and self._is_folder(sources):
                 keeper = DISK  # the baseline again, so the next start reads the folder
             check = partial(self._beside_broken, self._check)
-            return await self._change(sources, keeper, who, note, within, check=check, consent=_Consent())
+            return await self._change(Wanted(sources), check, _Order(who, note, within, author=keeper))
 
     async def roll_back(self, request: admin.MonitorRollback, who: str) -> Replacement:
         """Bring a revision into force again: None is the previous revision, 0 no specifications.
@@ -407,16 +422,8 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             note, last = f"rolled back to revision {row.revision}", kept_in(row)
             as_before = partial(self._as_at_start, known=last.warnings)
             check = as_before if who == UNCONFIRMED else self._strictly
-            return await self._change(
-                sources_of(row),
-                who,
-                who,
-                note,
-                check=check,
-                switches=last.switches,
-                given=last.given,
-                consent=_ALL,
-            )
+            wanted = Wanted(sources_of(row), switches=last.switches, given=last.given)
+            return await self._change(wanted, check, _Order(who, note, consent=_ALL))
 
     async def confirm(self, request: admin.MonitorConfirm, who: str) -> answers.MonitorsConfirmed:
         async with self._changing(request.expected):
@@ -473,7 +480,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         warnings = []
         if not request.shadow:
             others = set(self.switches.shadowed()) - set(request.names)
-            warnings = self._judged(self.checked, others, _Consent(request.force), promoted=request.names)
+            warnings = self._judged(self.now, others, _Consent(request.force), promoted=request.names)
         self._check_limit(request)
         return warnings
 
@@ -521,30 +528,24 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         ]
         if not changed:
             return changed
-        before, others = switches.said, dict.fromkeys(changed, to)
-        require_whole(switches.states | others, self.checked)
-        switched_shadow = to == SHADOW or any(map(switches.in_shadow, changed))
-        if not switched_shadow:
-            take_effect()  # otherwise the rollout decides when
-        await self._count()
-        switches.said = before | others
-        if switched_shadow:
-            try:
-                await self.rollout.take(self._revision(self.revision, self.sources, self.checked))
-            except (SpecificationsRefusedError, WithdrawnError):
-                switches.said = before
-                raise
-        # Killed between the two, control leaves a limit without its switch, never the reverse.
-        if seconds is None:
-            self.store.save_setting(SWITCHES, json.dumps(switches.said))
-            self.returns.end(changed)
-        else:
-            self.returns.begin({name: switches.states[name] or True for name in changed}, seconds, to)
-            self.store.save_setting(SWITCHES, json.dumps(switches.said))
+        new, shadow = (
+            in_force.switched(self.now, changed, to),
+            to == SHADOW or any(map(switches.in_shadow, changed)),
+        )
+        back = {name: switches.states[name] or True for name in changed}
+
+        def store() -> None:
+            # Killed between the two, control leaves a limit without its switch, never the reverse.
+            if seconds is None:
+                self._store_words(new)
+                self.returns.end(changed)
+            else:
+                self.returns.begin(back, seconds, to)
+                self._store_words(new)
+
+        told = [(name, messages.MonitorSwitched(name, to is True)) for name in changed]
+        await self._bring(new, store, tell=None if shadow else told)
         for name in changed:
-            switches.states[name] = to
-            if not switched_shadow:
-                self.rollout.tell(name, messages.MonitorSwitched(name, to is True))
             self._say_switched(name, to, who)
         await self.store.settled()
         await self.rollout.carried_out()
@@ -606,7 +607,8 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             ]  # fmt: skip
             take_effect()
             if held:
-                await self._count()
+                await self._count(self.now.acts + 1)
+                self.now = replace(self.now, acts=self.now.acts + 1)
             away = []
             for name in held:
                 if not self.rollout.tell(name, messages.MonitorResumed(name)):
@@ -634,12 +636,13 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             new = parsed(self.checked.givens.get(name, ()), name, request.values)
             changed = [one for one, value in new.items() if value != present[one]]
             if changed:
-                take_effect()
-                await self._count()
-                self.givens.said = {**self.givens.said, name: {**self.givens.said.get(name, {}), **new}}
-                self.store.save_setting(_GIVEN, json.dumps(self.givens.said))
-                values = self.givens.in_force(self.checked)[name]
-                self.rollout.tell(name, messages.MonitorGiven(name, values))
+                coming = in_force.given(self.now, name, new)
+                values = coming.givens.in_force(coming.checked)[name]
+                await self._bring(
+                    coming,
+                    partial(self._store_words, coming),
+                    tell=[(name, messages.MonitorGiven(name, values))],
+                )
                 self._say_given(name, {one: present[one] for one in changed}, who)
                 await self.store.settled()
                 await self.rollout.carried_out()
@@ -687,9 +690,6 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         found = self._folder.looked_at() if self.folder is not None else None
         return found is not None and found.with_topics(sources.topics) == sources
 
-    def _revision(self, number: int, sources: Sources, checked: CheckedSpecifications) -> Revision:
-        return Revision(number, sources, checked, self.switches.shadows_of(checked))
-
     async def _kept(self) -> list[MonitorRevisionRow]:
         await self.store.settled()
         return await super()._kept()
@@ -705,93 +705,72 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         if unknown:
             raise UnknownMonitorError(self._unknown(unknown))
 
-    async def _count(self) -> None:
+    async def _count(self, acts: int) -> None:
         """Store the new tag before it is used, so that no crash restores an old one."""
-        self.store.save_setting(_ACTS, str(self._acts + 1))
+        self.store.save_setting(_ACTS, str(acts))
         await self.store.settled()
-        self._acts += 1
 
     async def _go_back(self, revision: int) -> None:
         await self.roll_back(admin.MonitorRollback(revision), UNCONFIRMED)
 
-    async def _change(
+    async def _bring(
         self,
-        sources: Sources,
-        keeper: str,
-        who: str,
-        note: str,
-        confirm_within: float | None = None,
+        new: InForce,
+        store: Callable[[], None],
         *,
-        check: Callable[[Sources], Awaitable[CheckedSpecifications]],
-        kept: Sequence[str] = (),
-        loaded: Collection[str] = (),
-        switches: Mapping[str, Switch] = {},
-        given: Given = NO_VALUES,
-        shadow: Collection[str] = (),
-        enable: Collection[str] = (),
-        consent: _Consent,
-        topics: Mapping[str, Mapping[str, str]] = MappingProxyType({}),
-        constants: Given = NO_VALUES,
-    ) -> Replacement:
-        """Bring sources into force on all relays, or on none.
+        tell: Sequence[tuple[str, messages.Message]] | None = None,
+    ) -> list[str]:
+        """Bring the next value into force on all relays, or on none; return the monitors that began again elsewhere.
 
-        `kept` are files that are not in the folder, `loaded` those that the operator named. `switches`, `given`,
-        `shadow` and `enable` are for monitors that are not in force yet.
+        `store` stores it, and `tell` are messages for the relays of monitors. Without them, the value is rolled out.
+        An error before it is in force has changed nothing.
         """
-        before, previous, switched = self.revision, self.sources, self.switches.said
-        said = self.givens.said
-        self.switches.said = {
-            **{monitor: to for monitor, to in switches.items() if monitor not in self.checked.monitors},
-            **switched,
-        }
+        if tell is not None:
+            take_effect()  # otherwise the rollout decides when
+        if new.acts != self.now.acts:
+            await self._count(new.acts)
+        moved = await self.rollout.take(new) if tell is None else []
+        self.now = new
+        self.rollout.adopt(new)
+        store()
+        for name, message in tell or ():
+            self.rollout.tell(name, message)
+        return moved
+
+    async def _change(
+        self, wanted: Wanted, check: Callable[[Sources], Awaitable[CheckedSpecifications]], order: _Order
+    ) -> Replacement:
+        before = self.now
         try:
-            checked = await check(sources)
-            sources = sources.with_topics(sources.topics, checked.givens)
-            new = self._check_given(topics, constants, checked)
-            back = {name: dict(values) for name, values in given.items() if name not in self.checked.monitors}
-            self.givens.said = {**back, **said} | {name: {**said.get(name, {}), **new[name]} for name in new}
-            states, files = self.switches.states_of(checked), checked.monitors.items()
-            put: dict[str, Switch] = {name: SHADOW for name, file in files if file in shadow}
-            put |= {name: True for name, file in files if file in enable and states[name] is False}
-            in_force = {name: True for name in checked.monitors if self.switches.enabled(name)} | put
-            self.switches.said |= put
-            warnings = self._judged(checked, self._in_shadow(checked), consent) + self.givens.dropped(checked)
-            require_whole(self.switches.states_of(checked) | in_force, checked)
-            moved = await self.rollout.take(self._revision(before + 1, sources, checked))
-        except WithdrawnError:
-            self.switches.said, self.givens.said = switched, said
-            raise
+            checked = await check(wanted.sources)
+            new, put, given = in_force.loaded(before, wanted, checked, signed=bool(self.site_keys))
+            warnings = self._judged(new, _in_shadow(new), order.consent) + new.givens.dropped(checked)
+            kept = replace(order, warnings=warnings)
+            moved = await self._bring(
+                new, lambda: self._keep(before, new, kept, self.rollout.began(checked.monitors))
+            )
         except SpecificationsRefusedError as error:
-            self.switches.said, self.givens.said = switched, said
-            hint = [f"not of the folder, and kept: {', '.join(kept)} (prune removes them)"] if kept else []
+            others = ", ".join(order.kept)
+            hint = [f"not of the folder, and kept: {others} (prune removes them)"] if others else []
             findings = error.findings + hint
             self._trail.happened(
                 "specifications refused",
                 f"revision {self.revision} stays in force: {error.findings[0]}",
                 findings=findings[:100],
-                who=who,
+                who=order.who,
             )
             raise SpecificationsRefusedError(findings) from error
-        began = self.rollout.began(checked.monitors)
-        self._keep(
-            sources,
-            checked,
-            who=keeper,
-            note=note,
-            by=who,
-            within=confirm_within,
-            began=began,
-            warnings=warnings,
-        )
         for name, to in put.items():
-            self._say_switched(name, to, who, ", as it was loaded")
-        for name in new:
-            self._say_given(name, {one: said.get(name, {}).get(one, "the default") for one in new[name]}, who)
+            self._say_switched(name, to, order.who, ", as it was loaded")
+        for name in given:
+            said = before.givens.said.get(name, {})
+            self._say_given(name, {one: said.get(one, "the default") for one in given[name]}, order.who)
         await self.store.settled()
         await self.rollout.all_taken()
         self._published()
         began = self.rollout.began(checked.monitors)  # also on relays that took them only now
-        done = self._replaced(before, sources.difference(previous), moved, began, kept, loaded=loaded)
+        files = new.sources.difference(before.sources)
+        done = self._replaced(before.number, files, moved, began, order.kept, loaded=order.loaded)
         return msgspec.structs.replace(done, warnings=[*done.warnings, *warnings])
 
     async def _strictly(self, sources: Sources) -> CheckedSpecifications:
@@ -824,53 +803,29 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         warnings = [_idle(file) for file in errors if file in idle]
         return msgspec.structs.replace(checked, left_out=left_out, warnings=(*checked.warnings, *warnings))
 
-    def _check_given(
-        self, topics: Mapping[str, Mapping[str, str]], constants: Given, checked: CheckedSpecifications
-    ) -> dict[str, dict[str, messages.GivenValue]]:
-        require_topics(topics, checked)
-        if topics and self.site_keys:
-            text = "the site signs the topics of a text, so a load cannot replace them: sign a text with another topic"
-            raise SpecificationsRefusedError([text])
-        unknown = [name for name in constants if name not in checked.monitors]
-        if unknown:
-            raise SpecificationsRefusedError([unknown_monitors(unknown, checked)])
-        return {
-            name: parsed(checked.givens.get(name, ()), name, values) for name, values in constants.items()
-        }
-
-    def _in_shadow(self, checked: CheckedSpecifications, files: Collection[str] = ()) -> set[str]:
-        states = self.switches.states_of(checked)
-        return {name for name, file in checked.monitors.items() if states[name] == SHADOW or file in files}
-
     def _judged(
-        self,
-        coming: CheckedSpecifications,
-        shadow: Collection[str],
-        consent: _Consent,
-        *,
-        promoted: Collection[str] = (),
+        self, coming: InForce, shadow: Collection[str], consent: _Consent, *, promoted: Collection[str] = ()
     ) -> list[str]:
         cut = judge_topics(
-            coming, self.checked, self._live(), shadow=shadow, forced=consent.force, promoted=promoted
+            coming.checked, self.checked, self._live(), shadow=shadow, forced=consent.force, promoted=promoted
         )
         held = self._held(coming, shadow, hold=consent.hold)
         if cut.conflicts or held.conflicts:
             raise SpecificationsRefusedError([*cut.conflicts, *held.conflicts, *cut.warnings, *held.warnings])
         return cut.warnings + held.warnings
 
-    def _held(self, coming: CheckedSpecifications, shadow: Collection[str], *, hold: bool) -> TopicFindings:
-        states = self.switches.states_of(coming)
+    def _held(self, coming: InForce, shadow: Collection[str], *, hold: bool) -> TopicFindings:
         acting = {
             name
-            for name in coming.monitors
-            if self.switches.enabled(name) and states[name] and name not in shadow
+            for name, state in coming.states.items()
+            if self.switches.enabled(name) and state and name not in shadow
         }
         return judge_holds(
-            coming,
+            coming.checked,
             self.checked,
             self._live(),
             acting=acting - self.rollout.held,
-            moved=self.rollout.moved_files(coming),
+            moved=self.rollout.moved_files(coming.checked),
             hold=hold,
         )
 
@@ -898,43 +853,33 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             held={name: why for name, why in self.rollout.why_held.items() if name in states},
         )  # fmt: skip
 
-    def _keep(
-        self,
-        sources: Sources,
-        checked: CheckedSpecifications,
-        *,
-        who: str,
-        note: str,
-        by: str | None = None,
-        within: float | None = None,
-        began: Sequence[str] = (),
-        warnings: Sequence[str] = (),
-    ) -> None:
-        last, before = self.in_force, sources_of(self.in_force)
+    def _keep(self, earlier: InForce, new: InForce, order: _Order, began: Sequence[str] = ()) -> None:
+        """Store a revision, and its predecessor with its last switches."""
+        last, before, checked = self.in_force, sources_of(self.in_force), new.checked
         if last.revision:
             ended = StoredSpecifications(
                 before.files,
                 before.definitions,
                 before.signatures,
                 before.topics,
-                self.switches.said,
-                self.givens.said,
+                dict(earlier.switches.said),
+                {name: dict(values) for name, values in earlier.givens.said.items()},
                 kept_in(last).warnings,
             )
             self.store.save_monitor_revision(last._replace(sources=text_of(ended)))
-        text = text_with_warnings(sources, checked)
-        row = MonitorRevisionRow(last.revision + 1, text, clock.wall(), who, note)
-        self._put_in_force(row, within)
-        self._enforce(sources, checked)
-        added, changed, removed = sources.difference(before)
+        text = text_with_warnings(new.sources, checked)
+        row = MonitorRevisionRow(new.number, text, clock.wall(), order.author or order.who, order.note)
+        self._put_in_force(row, order.within)
+        self._enforce(new)
+        added, changed, removed = new.sources.difference(before)
         self._trail.happened(
             "specifications loaded",
-            f"revision {row.revision} of the specifications is in force: {note}",
+            f"revision {row.revision} of the specifications is in force: {order.note}",
             category="monitor",
             resource="",
-            who=by or who,
+            who=order.who,
             revision_of_specifications=row.revision,
-            sha256=fingerprint_of_all(sources.named()),
+            sha256=fingerprint_of_all(new.sources.named()),
             compiled_sha256=fingerprint(checked.compiled),
             monitors=list(checked.monitors),
             added=added,
@@ -943,7 +888,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             began=list(began),
             signed_by=checked.signed_by,
             certificates=checked.certificates,
-            warnings=[*checked.warnings, *warnings][:MOST_WARNINGS],
+            warnings=[*checked.warnings, *order.warnings][:MOST_WARNINGS],
         )
 
     def _keep_warnings(self) -> None:
@@ -953,12 +898,13 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             self.in_force = self.in_force._replace(sources=text)
             self.store.save_monitor_revision(self.in_force)
 
-    def _enforce(self, sources: Sources, checked: CheckedSpecifications) -> None:
-        self.sources, self.checked = sources, checked
-        for name in self.switches.enforce(checked):
+    def _enforce(self, new: InForce) -> None:
+        self.now, drawn_in, dropped = in_force.cleared(new)
+        self.rollout.adopt(self.now)
+        for name in drawn_in:
             self._say_switched(name, SHADOW, self.in_force.who, ": it shares variables with one that is")
         self.returns.keep(self.switches.states)
-        for text in self.givens.enforce(checked):
+        for text in dropped:
             self._trail.happened(
                 "monitor set",
                 text,
@@ -967,8 +913,16 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
                 resource="",
                 who=self.in_force.who,
             )
-        self.store.save_setting(SWITCHES, json.dumps(self.switches.said))
-        self.store.save_setting(_GIVEN, json.dumps(self.givens.said))
+        self._store_words(self.now)
+
+    def _store_words(self, now: InForce) -> None:
+        self.store.save_setting(SWITCHES, json.dumps(dict(now.switches.said)))
+        self.store.save_setting(_GIVEN, json.dumps(dict(now.givens.said)))
+
+
+def _in_shadow(coming: InForce, files: Collection[str] = ()) -> set[str]:
+    found = coming.checked.monitors.items()
+    return {name for name, file in found if coming.states[name] == SHADOW or file in files}
 
 
 def _idle(file: str) -> str:

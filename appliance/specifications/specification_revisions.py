@@ -8,13 +8,14 @@ import msgspec
 
 from appliance.base.actors import DISK
 from appliance.channel.messages import GivenValue
-from appliance.specifications.rollout import Switch
+from appliance.specifications.in_force import unknown_monitors
 from appliance.specifications.specification_files import (
     CheckedSpecifications,
     Sources,
     SpecificationFolder,
     SpecificationsRefusedError,
 )
+from appliance.specifications.switches import Switch
 from appliance.store.state_file import MonitorRevisionRow, StateStore
 
 Check = Callable[[Sources, Sequence[str], Sequence[str] | None], Awaitable[CheckedSpecifications]]
@@ -133,11 +134,6 @@ def _without_unusable(
     present = sources.named()
     unusable = {name: error for name, error in errors.items() if name not in present}
     return msgspec.structs.replace(checked, left_out={**unusable, **checked.left_out})
-
-
-def unknown_monitors(names: Sequence[str], checked: CheckedSpecifications) -> str:
-    known = ", ".join(checked.monitors) or "none is loaded"
-    return f"no monitor is named {', '.join(names)}; there are: {known}"
 
 
 async def _check_kept(

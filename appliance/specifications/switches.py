@@ -1,31 +1,46 @@
-"""Track which monitors are enabled, disabled or in shadow mode (`SHADOW`). No I/O.
+"""The switches of monitors: enabled, disabled, or in shadow mode (`SHADOW`). No I/O.
 
 `--enable` applies to monitors that no operator has switched. Monitors that share variables are in shadow mode
 together.
 """
 
-import json
 from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Literal
 
-from appliance.specifications.rollout import SHADOW, Switch
 from appliance.specifications.specification_files import CheckedSpecifications, SpecificationsRefusedError
 
+SHADOW: Literal["shadow"] = "shadow"
+Switch = bool | Literal["shadow"]
+"""Whether a monitor's actions take effect; in shadow mode they are only reported."""
+
 SWITCHES = "monitor switches"
+_WORDS = frozenset({"all", "none", "shadow"})
 
 
+@dataclass(frozen=True, slots=True)
 class Switches:
-    """The states of monitors; `said` has the switches of operators, `enable` is the start option."""
+    """The states of monitors in force; `said` has the switches of operators, `enable` is the start option."""
 
-    def __init__(self, enable: str) -> None:
-        self.starts_in_shadow = enable == "shadow"
-        self._all: Switch = SHADOW if self.starts_in_shadow else enable == "all"
-        words = {"all", "none", "shadow"}
-        self.named = set() if enable in words else {name.strip() for name in enable.split(",")}
-        self.said: dict[str, Switch] = {}
-        self.states: dict[str, Switch] = {}
+    enable: str = "all"
+    said: Mapping[str, Switch] = field(default_factory=dict)
+    states: Mapping[str, Switch] = field(default_factory=dict)
+    """Follows from the other fields and the monitors."""
 
-    def restore(self, text: str) -> None:
-        self.said = json.loads(text)
+    @property
+    def starts_in_shadow(self) -> bool:
+        return self.enable == SHADOW
+
+    @property
+    def named(self) -> set[str]:
+        return set() if self.enable in _WORDS else {name.strip() for name in self.enable.split(",")}
+
+    def of(self, checked: CheckedSpecifications) -> "Switches":
+        """Return the same switches for the monitors of these specifications."""
+        return replace(self, states=self.states_of(checked))
+
+    def saying(self, said: Mapping[str, Switch]) -> "Switches":
+        return replace(self, said=said)
 
     def enabled(self, name: str) -> bool:
         return self.states.get(name) is True
@@ -40,26 +55,18 @@ class Switches:
         return {name: to for name, to in self.said.items() if to is not True and self.states.get(name) == to}
 
     def states_of(self, checked: CheckedSpecifications) -> dict[str, Switch]:
-        states = {name: self._own(name) for name in checked.monitors}
+        states = {name: self.own(name) for name in checked.monitors}
         if SHADOW in states.values():
             for group in checked.sharing:
                 if any(states[name] == SHADOW for name in group):
                     states |= {name: SHADOW for name in group if states[name] is True}
         return states
 
-    def shadows_of(self, checked: CheckedSpecifications) -> frozenset[str]:
-        return frozenset(name for name, state in self.states_of(checked).items() if state == SHADOW)
-
-    def _own(self, name: str) -> Switch:
-        return self.said.get(name, self._all or name in self.named)
-
-    def enforce(self, checked: CheckedSpecifications) -> list[str]:
-        """Return the monitors that are in shadow mode only because of others."""
-        self.said = {name: to for name, to in self.said.items() if name in checked.monitors}
-        self.states = self.states_of(checked)
-        drawn_in = [name for name, to in self.states.items() if to == SHADOW and self._own(name) != SHADOW]
-        self.said |= dict.fromkeys(drawn_in, SHADOW)
-        return drawn_in
+    def own(self, name: str) -> Switch:
+        """Return the switch of a monitor, without those that share its variables."""
+        return self.said.get(
+            name, SHADOW if self.starts_in_shadow else self.enable == "all" or name in self.named
+        )
 
 
 def require_whole(states: Mapping[str, Switch], checked: CheckedSpecifications) -> None:

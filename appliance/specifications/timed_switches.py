@@ -10,8 +10,8 @@ from collections.abc import Awaitable, Callable, Iterable, Mapping
 import msgspec
 import structlog
 
-from appliance.specifications.rollout import Switch
 from appliance.specifications.specification_files import SpecificationsRefusedError
+from appliance.specifications.switches import Switch
 from appliance.store.ends import EndKind, EndTable
 from appliance.store.state_file import StateStore
 from appliance.store.writer_thread import StoreError

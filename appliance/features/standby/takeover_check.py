@@ -8,6 +8,7 @@ claim the lease, but still follows the active one and stays in the in-sync set.
 
 import asyncio
 import contextlib
+import json
 import os
 import sqlite3
 import tempfile
@@ -33,7 +34,8 @@ from appliance.features.standby.standby_summary import UNCHECKED
 from appliance.master.graph.registry import Registry
 from appliance.master.reconcile.sinks import restore
 from appliance.policy.judgement import PolicyContext
-from appliance.specifications.rollout import Parts, Revision, parts_wanted
+from appliance.specifications.in_force import InForce
+from appliance.specifications.rollout import Parts, parts_wanted
 from appliance.specifications.specification_files import SpecificationFolder
 from appliance.specifications.specification_revisions import Check, specifications_at_start
 from appliance.specifications.switches import SWITCHES, Switches
@@ -121,8 +123,7 @@ class TakeoverCheck:
         if settings.audit.on_audit_failure == "deny":
             await asyncio.to_thread(_require_log, self._folder / "audit.db")
         last, said = await asyncio.to_thread(self._load_state)
-        switches = Switches(settings.enable)
-        switches.restore(said)
+        switches = Switches(settings.enable, json.loads(said))
         found = await specifications_at_start(
             last,
             SpecificationFolder(settings.monitors),
@@ -130,8 +131,7 @@ class TakeoverCheck:
             settings.site_keys,
             named=switches.named,
         )
-        revision = Revision(0, found.sources, found.checked, switches.shadows_of(found.checked))
-        wanted = parts_wanted(revision, settings.relays)
+        wanted = parts_wanted(InForce(0, found.sources, found.checked, switches), settings.relays)
         if wanted:
             await self._parts(found.checked.compiled, wanted)
         if self.obstacle != "":  # the membership stays the same, and each call writes files

@@ -1,7 +1,7 @@
 from collections.abc import Mapping
 
-from appliance.specifications.rollout import Switch
 from appliance.specifications.specification_manager import SpecificationManager
+from appliance.specifications.switches import Switch
 from appliance.specifications.timed_switches import TIMED, TimedSwitches
 from appliance.store.ends import EndTable
 from appliance.store.state_file import StateStore

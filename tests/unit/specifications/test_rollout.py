@@ -9,7 +9,8 @@ from appliance.base.withdrawal import WithdrawnError, awaited
 from appliance.channel import messages
 from appliance.specifications.allocation import TOPIC, Allocation, Move, Resource
 from appliance.specifications.checking import check
-from appliance.specifications.rollout import InheritedState, Revision, Rollout
+from appliance.specifications.in_force import InForce
+from appliance.specifications.rollout import InheritedState, Rollout
 from appliance.specifications.specification_files import (
     Sources,
     SpecificationsRefusedError,
@@ -30,9 +31,9 @@ def spec(name: str, *topics: str) -> str:
     return f"hold {name}() {{ {events} }}"
 
 
-def revision(number: int, **files: str) -> Revision:
+def revision(number: int, **files: str) -> InForce:
     sources = Sources({f"{name}.rv": text for name, text in files.items()})
-    return Revision(number, sources, check(sources, ()))
+    return InForce(number, sources, check(sources, ()))
 
 
 def taken(statement: messages.SpecificationsStated) -> messages.SpecificationsTaken:
@@ -46,8 +47,7 @@ def files_of(message: messages.SpecificationsStated) -> list[str]:
 class Fleet:
     def __init__(self, trail: AuditTrail) -> None:
         self.rollout = Rollout(
-            Allocation(2), trail, "drop", lambda checked: dict.fromkeys(checked.monitors, True), self, slices=1000,
-            parts=parts_here,
+            Allocation(2), trail, "drop", self, slices=1000, parts=parts_here,
         )  # fmt: skip
         self.story: list[tuple[Any, ...]] = []
         self.stated: list[tuple[int, messages.SpecificationsStated]] = []

@@ -150,6 +150,27 @@ async def test_a_load_whose_client_gave_up_never_takes_effect(desk: Desk) -> Non
     assert monitors.names() == ["a", "b"]
 
 
+async def test_a_refused_order_leaves_the_same_value_in_force(desk: Desk) -> None:
+    monitors = await desk.monitors()
+    await monitors.load(admin.MonitorLoad({"b.rv": B}), "eve")
+    await monitors.shadow(admin.MonitorShadow(["b"], True), "eve")
+    before, desk.findings = monitors.now, ["the relay says no"]
+    (desk.folder / "c.rv").write_text(C)
+    for order in (
+        monitors.load(admin.MonitorLoad({"c.rv": C}, shadow=True, confirm_within=60.0), "eve"),
+        monitors.reload(admin.MonitorReload(prune=True), "eve"),
+        monitors.remove(admin.MonitorRemove(["b"]), "eve"),
+        monitors.roll_back(admin.MonitorRollback(1), "eve"),
+        monitors.shadow(admin.MonitorShadow(["a"], True), "eve"),
+        monitors.shadow(admin.MonitorShadow(["b"], False, confirm_within=60.0), "eve"),
+        monitors.take_bundle(Sources({"c.rv": C}), "eve", "a bundle"),
+    ):
+        with pytest.raises(SpecificationsRefusedError, match="the relay says no"):
+            await order
+        assert monitors.now is before
+        assert (monitors.confirm_by, monitors.returns.unconfirmed()) == (None, [])
+
+
 async def test_a_client_has_one_dry_run_at_a_time(desk: Desk) -> None:
     begun, goes_on = asyncio.Event(), asyncio.Event()
 

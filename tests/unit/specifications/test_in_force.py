@@ -1,0 +1,115 @@
+from collections.abc import Callable
+from copy import deepcopy
+from typing import Any
+
+import pytest
+
+from appliance.channel.messages import GivenDeclared
+from appliance.specifications.givens import Givens
+from appliance.specifications.in_force import InForce, Wanted, cleared, given, loaded, switched
+from appliance.specifications.specification_files import (
+    CheckedSpecifications,
+    Sources,
+    SpecificationsRefusedError,
+)
+from appliance.specifications.switches import SHADOW, Switches
+
+SPEED = GivenDeclared("speed", "double", 1.0, 1.0, "m/s", 0.0, 2.0)
+
+
+def checked(*names: str, sharing: tuple[tuple[str, ...], ...] = ()) -> CheckedSpecifications:
+    return CheckedSpecifications(
+        monitors={name: f"{name}.rv" for name in names}, sharing=tuple(map(frozenset, sharing)),
+        givens=dict.fromkeys(names, (SPEED,)),
+    )  # fmt: skip
+
+
+def sources(*names: str) -> Sources:
+    return Sources({f"{name}.rv": name for name in names})
+
+
+def in_force(*names: str, enable: str = "all", **said: Any) -> InForce:
+    return InForce(3, sources(*names), checked(*names), Switches(enable, said), acts=7)
+
+
+NOW = in_force("a", "b", a=False)
+ORDERS: dict[str, Callable[[InForce], object]] = {
+    "load": lambda now: loaded(now, Wanted(sources("c"), shadow={"c.rv"}), checked("c"), signed=False),
+    "switch": lambda now: switched(now, ["b"], SHADOW),
+    "set": lambda now: given(now, "a", {"speed": 0.5}),
+    "clear": cleared,
+}
+
+
+@pytest.mark.parametrize("name", ORDERS)
+def test_an_order_leaves_the_earlier_value_as_it_was(name: str) -> None:
+    now = deepcopy(NOW)
+    ORDERS[name](now)
+    assert now == NOW
+
+
+def test_a_load_keeps_all_switches_and_gives_its_files_theirs() -> None:
+    wanted = Wanted(sources("a", "b", "c"), shadow={"c.rv"}, constants={"b": {"speed": 0.5}})
+    new, put, values = loaded(NOW, wanted, checked("a", "b", "c"), signed=False)
+    assert (new.tag, new.states) == ("4.7", {"a": False, "b": True, "c": SHADOW})
+    assert (put, values, new.givens.said) == ({"c": SHADOW}, {"b": {"speed": 0.5}}, {"b": {"speed": 0.5}})
+
+
+def test_the_last_words_of_a_revision_are_for_monitors_that_are_not_in_force() -> None:
+    wanted = Wanted(
+        sources("a", "c"),
+        switches={"a": SHADOW, "c": False},
+        given={"a": {"speed": 0.1}, "c": {"speed": 0.2}},
+    )
+    new, put, values = loaded(NOW, wanted, checked("a", "c"), signed=False)
+    assert new.states == {"a": False, "c": False}
+    assert (put, values, new.givens.said) == ({}, {}, {"c": {"speed": 0.2}})
+
+
+@pytest.mark.parametrize(("enable", "state"), [("none", True), ("shadow", SHADOW)])
+def test_a_load_that_enables_ends_no_shadow_mode(enable: str, state: object) -> None:
+    now = in_force("a", enable=enable)
+    new, _put, _given = loaded(now, Wanted(sources("b"), enable={"b.rv"}), checked("b"), signed=False)
+    assert new.states == {"b": state}
+
+
+def test_a_monitor_in_force_is_not_drawn_into_shadow_mode() -> None:
+    contents = checked("b", "c", sharing=(("b", "c"),))
+    with pytest.raises(SpecificationsRefusedError, match="do not go together"):
+        loaded(NOW, Wanted(sources("b", "c"), shadow={"c.rv"}), contents, signed=False)
+    new, _put, _given = loaded(in_force(), Wanted(sources("b", "c"), shadow={"c.rv"}), contents, signed=False)
+    now, drawn_in, _dropped = cleared(new)
+    assert (now.states, now.switches.said, drawn_in) == (
+        {"b": SHADOW, "c": SHADOW},
+        {"c": SHADOW, "b": SHADOW},
+        ["b"],
+    )
+    with pytest.raises(SpecificationsRefusedError, match="do not go together"):
+        switched(now, ["b"], True)
+    assert switched(now, ["b", "c"], True).states == {"b": True, "c": True}
+
+
+def test_nothing_is_kept_about_what_is_not_in_force() -> None:
+    new = InForce(
+        4, sources("a"), checked("a"), Switches(said={"a": False, "b": False}), Givens({"b": {"speed": 0.1}})
+    )
+    now, drawn_in, dropped = cleared(new)
+    assert (now.switches.said, now.givens.said, drawn_in, dropped) == ({"a": False}, {}, [], [])
+
+
+def test_a_site_that_signs_lets_no_load_replace_a_topic() -> None:
+    topic = GivenDeclared("t", "topic", "/x", "/x")
+    contents = CheckedSpecifications(monitors={"a": "a.rv"}, givens={"a": (topic,)})
+    wanted = Wanted(sources("a"), topics={"a": {"t": "/y"}})
+    with pytest.raises(SpecificationsRefusedError, match="the site signs"):
+        loaded(NOW, wanted, contents, signed=True)
+    assert loaded(NOW, wanted, contents, signed=False).new.number == 4
+
+
+def test_each_switch_and_value_has_a_tag_of_its_own() -> None:
+    tags = [
+        NOW.tag,
+        switched(NOW, ["b"], False).tag,
+        given(given(NOW, "a", {"speed": 0.1}), "a", {"speed": 1.0}).tag,
+    ]
+    assert tags == ["3.7", "3.8", "3.9"]
