@@ -1,6 +1,6 @@
 """The specifications in force: load, switch, roll back, and answer operators.
 
-What is in force is one immutable value (`in_force.py`), which each change replaces once all relays have its successor.
+An immutable value holds all that is in force (`in_force.py`). A change replaces it once all relays have its successor.
 
 1. The appliance never writes to the folder of specifications. Changes are revisions in the store; revisions and
    switches survive a restart.
@@ -116,7 +116,7 @@ _ALL = _Consent(force=True, hold=True)
 
 @dataclass(frozen=True, slots=True)
 class _Order:
-    """Who orders a change, and how.
+    """The author of a change, and its terms.
 
     `within` is the time in which it must be confirmed. `author` is the author of the revision, unless it is `who`.
     `kept` are files that are not in the folder, `loaded` those that the operator named.

@@ -98,13 +98,13 @@ MUTANTS: dict[tuple[str, str], Without] = {
     ),
     ("follower", "block"): Without(
         _ACCESS,
-        "        if self.is_blocked(peer):\n            return _BLOCKED\n        kept",
+        '        if self.is_blocked(peer):\n            return _BLOCKED\n        return ""',
         "        kept",
     ),
     ("follower", "end of a right"): Without(
         _ACCESS,
-        "good = kept is not None and not self._ends.passed(kept.id, kept.expires)",
-        "good = kept is not None",
+        "return clock.since_boot() < self._ends.get(token, (0.0, 0.0))[1]",
+        "return token in self._ends",
     ),
     ("follower", "share"): Without(_STREAMS, "if self._tokens.refusal(bearer.id):", "if False:"),
     ("follower", "binding"): Without(
