@@ -12,6 +12,7 @@ from typer.core import TyperCommand, TyperGroup, TyperOption
 
 from appliance.base.option_group import GroupedVerb
 from appliance.base.validation_messages import refusal
+from appliance.cli.help_panels import in_order, panel_of
 from appliance.cli.verb_table import Group, Verb, Verbs, joined
 from rosmop.tool.renamed_options import renamed
 
@@ -23,11 +24,15 @@ def application(
     *,
     further: Callable[[], Iterable[Verbs]] = tuple,
     callback: Callable[..., None] | None = None,
+    panels: bool = False,
     **settings: Any,
 ) -> typer.Typer:
-    """Return an application; `further` returns more verbs, for help, completion and a name that `verbs` lacks."""
+    """Return an application; `further` returns more verbs, for help, completion and a name that `verbs` lacks.
+
+    `panels`: the help lists the commands in the panels of `help_panels`.
+    """
     app = typer.Typer(
-        cls=_group_of(verbs, further),
+        cls=_group_of(verbs, further, panels=panels),
         no_args_is_help=True,
         pretty_exceptions_enable=False,
         context_settings={"help_option_names": _HELP_OPTIONS},
@@ -41,7 +46,7 @@ def _nothing() -> None:
     pass
 
 
-def _group_of(verbs: Verbs, further: Callable[[], Iterable[Verbs]]) -> type[TyperGroup]:
+def _group_of(verbs: Verbs, further: Callable[[], Iterable[Verbs]], *, panels: bool) -> type[TyperGroup]:
     class _Lazy(TyperGroup):
         # click sets it
         commands = property(lambda self: self.all_commands, lambda _self, _given: None)
@@ -53,7 +58,12 @@ def _group_of(verbs: Verbs, further: Callable[[], Iterable[Verbs]]) -> type[Type
         @functools.cached_property
         def all_commands(self) -> dict[str, Any]:
             own, table = self.own_commands, joined(verbs, *further())
-            return {name: own.get(name) or _command_of(verb, name, tuple) for name, verb in table.items()}
+            found = {name: own.get(name) or _command_of(verb, name, tuple) for name, verb in table.items()}
+            if not panels:
+                return found
+            for name, command in found.items():
+                command.rich_help_panel = panel_of(name)
+            return {name: found[name] for name in in_order(found)}
 
         def get_params(self, ctx: Any) -> list[Any]:
             return _without_type_of_flags(super().get_params(ctx))

@@ -12,6 +12,7 @@ import typer
 
 from appliance import __version__
 from appliance.base.user_errors import UserError
+from appliance.cli.first_contact import first_contact
 from appliance.cli.lazy import application
 from appliance.cli.verb_table import Group, Verb, Verbs, joined
 from rosmop.tool.terminal import printable
@@ -60,6 +61,7 @@ app = application(
     VERBS,
     further=feature_verbs,
     callback=_global_options,
+    panels=True,
     name="rosrv",
     help="A network-security appliance for ROS 1 robots.",
 )
@@ -68,6 +70,8 @@ app = application(
 def main() -> None:
     _open_closed_streams()
     sys.argv[1:] = _asking_for_help(_without_old_flags(sys.argv[1:]))
+    if not sys.argv[1:] and sys.stdin.isatty() and sys.stdout.isatty():
+        sys.exit(first_contact())
     try:
         app()
     except Exception as error:  # noqa: BLE001  the last resort: print the error and its place

@@ -170,7 +170,8 @@ def _announce(said: ControlReady, settings: Settings, *, as_json: bool) -> None:
         if settings.monitors is not None:
             more.append(f"Monitors: {settings.monitors} (rosrv monitor list)")
         if rest is not None:
-            more += [f"Console: {rest}/console/", f"REST: {rest}"]
+            browsed = rest if settings.api_published else _rest_url(settings, "127.0.0.1")
+            more += [f"Console: {browsed}/console/", f"REST: {browsed}"]
         if said.token is not None:
             more.append(f"The first access token (admin) is in {_keep_token(settings.state, said.token)}")
     try:
@@ -184,12 +185,16 @@ def _announce(said: ControlReady, settings: Settings, *, as_json: bool) -> None:
             write_line(one, sys.stderr)
 
 
-def _rest_url(settings: Settings) -> str | None:
+def _rest_url(settings: Settings, own: str = "") -> str | None:
+    """Return the URL of REST; `own` replaces this machine's address, where REST listens on all of them.
+
+    A container that publishes REST on loopback has an address that browsers do not reach.
+    """
     if settings.api_address is None:
         return None
     host, port = settings.api_address
     if host in ("0.0.0.0", "::"):  # noqa: S104  compared only
-        host = own_address(settings)
+        host = own or own_address(settings)
     shown = f"[{host}]" if ":" in host else host
     return f"{'https' if settings.api_tls else 'http'}://{shown}:{port}"
 

@@ -16,7 +16,7 @@ from appliance.cli.commit_confirm import ConfirmWithin, seconds_within
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.monitor_changes import say_replaced, say_shadow_deadline
 from appliance.cli.output import moment, say_json
-from appliance.features.guards.guard_answers import GuardRow, Suggestion
+from appliance.features.guards.guard_answers import GuardList, GuardRow, Suggestion
 from appliance.features.guards.guard_facts import preset_row, values_of
 from appliance.features.guards.guard_requests import (
     GuardNew,
@@ -64,18 +64,20 @@ _Hold = Annotated[
 
 @speaks
 def list_guards(appliance: Appliance) -> None:
-    """List the presets with their parameters, and the guards of the running appliance.
+    """List the guards of the running appliance, and the presets with their parameters.
 
     Example: rosrv guard list
     """
+    if appliance.said or _runs(appliance):
+        _list_loaded(appliance, appliance.ask_or_exit(GuardsWanted()))
     for preset in PRESETS.values():
         if appliance.as_json:
             say_json(preset_row(preset))
         else:
             _say_preset(preset)
-    if not appliance.said and not _runs(appliance):
-        return
-    body = appliance.ask_or_exit(GuardsWanted())
+
+
+def _list_loaded(appliance: Appliance, body: GuardList) -> None:
     for row in body.guards:
         if appliance.as_json:
             held, shadow, on = (row.state == state for state in ("holding", "shadow", "off"))
@@ -92,6 +94,8 @@ def list_guards(appliance: Appliance) -> None:
             say_json({"warning": warning})
         else:
             say(warning, "yellow")
+    if not appliance.as_json:
+        say("the presets for further guards:" if body.guards else "no guard is loaded; the presets:", "bold")
 
 
 @speaks

@@ -10,6 +10,7 @@ POLICY_TOOLS = Feature(
     routes=f"{_PLACE}policy_tool_routes:routes",
     answers=f"{_PLACE}policy_routes:ANSWERS",
     verbs={
+        "host": Group("", {"show": Verb(f"{_PLACE}policy_verbs:show_host", after=FIRST)}, after="config"),
         "audit": Group("", {"why": Verb(f"{_PLACE}grant_verb:why", after=FIRST)}),
         "policy": Group(
             "Check, explain, test, compare, learn and change access policies.",

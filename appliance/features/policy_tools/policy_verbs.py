@@ -3,6 +3,7 @@
 Exit status: 0 allowed, valid; 1 denied, errors, a failed case; 2 usage.
 """
 
+import contextlib
 from collections.abc import Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -29,7 +30,7 @@ from appliance.features.policy_tools.policy_input import (
     read_text,
     usage_error,
 )
-from appliance.policy.actions import BadWordError, check_resource
+from appliance.policy.actions import BadWordError, check_resource, find_host
 from appliance.policy.judgement import PolicyContext, PolicyJudgement, judge
 from appliance.policy.live_rights import Ending
 from appliance.policy.model import Category, Decision, Request
@@ -207,6 +208,38 @@ def explain_request(
             for line in _allowing(policy, request):
                 say(line)
     raise typer.Exit(0 if explanation.allowed else 1)
+
+
+@speaks
+def show_host(
+    appliance: Appliance,
+    name: Annotated[
+        str,
+        typer.Argument(
+            metavar="NAME",
+            help="An address, or the name of an enrolled host, a door, a group of one host, or robot",
+            show_default=False,
+        ),
+    ],
+) -> None:
+    """Show what a host may do: the rules of the policy in force that grant it something. Exit status 1 if none does.
+
+    Example: rosrv host show door:alice
+    """
+    policy = compiled(appliance, None, None, None)
+    host = _known_as(name, policy)
+    if not appliance.as_json:
+        say(f"{host}, by the policy in force:", "bold")
+    raise typer.Exit(_list_rights(appliance, policy, host))
+
+
+def _known_as(name: str, policy: Policy) -> str:
+    """Return the word of the policy for a host: an enrolled host or a door may be named without its kind."""
+    for word in (name, f"host:{name}", f"door:{name}"):
+        with contextlib.suppress(BadWordError):
+            find_host(word, policy)
+            return word
+    return name
 
 
 def _list_rights(appliance: Appliance, policy: Policy, host: str) -> int:

@@ -69,6 +69,7 @@ LOOKING = [
     ("policy", "show"), ("policy", "show", "1", "--json"), ("policy", "show", "777"),
     ("policy", "who-may", "command", "getPid"), ("policy", "who-may", "command", "getPid", "--json"),
     ("policy", "explain", "--host", "127.0.0.1", "--command", "getPid"),
+    ("host", "show", "127.0.0.1"),
     ("policy", "diff", "1", "1", "--json"), ("policy", "diff", "777"), ("policy", "diff", "1", "777", "--json"),
     ("topic", "publishers", "/nowhere", "--at", "2026-01-01"),
     ("topic", "info", "/nowhere"), ("topic", "echo", "/nowhere"), ("topic", "echo", "/nowhere", "--json"),

@@ -9,6 +9,7 @@ import msgspec
 import pytest
 from structlog.testing import capture_logs
 
+from appliance.cli import up
 from appliance.cli.up import _announce
 from appliance.configuration.settings import Settings
 from appliance.supervisor.errors import StartError
@@ -40,6 +41,15 @@ def test_the_first_token_is_in_its_file_before_the_line_is_printed(
         f"Console: https://127.0.0.1:8443/console/\nREST: https://127.0.0.1:8443\n"
         f"The first access token (admin) is in {kept}\n"
     )
+
+
+def test_a_container_prints_the_address_that_a_browser_reaches(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(up, "own_address", lambda _settings: "172.29.76.2")
+    with capture_logs() as said:
+        _announce(READY, Settings(state=tmp_path, api="0.0.0.0:8443", api_published=False), as_json=False)
+    assert "Console: https://127.0.0.1:8443/console/" in [str(one["event"]) for one in said]
 
 
 def test_without_a_terminal_all_lines_are_of_the_log(tmp_path: Path) -> None:

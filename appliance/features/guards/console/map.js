@@ -36,7 +36,7 @@ export function FenceMap({ name, polygon, margin, trail, draft = null, move }) {
     const size = event.shiftKey ? 1 : 0.1;
     move(index, { x: tenth(corner.x + step[0] * size), y: tenth(corner.y + step[1] * size) });
   };
-  const where = last ? `The robot is at ${short(last.x)}, ${short(last.y)}, ${short(Math.abs(depth(last, polygon)))} m ${depth(last, polygon) < 0 ? "outside of the fence" : "from the edge"}.` : "The robot's position is not known.";
+  const where = last ? `The robot is at ${short(last.x)}, ${short(last.y)}, ${short(Math.abs(depth(last, polygon)))} m ${depth(last, polygon) < 0 ? "outside of the fence" : "from the edge"}.` : "No position yet: Watch reads it.";
   return html`<figure class="fence">
     <svg ref=${drawing} class="fence-map" viewBox=${`${frame.x} ${-frame.y - frame.height} ${frame.width} ${frame.height}`} role=${move ? "group" : "img"} aria-label=${`Map of ${name}. ${where}`}
       onPointerMove=${(/** @type {PointerEvent} */ event) => held !== null && move?.(held, at(event))} onPointerUp=${() => setHeld(null)} onPointerCancel=${() => setHeld(null)}>

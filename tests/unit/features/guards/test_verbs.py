@@ -258,7 +258,7 @@ def test_lists_and_proposals_are_printed(tmp_path: Path, capsys: pytest.CaptureF
     run(verbs.list_guards, Robot(tmp_path, FENCE))
     shown = capsys.readouterr().out
     assert all(f"{name}: {preset.what}" in shown for name, preset in PRESETS.items())
-    assert shown.endswith(
+    assert shown.startswith(
         "guard fence: fence on /cmd_vel, in force, stopping, 3 stops, since 1970-01-01 00:00Z: at the edge"
         " (/teleop on 10.0.0.7)\n"
         "guard old: fence 1, older: rosrv guard upgrade old; on /cmd_vel, in force, stopping, 3 stops,"
@@ -266,6 +266,7 @@ def test_lists_and_proposals_are_printed(tmp_path: Path, capsys: pytest.CaptureF
         "    silent=0 is below the standard\n"
         "guard mine: fence 1, changed: not the text of the preset; on /cmd_vel, in force, stopping, 3 stops\n"
         "fence acts before rate\n"
+        "the presets for further guards:\n"
     )
     run(verbs.suggest, Robot(None))
     assert capsys.readouterr().out == (

@@ -1,0 +1,55 @@
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import typer
+
+from appliance.features.policy_tools import policy_verbs
+from appliance.policy.model import address_of
+from appliance.policy.policy_compiler import compile_policy
+
+POLICY = """\
+[Groups]
+site = 10.77.0.0/24
+[Nodes]
+default = site door:alice
+[Publishers]
+default = site
+/goal = site, ask door:alice
+[Subscribers]
+/odom = site door:alice
+[Services]
+[Clients]
+[Parameters]
+[Commands]
+default = site
+"""
+
+
+@pytest.fixture
+def shown(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Any:
+    hosts = {"door:alice": address_of("198.19.240.2")}
+    policy = compile_policy(POLICY, file="site.ini", hosts=hosts)
+    monkeypatch.setattr(policy_verbs, "compiled", lambda *_given: policy)
+
+    def show(name: str) -> tuple[int, list[str]]:
+        fake = SimpleNamespace(as_json=False)
+        with pytest.raises(typer.Exit) as left:
+            policy_verbs.show_host.function(fake, name)  # type: ignore[attr-defined]
+        return left.value.exit_code, capsys.readouterr().out.splitlines()
+
+    return show
+
+
+@pytest.mark.parametrize("name", ["door:alice", "alice"])
+def test_the_rights_of_a_door_are_listed_by_its_name(shown: Any, name: str) -> None:
+    status, lines = shown(name)
+    assert status == 0
+    assert lines[0] == "door:alice, by the policy in force:"
+    assert len(lines) == 4
+    assert "/goal" in lines[2]
+    assert "needs an approval" in lines[2]
+
+
+def test_a_host_without_rights_has_none_listed(shown: Any) -> None:
+    assert shown("10.9.9.9") == (1, ["10.9.9.9, by the policy in force:", "no rule grants 10.9.9.9 anything"])
