@@ -35,7 +35,7 @@ def shown(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -
     def show(name: str) -> tuple[int, list[str]]:
         fake = SimpleNamespace(as_json=False)
         with pytest.raises(typer.Exit) as left:
-            policy_verbs.show_host.function(fake, name)  # type: ignore[attr-defined]
+            policy_verbs.show_host.function(fake, name)
         return left.value.exit_code, capsys.readouterr().out.splitlines()
 
     return show
