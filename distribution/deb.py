@@ -1,4 +1,4 @@
-"""`make package`: build dist/rosrv_VERSION_ARCH.deb for Debian 12 and Ubuntu 24.04.
+"""`make package`: build dist/rosrv_VERSION_ARCH.deb for Debian 12 and 13.
 
     python -m distribution.deb amd64 arm64
 

@@ -1,7 +1,7 @@
 """Make the locked Python environment of the package, for one architecture and all interpreters.
 
     lib/python3.11/site-packages   files for this interpreter only
-    lib/python3.12/site-packages
+    lib/python3.12/site-packages   and so on
     common                         files for all: each `site-packages` has a `common.pth` with its path
 
 The wheels are those of requirements.lock, verified by hash. None of their code runs here. python-iptables has no
@@ -20,7 +20,7 @@ from distribution.programs import BuildError, run
 
 UV = ROOT / ".venv/bin/uv"
 PIP = ROOT / ".venv/bin/pip"
-INTERPRETERS = ("3.11", "3.12", "3.13")  # of Debian 12, of Ubuntu 24.04, of Debian 13
+INTERPRETERS = ("3.11", "3.12", "3.13")  # from Debian 12 to Debian 13
 _SOURCE_ONLY = "python-iptables"
 
 

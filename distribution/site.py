@@ -16,7 +16,16 @@ from appliance import __version__
 from distribution import image
 from distribution.checkout import ROOT, time_of_commit
 
-BESIDE = ("compose.yaml", "compose.host.yaml", "LICENSE", "docs", "ipsec", "monitors", "policies")
+BESIDE = (
+    "compose.yaml",
+    "compose.host.yaml",
+    "compose.local.yaml",
+    "LICENSE",
+    "docs",
+    "ipsec",
+    "monitors",
+    "policies",
+)
 
 
 def pack(parts: tuple[Path, ...], *, moment: int) -> Path:

@@ -320,7 +320,7 @@ def builder(*, clock: bool = False) -> Iterator[Engine]:
 
 
 def project(directory: Path) -> Path:
-    for name in ("compose.yaml", "compose.host.yaml", "compose.standby.yaml"):
+    for name in ("compose.yaml", "compose.host.yaml", "compose.local.yaml", "compose.standby.yaml"):
         shutil.copy(ROOT / name, directory)
     for name in ("policies", "monitors"):
         shutil.copytree(ROOT / name, directory / name)

@@ -25,7 +25,7 @@ def test_the_image_has_every_user() -> None:
 
 
 def test_the_archive_of_a_site_has_what_its_compose_files_mount() -> None:
-    for name in ("compose.yaml", "compose.host.yaml"):
+    for name in ("compose.yaml", "compose.host.yaml", "compose.local.yaml"):
         assert name in BESIDE
         services = yaml.safe_load((ROOT / name).read_text())["services"].values()
         mounts = [mount.split(":")[0] for one in services for mount in one.get("volumes", [])]
@@ -43,6 +43,11 @@ def test_the_next_archive_of_a_site_uses_the_same_volume(tmp_path: Path) -> None
         content = archive.extractfile(name)
         assert content is not None
         assert b"COMPOSE_PROJECT_NAME=rosrv\n" in content.readlines()
+
+
+def test_the_local_master_is_for_this_machine_only() -> None:
+    local = yaml.safe_load((ROOT / "compose.local.yaml").read_text())
+    assert local == {"services": {"appliance": {"ports": ["127.0.0.1:11311:11311"]}}}
 
 
 def test_each_appliance_has_a_name() -> None:

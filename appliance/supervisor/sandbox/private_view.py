@@ -9,6 +9,7 @@
 
 import contextlib
 import ctypes
+import errno
 import os
 import socket
 import stat
@@ -39,6 +40,10 @@ _ATTR_IDMAP = 1 << 20
 _REMEDY = (
     "let all users enter every folder above it and read its files (chmod -R go+rX), or use another folder, such as "
     "one in /opt"
+)
+_NOT_A_MOUNT = (
+    "the root directory is not a mount point, as in a chroot, so no view of the program can be mounted for the users "
+    "of the processes: before the chroot, run `mount --bind DIR DIR` with its directory"
 )
 
 
@@ -104,7 +109,12 @@ def enter(view: PrivateView, account: Account) -> None:
 
 def _enter(view: PrivateView, account: Account) -> None:
     libc_call("unshare(CLONE_NEWNS)", _CLONE_NEWNS)
-    _mount("none", "/", None, _MS_REC | _MS_SLAVE)
+    try:
+        _mount("none", "/", None, _MS_REC | _MS_SLAVE)
+    except OSError as error:
+        if error.errno == errno.EINVAL:
+            raise ViewError(_NOT_A_MOUNT) from error
+        raise
     trees = [(folder, _tree(folder, account if folder in view.owned else None)) for folder in view.program]
     trees += [(view.state, _clone(view.state))] if view.state is not None else []
     mask = os.umask(0o022)
