@@ -477,6 +477,30 @@ def test_a_forger_who_rehashes_has_no_signature(
     assert re.search(r"WRONG +(records?[ .]|checkpoint|policies)", reviewer.said), reviewer.said
 
 
+def _of_another_log(members: Members, *, checkpoints: bool) -> Members:
+    manifest = json.loads(members["manifest.json"]) | {"log": "0" * 32}
+    changed = {**members, "manifest.json": json.dumps(manifest).encode()}
+
+    def rename(records: list[dict[str, Any]]) -> None:
+        for record in records:
+            if checkpoints and record["chain"].get("checkpoint"):
+                record["chain"]["checkpoint"]["log"] = manifest["log"]
+
+    return lines(changed, rename)
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("checkpoints", [False, True], ids=["manifest", "manifest and checkpoints"])
+def test_records_of_another_log_are_named(
+    bundle: Path, tmp_path: Path, reviewer: Reviewer, *, checkpoints: bool
+) -> None:
+    """A log that took another one's place proves nothing of the other one."""
+    changed = _of_another_log(members_of(bundle), checkpoints=checkpoints)
+    assert reviewer.status(written(changed, tmp_path / "x.zip")) == 1
+    wrong = "is not signed with the key" if checkpoints else "does not seal the records"
+    assert re.search(rf"WRONG +checkpoint \d+: {wrong}", reviewer.said), reviewer.said
+
+
 @pytest.mark.nightly
 def test_another_policy_with_a_matching_manifest_is_named(
     bundle: Path, tmp_path: Path, reviewer: Reviewer
