@@ -4,23 +4,27 @@ import json
 import os
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
 
-from tests.support.entrance_mutants import MUTANTS
 from tests.support.entrances import CELLS
 
 ROOT = Path(__file__).parents[2]
+_TABLE = tomllib.loads((ROOT / "tests" / "support" / "entrance_mutants.toml").read_text(encoding="utf-8"))
 
 
-@pytest.mark.parametrize(("entrance", "rule"), MUTANTS, ids=[f"{one}, {rule}" for one, rule in MUTANTS])
-def test_a_missing_rule_is_seen(entrance: str, rule: str) -> None:
-    tests = [f"tests/{one}" for one in CELLS[entrance][rule].split()]
+@pytest.mark.parametrize(
+    "change", _TABLE["without"], ids=lambda change: f"{change['entrance']}, {change['rule']}"
+)
+def test_a_missing_rule_is_seen(change: dict[str, str]) -> None:
+    tests = [f"tests/{one}" for one in CELLS[change["entrance"]][change["rule"]].split()]
+    changed = json.dumps([change["file"], change["old"], change["new"]])
     ran = subprocess.run(
         [sys.executable, "-m", "pytest", "-q", "-n", "0", "-p", "tests.support.changed_module", *tests],
         cwd=ROOT,
-        env=os.environ | {"CHANGED": json.dumps(MUTANTS[entrance, rule])},
+        env=os.environ | {"CHANGED": changed},
         capture_output=True,
         text=True,
         check=False,

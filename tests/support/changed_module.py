@@ -1,40 +1,22 @@
-"""A pytest plugin that changes a module before it is loaded, by the JSON of CHANGED: file, old text, new text.
+"""A pytest plugin that changes a module before any other loads it, by the JSON of CHANGED: file, old text, new text.
 
 CHANGED='["appliance/x.py", "old", "new"]' pytest -p tests.support.changed_module
 """
 
-import importlib.abc
-import importlib.machinery
 import importlib.util
 import json
 import os
 import sys
-from collections.abc import Sequence
 from pathlib import Path
-from types import CodeType, ModuleType
 
 _FILE, _OLD, _NEW = json.loads(os.environ["CHANGED"])
-
-
-class _ChangedLoader(importlib.machinery.SourceFileLoader):
-    def get_code(self, fullname: str) -> CodeType:
-        text = Path(self.path).read_text(encoding="utf-8")
-        assert text.count(_OLD) == 1, f"{_FILE} has {text.count(_OLD)} times {_OLD!r}"
-        return compile(text.replace(_OLD, _NEW), self.path, "exec")
-
-
-class _Finder(importlib.abc.MetaPathFinder):
-    def find_spec(
-        self, fullname: str, path: Sequence[str] | None, _target: ModuleType | None = None
-    ) -> importlib.machinery.ModuleSpec | None:
-        if _FILE.removeprefix("fleet/") != f"{fullname.replace('.', '/')}.py":
-            return None
-        spec = importlib.machinery.PathFinder.find_spec(fullname, path)
-        if spec is None or spec.origin is None:
-            return None
-        return importlib.util.spec_from_loader(
-            fullname, _ChangedLoader(fullname, spec.origin), origin=spec.origin
-        )
-
-
-sys.meta_path.insert(0, _Finder())
+_NAME = _FILE.removeprefix("fleet/").removesuffix(".py").replace("/", ".")
+_SPEC = importlib.util.find_spec(_NAME)
+assert _SPEC is not None
+assert _SPEC.origin is not None
+assert _NAME not in sys.modules, f"{_NAME} is loaded already"
+_TEXT = Path(_SPEC.origin).read_text(encoding="utf-8")
+assert _TEXT.count(_OLD) == 1, f"{_FILE} has {_TEXT.count(_OLD)} times {_OLD!r}"
+_MODULE = sys.modules[_NAME] = importlib.util.module_from_spec(_SPEC)
+exec(compile(_TEXT.replace(_OLD, _NEW), _SPEC.origin, "exec"), _MODULE.__dict__)  # noqa: S102  our own text
+setattr(sys.modules[_NAME.rpartition(".")[0]], _NAME.rpartition(".")[2], _MODULE)

@@ -1,4 +1,4 @@
-"""What each cache does with a failure: a cache that keeps successes only lets its caller make the work repeat."""
+"""Each cache states what becomes of a failure: one that keeps successes only lets its caller repeat the work."""
 
 import ast
 from collections.abc import Iterator
@@ -29,6 +29,7 @@ FAILURES = {
     "appliance/configuration/inventory.py::inventory": OURS,
     "appliance/features/doors/rosbridge_frames.py::_publish_head": NEVER,
     "appliance/features/guards/released.py::versions_of": OURS,
+    "appliance/features/guards/presets.py::_value_of": OURS,
     "appliance/features/guards/released.py::origin_of": OURS,
     "appliance/features/standby/witness.py::tag_of": NEVER,
     "appliance/features/views.py::pair_view": OURS,

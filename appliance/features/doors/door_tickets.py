@@ -79,7 +79,7 @@ def new_ticket(door: str, seconds: float, who: str) -> tuple[TicketRow, str]:
 def left_by_its_maker(row: TicketRow, bearers: Collection[str]) -> str:
     """Return a warning if the maker of a ticket is none of the `bearers`, the names of usable tokens and sessions.
 
-    The ticket stays valid: whoever starts a dashboard signs out before it ends.
+    The ticket stays valid: an operator starts a dashboard, and signs out before it ends.
     """
     if row.who in bearers or row.who == OPERATOR:
         return ""
