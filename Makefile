@@ -90,6 +90,7 @@ fleet: setup ## the collector: its images dist/rosrv-fleet-images_VERSION_ARCH.t
 	docker save --output dist/rosrv-fleet-images_$$($(BIN)/python -c 'import appliance; print(appliance.__version__)')_$$(dpkg --print-architecture).tar rosrv/fleet rosrv/fleet-postgres
 
 release: ## everything anew, with provenance and checksums that KEY=FILE signs
+	$(BIN)/python -m distribution.released_presets --check
 	$(BIN)/python -m distribution.sizes --release
 	rm -rf dist
 	$(MAKE) wheel package site fleet ARCH="amd64 arm64"

@@ -1,10 +1,10 @@
 """Keep the present presets as released versions, so that later versions recognise guards that were made from them.
 
-`python -m distribution.released_presets` before a release; `tests/unit/features/guards/test_released.py` checks it.
+`python -m distribution.released_presets` before a release, which checks it (`--check`).
 """
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import product
 
 from appliance.features.guards.presets import PRESETS, Guard, Preset, text_of, types_in
@@ -20,7 +20,19 @@ def lines_of(preset: Preset) -> Iterator[str]:
         yield f"{hash_of(text, preset)} {preset.name} {preset.version} {pairs}"
 
 
-def main() -> None:
+def missing() -> list[str]:
+    """Return the presets whose present version is not kept as a released one."""
+    kept = (FOLDER / "texts.sha256").read_text(encoding="ascii").splitlines()
+    return [preset.name for preset in PRESETS.values() if not {*lines_of(preset)} <= {*kept}]
+
+
+def main(arguments: Sequence[str]) -> None:
+    if arguments == ["--check"]:
+        if names := missing():
+            sys.exit(
+                f"{', '.join(names)}: run python -m distribution.released_presets, and commit what it writes"
+            )
+        return
     table = FOLDER / "texts.sha256"
     lines = table.read_text(encoding="ascii").splitlines()
     for preset in PRESETS.values():
@@ -35,4 +47,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    main(sys.argv[1:])

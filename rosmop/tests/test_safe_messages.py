@@ -277,7 +277,7 @@ ASKING = """(int n = 0; event e(int c) /plain own/Plain '{count:c}' {
 
 @pytest.mark.parametrize("how", ALTERING)
 def test_the_module_and_the_interpreter_know_alike_which_messages_are_altered(how: str) -> None:
-    """A message that the first specification leaves as it was is not altered, also if it is the safe one."""
+    """A message that the first specification leaves as it was is not altered, even if it is the safe one."""
     first = f"a() {{ {ON_PLAIN} event e(int c) /plain own/Plain '{{count:c}}' {{ {ALTERING[how]} }} }}"
     both = BothWays(first, *(f"{name}() {{ {ASKING[1:]}" for name in "bc"))
     random, told = seeded(34), 0

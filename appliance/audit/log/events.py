@@ -76,6 +76,8 @@ EVENTS: dict[str, str] = {
     " text no longer declares it with this range; `detail` has who ordered it, `values` and `before`.",
     "driver checked": "An operator measured whether a robot's driver stops its base when commands end; `detail` has"
     " `outcome`, `seconds` from the last command, and who ordered it.",
+    "guard bypassed": "A node took a guarded command from a publisher that the appliance did not give it, twice in a"
+    " row; `detail` has `node`, `host` and `publishers`. It is recorded again when this has ended and begins again.",
     "monitor resumed": "The topics that a monitor held after a restart resume; `detail` has who ordered it.",
     "monitors restarted": "A relay process was restarted: its monitors are in their initial state, and some hold their"
     " topics.",
@@ -234,9 +236,9 @@ SEVERITIES: dict[str, Severity] = {
             "tunnel refused",
         ),
         Severity.ALARM: (
-            "adoption failed", "fleet not joined", "forwarding gap", "monitor not built", "monitors restarted",
-            "policy file refused",
-            "probe failed", "process failing", "protection forgotten", "publication refused", "records lost",
+            "adoption failed", "fleet not joined", "forwarding gap", "guard bypassed", "monitor not built",
+            "monitors restarted", "policy file refused", "probe failed", "process failing", "protection forgotten",
+            "publication refused", "records lost",
             "topics held",
         ),
     }.items()

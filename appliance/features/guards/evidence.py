@@ -1,7 +1,7 @@
 """Compute the digest that binds a guard to its preset, its text and its values.
 
-The same digest in `rosrv guard list`, in a report and in a record means the same guard. The digest of a preset's text
-is also on the evidence page, beside what was proved and simulated of this text.
+The same digest in `rosrv guard list --json` at two times means the same guard. The digest of a preset's text is also on
+the evidence page, beside what was proved and simulated of this text.
 """
 
 import hashlib

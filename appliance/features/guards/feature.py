@@ -21,7 +21,7 @@ def _operate(context: OperatorContext) -> FeaturePart:
     from appliance.features.guards.driver_check import DriverChecks  # noqa: PLC0415  only control needs it
     from appliance.features.guards.guard_orders import GuardOrders  # noqa: PLC0415  only control needs it
 
-    orders = GuardOrders(context.monitors, context.graph, context.connections)
+    orders = GuardOrders(context.monitors, context.graph, context.connections, context.core.trail)
     checks = DriverChecks(context.monitors, context.core.trail, context.graph, context.processes)
     return FeaturePart(
         methods=(*orders.methods(), *checks.methods()),

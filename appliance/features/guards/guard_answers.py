@@ -93,6 +93,9 @@ class GuardRow(msgspec.Struct, frozen=True):
             "the nodes, with their topics, that it must hear before a motion passes, or empty if there are none"
         ),
     ] = ""
+    digest: Annotated[
+        str, doc("binds its preset, text and values: the same digest is the same guard, with the same values")
+    ] = ""
 
 
 class GuardList(msgspec.Struct, frozen=True):

@@ -15,6 +15,7 @@ from appliance.control.errors import SenselessError, UnknownThingError
 from appliance.control.operators.request_method import RequestMethod
 from appliance.features.feature import ConnectedNodes
 from appliance.features.guards import guard_requests
+from appliance.features.guards.evidence import guard_digest
 from appliance.features.guards.guard_answers import (
     GuardList,
     GuardPlan,
@@ -45,9 +46,10 @@ from appliance.features.guards.presets import (
 from appliance.features.guards.released import origin_of
 from appliance.features.guards.suggestions import LoadedGuard, advice
 from appliance.features.guards.upgrades import Upgrade, same, upgraded
-from appliance.features.guards.view import ActingGuard, GuardsState
+from appliance.features.guards.view import ActingGuard, BypassedGuard, GuardsState
 from appliance.specifications.specification_files import SpecificationsRefusedError
 from appliance.specifications.specification_manager import SpecificationManager
+from appliance.telemetry.audit_trail import AuditTrail
 
 STOPPING_SECONDS = 2.0
 """A guard is stopping if it acted in these last seconds; relays report once a second."""
@@ -63,10 +65,14 @@ class GuardOrders:
     """Answers requests about guards; `graph()` returns the present graph."""
 
     def __init__(
-        self, monitors: SpecificationManager, graph: Callable[[], Graph], connections: ConnectedNodes
+        self,
+        monitors: SpecificationManager,
+        graph: Callable[[], Graph],
+        connections: ConnectedNodes,
+        trail: AuditTrail,
     ) -> None:
-        self._monitors, self._graph = monitors, graph
-        self.placement = Placement(self._guarded_commands, graph, connections)
+        self._monitors, self._graph, self._trail = monitors, graph, trail
+        self.placement = Placement(self._guarded_commands, graph, connections, self._note_bypass)
         self._acts: dict[str, int] = {}
         self._acted_at: dict[str, float] = {}
         self._acting_since: dict[str, float] = {}
@@ -104,6 +110,17 @@ class GuardOrders:
         place = self.placement
         return (
             GuardsState(loaded, acting, place.elsewhere, place.bypassed, place.unanswered) if loaded else None
+        )
+
+    def _note_bypass(self, found: BypassedGuard) -> None:
+        self._trail.happened(
+            "guard bypassed",
+            f"{found.node} takes {found.topic} from {', '.join(found.publishers)}, past its guards",
+            category="monitor",
+            resource=found.topic,
+            node=found.node,
+            host=found.host,
+            publishers=found.publishers,
         )
 
     async def guards(self, request: guard_requests.GuardsWanted) -> GuardList:
@@ -156,7 +173,7 @@ class GuardOrders:
 
     async def upgrade(self, request: guard_requests.GuardUpgrade, who: str) -> Replacement:
         monitors, name = self._monitors, request.name
-        new = self._upgraded(name)
+        new = self._upgraded(name, request.topics)
         order = admin.MonitorLoad(
             {monitors.checked.monitors[name]: new.text}, note=described(new.text), expected=request.expected,
             confirm_within=request.confirm_within, shadow=monitors.switches.in_shadow(name), hold=request.hold,
@@ -176,7 +193,7 @@ class GuardOrders:
         else:
             present, text, _constants = self._changed(name, request.values)
             if request.upgrade:
-                new = self._upgraded(name)
+                new = self._upgraded(name, request.topics)
                 text, kept = new.text, new.warnings
             file = "" if text == present else monitors.checked.monitors[name]
             row = self._row(name, self._guards()[name])
@@ -229,13 +246,13 @@ class GuardOrders:
         placed = Placed(name, preset.name, request.topics["command"], file)
         return file, text + statements(placed, self._placed())
 
-    def _upgraded(self, name: str) -> Upgrade:
+    def _upgraded(self, name: str, topics: Mapping[str, str]) -> Upgrade:
         preset, text = self._guard(name)
         try:
             in_force = {
                 one.name: _written(one.value) for one in self._row(name, preset).given if one.kind != "topic"
             }
-            return upgraded(text, in_force, facts_of(self._graph()))
+            return upgraded(text, in_force, facts_of(self._graph()), topics)
         except GuardError as error:
             raise SenselessError(str(error)) from error
 
@@ -321,5 +338,6 @@ class GuardOrders:
             version=preset.version,
             origin=origin_of(text),
             below=below_the_standard(preset, values_of(given)),
+            digest=guard_digest(PRESETS[preset.name], text, values_of(given)),
             awaits=row.awaits if (row := monitors.rollout.rows.get(name)) is not None else "",
         )

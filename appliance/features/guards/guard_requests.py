@@ -36,11 +36,17 @@ class GuardValues(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     values: Annotated[_Values, doc("by parameter")]
 
 
+class GuardTopics(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Topics of a guard that is made again, instead of those that it has, or beside them."""
+
+    topics: Annotated[_Values, doc("by the names that the preset has for them")] = {}
+
+
 class GuardDraft(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A change of a guard to try: with `preset` a new guard, otherwise new values of the guard `name`."""
 
     preset: Annotated[_Name, doc("the preset of a new guard, or empty for a guard that is loaded")] = ""
-    topics: Annotated[_Values, doc("of a new guard, as in a new guard")] = {}
+    topics: Annotated[_Values, doc("of a new guard, or of an `upgrade` instead of those that it has")] = {}
     types: Annotated[_Values, doc("of a new guard, as in a new guard")] = {}
     name: Annotated[_Name, doc("the guard; by default, it has the name of the preset")] = ""
     values: Annotated[_Values, doc("by parameter, as text")] = {}
@@ -105,8 +111,8 @@ class GuardSet(AdminRequest[GuardList], frozen=True, tag="guard set"):
 
 
 @rest(
-    "admin", "POST", "/v1/guards/{name}/upgrade", ("confirm_within", "hold"), name="upgrade_guard", of=MONITORS,
-    problems=_NO_GUARD,
+    "admin", "POST", "/v1/guards/{name}/upgrade", ("confirm_within", "hold"), name="upgrade_guard", body=GuardTopics,
+    of=MONITORS, problems=_NO_GUARD,
 )  # fmt: skip
 class GuardUpgrade(AdminRequest[Replacement], frozen=True, tag="guard upgrade"):
     """Make a guard of an older version again from the present preset, with its topics and values.
@@ -115,6 +121,7 @@ class GuardUpgrade(AdminRequest[Replacement], frozen=True, tag="guard upgrade"):
     """
 
     name: OneMonitor
+    topics: dict[str, str] = msgspec.field(default_factory=dict)
     expected: str | None = None
     confirm_within: Confirm = None
     hold: Hold = False

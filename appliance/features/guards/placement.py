@@ -31,11 +31,16 @@ class GuardedDriver(NamedTuple):
 
 
 class Placement:
-    """Finds the drivers of guarded topics; `commands()` returns these topics."""
+    """Finds the drivers of guarded topics; `commands()` returns these topics. `report` takes each new bypass."""
 
     def __init__(
-        self, commands: Callable[[], Iterable[str]], graph: Callable[[], Graph], connections: ConnectedNodes
+        self,
+        commands: Callable[[], Iterable[str]],
+        graph: Callable[[], Graph],
+        connections: ConnectedNodes,
+        report: Callable[[BypassedGuard], None],
     ) -> None:
+        self._report = report
         self._commands, self._graph, self._connections = commands, graph, connections
         self.elsewhere: list[str] = []
         self._suspected: dict[GuardedDriver, set[str]] = {}
@@ -44,10 +49,7 @@ class Placement:
 
     @property
     def bypassed(self) -> list[BypassedGuard]:
-        return [
-            BypassedGuard(driver.topic, driver.node, driver.host, uris)
-            for driver, uris in sorted(self._confirmed.items())
-        ]
+        return [_bypassed(driver, uris) for driver, uris in sorted(self._confirmed.items())]
 
     @property
     def unanswered(self) -> list[str]:
@@ -82,6 +84,8 @@ class Placement:
         again = [uri for uri in uris if uri in self._suspected.get(driver, ())]
         self._suspected[driver] = {*uris}
         if again:
+            if driver not in self._confirmed:
+                self._report(_bypassed(driver, again))
             self._confirmed[driver] = again
         elif not uris:
             self._confirmed.pop(driver, None)
@@ -111,3 +115,7 @@ class Placement:
                 )
             elif not here:
                 yield f"{topic}: the base is on {host}: a cut between here and there is not guarded"
+
+
+def _bypassed(driver: GuardedDriver, uris: list[str]) -> BypassedGuard:
+    return BypassedGuard(driver.topic, driver.node, driver.host, uris)

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 
 from appliance.features.guards.plans import planned
 from appliance.features.guards.presets import (
@@ -28,8 +29,13 @@ class Upgrade:
     warnings: list[str]
 
 
-def upgraded(text: str, in_force: Mapping[str, str], graph: Iterable[TopicFacts]) -> Upgrade:
-    """Return the upgrade of a guard, whose constants have the values `in_force`.
+def upgraded(
+    text: str,
+    in_force: Mapping[str, str],
+    graph: Iterable[TopicFacts],
+    topics: Mapping[str, str] = MappingProxyType({}),
+) -> Upgrade:
+    """Return the upgrade of a guard, whose constants have the values `in_force`; `topics` replace those that it has.
 
     Raises `GuardError` if the text is not that of an older version, or if a value that was set cannot be kept.
     """
@@ -66,7 +72,8 @@ def upgraded(text: str, in_force: Mapping[str, str], graph: Iterable[TopicFacts]
         if each not in values and each not in changed:
             changed[each] = ["", parameter.default]
     try:
-        guard = planned(preset, name, topics_in(text), graph, values, types_in(text))
+        types = {each: kind for each, kind in types_in(text).items() if each not in topics}
+        guard = planned(preset, name, {**topics_in(text), **topics}, graph, values, types)
     except GuardError as error:
         raise GuardError(f"{name}: {error}; or remove it, and make it again") from error
     return Upgrade(text_of(guard) + order_of(text), changed, warnings)

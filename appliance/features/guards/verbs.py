@@ -285,6 +285,12 @@ def upgrade(
         ),
     ] = None,
     *,
+    further: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--topic", metavar="NAME=TOPIC", help="A topic that the present preset needs (repeatable)"
+        ),
+    ] = None,
     confirm_within: ConfirmWithin = None,
     hold: _Hold = False,
     dry_run: _DryRun = False,
@@ -292,28 +298,42 @@ def upgrade(
     """Make guards of an older version again from the present presets, with their topics and values.
 
     Each guard begins again: the base is stopped until the next command. A value that the present version does not
-    have or allow is refused with its name.
+    have or allow is refused with its name, and so is a topic that no node has; the other guards are upgraded.
 
     Example: rosrv guard upgrade --dry-run
     """
     if name is None:
         if confirm_within is not None:
             raise GuardError("--confirm-within is for one guard: name it; see rosrv guard list")
+        if further:
+            raise GuardError("--topic is for one guard: name it; see rosrv guard list")
         names = [row.name for row in appliance.ask_or_exit(GuardsWanted()).guards if row.origin == "older"]
         if not names and not appliance.as_json:
             say("no guard has an older version")
     else:
         names = [name]
-    within = seconds_within(confirm_within, "guard")
+    within, refused = seconds_within(confirm_within, "guard"), False
+    topics = _pairs(further, "--topic NAME=TOPIC")
     for each in names:
-        if dry_run:
-            _plan(appliance, GuardTry(name=each, upgrade=True, hold=hold))
-            continue
-        body = appliance.ask_or_exit(GuardUpgrade(each, confirm_within=within, hold=hold))
-        _say_changed(appliance, body)
-        loaded = appliance.ask_or_exit(admin.MonitorsWanted(texts=True))
-        file = next(row.file for row in loaded.monitors if row.name == each)
-        _write(appliance, loaded, file, (loaded.files or {})[file], temporary=body.confirm_by is not None)
+        try:
+            if dry_run:
+                _plan(appliance, GuardTry(name=each, topics=topics, upgrade=True, hold=hold))
+            else:
+                _upgrade(appliance, GuardUpgrade(each, topics, confirm_within=within, hold=hold))
+        except typer.Exit as end:
+            if end.exit_code != 1:
+                raise
+            refused = True
+    if refused:
+        raise typer.Exit(1)
+
+
+def _upgrade(appliance: Appliance, order: GuardUpgrade) -> None:
+    body = appliance.ask_or_exit(order)
+    _say_changed(appliance, body)
+    loaded = appliance.ask_or_exit(admin.MonitorsWanted(texts=True))
+    file = next(row.file for row in loaded.monitors if row.name == order.name)
+    _write(appliance, loaded, file, (loaded.files or {})[file], temporary=body.confirm_by is not None)
 
 
 @speaks

@@ -49,7 +49,7 @@ def states(at: float, names: Sequence[str], positions: Sequence[float]) -> bytes
 
 
 class JointsWorld(World):
-    """Trajectories that are good, too fast, out of limits, malformed, or that begin at another place."""
+    """Good and wrong trajectories: out of limits, malformed, or from another place."""
 
     preset: ClassVar[str] = "joints"
     span = 8000

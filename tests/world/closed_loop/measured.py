@@ -28,7 +28,7 @@ FAULTS = ("dead", "NaN", "infinite", "cut")
 
 
 class MeasuredWorld(World):
-    """A base that at times drives by itself, and its odometry, which may fail."""
+    """A base that at times drives without a command, and its odometry, which may fail."""
 
     still = 0.05
     silent: float

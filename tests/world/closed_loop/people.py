@@ -14,7 +14,7 @@ TICK = 20
 
 @dataclass
 class Switch:
-    """What a node says on the topic of a switch."""
+    """The last word of a node on the topic of a switch."""
 
     on: bool = False
     heard: int = NEVER

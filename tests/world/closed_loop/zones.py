@@ -77,7 +77,7 @@ class ZoneWorld(SeparationWorld):
         return " ".join(f"{x},{y}" for x, y in ((far, -far), (far, far), (-far, far), (-far, -far)))
 
     def _around(self) -> None:
-        """Place walls and persons; the zone is free at first in most worlds."""
+        """Place obstacles and persons; the zone is free at first in most worlds."""
         r = self.random
         for _wall in range(r.choice((1, 2))):
             away, angle = self.half + r.uniform(-0.1, 2), r.uniform(-math.pi, math.pi)

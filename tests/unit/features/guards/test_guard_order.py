@@ -177,7 +177,7 @@ def test_the_wrong_order_has_its_consequence_and_a_new_guard_is_put_right(
     [moves_after_a_reset_without_a_zero, moves_after_the_zone_without_a_zero],
     ids=lambda one: one.__name__,
 )
-def test_a_stop_by_another_guard_is_no_zero_of_the_node_in_any_order(moves: Callable[[bool], bool]) -> None:
+def test_a_stop_by_another_guard_is_never_a_zero_of_the_node(moves: Callable[[bool], bool]) -> None:
     assert not moves(False) and not moves(True)
 
 

@@ -1,6 +1,7 @@
 from collections import Counter
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import msgspec
 import pytest
@@ -69,7 +70,7 @@ def manager() -> Manager:
 
 @pytest.fixture
 def orders(manager: Manager) -> GuardOrders:
-    return GuardOrders(manager, lambda: Graph([], [], []), Connections())  # type: ignore[arg-type]  # as much as guards need
+    return GuardOrders(manager, lambda: Graph([], [], []), Connections(), Mock())  # type: ignore[arg-type]  # as much as guards need
 
 
 async def row(orders: GuardOrders) -> Any:
@@ -132,6 +133,15 @@ async def test_a_guard_has_its_last_stop(manager: Manager, orders: GuardOrders) 
 async def test_a_guard_is_withholding_while_its_relay_says_so(manager: Manager, orders: GuardOrders) -> None:
     manager.rollout.rows["fence"] = SimpleNamespace(withholds=True, awaits="")
     assert (await row(orders)).state == "withholding"
+
+
+async def test_a_guard_has_the_digest_of_its_preset_text_and_values(
+    manager: Manager, orders: GuardOrders
+) -> None:
+    before = (await row(orders)).digest
+    assert len(before) == 16 and (await row(orders)).digest == before
+    manager.sources.files["fence.rv"] = text_of(FENCE).replace("<= silent", "<= 1e9", 1)
+    assert (await row(orders)).digest != before
 
 
 async def test_a_guard_names_the_nodes_that_it_awaits(manager: Manager, orders: GuardOrders) -> None:
@@ -272,7 +282,7 @@ async def test_suggestions_name_the_guards_that_are_loaded(manager: Manager) -> 
     given = [SimpleNamespace(name=name, kind="topic", value=topic) for name, topic in
              (("command", "/cmd_vel"), ("by", "/odom"))]  # fmt: skip
     manager.givens = SimpleNamespace(states=lambda _checked, _name: given)
-    orders = GuardOrders(manager, lambda: Graph([], topics, []), Connections())  # type: ignore[arg-type]  # as much as guards need
+    orders = GuardOrders(manager, lambda: Graph([], topics, []), Connections(), Mock())  # type: ignore[arg-type]  # as much as guards need
     found = await orders.suggestions(guard_requests.GuardSuggestionsWanted())
     assert [one.name for one in found.loaded] == ["fence"]
     assert [one.preset for one in found.suggestions] == ["deadman", "speed"]
@@ -308,7 +318,7 @@ async def test_a_guard_shows_its_version_and_is_upgraded_once(
 async def test_a_new_guard_and_the_list_say_that_the_base_is_on_another_machine(manager: Manager) -> None:
     nodes = [Node("/base", "10.0.0.5", "live", [], ["/c"], [])]
     graph = Graph(nodes, [Topic("/c", TYPES["command"], True, [], ["/base"], [])], [])
-    orders = GuardOrders(manager, lambda: graph, Connections())  # type: ignore[arg-type]  # as much as guards need
+    orders = GuardOrders(manager, lambda: graph, Connections(), Mock())  # type: ignore[arg-type]  # as much as guards need
     warning = "/c: the base is on 10.0.0.5: a cut between here and there is not guarded"
     loaded = Replacement(2, "2.0", 1, [], [], [], [], ["another"], [], [], None)
     manager.load = lambda *_given, **_options: _answered(loaded)  # type: ignore[method-assign]  # with warnings

@@ -16,6 +16,7 @@ class Connections:
     def __init__(self) -> None:
         self.answers: list[list[str] | None] = []
         self.asked: list[tuple[str, str]] = []
+        self.reported: list[BypassedGuard] = []
 
     def is_here(self, host: str) -> bool | None:
         return {"10.111.0.1": True, "172.29.77.10": None}.get(host, False)
@@ -41,7 +42,10 @@ def placed(
         nodes=[SimpleNamespace(name=name, host=host if "mux" not in name else "10.0.0.77") for name in names],
     )
     connections = Connections()
-    return Placement(commands or (lambda: topics_of_guards), lambda: graph, connections), connections
+    place = Placement(
+        commands or (lambda: topics_of_guards), lambda: graph, connections, connections.reported.append
+    )
+    return place, connections
 
 
 @pytest.mark.parametrize(
@@ -87,6 +91,7 @@ async def test_an_unknown_publisher_is_reported_when_it_is_there_twice_and_until
             [BypassedGuard("/cmd_vel", "/turtlebot3_core", "10.0.0.5", [THEIRS])] if reported else []
         ), answer
     assert {*connections.asked} == {("/turtlebot3_core", "/cmd_vel")}
+    assert connections.reported == [BypassedGuard("/cmd_vel", "/turtlebot3_core", "10.0.0.5", [THEIRS])]
 
 
 async def test_a_node_without_an_answer_is_named_after_some_questions() -> None:

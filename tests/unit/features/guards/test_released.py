@@ -1,9 +1,11 @@
 """Guards of released versions are recognised by their texts, and upgraded with their values."""
 
 import re
+import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import product
+from pathlib import Path
 
 import pytest
 
@@ -24,6 +26,7 @@ from appliance.features.guards.presets import (
 )
 from appliance.features.guards.released import FOLDER, origin_of
 from appliance.features.guards.upgrades import upgraded
+from distribution import released_presets
 from distribution.released_presets import lines_of
 from tests.support.examples import sample
 
@@ -172,3 +175,21 @@ def test_a_value_that_cannot_be_kept_is_named(older: Preset) -> None:
     ):
         with pytest.raises(GuardError, match=why):
             upgraded(text, {}, [])
+
+
+def test_a_release_is_refused_until_its_presets_are_kept(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    shutil.copytree(FOLDER, tmp_path / "released")
+    monkeypatch.setattr(released_presets, "FOLDER", tmp_path / "released")
+    monkeypatch.setattr(released_presets, "PRESETS", {name: PRESETS[name] for name in ("sane", "rate")})
+    table = tmp_path / "released" / "texts.sha256"
+    for name in ("sane", "rate"):
+        (tmp_path / "released" / f"{name}-{PRESETS[name].version}.rv").unlink(missing_ok=True)
+        wanted = [*released_presets.lines_of(PRESETS[name])]
+        kept = [line for line in table.read_text().splitlines() if line not in wanted]
+        table.write_text("\n".join(kept) + "\n")
+    with pytest.raises(SystemExit, match="sane, rate: run python -m"):
+        released_presets.main(["--check"])
+    released_presets.main([])
+    released_presets.main(["--check"])

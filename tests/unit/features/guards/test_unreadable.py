@@ -201,7 +201,7 @@ def test_speakers_are_all_heard_and_all_awaited() -> None:
 @MADE
 @pytest.mark.parametrize("how", ["unreadable", "enabled again", "restarted"])
 @pytest.mark.parametrize(("name", "permits", "forbids"), [("enable", b"\1", b"\0"), ("mode", b"\0", b"\1")])
-def test_what_a_node_said_is_not_forgotten_when_the_guard_begins_again(
+def test_the_word_of_a_node_is_not_forgotten_when_the_guard_begins_again(
     name: str, permits: bytes, forbids: bytes, how: str, made: Callable[[SetPart], MonitorSet]
 ) -> None:
     """One of two nodes forbids the motion, and says nothing more; the guard must not go on with the other alone."""

@@ -13,6 +13,7 @@ from appliance.channel.answers.monitor_answers import GivenSet, Replacement, Swi
 from appliance.cli.output import say_json
 from appliance.features.guards import verbs
 from appliance.features.guards.guard_answers import (
+    GuardList,
     GuardPlan,
     GuardRow,
     LastStop,
@@ -301,5 +302,35 @@ def test_all_guards_of_an_older_version_are_upgraded_and_written(
     with pytest.raises(typer.Exit):
         run(verbs.upgrade, robot, dry_run=True)
     assert "would be refused: it would hold /c" in capsys.readouterr().out
-    with pytest.raises(GuardError, match="for one guard"):
-        run(verbs.upgrade, robot, confirm_within="5m")
+    for options in ({"confirm_within": "5m"}, {"further": ["by=/odom"]}):
+        with pytest.raises(GuardError, match="for one guard"):
+            run(verbs.upgrade, robot, **options)
+    robot.orders.clear()
+    run(verbs.upgrade, robot, "old", further=["by=/other"])
+    assert robot.orders == [GuardUpgrade("old", {"by": "/other"})]
+
+
+def test_a_guard_that_cannot_be_upgraded_does_not_keep_the_others_from_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot = Robot(tmp_path, Guard("old", PRESETS["fence"], types=FENCE.types))
+    ask, asked = robot.ask_or_exit, []
+
+    def answer(request: Any) -> Any:
+        match request:
+            case GuardsWanted():
+                rows = [
+                    GuardRow(name, "fence", "", "free", {}, {}, [], {}, 0, origin="older")
+                    for name in ("bad", "old")
+                ]
+                return GuardList(2, "2", [], rows)
+            case GuardUpgrade("bad"):
+                raise typer.Exit(1)
+            case GuardUpgrade(name):
+                asked.append(name)
+        return ask(request)
+
+    monkeypatch.setattr(robot, "ask_or_exit", answer)
+    with pytest.raises(typer.Exit):
+        run(verbs.upgrade, robot)
+    assert asked == ["old"]

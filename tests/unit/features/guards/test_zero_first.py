@@ -78,14 +78,14 @@ def judge(before: str, preset: str) -> None:
 
 @pytest.mark.parametrize("preset", WAITING)
 @pytest.mark.parametrize("stopper", STOPPERS)
-def test_what_another_monitor_sends_is_no_zero_of_the_node(stopper: str, preset: str) -> None:
+def test_a_stop_by_another_monitor_is_not_a_zero_of_the_node(stopper: str, preset: str) -> None:
     judge(f"before() given {{ topic command = /cmd_vel; }} {{ {SAFE} {STOPPERS[stopper]} }}", preset)
 
 
 @pytest.mark.nightly
 @pytest.mark.parametrize("preset", WAITING)
 @pytest.mark.parametrize("first", BEFORE)
-def test_a_stop_of_another_guard_is_no_zero_of_the_node(first: str, preset: str) -> None:
+def test_a_stop_by_another_guard_is_not_a_zero_of_the_node(first: str, preset: str) -> None:
     before = PRESETS[first]
     types = {topic: next(iter(rows)) for topic, rows in before.topics.items()}
     silent = {
