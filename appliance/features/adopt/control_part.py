@@ -24,7 +24,7 @@ from appliance.master.calls.parameter_calls import ParameterCalls, ParameterWrit
 from appliance.master.graph.registry import Life
 from appliance.master.graph.revocation import ROSOUT
 from appliance.policy.model import Address, address_of
-from appliance.rpc.master_reader import MasterReader
+from appliance.rpc.master_reader import Entry, MasterReader
 from appliance.rpc.server import Peer
 from appliance.supervisor.machine_work import Found
 from roswire.uris import NodeUri
@@ -48,7 +48,7 @@ class AdoptMemory(msgspec.Struct):
     """Keeps over a restart of control the keys of adopted nodes, and all that stays with the other master."""
 
     nodes: list[str] = []
-    denied: dict[str, str] = {}
+    denied: list[tuple[Entry, str]] = []
     missing: dict[str, str] = {}
 
 
@@ -191,9 +191,7 @@ class AdoptPart:
             try:
                 await self._machine("want", wanted=False)
                 facts = await self._operation.facts()
-                if facts.record.phase is Phase.FREE:
-                    raise SenselessError("nothing is adopted: the robot's nodes use their own master")
-                return await self._give()
+                return GiveBackReport() if facts.record.phase is Phase.FREE else await self._give()
             except AdoptError as error:
                 raise UnavailableError(
                     f"{error}. The release is tried again while the appliance runs"
@@ -268,14 +266,14 @@ class AdoptPart:
         """Restore what an earlier control knew, now that the registry is restored."""
         memory = _memory(self._base.store)
         self._missing = memory.missing
-        self._graph.denied.update({tuple(text.split(" ", 2)): why for text, why in memory.denied.items()})  # type: ignore[misc]  # three words
+        self._graph.denied.update(memory.denied)
         registry = self._parts.core.registry
         self._graph.subscribers.unasked.update(filter(None, map(registry.by_key, memory.nodes)))
 
     def _save(self) -> None:
         memory = AdoptMemory(
             sorted(node.key for node in self._graph.subscribers.unasked),
-            {" ".join(entry): why for entry, why in self._graph.denied.items()},
+            list(self._graph.denied.items()),
             self._missing,
         )
         self._base.store.save_setting(_SETTING, msgspec.json.encode(memory).decode())

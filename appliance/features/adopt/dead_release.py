@@ -72,6 +72,9 @@ async def _release(state: Path, store: StateStore) -> GiveBackReport:
         _no_order, flush=lambda: None,
     )  # fmt: skip
     keys = [node.key for node in graph.nodes()]
+    if record.phase is Phase.FREE:
+        save_record(state, msgspec.structs.replace(record, wanted=False))
+        return GiveBackReport()
     operation = AdoptOperation(
         machine, lambda _facts: MasterReader(NodeUri("http", _HERE, MASTER_PORT, "/")), graph,
         _StoredParameters(store.load_parameters()), waiting=lambda: 0, silence=lambda: None, speak=lambda: None,

@@ -73,6 +73,9 @@ def release(
     if appliance.as_json:
         say_json(msgspec.to_builtins(report))
         return
+    if not report.nodes:
+        say("nothing was adopted: the robot's nodes use their own master")
+        return
     say(
         f"released in {report.seconds:g} s: {counted(report.nodes, 'node')} use {report.master or 'their own master'}"
         f" again; {counted(report.given, 'registration')} given back, {report.ended} ended"

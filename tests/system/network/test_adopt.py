@@ -5,6 +5,7 @@ import json
 import os
 import subprocess
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -187,4 +188,32 @@ def test_an_ordered_stop_gives_the_graph_back_and_a_crash_does_not(
     assert "released" in rosrv(robot, appliance, "release", "--dead")
     assert robot.graph() == graph
     robot.hears()
+    assert robot.lives() == lives
+
+
+@pytest.mark.nightly
+def test_a_service_that_waits_for_the_robots_master_takes_its_graph_over(
+    robot: Robot, appliance: Appliance, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The robot booted first: the service waits, `rosrv adopt` notes the order, and the start takes the graph over."""
+    graph, lives = robot.graph(), robot.lives()
+    monkeypatch.setenv(
+        "NOTIFY_SOCKET", str(tmp_path / "systemd")
+    )  # as under systemd, where the service waits
+    with ThreadPoolExecutor(1) as threads:
+        started = threads.submit(appliance.start)
+        eventually(
+            lambda: "holds TCP 11311" in rosrv(robot, appliance, "status", check=False), appliance.story
+        )
+        assert robot.graph() == graph
+        assert "adopted: 12 nodes" in rosrv(robot, appliance, "adopt")
+        started.result()
+    robot.hears()
+    assert robot.graph() == graph
+    appliance.kill("control")
+    until_taken(robot, appliance)
+    robot.hears()
+    rosrv(robot, appliance, "release")
+    robot.hears()
+    assert robot.graph() == graph
     assert robot.lives() == lives

@@ -1,0 +1,126 @@
+import ipaddress
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from appliance.base.shipped import SHIPPED
+from appliance.features.adopt.adopt_check import CheckedRobot, CheckLine, graph_lines
+from appliance.features.adopt.adopt_record import AdoptRecord, Phase, boot_id, load_record, save_record
+from appliance.features.adopt.machine_facts import RobotMaster
+from appliance.features.adopt.machine_side import wanted_record
+from appliance.features.adopt.robot_side import AUDIT_ONLY, make_audit_only
+from appliance.network.listening_sockets import TcpSocket
+from appliance.network.namespaces import NetworkError
+from appliance.policy.policy_compiler import compile_policy
+from appliance.rpc.graph_inventory import GraphInventory, SurveyedNode, SurveyedService, SurveyedTopic
+
+MASTER = RobotMaster(1, "/usr/bin/rosmaster", "robot", "roscore.service", "system.slice/roscore.service")
+LINK = ipaddress.ip_address("10.111.0.1")
+DEFAULT = (SHIPPED / "policies" / "default.ini").read_text()
+
+
+def socket(port: int, address: str = "0.0.0.0", *, listens: bool = True) -> TcpSocket:
+    return TcpSocket(
+        4, address, port, "0.0.0.0", 0, listens=listens, established=not listens, inode=str(port)
+    )
+
+
+def robot(policy: str = DEFAULT, *nodes: SurveyedNode, sockets: tuple[TcpSocket, ...] = ()) -> CheckedRobot:
+    inventory = GraphInventory(
+        "http://127.0.0.1:11311", "127.0.0.1",
+        nodes or (SurveyedNode("/base", "http://base:4001/", "192.168.50.1"),),
+        (SurveyedTopic("/odom", "nav_msgs/Odometry", ("/base",)),),
+        (SurveyedService("/reset", ("/base",), "rosrpc://base:5001"),), ("/speed",),
+    )  # fmt: skip
+    return CheckedRobot(
+        11311, AdoptRecord(), MASTER, inventory, frozenset({"192.168.50.1"}), (socket(4001), *sockets),
+        compile_policy(policy, file="policy.ini", robot=[LINK]), LINK,
+    )  # fmt: skip
+
+
+def lines(state: CheckedRobot) -> dict[str, CheckLine]:
+    return {line.about: line for line in graph_lines(state)}
+
+
+def test_a_robot_that_can_be_adopted_has_no_stop() -> None:
+    found = lines(robot())
+    assert {line.level for line in found.values()} == {"ok"}
+    assert found["master"].text.startswith("/usr/bin/rosmaster (roscore.service), 1 node, 1 topic, 1 service")
+    assert found["policy"].text == "0 of 2 registrations would be denied"
+
+
+def test_a_robot_without_a_master_or_with_another_program_stops() -> None:
+    assert lines(replace(robot(), master=None))["master"].level == "stop"
+    assert lines(replace(robot(), inventory=None))["master"].level == "stop"
+
+
+@pytest.mark.parametrize(
+    ("node", "sockets", "about", "level"),
+    [
+        (SurveyedNode("/far", "http://nuc:4002/"), (), "hosts", "stop"),
+        (SurveyedNode("/lo", "http://localhost:4002/", "127.0.0.1"), (socket(4002),), "nodes", "stop"),
+        (
+            SurveyedNode("/lo", "http://base:4002/", "127.0.1.1"),
+            (socket(4002, "127.0.0.1"),),
+            "nodes",
+            "stop",
+        ),
+        (SurveyedNode("/gone", "http://base:4002/", "192.168.50.1", problem="refuses"), (), "nodes", "warn"),
+        (SurveyedNode("/other", "http://nuc:4002/", "192.168.50.2"), (), "hosts", "warn"),
+    ],
+)
+def test_a_node_that_cannot_be_moved_is_named(
+    node: SurveyedNode, sockets: tuple[TcpSocket, ...], about: str, level: str
+) -> None:
+    found = lines(robot(DEFAULT, node, sockets=sockets))[about]
+    assert found.level == level
+    assert node.name in found.text or node.host in found.text
+
+
+def test_denied_registrations_are_counted_and_named() -> None:
+    denying = DEFAULT.replace("[Publishers]", "[Publishers]\n/odom = 10.9.9.9\n#")
+    assert "1 of 2 registrations would be denied: /base /odom" in lines(robot(denying))["policy"].text
+    assert lines(robot(denying))["policy"].level == "warn"
+    audit_only = lines(robot(denying + AUDIT_ONLY))["policy"]
+    assert audit_only == ("ok", "policy", "audit-only: 1 of 2 registrations would be denied")
+
+
+def test_connections_that_would_be_cut_are_counted() -> None:
+    state = robot(DEFAULT, sockets=(socket(11311, listens=False), socket(5001, listens=False)))
+    assert lines(state)["would cut"].text.startswith(
+        "1 connection to the master, about 0 connections of topics, 1 at"
+    )
+
+
+def test_only_the_shipped_policy_becomes_audit_only(tmp_path: Path) -> None:
+    file = tmp_path / "policy.ini"
+    file.write_text(DEFAULT)
+    file.chmod(0o640)
+    assert make_audit_only(file)
+    assert make_audit_only(file), "once more changes nothing"
+    assert compile_policy(file.read_text(), file="policy.ini").all_audit_only
+    assert file.stat().st_mode & 0o777 == 0o640
+    file.write_text(f"{DEFAULT}\n# mine\n")
+    assert not make_audit_only(file)
+    assert file.read_text() == f"{DEFAULT}\n# mine\n"
+
+
+def test_the_record_survives_and_its_phase_is_of_one_boot(tmp_path: Path) -> None:
+    state = tmp_path / "state"
+    assert load_record(state) == AdoptRecord(boot=boot_id())
+    save_record(state, AdoptRecord(wanted=True, phase=Phase.TAKEN, boot=boot_id()))
+    assert load_record(state).phase is Phase.TAKEN
+    save_record(state, AdoptRecord(wanted=True, phase=Phase.TAKEN, boot="an earlier one"))
+    assert load_record(state) == AdoptRecord(wanted=True, boot=boot_id())
+    (state / "adopt.json").write_text("{")
+    with pytest.raises(NetworkError, match="release --dead"):
+        load_record(state)
+
+
+def test_the_recorded_master_stays_the_one_of_the_order() -> None:
+    record = wanted_record(AdoptRecord(), MASTER)
+    assert (record.unit, record.user, record.group) == (MASTER.unit, MASTER.user, MASTER.group)
+    assert wanted_record(record, RobotMaster(2, "/tmp/x", "nobody")) is record
+    with pytest.raises(NetworkError, match="start the robot first"):
+        wanted_record(AdoptRecord(), None)
