@@ -20,6 +20,9 @@ _ACTS = {
 _TELLING = ("password", "passwd", "passphrase", "secret", "token", "apikey", "credential", "privatekey")
 
 
+_SHARED = "/rosout"  # each node publishes it
+
+
 class NodeConnection(msgspec.Struct, frozen=True):
     """A row of a node's `getBusInfo`. `peer` is a node or a URI, as the node says."""
 
@@ -127,7 +130,7 @@ def problems(inventory: GraphInventory) -> Iterator[str]:
         elif node.host.startswith("127.") and not inventory.master_host.startswith("127."):
             yield f"{node.name} announces {node.uri}, which no other host reaches: set ROS_IP or ROS_HOSTNAME for it"
     for topic in inventory.topics:
-        if len(hosts := inventory.hosts_of(topic.publishers)) > 1:
+        if topic.name != _SHARED and len(hosts := inventory.hosts_of(topic.publishers)) > 1:
             yield f"{topic.name} has publishers on more than one host: {', '.join(sorted(hosts))}"
     for service in inventory.services:
         if len(service.providers) > 1:

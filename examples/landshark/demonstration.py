@@ -23,6 +23,7 @@ from rich.markup import escape
 from appliance.base.shipped import SHIPPED
 from appliance.cli.output import say_json
 from appliance.network.namespaces import NetworkError, has_privileges
+from examples.landshark.adopt_show import AdoptShow, AdoptStage
 from examples.landshark.doorway import Doorway
 from examples.landshark.lab import Lab
 from examples.landshark.mistakes import Mistakes, Ways
@@ -249,7 +250,9 @@ def require_everything() -> None:
         raise DemoError(f"ROS 1 is missing for {NODE_PYTHON}: sudo apt-get install rosout {packages}")
 
 
-def demonstrate(*, hold: bool, picture: Path | None, as_json: bool, standby: bool = False) -> int:
+def demonstrate(
+    *, hold: bool, picture: Path | None, as_json: bool, standby: bool = False, adopt: bool = False
+) -> int:
     """Return the exit status. Draw the robot's paths into the file `picture`."""
     console, errors = Console(stderr=as_json), Console(stderr=True)
     signal.signal(signal.SIGTERM, _interrupt)
@@ -257,6 +260,8 @@ def demonstrate(*, hold: bool, picture: Path | None, as_json: bool, standby: boo
         require_everything()
         with ExitStack() as stack:
             lab = stack.enter_context(Lab("rosrv-demo"))
+            if adopt:
+                return _show_adopt(stack.enter_context(AdoptStage(lab, SHIPPED)), console, hold, as_json)
             if standby:
                 return _show_standby(stack.enter_context(StandbyStage(lab, SHIPPED)), console, hold, as_json)
             stage = stack.enter_context(Stage(lab, SHIPPED))
@@ -303,6 +308,24 @@ def _show_standby(stage: StandbyStage, console: Console, hold: bool, as_json: bo
             f"\nEverything keeps running until Ctrl-C, with b as the active appliance.\n"
             f"Explore:  {command} standby status --state {stage.other_state}\n"
             f"          {command} status --state {stage.other_state}",
+            soft_wrap=True,
+            highlight=False,
+        )
+        signal.pause()
+    return 0 if good else 1
+
+
+def _show_adopt(stage: AdoptStage, console: Console, hold: bool, as_json: bool) -> int:
+    show = AdoptShow(stage, console)
+    good = show.run()
+    _print_results(show.results, as_json)
+    if hold:
+        command = shutil.which("rosrv") or Path(sys.executable).with_name("rosrv")
+        inside = f"ip netns exec {stage.robot_host.namespace.name}"
+        console.print(
+            f"\nEverything keeps running until Ctrl-C.\n"
+            f"Adopt it again:  {inside} {command} adopt --state {stage.state}\n"
+            f"Release it:      {inside} {command} release --state {stage.state}",
             soft_wrap=True,
             highlight=False,
         )

@@ -118,3 +118,16 @@ def test_demo_without_root() -> None:
     assert done.returncode == 1
     assert "needs root" in done.stderr
     assert "Traceback" not in done.stderr
+
+
+@pytest.mark.nightly
+def test_demo_of_an_adoption(temporary: Path) -> None:
+    environment = os.environ | {"TMPDIR": str(temporary)}
+    done = subprocess.run(
+        [ROSRV, "demo", "--adopt", "--json"],
+        env=environment, capture_output=True, text=True, timeout=LIMIT, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
+    results = [json.loads(line) for line in done.stdout.splitlines()]
+    assert len(results) == 5
+    assert all(result["good"] for result in results)
