@@ -1,10 +1,12 @@
 """The commands `rosrv host block|unblock|blocks`."""
 
 import functools
+import shlex
 from typing import Annotated
 
 import typer
 
+from appliance.base import clock
 from appliance.base.counted import counted
 from appliance.cli import output
 from appliance.cli.connection.target import Appliance, speaks
@@ -15,6 +17,7 @@ from appliance.features.blocks.block_requests import (
     BlockedHost,
     BlockEnded,
     HostBlock,
+    HostBlocked,
     HostBlocks,
     HostUnblock,
 )
@@ -76,6 +79,8 @@ def block(
         say(f"{'would end' if dry_run else 'ended'}: {use}")
     if body.replaced is not None:
         say(f"this replaces the block by {_whose(body.replaced)}")
+    if not dry_run:
+        say(f"undo: {_undo(body)}")
     for other in body.other_addresses:
         say(
             f"! the same machine also has the address {other}, which is not blocked: rosrv host block {other}",
@@ -124,6 +129,16 @@ def _named(row: BlockedHost, running: Appliance) -> str:
 def _whose(row: BlockedHost) -> str:
     end = "without an end" if row.until is None else f"until {moment(row.until)}"
     return f"{row.who}, {end}{_note(row)}"
+
+
+def _undo(body: HostBlocked) -> str:
+    """Return the command that brings back the state before a block, with the present rest of the time."""
+    earlier = body.replaced
+    if earlier is None:
+        return f"rosrv host unblock {body.address}"
+    left = "" if earlier.until is None else f" --for {max(1, round(earlier.until - clock.wall()))}s"
+    note = f" --note {shlex.quote(earlier.note)}" if earlier.note else ""
+    return f"rosrv host block {body.address}{left}{note}"
 
 
 def _note(row: BlockedHost) -> str:

@@ -123,7 +123,9 @@ def remove(appliance: Appliance, name: _Name) -> None:
     Example: rosrv door remove agent-1
     """
     body = appliance.answer_or_exit(DoorRemove(name))
-    say(f"{body.name} ({body.address}) is removed")
+    port = "" if body.port is None else f" --port {body.port}"
+    source = f" --from {body.source}" if body.source else ""
+    say(f"{body.name} ({body.address}) is removed; undo: rosrv door add {body.name}{port}{source}")
 
 
 def _client(one: ConnectedClient) -> str:

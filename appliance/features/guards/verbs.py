@@ -1,5 +1,6 @@
 """The commands `rosrv guard list|suggest|new|set|enforce|upgrade|remove`."""
 
+import shlex
 import tempfile
 from pathlib import Path
 from typing import Annotated
@@ -343,9 +344,12 @@ def remove(appliance: Appliance, name: _Name, confirm_within: ConfirmWithin = No
     Example: rosrv guard remove fence
     """
     loaded, row, _text = _guard(appliance, name)
+    guard = next(one for one in appliance.ask_or_exit(GuardsWanted()).guards if one.name == name)
     order = admin.MonitorRemove([name], confirm_within=seconds_within(confirm_within, "guard"))
     body = appliance.ask_or_exit(order)
     _say_changed(appliance, body)
+    if not appliance.as_json and body.confirm_by is None:
+        say(f"undo: {_undo(guard)}")
     folder = _folder(appliance, loaded)
     if folder and body.confirm_by is None:
         path = file_of(row.file.removesuffix(".rv"), folder)
@@ -355,6 +359,24 @@ def remove(appliance: Appliance, name: _Name, confirm_within: ConfirmWithin = No
         except OSError as error:
             why = f"{path} is not removed: {error.strerror}; a reload of the folder loads the guard again"
             _say_obstacle(appliance, why)
+
+
+def _undo(guard: GuardRow) -> str:
+    """Return the command that makes a removed guard again. It begins in its initial state."""
+    if guard.origin != "current":
+        return "rosrv monitor rollback"
+    constants = {
+        one.name: str(one.value) for one in guard.given if one.kind != "topic" and one.value != one.default
+    }
+    topics = dict(guard.topics)
+    words = ["rosrv", "guard", "new", guard.preset, topics.pop("command")]
+    words += [f"{name}={value}" for name, value in (constants | guard.loads).items()]
+    words += ["--by", by] if (by := topics.pop("by", "")) else []
+    words += [word for name, topic in topics.items() for word in ("--topic", f"{name}={topic}")]
+    words += [word for name, kind in guard.types.items() for word in ("--type", f"{name}={kind}")]
+    words += ["--name", guard.name] if guard.name != guard.preset else []
+    words += ["--shadow"] if guard.state == "shadow" else []
+    return shlex.join(words)
 
 
 def _runs(appliance: Appliance) -> bool:

@@ -49,6 +49,18 @@ def test_a_blocked_host_is_listed_until_it_is_unblocked(
     blocked = page.get_by_role("region", name="Blocked hosts")
     expect(blocked.get_by_role("row", name=HOST)).to_contain_text("tablet lost")
     [block] = appliance.rest().get("/v1/blocks").json["blocks"]
+    page.get_by_role("button", name="Block a host").press("Enter")
+    dialog.get_by_label("Address").fill(HOST)
+    dialog.get_by_label("For", exact=True).select_option("900")
+    dialog.get_by_role("button", name="Block the host").press("Enter")
+    expect(dialog).to_have_count(0)
+    reader.toast(f"{HOST} is blocked").last.locator(
+        "xpath=ancestor::*[contains(@class, 'notice-body')]"
+    ).get_by_role("button", name="Undo").click()
+    expect(reader.toast("has its earlier block")).to_be_visible()
+    [restored] = appliance.rest().get("/v1/blocks").json["blocks"]
+    assert (restored["note"], round(restored["until"] - block["until"])) == ("tablet lost", 0)
+    block = restored | {"until": block["until"], "since": block["since"]}
     assert (block["address"], round(block["until"] - block["since"])) == (HOST, 3600)
     assert reader.axe() == []
     page.keyboard.press("1")

@@ -1,3 +1,4 @@
+import shlex
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -55,6 +56,15 @@ def test_a_fence_is_drawn_changed_and_enforced(
     row.get_by_role("button", name="Remove").click()
     page.get_by_role("dialog").get_by_role("button", name="Remove").click()
     expect(page.get_by_text("No guard", exact=True)).to_be_visible()
+    page.get_by_role("button", name="Undo").click()
+    expect(reader.toast("fence is back")).to_be_visible()
+    expect(row).to_contain_text("/cmd_vel")
+    assert "POLYGON[] = {-1, -1, 2, -1, 1, 1, -1, 1}" in appliance.rosrv("monitor", "show").stdout
+    removed = appliance.rosrv("guard", "remove", "fence").stdout
+    undo = shlex.split(removed.partition("undo: ")[2].splitlines()[0])
+    assert appliance.rosrv(*undo[1:]).returncode == 0
+    assert "POLYGON[] = {-1, -1, 2, -1, 1, 1, -1, 1}" in appliance.rosrv("monitor", "show").stdout
+    appliance.rosrv("guard", "remove", "fence")
 
 
 def test_the_check_of_a_driver_asks_measures_and_ends_with_its_window(

@@ -33,7 +33,7 @@ export function useHeldCalls() {
     const counts = one.status?.approvals;
     if (!counts) return "";
     const some = counts.waiting + counts.leases > 0 || held.get().rows?.length;
-    return [one.status.since, counts.waiting, counts.leases, some && one.heard].join(" ");
+    return [one.status.since, counts.waiting, counts.leases, some ? one.heard : ""].join(" ");
   });
   const record = useStore(notable, (one) => (one.latest?.event.startsWith("approval ") ? one.latest.sequence : 0));
   const signedIn = useStore(session, ({ current }) => current !== null);

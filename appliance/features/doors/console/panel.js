@@ -43,7 +43,11 @@ function DoorRow(/** @type {{door: any, again: () => void}} */ { door, again }) 
     close();
     try {
       await ask("DELETE", `/v1/doors/${encodeURIComponent(door.name)}`, { match: "*" });
-      done(`${door.name} is removed`, "Its connections and tickets have ended.");
+      done(`${door.name} is removed`, "Its connections and tickets have ended.", async () => {
+        await ask("POST", "/v1/doors", { json: { name: door.name, port: door.port, source: door.source }, match: "*" });
+        done(`${door.name} is back`, "Its tickets stay ended.");
+        again();
+      });
     } catch (failure) {
       failed(failure);
     }

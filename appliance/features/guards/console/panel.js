@@ -11,6 +11,8 @@ import { Given } from "#console/parts/given.js";
 import { Icon } from "#console/parts/icon.js";
 import { useLook } from "#console/parts/look.js";
 import { Empty, Failure, Loading, Notice } from "#console/parts/notice.js";
+import { done } from "#console/parts/toast.js";
+import { ask } from "#console/rest.js";
 import { Link } from "#console/router.js";
 import { CheckDriver } from "./driver.js";
 import { corners } from "./geometry.js";
@@ -77,8 +79,18 @@ function Guard(/** @type {{guard: any, guards: ReturnType<typeof useGuards>, see
         <p>It stops the robot no longer: it only records what it would have done.</p></${Confirm}>`}
       ${open === "upgrade" && html`<${Confirm} title=${`Upgrade ${guard.name}?`} verb="Upgrade" role="admin" close=${close} act=${() => guards.order(`${guard.name} is upgraded`, "It begins in its initial state.", "POST", `/v1/guards/${encodeURIComponent(guard.name)}/upgrade`)}>
         <p>It is made again from ${guard.preset} ${preset?.version}, with its topics and values, and begins again: the base is stopped until the next command. <code>rosrv guard upgrade ${guard.name} --dry-run</code> reports the differences.</p></${Confirm}>`}
-      ${open === "remove" && html`<${Confirm} title=${`Remove ${guard.name}?`} verb="Remove" role="admin" tone="danger" close=${close} act=${() => guards.order(`${guard.name} is removed`, "", "DELETE", path)}>
+      ${open === "remove" && html`<${Confirm} title=${`Remove ${guard.name}?`} verb="Remove" role="admin" tone="danger" close=${close} act=${() => guards.order(`${guard.name} is removed`, "", "DELETE", path, { undo: guard.origin === "current" ? bringBack(guard) : undefined })}>
         <p>It stops the robot no longer. The file <code><${Given} value=${guard.file} /></code> on disk is kept: remove it there also, or the next reload loads it again.</p></${Confirm}>`}</td></tr>`;
+}
+
+/** A function that makes a removed guard again, in its initial state, unless the specifications have changed since. @param {any} guard */
+function bringBack({ name, preset, topics, types, given, loads, state }) {
+  const constants = given.filter((/** @type {any} */ one) => one.kind !== "topic").map((/** @type {any} */ one) => [one.name, String(one.value)]);
+  const json = { name, preset, topics, types, values: { ...Object.fromEntries(constants), ...loads }, shadow: state === "shadow" };
+  return async (/** @type {string} */ tag) => {
+    await ask("POST", "/v1/guards", { json, match: `"${tag}"` });
+    done(`${name} is back`, "It begins in its initial state.");
+  };
 }
 
 function Enforce(/** @type {{guard: any, guards: ReturnType<typeof useGuards>, path: string, close: () => void}} */ { guard, guards, path, close }) {

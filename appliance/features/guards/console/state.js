@@ -12,7 +12,7 @@ const PASSING = ["stopping", "withholding", "shadow"]; // states whose counts ch
 export function useGuards({ presets = true } = {}) {
   const [state, setState] = useState({ body: /** @type {any} */ (null), error: /** @type {unknown} */ (null) });
   const passing = state.body?.guards.some((/** @type {any} */ row) => PASSING.includes(row.state) || row.preset === "withhold");
-  const mark = useStore(live, (one) => JSON.stringify([one.status?.monitors ?? null, one.samples.at(-1)?.monitors ?? null, passing && one.samples.at(-1)?.time]));
+  const mark = useStore(live, (one) => JSON.stringify([one.status?.monitors ?? null, one.samples.at(-1)?.monitors ?? null, passing ? one.samples.at(-1)?.time : null]));
   const again = async () => {
     try {
       setState({ body: await get("/v1/guards", { presets: presets ? undefined : 0 }), error: null });
@@ -23,12 +23,15 @@ export function useGuards({ presets = true } = {}) {
   useEffect(() => {
     again();
   }, [mark]);
-  /** Send a change, say that it is done, and fetch the guards again. Returns whether it was done. */
-  const order = async (/** @type {string} */ said, /** @type {string} */ more, /** @type {string} */ method, /** @type {string} */ path, /** @type {any} */ options = {}) => {
+  /** Send a change, say that it is done, and fetch the guards again. Returns whether it was done. `undo` gets the tag after it. */
+  const order = async (/** @type {string} */ said, /** @type {string} */ more, /** @type {string} */ method, /** @type {string} */ path, /** @type {any} */ { undo, ...options } = {}) => {
     let made = false;
     try {
-      await ask(method, path, { ...options, match: `"${state.body.tag}"` });
-      done(said, more);
+      const { body } = await ask(method, path, { ...options, match: `"${state.body.tag}"` });
+      done(said, more, undo && (async () => {
+        await undo(body.tag);
+        await again();
+      }));
       made = true;
     } catch (failure) {
       failed(failure);

@@ -1,6 +1,7 @@
 /** Block a host during an incident, and the list of blocked hosts. */
 
 import { html, useEffect, useState } from "../html.js";
+import { applianceTime } from "../live.js";
 import { Moment } from "../moments.js";
 import { counted } from "../numbers.js";
 import { Button } from "../parts/button.js";
@@ -34,7 +35,11 @@ function BlockDialog(/** @type {{host: string, close: () => void, after: () => v
       const { body } = await ask("POST", "/v1/blocks", { match: "*", json });
       const uses = body.ended.uses.length ? ` Ended: ${body.ended.uses.join("; ")}.` : "";
       const others = body.other_addresses.length ? ` Not blocked: its other address ${body.other_addresses.join(", ")}.` : "";
-      done(`${body.name || body.address} is blocked`, `It lost ${ended(body.ended)}.${uses}${others}`);
+      const undo = async () => {
+        await takeBack(body);
+        after();
+      };
+      done(`${body.name || body.address} is blocked`, `It lost ${ended(body.ended)}.${uses}${others}`, undo);
       after();
       close();
     } catch (failure) {
@@ -49,6 +54,16 @@ function BlockDialog(/** @type {{host: string, close: () => void, after: () => v
     <${Field} label="For" value=${seconds} set=${setSeconds} options=${TIMES} />
     <${Field} label="Note for other operators" value=${note} set=${setNote} placeholder="tablet lost" maxlength="200" />
     ${error?.status === 422 && html`<${Check} label="Block it even if it is the robot's own host, or yours" on=${force} set=${setForce} />`}</${Dialog}>`;
+}
+
+/** Lift a block, or bring back the one that it replaced. @param {any} block */
+async function takeBack({ address, name, replaced }) {
+  if (!replaced) await ask("DELETE", `/v1/blocks/${encodeURIComponent(address)}`, { match: "*" });
+  else {
+    const left = replaced.until === null ? null : Math.max(1, replaced.until - (applianceTime() ?? Date.now() / 1000));
+    await ask("POST", "/v1/blocks", { match: "*", json: { address, for_seconds: left, note: replaced.note, force: true } });
+  }
+  done(replaced ? `${name || address} has its earlier block` : `${name || address} is no longer blocked`);
 }
 
 /** What would end. @param {{host: string}} given */

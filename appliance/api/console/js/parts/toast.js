@@ -8,13 +8,14 @@ import { Icon } from "./icon.js";
 import { Notice } from "./notice.js";
 
 const SECONDS = 6;
-const toasts = createStore(/** @type {{id: number, tone: any, title: string, text: string}[]} */ ([]));
+const UNDO_SECONDS = 20; // the time to take an order back
+const toasts = createStore(/** @type {{id: number, tone: any, title: string, text: string, undo?: () => Promise<any>}[]} */ ([]));
 let number = 0;
 
-/** @param {string} title @param {string} [text] */
-export function done(title, text = "") {
-  const id = show("allow", title, text);
-  setTimeout(() => drop(id), SECONDS * 1000);
+/** @param {string} title @param {string} [text] @param {() => Promise<any>} [undo] sends the order that takes this one back */
+export function done(title, text = "", undo) {
+  const id = show("allow", title, text, undo);
+  setTimeout(() => drop(id), (undo ? UNDO_SECONDS : SECONDS) * 1000);
 }
 
 /** @param {unknown} error */
@@ -30,12 +31,21 @@ export function Toasts() {
   const shown = useStore(toasts);
   return html`<div class="toasts" role="status" aria-live="polite">${shown.map((one) => html`<${Notice} key=${one.id} tone=${one.tone}
     title=${html`<div class="row"><span>${one.title}</span></div>`}>${one.text && html`<${Given} value=${one.text} most=${500} />`}
-    <button class="button small plain" onClick=${() => drop(one.id)}><${Icon} name="close" size=${14} />Dismiss</button></${Notice}>`)}</div>`;
+    ${one.undo && html`<button class="button small" onClick=${() => takeBack(one.id, one.undo)}>Undo</button>`}<button class="button small plain" onClick=${() => drop(one.id)}><${Icon} name="close" size=${14} />Dismiss</button></${Notice}>`)}</div>`;
 }
 
-function show(/** @type {string} */ tone, /** @type {string} */ title, /** @type {string} */ text) {
+async function takeBack(/** @type {number} */ id, /** @type {any} */ undo) {
+  drop(id);
+  try {
+    await undo();
+  } catch (failure) {
+    failed(failure);
+  }
+}
+
+function show(/** @type {string} */ tone, /** @type {string} */ title, /** @type {string} */ text, /** @type {any} */ undo = undefined) {
   const id = (number += 1);
-  toasts.set([...toasts.get().slice(-3), { id, tone, title, text }]);
+  toasts.set([...toasts.get().slice(-3), { id, tone, title, text, undo }]);
   return id;
 }
 
