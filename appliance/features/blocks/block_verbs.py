@@ -23,6 +23,7 @@ from appliance.features.blocks.block_requests import (
 )
 from rosmop.tool.terminal import say
 
+_MINUTES_FROM = 600
 _usage_error = functools.partial(output.usage_error, verb="rosrv host")
 _Address = Annotated[
     str,
@@ -136,9 +137,16 @@ def _undo(body: HostBlocked) -> str:
     earlier = body.replaced
     if earlier is None:
         return f"rosrv host unblock {body.address}"
-    left = "" if earlier.until is None else f" --for {max(1, round(earlier.until - clock.wall()))}s"
+    seconds = None if earlier.until is None else max(1, round(earlier.until - clock.wall()))
+    time = (
+        ""
+        if seconds is None
+        else f" --for {seconds}s"
+        if seconds < _MINUTES_FROM
+        else f" --for {round(seconds / 60)}m"
+    )
     note = f" --note {shlex.quote(earlier.note)}" if earlier.note else ""
-    return f"rosrv host block {body.address}{left}{note}"
+    return f"rosrv host block {body.address}{time}{note}"
 
 
 def _note(row: BlockedHost) -> str:

@@ -241,7 +241,9 @@ def test_a_constant_is_set_and_a_polygon_is_loaded(tmp_path: Path) -> None:
     assert not robot.orders
 
 
-def test_a_guard_is_brought_into_force_and_removed(tmp_path: Path) -> None:
+def test_a_guard_is_brought_into_force_and_removed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     robot = Robot(tmp_path, FENCE)
     (tmp_path / "fence.rv").write_text("x")
     order = run(verbs.enforce, robot, "fence", confirm_within="5m")
@@ -250,6 +252,7 @@ def test_a_guard_is_brought_into_force_and_removed(tmp_path: Path) -> None:
     assert (tmp_path / "fence.rv").exists()
     run(verbs.remove, robot, "fence")
     assert not (tmp_path / "fence.rv").exists()
+    assert capsys.readouterr().out.count("undo: rosrv guard new fence /cmd_vel\n") == 1
     robot.files["fence.rv"] = "fence() { }"
     with pytest.raises(GuardError, match="no guard is named fence"):
         run(verbs.remove, robot, "fence")
