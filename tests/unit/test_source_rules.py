@@ -291,7 +291,8 @@ WALL_CLOCK = {
     ],
     "the date of an end of `EndTable`, for people and for the api": [
         "api/front/access.py", "control/operators/handled_alarms.py", "control/operators/token_orders.py",
-        "features/blocks/block_orders.py", "features/blocks/block_verbs.py", "features/sso/sessions.py", "features/tunnels/enrolment_tokens.py",
+        "features/blocks/block_orders.py", "features/blocks/block_verbs.py",
+        "features/sso/sessions.py", "features/tunnels/enrolment_tokens.py",
         "features/standby/passive_rest.py",
     ],
     "the time of a signature, for a receiver on another machine": ["features/approvals/hook_process.py"],
