@@ -44,6 +44,8 @@ class _File(NamedTuple):
     """The words before a parenthesis in a test function: those that it calls, and others in its texts."""
     calls: tuple[str, ...]
     """All calls of the file, by name, once for each call."""
+    given_trails: int
+    """Objects that are made with a function `happened`."""
     is_nightly: bool
 
 
@@ -70,6 +72,7 @@ def _facts(path: Path) -> _File:
         sum(map(length, tests)),
         frozenset(_CALL.findall(bodies)),
         tuple(_CALL.findall(text)),
+        text.count("(happened=") + text.count(" happened=lambda"),
         any(map(_marks_nightly, tree.body)),
     )
 
@@ -87,8 +90,9 @@ def classes_in_tests() -> list[str]:
 
 
 def doubles_of_the_trail() -> list[str]:
-    """Return the definitions of `happened`, which the trail of control has."""
-    return [file.name for file in _files() for name, _lines in file.helpers if name == "happened"]
+    """Return the definitions of `happened`, which the trail of control has, and the objects that are given one."""
+    defined = [file.name for file in _files() for name, _lines in file.helpers if name == "happened"]
+    return defined + [file.name for file in _files() for _double in range(file.given_trails)]
 
 
 def calls_in_tests(*names: str) -> list[str]:
@@ -139,11 +143,11 @@ def _long_helpers_of(file: _File, long: dict[str, list[tuple[str, int]]]) -> Ite
 
 COUNTS = (
     Count("helpers", "helpers of more than 40 lines that a test's body calls", 7, 0, long_helpers),
-    Count("classes", "classes in tests", 630, 200, classes_in_tests),
-    Count("happened", "definitions of `happened` in tests", 16, 1, doubles_of_the_trail),
+    Count("classes", "classes in tests", 660, 200, classes_in_tests),
+    Count("happened", "doubles of the audit trail in tests", 13, 0, doubles_of_the_trail),
     Count("namespaces", "calls of `SimpleNamespace` in tests", 215, 0, lambda: calls_in_tests("SimpleNamespace")),
-    Count("casts", "calls of `cast` in tests", 195, 0, lambda: calls_in_tests("cast")),
-    Count("outside", "lines of 100 that are outside of test functions", 58, 40, lines_outside_of_tests),
+    Count("casts", "calls of `cast` in tests", 178, 0, lambda: calls_in_tests("cast")),
+    Count("outside", "lines of 100 that are outside of test functions", 59, 40, lines_outside_of_tests),
     Count("nightly", "lines of unit files that are nightly as a whole", 14450, 4000, lines_of_nightly_unit_files),
 )  # fmt: skip
 

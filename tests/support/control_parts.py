@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable
 from types import SimpleNamespace
 from typing import Any, NamedTuple, Self, cast
 
+from appliance.audit.log.record import AuditRecord
 from appliance.channel import messages
 from appliance.configuration import settings
 from appliance.master.calls.call import ApiUri, Caller
@@ -35,10 +36,10 @@ from appliance.rpc.server import HttpRequest, Peer
 from appliance.rpc.xmlrpc_client import RefusedError, UnansweredError
 from appliance.specifications.allocation import Allocation
 from appliance.store.state_file import StateStore
-from appliance.telemetry.metrics import Meter
 from roswire.parameter_tree import standing_at
 from roswire.uris import node_uri, parse_node_uri
 from roswire.xmlrpc import Value, XmlRpcLimits, build_call, parse_response
+from tests.support.core import FakeTrail
 from tests.support.idle import idle
 from tests.support.parameters import mirror, put
 from tests.support.serving import serving
@@ -55,6 +56,8 @@ class Denied(NamedTuple):
     resource: str
     decision: Decision
     about: dict[str, str]
+    record: str
+    """The id of the record."""
 
 
 class Told(NamedTuple):
@@ -80,51 +83,45 @@ Seen = Told | Ended | Record | messages.Message | Wanted
 _OF_GRAPH = {"registered", "unregistered", "revoked", "replaced", "takeover", "node lost", "node returned"}
 
 
-class Records:
+class Records(FakeTrail):
+    """The trail of these parts. Records about the graph are noted in the order of all that is seen."""
+
     def __init__(self, note: Callable[[Seen], None] = lambda _seen: None) -> None:
-        self._note = note
-        self.events: list[tuple[str, str | None]] = []
+        super().__init__(self._recorded)
+        self._see = note
         self.denied: list[Denied] = []
         self.refused: list[str] = []
 
-        self.strict = False
-        self.revision = 1
-        self.obstacle: str | None = None
-        self.debt = ""
-        self.meter = Meter()
-
     def clear(self) -> None:
-        self.events.clear()
+        self.records.clear()
         self.denied.clear()
         self.refused.clear()
 
-    def shut_out(self, _host: str) -> str:
-        return ""
-
-    def owing(self, _host: str) -> str:
-        return self.debt
-
-    async def still_owing(self, host: str) -> str:
-        return self.owing(host)
+    @property
+    def pairs(self) -> list[tuple[str, str | None]]:
+        """Return the event of each record, or its decision, with the resource."""
+        return [
+            (str(record.decision) if record.event == "decision" else record.event, record.resource)
+            for record in self.records
+        ]
 
     def decided(
-        self, _caller: Any, _method: str, category: str, resource: str, decision: Decision, /, **more: Any
+        self, asker: Any, method: str, category: str, resource: str, decision: Decision, **more: Any
     ) -> str:
-        self.events.append(("allow" if decision.allowed else "deny", resource))
+        record = super().decided(asker, method, category, resource, decision, **more)
         if decision.would_deny:
             self.refused.append(f"would deny: {category} {resource}")
         if not decision.allowed:
             about = {name: value for name, value in more.items() if name != "reads"}
-            self.denied.append(Denied(category, resource, decision, about))
-        return "id"
+            self.denied.append(Denied(category, resource, decision, about, record))
+        return record
 
-    def happened(self, event: str, _reason: str, *, resource: str | None = None, **detail: Any) -> str:
-        self.events.append((event, resource))
-        if event in _OF_GRAPH:
-            self._note(Record(event, detail["caller_id"], detail["category"], str(resource)))
-        if event in {"malformed", "limit exceeded"}:
-            self.refused.append(f"{event}: {detail.get('caller_id', '')} {detail['category']} {resource}")
-        return "id"
+    def _recorded(self, record: AuditRecord) -> None:
+        caller_id, category, resource = record.caller_id or "", str(record.category), str(record.resource)
+        if record.event in _OF_GRAPH:
+            self._see(Record(record.event, caller_id, category, resource))
+        if record.event in {"malformed", "limit exceeded"}:
+            self.refused.append(f"{record.event}: {caller_id} {category} {resource}")
 
 
 class Deliveries:
@@ -379,7 +376,7 @@ class ControlParts:
         cast(Any, self.nodes).client = self.clients.client
         self.surround()
         self.addresses, self.parameters = Addresses(), mirror()
-        trail = cast(Any, self.records)
+        trail = self.records
         rights = ParameterRights(lambda: self.current, trail)
         self.graph = RosGraph(self.registry, self.grants, trail)
         self.relay = RelayControl(

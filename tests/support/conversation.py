@@ -58,6 +58,7 @@ from roswire.xmlrpc import FaultReceived, Value
 from tests.support.control_parts import ControlParts, Ended, Record, Seen, Told
 from tests.support.conversation_calls import OWN, PORTS, QUESTIONS, WrittenCall, call_of, is_call
 
+_RECORD = re.compile(r"\[[0-9a-f]{20}\]")
 _REGISTER = {Kind.PUBLICATION: "registerPublisher", Kind.SUBSCRIPTION: "registerSubscriber"}
 
 
@@ -85,7 +86,7 @@ class Conversation:
         else:
             answers = await (self._call_by(line) if is_call(line) else self._event(line))
         await self._settle()
-        answers += self._finished()
+        answers = [_RECORD.sub("[id]", answer) for answer in (*answers, *self._finished())]
         if self._only_answers:
             return answers
         shown = [self._shown(seen) for seen in self.parts.seen]
@@ -163,7 +164,7 @@ class Conversation:
         denied = self.parts.records.denied
         for place, one in enumerate(denied):
             told = text_for_caller(one.decision, self.parts.current.tell)
-            if text == f"{told} [id]":
+            if text == f"{told} [{one.record}]":
                 del denied[place]
                 about = "".join(f" {name} {value}" for name, value in one.about.items())
                 longer = (

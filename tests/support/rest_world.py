@@ -42,6 +42,7 @@ from appliance.specifications.specification_manager import SpecificationManager
 from appliance.store.access_tokens import TokenRow, make_token
 from tests.support.answers import example
 from tests.support.asgi import sent
+from tests.support.core import FakeTrail
 from tests.support.feature_parts import answered_later, idle_parts
 from tests.support.idle import idle
 from tests.support.inline_loop import InlineLoop
@@ -103,25 +104,12 @@ class Tokens:
     def used(self, token_id: str) -> None: ...
 
 
-class Trail:
-    obstacle: str | None = None
-
-    def __init__(self) -> None:
-        self.records: list[dict[str, Any]] = []
-
-    def happened(self, event: str, reason: str, **fields: Any) -> str:
-        self.records.append({"event": event, "reason": reason, **fields})
-        return "id"
-
-    async def durable(self) -> None: ...
-
-
 class RestWorld:
     def __init__(self, state: Path = _STATE) -> None:
         with using(VirtualClock(wall=_NOW)):
             self._runner = asyncio.Runner(loop_factory=InlineLoop)
             self._runner.get_loop()  # which keeps this clock
-        self.carried, self.tokens, self.trail = Carried(), Tokens(), Trail()
+        self.carried, self.tokens, self.trail = Carried(), Tokens(), FakeTrail()
         self.gate, self.control = make_api(state)
         self._ends = memory_link(ApiLink)
         self._runner.run(self._connect())
@@ -151,7 +139,7 @@ class RestWorld:
             require_room=lambda: None,
         )
         rest = RestLink(
-            administration, cast(Any, self.tokens), cast(Any, self.trail),
+            administration, cast(Any, self.tokens), self.trail,
             served=lambda _pin: None, certified=lambda _sha256: None, require_proof=False, uses=RestUses(),
         )  # fmt: skip
         rest.attach(self._ends[0])
@@ -198,7 +186,7 @@ class RestWorld:
             self._ends[1].send(RequestMade(10_000, request, self.tokens.texts[role], asked))
 
         self.play(play)
-        [record] = self.trail.records
+        [record] = self.trail.rows
         return record
 
     def play(self, what: Callable[[], Awaitable[T]]) -> T:

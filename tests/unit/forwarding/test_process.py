@@ -10,20 +10,20 @@ from appliance.channel import messages
 from appliance.channel.channel import Channel
 from appliance.control.links.forwarder_link import ForwarderLink
 from appliance.forwarding.process import ForwardingProcess, ProgressReports
-from appliance.telemetry.audit_trail import AuditTrail
+from tests.support.core import FakeTrail
 
 pytestmark = pytest.mark.anyio
 
 
 class Control:
     def __init__(self) -> None:
-        self.gaps: list[int] = []
-        self.forwarded = ForwarderLink("udp://127.0.0.1:514", "all", cast(AuditTrail, self))
+        self.trail = FakeTrail()
+        self.forwarded = ForwarderLink("udp://127.0.0.1:514", "all", self.trail)
         self.hears: Callable[[object, tuple[int, ...]], None] = lambda _message, _descriptors: None
 
-    def happened(self, event: str, _text: str, **detail: Any) -> None:
-        if event == "forwarding gap":
-            self.gaps.append(detail["count"])
+    @property
+    def gaps(self) -> list[int]:
+        return [row["count"] for row in self.trail.rows if row["event"] == "forwarding gap"]
 
     def attach(self, _loop: object, received: Any, *_ends: object) -> None:
         self.hears = received

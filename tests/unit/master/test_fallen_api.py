@@ -20,6 +20,7 @@ from appliance.control.rest.rest import RestLink
 from appliance.control.rest.rest_uses import RestUses
 from appliance.signing.request_signing import proof_of, reading_key, statement
 from appliance.store.state_file import StateStore
+from tests.support.core import FakeTrail
 from tests.support.ends import ends_of
 from tests.support.engines import InlineDatabase
 from tests.support.heard import Heard
@@ -36,19 +37,18 @@ class World:
         self.store = StateStore(directory, failed=lambda _text: None, kind=InlineDatabase)
         self.ends = ends_of(self.store, directory)
         self.done: list[tuple[AnyRequest, str]] = []
-        self.recorded: list[dict[str, Any]] = []
-        self.obstacle: str | None = None
+        self.trail = FakeTrail()
         self.apis: list[Api] = []
-        self.tokens = TokenOrders(self.store, self, self.ends, self.token_changed)  # type: ignore[arg-type]  # this class is the trail
+        self.tokens = TokenOrders(self.store, self.trail, self.ends, self.token_changed)
         self.begin(require_proof=False)
 
     def begin(self, *, require_proof: bool) -> None:
-        self.tokens = TokenOrders(self.store, self, self.ends, self.token_changed)  # type: ignore[arg-type]  # as above
+        self.tokens = TokenOrders(self.store, self.trail, self.ends, self.token_changed)
         parts: Any = self
         self.link = RestLink(
             parts,
             self.tokens,
-            parts,
+            self.trail,
             served=print,
             certified=print,
             require_proof=require_proof,
@@ -61,13 +61,9 @@ class World:
         self.done.append((request, who))
         return AdminAnswer(True)
 
-    def happened(self, event: str, reason: str, **fields: Any) -> str:
-        self.recorded.append({"event": event, "reason": reason, **fields})
-        return "id"
-
     @property
     def refusals(self) -> list[dict[str, Any]]:
-        return [one for one in self.recorded if one["event"] == "order refused"]
+        return [one for one in self.trail.rows if one["event"] == "order refused"]
 
 
 class Api:

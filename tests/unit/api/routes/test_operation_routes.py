@@ -254,9 +254,9 @@ def test_role_dry_run_and_etag_decide_what_an_operation_does(operation: Operatio
             changes = operation.is_change and not dry and not expected[1]
             assert [who for _order, who in world().carried.orders] == [f"a-{role}"] * changes, case
             if role is None:  # the journal folds equal calls without a token
-                assert {one["decision"] for one in world().trail.records} <= {"deny"}
+                assert {one["decision"] for one in world().trail.rows} <= {"deny"}
             elif operation.is_change:
-                [record] = world().trail.records
+                [record] = world().trail.rows
                 denied = bool(expected[1]) and (expected[0] in (401, 403) or not dry)
                 assert (record["event"], record["decision"], record["who"], record["status"]) == (
                     "rest call", "deny" if denied else "allow", f"a-{role}", expected[0],
@@ -311,7 +311,7 @@ def test_a_rejection_by_control_is_a_problem(
     require_problem(answer, status, kind)
     assert "secret" not in answer.text
     assert ("ETag" in answer.headers) is isinstance(error, MonitorsChangedError)
-    [record] = world().trail.records
+    [record] = world().trail.rows
     assert (record["decision"], record["status"]) == ("deny", status)
 
 

@@ -78,7 +78,7 @@ def test_a_rejected_policy_has_every_finding(world: RestWorld, target: str) -> N
     assert [(one["line"], one["severity"]) for one in problem["findings"]] == [(3, "error"), (4, "error")]
     assert "did you mean Publishers?" in problem["findings"][1]["text"]
     assert [type(one.request) for one in world.made] == [admin.PolicyLoad] * (target == "/v1/policy")
-    [record] = world.trail.records
+    [record] = world.trail.rows
     assert record["decision"] == ("deny" if target == "/v1/policy" else "allow"), "a draft changes nothing"
 
 

@@ -297,7 +297,7 @@ async def test_a_file_that_a_reload_refuses_is_refused_at_a_start(tmp_path: Path
         with appliance.started(restarted=restarted, site_keys=[LINE]) as policies:
             assert (policies.revision, policies.current.text) == (1, OPEN)
             assert policies.file_refused == refused.value.findings[0], "even after a crash of control"
-            recorded = [event for event, _resource in appliance.records.events]
+            recorded = [event for event, _resource in appliance.records.pairs]
             assert recorded == ([] if restarted else ["policy file refused"])
     appliance.file.write_text(OTHER)
     beside.write_text(signed(OTHER))

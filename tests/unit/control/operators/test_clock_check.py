@@ -1,5 +1,4 @@
 from pathlib import Path
-from typing import Any, cast
 
 import pytest
 
@@ -8,41 +7,33 @@ from appliance.base.clock import using
 from appliance.channel.answers.status import ClockState
 from appliance.cli.status_verb import doubted_clock
 from appliance.control.operators.clock_check import ClockCheck
-from appliance.telemetry.audit_trail import AuditTrail
+from tests.support.core import FakeTrail
 from tests.support.virtual_clock import VirtualClock
 
 
-class Trail:
-    def __init__(self) -> None:
-        self.events: list[str] = []
-
-    def happened(self, event: str, _text: str, **_more: Any) -> None:
-        self.events.append(event)
-
-
 @pytest.fixture
-def trail() -> Trail:
-    return Trail()
+def trail() -> FakeTrail:
+    return FakeTrail()
 
 
-def test_an_unsynchronised_clock_is_recorded_once(trail: Trail) -> None:
-    clock = ClockCheck(cast(AuditTrail, trail), lambda: 0.0)
+def test_an_unsynchronised_clock_is_recorded_once(trail: FakeTrail) -> None:
+    clock = ClockCheck(trail, lambda: 0.0)
     for synchronised in (None, False, False, True, True, None, False):
         clock.synchronisation_reported(synchronised)
         assert clock.state() == ClockState(synchronised, 0.0)
     assert trail.events == ["clock not synchronised", "clock synchronised", "clock not synchronised"]
 
 
-def test_a_right_clock_is_not_recorded(trail: Trail) -> None:
-    clock = ClockCheck(cast(AuditTrail, trail), lambda: 0.0)
+def test_a_right_clock_is_not_recorded(trail: FakeTrail) -> None:
+    clock = ClockCheck(trail, lambda: 0.0)
     clock.synchronisation_reported(True)
     clock.look()
     assert trail.events == []
 
 
-def test_a_clock_that_was_set_back_is_recorded_once(trail: Trail) -> None:
+def test_a_clock_that_was_set_back_is_recorded_once(trail: FakeTrail) -> None:
     behind = [1.5]
-    clock = ClockCheck(cast(AuditTrail, trail), lambda: behind[0])
+    clock = ClockCheck(trail, lambda: behind[0])
     clock.look()
     assert (trail.events, clock.state().behind_seconds) == ([], 0.0)
     for behind[0] in (3600.0, 3590.0, 0.5, 90.0):
@@ -51,9 +42,9 @@ def test_a_clock_that_was_set_back_is_recorded_once(trail: Trail) -> None:
     assert clock.state().behind_seconds == 90.0
 
 
-def test_each_step_forward_is_recorded(trail: Trail) -> None:
+def test_each_step_forward_is_recorded(trail: FakeTrail) -> None:
     started = [1000.0]
-    clock = ClockCheck(cast(AuditTrail, trail), lambda: 0.0, lambda: started[0])
+    clock = ClockCheck(trail, lambda: 0.0, lambda: started[0])
     for started[0] in (1000.0, 1001.0, 4600.0, 4600.0, 1000.0, 1003.0):
         clock.look()
     assert trail.events == ["clock set forward"] * 2
@@ -62,9 +53,9 @@ def test_each_step_forward_is_recorded(trail: Trail) -> None:
 @pytest.mark.parametrize(
     ("days", "said"), [(0.5, None), (2000.0, "wrong: 2000 days before this program was built")]
 )
-def test_a_clock_before_the_build_date_is_reported(trail: Trail, days: float, said: str | None) -> None:
+def test_a_clock_before_the_build_date_is_reported(trail: FakeTrail, days: float, said: str | None) -> None:
     made = Path(shipped.__file__).stat().st_mtime
-    clock = ClockCheck(cast(AuditTrail, trail), lambda: 0.0)
+    clock = ClockCheck(trail, lambda: 0.0)
     clock.synchronisation_reported(True)
     with using(VirtualClock(wall=made - days * 86_400)):
         told = doubted_clock(clock.state())

@@ -29,6 +29,7 @@ from appliance.control.rest.rest import RestLink
 from appliance.control.rest.rest_uses import RestUses
 from appliance.store.access_tokens import TokenRow, make_token
 from tests.support.answers import example
+from tests.support.core import FakeTrail
 from tests.support.heard import Heard
 from tests.support.memory_channel import memory_link
 
@@ -51,8 +52,7 @@ def loading(number: int, text: str, shown: str = TOKEN) -> RequestMade:
 class Everything:
     def __init__(self) -> None:
         self.asked: list[tuple[AnyRequest, str]] = []
-        self.recorded: list[dict[str, Any]] = []
-        self.obstacle: str | None = None
+        self.trail = FakeTrail()
         self.ends: list[Channel] = []  # closed after the run
         self.uses: list[str] = []
         self.only_slow = False  # whether only requests other than the status wait for `go`
@@ -79,10 +79,6 @@ class Everything:
 
     def used(self, token_id: str) -> None:
         self.uses.append(token_id)
-
-    def happened(self, event: str, reason: str, **fields: Any) -> str:
-        self.recorded.append({"event": event, "reason": reason, **fields})
-        return "id"
 
 
 class Api:
@@ -112,11 +108,11 @@ def world() -> Iterator[Everything]:
 
 @pytest.fixture
 def link(world: Everything, pins: list[str]) -> RestLink:
-    parts: Any = world  # `Everything` is all three
+    parts: Any = world  # the administration and the tokens
     return RestLink(
         parts,
         parts,
-        parts,
+        world.trail,
         served=pins.append,
         certified=lambda _sha256: None,
         require_proof=False,
@@ -213,11 +209,11 @@ async def test_a_defect_costs_one_answer(api: Api) -> None:
 
 
 async def test_nothing_is_changed_while_the_log_cannot_be_written(world: Everything, api: Api) -> None:
-    world.obstacle = "the audit log cannot be written: disk full"
+    world.trail.log.failure = "disk full"
     api.channel.send(loading(1, "[Nodes]"))
     api.channel.send(RequestMade(2, StatusWanted(), TOKEN))
     _tokens, refused, served = await api.until(3)
-    assert (answer_of(refused).trouble, answer_of(refused).error) == ("failed", world.obstacle)
+    assert (answer_of(refused).trouble, answer_of(refused).error) == ("failed", world.trail.obstacle)
     assert answer_of(served).ok
     assert [request for request, _who in world.asked] == [StatusWanted()]
 
@@ -291,7 +287,7 @@ async def test_calls_are_recorded_with_their_outcome(world: Everything, api: Api
     api.channel.send(RestCalled("10.0.0.2", "", "GET", "/" + "x" * 5000, 401, "no token", 5, 3))
     api.channel.send(RequestMade(1, StatusWanted(), TOKEN))
     await api.until(2)
-    served, refused = world.recorded
+    served, refused = world.trail.rows
     assert (served["event"], served["decision"], served["who"]) == ("rest call", "allow", "alice")
     assert (refused["decision"], refused["who"], refused["count"]) == ("deny", None, 3)
     assert len(refused["resource"]) <= 300
@@ -301,4 +297,4 @@ async def test_uses_of_tokens_are_not_recorded(world: Everything, api: Api) -> N
     api.channel.send(TokenUsed(VIEWER.id))
     api.channel.send(RequestMade(1, StatusWanted(), TOKEN))
     await api.until(2)
-    assert (world.uses, world.recorded) == ([VIEWER.id], [])
+    assert (world.uses, world.trail.rows) == ([VIEWER.id], [])

@@ -1,5 +1,4 @@
 from pathlib import Path
-from typing import Any, cast
 
 import pytest
 
@@ -14,13 +13,13 @@ def test_a_replaced_certificate_is_recorded_once(tmp_path: Path) -> None:
     records = Records()
 
     def state(appliance: str, sha256: str) -> int:
-        RestCertificate(store, cast(Any, records), appliance).stated(sha256)
-        return len(records.events)
+        RestCertificate(store, records, appliance).stated(sha256)
+        return len(records.pairs)
 
     first, second = "a" * 64, "b" * 64
     assert [state("a", first), state("a", first), state("b", second), state("a", ""), state("a", first)] == [
         0
     ] * 5
     assert [state("a", second), state("a", second), state("b", second)] == [1] * 3
-    assert records.events == [("rest certificate replaced", None)]
+    assert records.pairs == [("rest certificate replaced", None)]
     store.close()

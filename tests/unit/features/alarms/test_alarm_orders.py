@@ -13,6 +13,7 @@ from appliance.features.alarms.alarm_orders import AlarmOrders
 from appliance.features.alarms.alarm_requests import AlarmAcknowledge, AlarmSilence, AlarmsWanted
 from appliance.store.state_file import StateStore
 from tests.support.answers import example
+from tests.support.core import FakeTrail
 from tests.support.ends import ends_of
 from tests.support.engines import InlineDatabase
 from tests.support.virtual_clock import VirtualClock
@@ -25,18 +26,18 @@ class Robot:
     def __init__(self, state: Path) -> None:
         self.state = state
         self.fields = BAD
-        self.events: list[str] = []
+        self.trail = FakeTrail()
         self.restart()
 
     def restart(self) -> None:
         store = StateStore(self.state, failed=pytest.fail, kind=InlineDatabase)
         self.ends = ends_of(store, self.state)
         handled = HandledAlarms(store, self.ends)
-        self.orders = AlarmOrders(handled, self, lambda: handled.marked(example(Status, **self.fields)))  # type: ignore[arg-type]  # it records
+        self.orders = AlarmOrders(handled, self.trail, lambda: handled.marked(example(Status, **self.fields)))
 
-    def happened(self, event: str, reason: str, **fields: Any) -> str:
-        self.events.append(f"{event} by {fields['who']}: {reason}")
-        return ""
+    @property
+    def events(self) -> list[str]:
+        return [f"{row['event']} by {row['who']}: {row['reason']}" for row in self.trail.rows]
 
     def alarm(self) -> Alarm | None:
         alarms = asyncio.run(self.orders.listed(AlarmsWanted())).alarms

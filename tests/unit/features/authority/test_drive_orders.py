@@ -20,6 +20,7 @@ from appliance.master.endpoints.host_signs import HostSigns
 from appliance.policy.model import Address, address_of
 from appliance.policy.policy import Policy
 from appliance.policy.policy_compiler import compile_policy
+from tests.support.core import FakeTrail
 from tests.support.virtual_clock import VirtualClock
 
 pytestmark = pytest.mark.anyio
@@ -42,14 +43,14 @@ class Site:
         self.policy: Policy = compile_policy(TEXT, file="site.ini")
         self.live = {address_of(host) for host in (PILOT, SECOND, BOSS, AGENT, STRANGER)}
         self.moved: dict[Address, float] = {}
-        self.records: list[dict[str, Any]] = []
+        self.trail = FakeTrail()
         self.applied: list[Address | None] = [None, None]
         self.ordered: list[list[Address | None]] = [[], []]
         self.ready = True
         self.hanging: set[str] = set()  # topics of a relay that does not answer
         self.orders = DriveOrders(
             lambda: self.policy,
-            cast(Any, self),
+            self.trail,
             HostSigns(self.live.__contains__, lambda host, _names: self.moved.get(host, 0.0)),
             cast(Any, self),
             decide_again=self.decide_again,
@@ -57,13 +58,10 @@ class Site:
             relays_ready=lambda: self.ready,
         )
 
-    def happened(self, event: str, reason: str, **detail: Any) -> None:
-        self.records.append({"event": event, "reason": reason, **detail})
-
     async def after(self, host: str, topics: frozenset[str], why: str) -> None:
         assert address_of(host) not in self.applied
         assert self.orders.holders() == {}
-        self.records.append({"event": "motion stopped", "reason": why, "topics": sorted(topics)})
+        self.trail.happened("motion stopped", why, topics=sorted(topics))
 
     def decide_again(self) -> int:
         for queue in self.ordered:
@@ -82,7 +80,7 @@ class Site:
     def handed_over(self) -> list[str]:
         return [
             f"{one['earlier']} -> {one['holder']}"
-            for one in self.records
+            for one in self.trail.rows
             if one["event"] == "authority handed over"
         ]
 
@@ -124,7 +122,7 @@ async def test_never_two_holders_and_never_none_for_longer_than_the_lease(site: 
         if chance.random() < 0.3:
             await site.pass_time(chance.choice((0.25, 1.0, LEASE + 0.5)), moves)
         hand_overs += len(site.handed_over())
-        site.records.clear()
+        site.trail.records.clear()
         state = await site.state()
         assert site.applied == [address_of(state.holder) if state.holder else None] * 2
         if not state.holder:
@@ -156,7 +154,7 @@ async def test_the_next_holder_of_a_group(site: Site) -> None:
     assert site.handed_over() == [
         f"nobody -> {PILOT}", f"{PILOT} -> {BOSS}", f"{BOSS} -> {SECOND}", f"{SECOND} -> {AGENT}", f"{AGENT} -> nobody",
     ]  # fmt: skip
-    assert [one["host"] for one in site.records if one["event"] == "authority refused"] == [
+    assert [one["host"] for one in site.trail.rows if one["event"] == "authority refused"] == [
         SECOND, AGENT, STRANGER, STRANGER,
     ]  # fmt: skip
     with pytest.raises(SenselessError):
@@ -184,12 +182,12 @@ async def test_a_holder_loses_a_group(site: Site) -> None:
         await site.orders.take(take, "op")
         site.policy = compile_policy(text, file="site.ini")
         await site.pass_time(CHECK_SECONDS)
-    reasons = [one["reason"].rpartition(": ")[2] for one in site.records if one.get("holder") == "nobody"]
+    reasons = [one["reason"].rpartition(": ")[2] for one in site.trail.rows if one.get("holder") == "nobody"]
     assert reasons == [
         "it was silent for 5 s", "its nodes ended", "the policy no longer lets it hold the group",
         "the policy no longer has the group",
     ]  # fmt: skip
-    stops = [one["reason"] for one in site.records if one["event"] == "motion stopped"]
+    stops = [one["reason"] for one in site.trail.rows if one["event"] == "motion stopped"]
     assert stops == [f"base: {reason}" for reason in reasons[:3]], "its messages pass without a group"
 
 
@@ -221,11 +219,11 @@ async def test_a_relay_that_hangs_delays_the_end_of_no_other_group(site: Site) -
     for _ in range(9):
         await asyncio.sleep(0)
     assert site.orders.holders() == {}
-    assert [one["topics"] for one in site.records if one["event"] == "motion stopped"] == [["/arm"]]
+    assert [one["topics"] for one in site.trail.rows if one["event"] == "motion stopped"] == [["/arm"]]
     await site.orders.check()  # both hand-overs are under way
     site.hanging.clear()
     await check
-    assert site.records[-1]["event"] == "authority handed over"
+    assert site.trail.rows[-1]["event"] == "authority handed over"
 
 
 async def test_nothing_is_handed_over_while_a_relay_starts(site: Site) -> None:

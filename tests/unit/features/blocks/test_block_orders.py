@@ -152,7 +152,7 @@ async def test_a_block_ends_everything_and_what_is_lifted_returns(tmp_path: Path
         await made.settle()
         assert made.hidden.has(Kind.PUBLICATION, "/scan") == ["/talker"]
         assert made.denial(NODE) is None
-        events = [event for event, _resource in made.records.events]
+        events = [event for event, _resource in made.records.pairs]
         assert events.count("revoked") == 3
         assert [event for event in events if event.startswith("host")] == ["host blocked", "host unblocked"]
 
@@ -184,12 +184,12 @@ async def test_a_registration_that_is_under_way_during_the_block_ends(tmp_path: 
         call = asyncio.create_task(
             made.ask("registerPublisher", "/talker", "/scan", "t/T", f"http://{NODE}:4001/")
         )
-        await until(lambda: ("allow", "/scan") in made.records.events)
+        await until(lambda: ("allow", "/scan") in made.records.pairs)
         assert (await made.block(NODE)).ended.publications == 0
         made.faces.go.set()
         await call
         await made.settle()
-        assert ("registered", "/scan") in made.records.events
+        assert ("registered", "/scan") in made.records.pairs
         assert not [one for one in made.revocation.live() if str(one.host) == NODE]
 
 
@@ -220,7 +220,7 @@ async def test_a_block_ends_by_the_age_clock_and_not_by_the_system_clock(tmp_pat
             await made.settle()
             assert made.hidden.has(Kind.PUBLICATION, "/scan") == ["/talker"]
             assert await made.blocked() == [OTHER]
-            assert ("host block ended", None) in made.records.events
+            assert ("host block ended", None) in made.records.pairs
 
 
 async def test_blocks_survive_restarts_and_end_while_the_machine_is_off(tmp_path: Path) -> None:
@@ -365,7 +365,7 @@ async def test_an_order_at_the_moment_of_the_end_finds_one_state(tmp_path: Path)
         made.ends.look()
         outcomes = await orders
         await until(lambda: made.denial(NODE) is None)
-        ends = [event for event, _ in made.records.events if event in {"host unblocked", "host block ended"}]
+        ends = [event for event, _ in made.records.pairs if event in {"host unblocked", "host block ended"}]
         assert len(ends) == 1
         assert sum(isinstance(outcome, UnknownThingError) for outcome in outcomes) == 2 - ends.count(
             "host unblocked"
@@ -407,7 +407,7 @@ async def test_a_dry_run_names_everything_and_blocks_nothing(tmp_path: Path) -> 
         assert answer.ended == BlockEnded(1, 0, 0, 0, 1, made.uses)
         assert answer.until is not None and await made.blocked() == []
         assert made.denial(NODE) is None
-        assert [event for event, _resource in made.records.events if event.startswith("host")] == []
+        assert [event for event, _resource in made.records.pairs if event.startswith("host")] == []
         assert (await made.block(NODE)).ended.uses == made.uses
 
 

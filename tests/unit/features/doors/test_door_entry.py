@@ -6,6 +6,7 @@ import pytest
 from appliance.features.doors.control_part import DoorOrders
 from appliance.policy.model import Address
 from appliance.store.door_tables import DoorRow
+from tests.support.core import FakeTrail
 
 ALICE = DoorRow("alice", "198.19.240.2", 1.0, None, 0, None, "")
 
@@ -23,10 +24,7 @@ def test_a_ticket_opens_a_door_for_hosts_that_are_not_blocked(
     peer: str, ticket: str, status: int, decision: str | None
 ) -> None:
     """A refusal is a denial of the peer, so those of unknown hosts are folded."""
-    records: list[dict[str, Any]] = []
-
-    def happened(_event: str, _reason: str, **more: Any) -> None:
-        records.append(more)
+    trail = FakeTrail()
 
     def blocked(host: Address) -> object | None:
         mapped = getattr(host, "ipv4_mapped", None) or host
@@ -37,7 +35,7 @@ def test_a_ticket_opens_a_door_for_hosts_that_are_not_blocked(
     orders.__dict__ |= {
         "_base": SimpleNamespace(
             policies=SimpleNamespace(current=SimpleNamespace(blocked=blocked)),
-            trail=SimpleNamespace(happened=happened),
+            trail=trail,
         ),
         "_table": SimpleNamespace(live=lambda: [ALICE]),
         "_visits": SimpleNamespace(find=lambda _door, _text: None),
@@ -46,6 +44,6 @@ def test_a_ticket_opens_a_door_for_hosts_that_are_not_blocked(
         "_used": {},
     }
     assert cast(Any, orders).enter("alice", ticket, peer, 3)[0] == status
-    assert [(one["host"], one["decision"]) for one in records] == (
+    assert [(one["host"], one["decision"]) for one in trail.rows] == (
         [] if decision is None else [(peer, decision)]
     )

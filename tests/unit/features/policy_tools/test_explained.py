@@ -7,22 +7,19 @@ for people come from the record, as `rosrv audit why`, REST and the console show
 import struct
 from collections.abc import Collection, Iterable, Mapping
 from types import MappingProxyType
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple
 
 import pytest
 
-from appliance.audit.log.record import AuditRecord, Severity
 from appliance.audit.log.record_format import LogEntry, without_contents
 from appliance.channel.messages import MonitorEvent
 from appliance.features.policy_tools.why import lines_of
 from appliance.relay.monitors.observation_points import ObservationPoint
 from appliance.specifications.records import MonitorRecords
-from appliance.telemetry.audit_trail import AuditTrail
-from appliance.telemetry.metrics import Meter
 from rosmop.run.outcomes import moment
 from rosmop.tests.acting import message
 from rosmop.tests.random_specifications import Traffic, definitions
-from tests.support.idle import idle_class
+from tests.support.core import FakeTrail
 from tests.unit.relay.monitors.test_batch_progress import Monitored
 
 MS = 1_000_000
@@ -48,24 +45,6 @@ class Row(NamedTuple):
     where: dict[str, dict[str, object]]
     values: Mapping[str, object] = MappingProxyType({})
     restarted: bool = False
-
-
-class Trail(idle_class(AuditTrail)):  # type: ignore[misc]  # it is made
-    def __init__(self) -> None:
-        self.records: list[AuditRecord] = []
-        self.meter = Meter()
-
-    def happened(
-        self, event: str, reason: str, *, severity: Severity, host: str | None, caller_id: str | None, category: str,
-        resource: str, more: dict[str, Any], **detail: Any,
-    ) -> str:  # fmt: skip
-        self.records.append(
-            AuditRecord(
-                id="1", time=1, event=event, severity=severity, host=host, caller_id=caller_id, category=category,
-                resource=resource, reason=reason, detail={**more, **detail},
-            )
-        )  # fmt: skip
-        return "1"
 
 
 def events_of(
@@ -126,8 +105,8 @@ def check(row: Row, *, together: bool, shadow: bool = False) -> None:
     assert detail.get("values", {}) == row.values
     named = detail.get("why", {}).get("events", [])
     assert [(one["event"], one.get("node", "")) for one in named] == row.because
-    trail = Trail()
-    MonitorRecords(cast(Any, trail), lambda _topic, _data: None, []).reported([found], 0)
+    trail = FakeTrail()
+    MonitorRecords(trail, lambda _topic, _data: None, []).reported([found], 0)
     (record,) = trail.records
     lines = list(lines_of(record))
     assert lines[0] == record.reason

@@ -17,7 +17,7 @@ from appliance.features.recorder.recording_orders import RecordingOrders
 from appliance.features.recorder.recording_plan import RecordingPlan
 from appliance.features.recorder.recording_store import MOST_TEMPORARY
 from appliance.features.recorder.settings import RecorderRules
-from appliance.telemetry.audit_trail import AuditTrail
+from tests.support.core import FakeTrail
 from tests.support.memory_channel import memory_link
 
 pytestmark = pytest.mark.anyio
@@ -27,25 +27,12 @@ KEPT = Recording(
 )
 
 
-class Trail:
-    def __init__(self) -> None:
-        self.events: list[tuple[str, dict[str, Any]]] = []
-        self.failure: str | None = None
-
-    def happened(self, event: str, _reason: str, **detail: Any) -> str:
-        self.events.append((event, detail))
-        return "record"
-
-    async def durable(self) -> str | None:
-        return self.failure
-
-
 class Scene:
     def __init__(self, **rules: Any) -> None:
-        self.trail = Trail()
+        self.trail = FakeTrail()
         self.orders = RecordingOrders(
             RecorderRules(**{"enabled": True} | rules),
-            cast(AuditTrail, self.trail),
+            self.trail,
             lambda: (4, 2),
             RecordingPlan(RecorderRules(**{"enabled": True} | rules), lambda host: host, IdSource().next),
         )
@@ -106,11 +93,11 @@ async def test_a_call_of_the_service_is_an_order() -> None:
     recorder = scene.attach(answer)
     assert await scene.orders.called(call) == messages.OwnServiceAnswered(7, True, KEPT.id)
     assert await scene.orders.called(call) == messages.OwnServiceAnswered(7, False, "this hour has its 6")
-    [(event, detail), _again] = scene.trail.events
-    assert event == "recording ordered"
-    assert (detail["host"], detail["caller_id"], detail["resource"]) == ("10.0.0.5", "/arm", call.service)
+    [row, _again] = scene.trail.rows
+    assert row["event"] == "recording ordered"
+    assert (row["host"], row["caller_id"], row["resource"]) == ("10.0.0.5", "/arm", call.service)
     wanted = heard[0]
-    assert (wanted.trigger.what, wanted.trigger.record) == ("service", "record")
+    assert (wanted.trigger.what, wanted.trigger.record) == ("service", row["id"])
     assert wanted.trigger.text == "/arm of 10.0.0.5 called /rosrv/record_now"
     assert (wanted.before, wanted.after) == (60, 10)
     recorder.close()
@@ -132,15 +119,15 @@ async def test_a_closed_recording_is_recorded_and_listed() -> None:
     assert heard == [recorder_link.RevisionsStated(4, 2), recorder_link.RecordingNoted(KEPT.id)]
     assert (await scene.orders.recordings(recording_requests.RecordingsWanted())).recordings == [KEPT]
     assert await scene.orders.recording(recording_requests.RecordingWanted(KEPT.id)) == KEPT
-    [(event, detail)] = scene.trail.events
-    assert (event, detail["recording"], detail["sha256"]) == ("recording closed", KEPT.id, "5a")
-    assert detail["triggers"] == ["drop r"]
+    [row] = scene.trail.rows
+    assert (row["event"], row["recording"], row["sha256"]) == ("recording closed", KEPT.id, "5a")
+    assert row["triggers"] == ["drop r"]
     recorder.send(recorder_link.RecordingRemoved(0, KEPT, "", "recorder.disk is full"))
     await told(scene, lambda: len(scene.trail.events) == 2)
-    assert scene.trail.events[1][1]["who"] == "recorder"
+    assert scene.trail.rows[1]["who"] == "recorder"
     await told(scene, lambda: len(heard) == 3)
     assert heard[2] == recorder_link.RecordingNoted(KEPT.id)
-    scene.trail.failure = "no space left on device"
+    scene.trail.log.failure = "no space left on device"
     recorder.send(recorder_link.RecordingClosed(KEPT))
     recorder.send(recorder_link.RevisionsWanted())
     await told(scene, lambda: len(heard) == 4)
@@ -156,10 +143,13 @@ async def test_a_closed_recording_is_recorded_and_listed() -> None:
 
 @pytest.mark.nightly
 async def test_orders_have_the_name_of_their_operator() -> None:
+    scene = Scene()
+
     def answer(message: Any) -> list[messages.Message]:
         match message:
             case recorder_link.RecordingRequested(number, trigger, before, after):
-                assert (trigger.record, trigger.text, before, after) == ("record", "eve: why", 60, 5)
+                [row] = scene.trail.rows
+                assert (trigger.record, trigger.text, before, after) == (row["id"], "eve: why", 60, 5)
                 return [recorder_link.RecordingStarted(number, KEPT.id, 9)]
             case recorder_link.RecordingRemovalWanted(number, recording_id, who):
                 if recording_id != KEPT.id:
@@ -167,7 +157,6 @@ async def test_orders_have_the_name_of_their_operator() -> None:
                 return [recorder_link.RecordingRemoved(number, KEPT, who, "")]
         return []
 
-    scene = Scene()
     recorder = scene.attach(answer)
     for senseless in (recording_requests.RecordNow(before=601.0), recording_requests.RecordNow(after=0.0)):
         with pytest.raises(SenselessError):
@@ -175,13 +164,13 @@ async def test_orders_have_the_name_of_their_operator() -> None:
     assert not scene.trail.events
     begun = await scene.orders.now(recording_requests.RecordNow(after=5, note="why"), "eve")
     assert (begun.id, begun.ends) == (KEPT.id, 9)
-    assert scene.trail.events[0][1]["who"] == "eve"
+    assert scene.trail.rows[0]["who"] == "eve"
     with pytest.raises(UnknownThingError, match="still being made"):
         await scene.orders.fetch(recording_requests.RecordingFetch(KEPT.id), "eve")
     with pytest.raises(UnknownThingError, match="no recording"):
         await scene.orders.fetch(recording_requests.RecordingFetch(""), "eve")
     assert await scene.orders.remove(recording_requests.RecordingRemove(KEPT.id), "eve") == KEPT
-    assert scene.trail.events[1][1]["who"] == "eve"
+    assert scene.trail.rows[1]["who"] == "eve"
     with pytest.raises(UnknownThingError):
         await scene.orders.remove(recording_requests.RecordingRemove("b" * 20), "eve")
     recorder.close()
@@ -208,7 +197,7 @@ async def test_a_fetch_needs_a_record(scene: Scene) -> None:
     await told(scene, lambda: bool(cast(Any, scene.orders.state()).recordings))
     assert scene.orders.limits() == (LimitUse("bytes of recordings", KEPT.size, 2 << 30, "recorder.disk"),)
     assert await scene.orders.fetch(recording_requests.RecordingFetch(KEPT.id), "eve") == KEPT
-    scene.trail.failure = "the disk is full"
+    scene.trail.log.failure = "the disk is full"
     with pytest.raises(UnavailableError, match="cannot be recorded"):
         await scene.orders.fetch(recording_requests.RecordingFetch(KEPT.id), "eve")
     recorder.close()
@@ -226,19 +215,20 @@ async def test_an_order_to_a_dying_recorder_fails_at_once(scene: Scene) -> None:
 
 @pytest.mark.nightly
 async def test_the_memory_can_be_fetched_and_is_not_listed() -> None:
+    scene = Scene()
     lent = iter([msgspec.structs.replace(KEPT, id=letter * 20) for letter in "bcdef"])
 
     def answer(message: Any) -> list[messages.Message]:
         if not isinstance(message, recorder_link.MemoryWanted):
             return []
-        assert (message.since, message.until > 0, message.trigger.record) == (7, True, "record")
+        assert (message.since, message.until > 0) == (7, True)
+        assert message.trigger.record == scene.trail.records[-1].id
         return [recorder_link.MemoryLent(message.number, next(lent))]
 
-    scene = Scene()
     recorder = scene.attach(answer)
     first = await scene.orders.of_memory(recording_requests.RecordingOfMemory(since=7), "eve")
     assert await scene.orders.fetch(recording_requests.RecordingFetch(first.id), "eve") == first
-    assert [(event, detail["who"]) for event, detail in scene.trail.events] == [
+    assert [(row["event"], row["who"]) for row in scene.trail.rows] == [
         ("recording ordered", "eve"),
         ("recording fetched", "eve"),
     ]
@@ -263,5 +253,5 @@ async def test_more_topics_than_a_record_can_name_are_rejected(scene: Scene) -> 
     assert not scene.trail.events
     longest = "/" + "t" * 499
     await scene.orders.read(recording_requests.RecordingRead(KEPT.id, [longest]), "eve")
-    assert scene.trail.events[0][1]["topics"] == [longest]
+    assert scene.trail.rows[0]["topics"] == [longest]
     recorder.close()

@@ -1,15 +1,16 @@
-from typing import Any, cast
+from typing import Any
 
 import pytest
 
+from appliance.audit.log.record import AuditRecord
 from appliance.channel import admin
 from appliance.control.errors import UnknownThingError
 from appliance.features.standby import standby_requests
 from appliance.features.standby.lease_client import HandOverError
 from appliance.features.standby.standby_answers import StandbyState
 from appliance.features.standby.standby_orders import SingleAppliance, StandbyAdministration, StandbyOrders
-from appliance.telemetry.audit_trail import AuditTrail
 from tests.support.answers import example
+from tests.support.core import FakeTrail
 
 pytestmark = pytest.mark.anyio
 
@@ -19,6 +20,10 @@ class Pair:
         self.role = role
         self.refusal = ""
         self.did: list[str] = []
+        self.trail = FakeTrail(self._recorded, lambda: self.did.append("on disk"))
+
+    def _recorded(self, record: AuditRecord) -> None:
+        self.did.append(f"{record.event} by {record.detail['who']}: {record.reason}")
 
     def state(self) -> StandbyState:
         other = {"name": "b", "address": "10.0.0.2"}
@@ -30,15 +35,8 @@ class Pair:
         self.did.append("handed over")
         self.role = "standby" if self.role == "active" else "active"
 
-    def happened(self, event: str, reason: str, *, who: str) -> str:
-        self.did.append(f"{event} by {who}: {reason}")
-        return "id"
-
-    async def durable(self) -> None:
-        self.did.append("on disk")
-
     def orders(self) -> StandbyOrders:
-        return StandbyOrders(self, cast(AuditTrail, self))
+        return StandbyOrders(self, self.trail)
 
 
 async def test_the_order_is_on_disk_before_the_switchover() -> None:
@@ -64,7 +62,7 @@ async def test_a_failed_switchover_is_recorded_with_its_reason() -> None:
 @pytest.mark.parametrize("request_", [standby_requests.StandbyWanted(), standby_requests.StandbyPromote()])
 async def test_a_single_appliance_says_how_it_gets_a_standby(request_: Any) -> None:
     pair = Pair("active")
-    orders = StandbyOrders(SingleAppliance(), cast(AuditTrail, pair))
+    orders = StandbyOrders(SingleAppliance(), pair.trail)
     with pytest.raises(UnknownThingError, match="rosrv standby join"):
         await (
             orders.state(request_)

@@ -100,7 +100,7 @@ async def test_a_node_of_another_machine_is_refused() -> None:
         "10.0.0.5 registers /far at http://robot2:4000/, but has no node on port 4000: a node registers"
         in answer[1]
     )
-    assert world.records.events[-1] == ("deny", "/t")
+    assert world.records.pairs[-1] == ("deny", "/t")
     assert world.registry.all() == []
     # A node with another address of its machine in its URI has its port open; the caller's own address needs no check.
     for node, uri in (("/near", "http://192.168.1.10:4001/"), ("/here", "http://10.0.0.5:4002/")):

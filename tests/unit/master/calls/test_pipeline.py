@@ -57,9 +57,9 @@ class Trail(Records):
         self.decisions: list[tuple[str, str, Decision]] = []
 
     def decided(
-        self, _caller: Any, method: str, _category: str, resource: str, decision: Decision, /, **about: Any
+        self, asker: Any, method: str, category: str, resource: str, decision: Decision, **more: Any
     ) -> str:
-        self.decisions.append((method, about.get("key", resource), decision))
+        self.decisions.append((method, more.get("key", resource), decision))
         return "id"
 
 
@@ -214,7 +214,7 @@ async def test_writes_after_a_waiting_read_are_decided_again() -> None:
     await scene(partial(registers, host=THIRD))
     await scene(partial(registers, host=OPERATOR), denied=False)
     await scene(lambda site: setattr(site, "policy", stricter))
-    await scene(lambda site: setattr(site.trail, "obstacle", "the log is full"))
+    await scene(lambda site: setattr(site.trail.log, "failure", "the log is full"))
 
 
 async def test_a_failure_in_a_run_stops_no_other_part(site: Site) -> None:
@@ -272,7 +272,7 @@ async def test_the_answers_of_a_multicall_are_bounded_together() -> None:
     assert [one[0][0] for one in answers[:10]] == [1] * 10
     assert all("more than 1000000 bytes; 90 more parts" in one["faultString"] for one in answers[10:])
     assert len(site.arrived) == 10
-    assert [event for event, _resource in site.trail.events] == ["limit exceeded"]
+    assert site.trail.events == ["limit exceeded"]
     usual = await site.ask(OPERATOR, "system.multicall", [part("getParam", "/arm/speed")] * 100)
     assert [one[0][0] for one in usual] == [1] * 100
 

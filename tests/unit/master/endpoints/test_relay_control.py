@@ -8,6 +8,7 @@ from typing import Any, cast
 
 import pytest
 
+from appliance.audit.log.record import RuleReference
 from appliance.channel import messages
 from appliance.channel.channel import Channel
 from appliance.master.endpoints.delivery import NodeApiClient
@@ -22,8 +23,8 @@ from appliance.policy.policy_compiler import compile_policy
 from appliance.quotas.pool import Bounds
 from appliance.quotas.table import GRANTS
 from appliance.specifications.allocation import SERVICE, TOPIC, Allocation, AllocationPlan, Move
-from appliance.telemetry.audit_trail import AuditTrail
 from roswire.uris import parse_node_uri
+from tests.support.core import FakeTrail
 from tests.support.stated import stated
 
 pytestmark = pytest.mark.anyio
@@ -66,7 +67,7 @@ def policy(*limits: str, nodes: str = "default = 10.0.0.5") -> Policy:
 
 class World:
     def __init__(self, grants: Bounds = GRANTS.bounds) -> None:
-        self.records: list[tuple[str, str, dict[str, Any]]] = []
+        self.trail = FakeTrail()
         self.lost: list[int] = []
         self.cut_off: list[tuple[str, str]] = []
         self.registry = Registry()
@@ -75,7 +76,7 @@ class World:
         self.put(left=0, right=1)
         self.ports = Ports()
         carried = RelayTraffic(
-            cast(AuditTrail, self),
+            self.trail,
             self.registry,
             2,
             lambda node, topic: self.cut_off.append((node.name, topic)),
@@ -94,7 +95,7 @@ class World:
             own_header=None,
             own_call=cast(Any, None),
         )
-        self.graph = RosGraph(self.registry, self.grants, cast(AuditTrail, self))
+        self.graph = RosGraph(self.registry, self.grants, self.trail)
         uri = "http://10.0.0.5:4000/"
         self.node = Incarnation(
             "key", "/node", HOST, parse_node_uri(uri), uri, "10.0.0.1", 1, 2, more_relay_ports=(3,)
@@ -116,10 +117,6 @@ class World:
 
     def relay_lost(self, relay: int) -> None:
         self.lost.append(relay)
-
-    def happened(self, event: str, reason: str, **fields: Any) -> str:
-        self.records.append((event, reason, fields))
-        return ""
 
     def grant_topic(self, topic: str, host: Address, caller_id: str) -> None:
         self.graph.topic_granted(self.node, topic, host, caller_id)
@@ -304,23 +301,23 @@ async def test_a_lost_relay_loses_its_connections(world: World) -> None:
 async def test_a_publisher_that_is_cut_for_its_messages_is_recorded(world: World) -> None:
     say = world.links[0].say
     say(messages.UpstreamLost("key", "/left", "the publisher closed the connection"), ())
-    assert world.records == []
+    assert world.trail.records == []
     say(messages.UpstreamLost("key", "/left", "a message of 1 GiB is declared", "limit exceeded"), ())
-    ((event, reason, fields),) = world.records
-    assert (event, reason) == ("limit exceeded", "a message of 1 GiB is declared")
-    assert (fields["host"], fields["caller_id"], fields["resource"]) == ("10.0.0.5", "/node", "/left")
-    assert fields["decision"] == "deny"
+    [record] = world.trail.records
+    assert (record.event, record.reason) == ("limit exceeded", "a message of 1 GiB is declared")
+    assert (record.host, record.caller_id, record.resource) == ("10.0.0.5", "/node", "/left")
+    assert record.decision == "deny"
     say(messages.UpstreamLost("other", "/left", "of nobody that is known", "malformed"), ())
-    assert len(world.records) == 1
+    assert len(world.trail.records) == 1
 
 
 async def test_unreported_events_of_a_relay_are_recorded(world: World) -> None:
     row = messages.TopicTraffic("key", "/left", 400, 4000, 0, 1)
     world.links[0].say(messages.TrafficReported([row], 40.0, 7), ())
     assert world.relay.carried.traffic["key", "/left"].messages_per_second == 10
-    ((event, reason, fields),) = world.records
-    assert (event, fields["lost"]) == ("records lost", 7)
-    assert "7 connections" in reason
+    [record] = world.trail.records
+    assert (record.event, record.detail["lost"]) == ("records lost", 7)
+    assert "7 connections" in record.reason
 
 
 async def test_limits_of_the_policy_are_sent_and_sent_again_on_change(world: World) -> None:
@@ -361,9 +358,9 @@ async def test_drops_of_a_limit_are_recorded_with_its_line(world: World) -> None
         messages.LimitedRow("key", "/left", "subscriber", "10.0.0.6", "/ear", 3, 30),
     ]
     world.links[0].say(messages.MessagesLimited(rows), ())
-    [(event, _reason, one), (_event, _other_reason, other)] = world.records[-2:]
-    assert (event, one["severity"].value, other["severity"].value) == ("rate limited", "warning", "info")
-    assert (str(one["rule"]), one["count"], one["bytes"]) == ("[Limits] /left (p.ini:2)", 7, 70)
+    one, other = world.trail.rows[-2:]
+    assert (one["event"], one["severity"], other["severity"]) == ("rate limited", "warning", "info")
+    assert (one["rule"], one["count"], one["bytes"]) == (RuleReference("Limits", "/left", "p.ini", 2), 7, 70)
     assert (other["host"], other["caller_id"], other["publisher"]) == ("10.0.0.6", "/ear", "/node")
     assert world.relay.carried.limited_messages == {("/left", "publisher"): 7, ("/left", "subscriber"): 3}
 

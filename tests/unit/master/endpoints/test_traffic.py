@@ -1,5 +1,4 @@
 import ipaddress
-from typing import Any, cast
 
 import pytest
 
@@ -8,14 +7,7 @@ from appliance.channel.messages import ConnectionRefused
 from appliance.master.endpoints.traffic import RelayTraffic
 from appliance.master.graph.registry import Incarnation, Kind, Registry
 from roswire.uris import parse_node_uri
-
-
-class Kept:
-    def __init__(self) -> None:
-        self.records: list[dict[str, Any]] = []
-
-    def happened(self, event: str, reason: str, **fields: Any) -> None:
-        self.records.append({"event": event, "reason": reason, **fields})
+from tests.support.core import FakeTrail
 
 
 @pytest.mark.parametrize(
@@ -23,7 +15,7 @@ class Kept:
     [("10.0.0.2", "/rosout", False), ("10.0.0.2", "/camera", True), ("10.0.0.66", "/rosout", True)],
 )
 def test_a_late_connection_of_our_own_node_is_not_an_attack(host: str, topic: str, attack: bool) -> None:
-    kept = Kept()
+    trail = FakeTrail()
     registry = Registry()
     for key, name, own in (("k", "/talker", False), ("o", "/rosout", True)):
         uri = f"http://10.0.0.2:4000/{key}"
@@ -32,16 +24,16 @@ def test_a_late_connection_of_our_own_node_is_not_an_attack(host: str, topic: st
         registry.add(node)
         if own:
             registry.register(node, Kind.SUBSCRIPTION, "/rosout", "rosgraph_msgs/Log")
-    told = RelayTraffic(cast(Any, kept), registry, 1, lambda _node, _topic: None)
+    told = RelayTraffic(trail, registry, 1, lambda _node, _topic: None)
     told.refused(ConnectionRefused("k", "topic", topic, host, "/rosout", "[/talker] is not a publisher", 1))
-    (record,) = kept.records
+    (record,) = trail.rows
     assert record["decision"] == ("deny" if attack else None)
     assert record["severity"] is (Severity.WARNING if attack else Severity.INFO)
     assert (record["category"], record["resource"], record["node"]) == ("topic", topic, "/talker")
 
 
 def test_a_refusal_without_a_name_has_no_category() -> None:
-    kept = Kept()
-    told = RelayTraffic(cast(Any, kept), Registry(), 1, lambda _node, _topic: None)
+    trail = FakeTrail()
+    told = RelayTraffic(trail, Registry(), 1, lambda _node, _topic: None)
     told.refused(ConnectionRefused("k", "", "", "10.0.0.66", "", "said nothing", 2))
-    assert (kept.records[0]["category"], kept.records[0]["count"]) == (None, 2)
+    assert (trail.rows[0]["category"], trail.rows[0]["count"]) == (None, 2)

@@ -126,4 +126,4 @@ async def test_an_update_of_the_whole_tree_needs_the_right_to_all_of_it() -> Non
     world.parameters.replace({"arm": 4711})
     world.subscribers.tell_parameters(node)
     assert not [one for one in world.deliveries.told if one[1] == "paramUpdate"]
-    assert ("deny", "/") in world.records.events
+    assert ("deny", "/") in world.records.pairs
