@@ -6,6 +6,7 @@ import pytest
 
 from appliance.control.motion_stop import MotionStop, published_before
 from appliance.store.state_file import IncarnationRow, RegistrationRow
+from tests.support.core import FakeTrail
 
 pytestmark = pytest.mark.anyio
 
@@ -35,8 +36,8 @@ async def test_a_new_control_stops_what_was_commanded_once_the_relays_have_its_o
         done.append("carried out")
 
     relay = SimpleNamespace(presence="away", carried_out=carried_out)
-    trail = SimpleNamespace(happened=lambda event, _reason, **detail: done.append((event, detail["host"])))
-    work = MotionStop(stop, cast(Any, trail), cast(Any, None)).at_start(lost, cast(Any, relay))
+    trail = FakeTrail(lambda record: done.append((record.event, record.host)))
+    work = MotionStop(stop, trail, cast(Any, None)).at_start(lost, cast(Any, relay))
     task = asyncio.ensure_future(work)
     await asyncio.sleep(10)
     assert done == []

@@ -13,6 +13,7 @@ from appliance.master.graph.registry import Incarnation, Kind, Registry
 from appliance.master.reconcile.sinks import StoredGraph
 from appliance.store.state_file import StateStore
 from roswire.uris import parse_node_uri
+from tests.support.core import FakeTrail
 from tests.support.engines import InlineDatabase
 from tests.support.idle import idle
 
@@ -36,17 +37,16 @@ class Restored:
         StoredGraph(idle(Grants), self.store).flush(before.take_changes())
         self.registry, self.refusal = Registry(), ""
         self.decided: list[tuple[object, list[str]]] = []
-        self.records: list[tuple[str, str, str]] = []
+        self.trail = FakeTrail()
 
     async def restore(self) -> None:
         await self.store.settled()
-        trail = SimpleNamespace(happened=self._happened)
         grants = Grants(lambda _row: None, set)
         parts = SimpleNamespace(
             core=SimpleNamespace(
                 registry=self.registry,
                 grants=grants,
-                graph=RosGraph(self.registry, grants, cast(Any, trail)),
+                graph=RosGraph(self.registry, grants, self.trail),
             ),
             serve=lambda _node: None,
             endpoints=SimpleNamespace(
@@ -64,8 +64,9 @@ class Restored:
         if self.refusal:
             raise NoPortError(self.refusal)
 
-    def _happened(self, event: str, reason: str, **fields: Any) -> None:
-        self.records.append((event, reason, fields["caller_id"]))
+    @property
+    def records(self) -> list[tuple[str, str, str | None]]:
+        return [(record.event, record.reason, record.caller_id) for record in self.trail.records]
 
     def _changed(self, policy: object) -> int:
         self.decided.append((policy, [resource.resource for _node, resource in self.registry.in_order()]))

@@ -4,7 +4,6 @@ import ipaddress
 import socket
 from collections.abc import Iterator
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
@@ -20,6 +19,7 @@ from appliance.rpc.connection_table import ConnectionTable, Stage
 from appliance.rpc.server import HttpRequest, Peer, exceeds_limit
 from appliance.telemetry.audit_trail import AuditTrail
 from roswire.xmlrpc import build_call
+from tests.support.core import FakeTrail
 from tests.support.engines import open_log
 
 pytestmark = pytest.mark.anyio
@@ -181,12 +181,9 @@ def test_a_blocked_host_is_refused_before_its_request_is_read(tmp_path: Path, te
     ],
 )
 def test_a_request_that_is_not_http_exceeds_no_limit(status: str, event: str) -> None:
-    records: list[tuple[str, str]] = []
-    trail = SimpleNamespace(
-        happened=lambda event, reason, **_more: records.append((event, reason)), pause=None, still_owing=None
-    )
-    limits = ListenerLimits(Settings(), cast(Any, trail), cast(Any, None), lambda _host: QuotaClass.NAMED)
+    trail = FakeTrail()
+    limits = ListenerLimits(Settings(), trail, cast(Any, None), lambda _host: QuotaClass.NAMED)
     peer = Peer(ipaddress.ip_address("10.0.0.9"), "10.0.0.9", "10.0.0.1")
     report = limits.troubled if exceeds_limit(status.encode()) else limits.malformed
     report(peer, "10.0.0.9 sent something")
-    assert records == [(event, "10.0.0.9 sent something")]
+    assert [(record.event, record.reason) for record in trail.records] == [(event, "10.0.0.9 sent something")]

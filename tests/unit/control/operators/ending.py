@@ -1,6 +1,3 @@
-from types import SimpleNamespace
-from typing import Any, cast
-
 from appliance.channel.admin import TokenAdd
 from appliance.channel.answers.status import Status
 from appliance.control.operators.handled_alarms import SILENCES, HandledAlarms
@@ -8,6 +5,7 @@ from appliance.control.operators.token_orders import TOKENS, TokenOrders
 from appliance.store.ends import EndTable
 from appliance.store.state_file import StateStore
 from tests.support.answers import example
+from tests.support.core import FakeTrail
 from tests.support.ends import Ending
 
 
@@ -16,8 +14,7 @@ class Token(Ending):
 
     def __init__(self, store: StateStore, ends: EndTable) -> None:
         super().__init__(store, ends)
-        trail = SimpleNamespace(happened=lambda *_args, **_more: "")
-        self.tokens = TokenOrders(store, cast(Any, trail), ends, lambda: None)
+        self.tokens = TokenOrders(store, FakeTrail(), ends, lambda: None)
 
     async def begin(self, seconds: float) -> None:
         await self.tokens.add(TokenAdd("ann", "viewer", seconds))

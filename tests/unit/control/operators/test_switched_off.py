@@ -7,6 +7,7 @@ import pytest
 
 from appliance.control.operators.switched_off import SwitchedOffWatch
 from appliance.store.state_file import StateStore
+from tests.support.core import FakeTrail
 from tests.support.engines import InlineDatabase
 
 
@@ -16,7 +17,11 @@ class Scene:
         self.off: dict[str, Any] = {}
         self.until: dict[str, float] = {}
         self.audit_only: set[str] = set()
-        self.recorded: list[str] = []
+        self.trail = FakeTrail()
+
+    @property
+    def recorded(self) -> list[str]:
+        return [f"{record.event}: {record.reason}" for record in self.trail.records]
 
     def watch(self, forgotten_after: float | None = 3600.0) -> SwitchedOffWatch:
         monitors: Any = SimpleNamespace(
@@ -26,10 +31,7 @@ class Scene:
         policies: Any = SimpleNamespace(
             current=SimpleNamespace(audit_only=lambda category: category.value in self.audit_only)
         )
-        trail: Any = SimpleNamespace(
-            happened=lambda event, reason, **_fields: self.recorded.append(f"{event}: {reason}")
-        )
-        return SwitchedOffWatch(monitors, policies, self.store, trail, forgotten_after)
+        return SwitchedOffWatch(monitors, policies, self.store, self.trail, forgotten_after)
 
 
 @pytest.fixture

@@ -14,6 +14,7 @@ from appliance.features.doors.door_table import DoorTable
 from appliance.features.doors.settings import Doors
 from appliance.features.doors.view import DOORS_VIEW, DoorsState
 from appliance.store.door_tables import DoorRow
+from tests.support.core import FakeTrail
 from tests.support.virtual_clock import VirtualClock
 
 ALICE = DoorRow("alice", "198.19.240.2", 1.0, None, 0, None, "")
@@ -24,8 +25,7 @@ class Bench:
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.sent: list[Any] = []
         self.asked: list[Any] = []
-        self.records: list[str] = []
-        self.details: list[dict[str, Any]] = []
+        self.trail = FakeTrail()
         self.made: list[int] = []
         self.left: list[tuple[str, str]] = []
         self.full = False
@@ -40,7 +40,7 @@ class Bench:
             policies=SimpleNamespace(current=SimpleNamespace(ports=range(19001, 20001)), revision=7),
             blocks=SimpleNamespace(reasons={}),
             lifeline=SimpleNamespace(say=self.asked.append),
-            trail=SimpleNamespace(happened=self._happened),
+            trail=self.trail,
         )
         self.policies = base.policies
         self.rows = [ALICE]
@@ -61,10 +61,6 @@ class Bench:
         )
         self.link = cast(Any, self.processes.links()["door"][0])
         monkeypatch.setattr(self.processes, "_given", self._given)
-
-    def _happened(self, event: str, *_words: str, **more: Any) -> None:
-        self.records.append(event)
-        self.details.append(more)
 
     def _link(self, heard: Any, lost: Any) -> SimpleNamespace:
         return SimpleNamespace(heard=heard, lost=lost, send=self._send, channel=object(), close=self._close)
@@ -120,7 +116,7 @@ def test_the_process_of_another_door_ends_and_its_successor_serves(
     bench.hears(message)
     assert [type(one) for one in bench.sent] == [door_link.DoorEnded]
     bench.ends()
-    assert (bench.records, bench.asked) == ([], [messages.ProcessWanted("door", 0)])
+    assert (bench.trail.events, bench.asked) == ([], [messages.ProcessWanted("door", 0)])
     bench.hears(NEW)
     assert type(bench.sent[-1]) is door_link.DoorGiven
 
@@ -191,11 +187,11 @@ def test_a_process_without_a_door_ends(bench: Bench) -> None:
 def test_the_death_of_a_process_is_recorded(bench: Bench) -> None:
     bench.hears(NEW)
     bench.link.lost("")
-    assert bench.records == ["door failed"]
+    assert bench.trail.events == ["door failed"]
     assert bench.processes.health(ALICE).restarts_lately == 1
     bench.rows.clear()
     bench.link.lost("")
-    assert bench.records == ["door failed"]
+    assert bench.trail.events == ["door failed"]
 
 
 def test_a_process_gets_the_definitions_in_force_before_its_door_and_each_change_once(bench: Bench) -> None:
@@ -230,10 +226,10 @@ def test_refusals_are_denials_of_the_peer_and_connections_are_folded(bench: Benc
     bench.hears(NEW)
     bench.hears(door_link.ConnectionsChanged("10.0.0.66", "", 0, 0, 9, "the agent's address is 10.0.0.7"))
     bench.hears(door_link.ConnectionsChanged("10.0.0.7", "", 2, 1, 0, "the client left"))
-    refused, began, ended = bench.details
+    refused, began, ended = bench.trail.rows
     assert (refused["host"], refused["decision"], refused["count"]) == ("10.0.0.66", "deny", 9)
     for one in (began, ended):
-        assert (one["host"], one["reads"], one["peer"]) == (ALICE.address, True, "10.0.0.7")
+        assert (one["host"], one["folds"], one["peer"]) == (ALICE.address, True, "10.0.0.7")
 
 
 def test_a_full_door_and_one_that_keeps_ending_are_alarms(bench: Bench) -> None:

@@ -15,6 +15,7 @@ from appliance.formats.bundle_archive import BundleContents
 from appliance.policy.policy_compiler import compile_policy
 from appliance.store.writer_thread import StoreError
 from tests.support.autojump import run
+from tests.support.core import FakeTrail
 from tests.support.memory_channel import memory_link
 
 _POLICY = "[Nodes]\ndefault = *\n"
@@ -88,14 +89,14 @@ class Disk:
 @pytest.mark.parametrize("wait", [1, 2], ids=["before the trial", "after the trial"])
 def test_a_bundle_that_a_full_disk_rolled_back_is_not_in_force_and_is_tried_again(wait: int) -> None:
     policies, monitors, hosts, disk = Revisions(), Revisions(), Hosts(), Disk(wait)
-    said: list[str] = []
+    trail = FakeTrail()
     bundles, file = Bundles(root=Path("root.json"), site="site-a", group="arms"), Path("file.pem")
     fleet = Fleet(
         collector="https://10.0.0.9:8444", robot="arm7", ca=file, certificate=file, key=file, bundles=bundles
     )
     parts: Any = {
         "policies": policies, "monitors": monitors, "hosts": hosts, "store": disk,
-        "trail": SimpleNamespace(happened=lambda event, *_reason, **_detail: said.append(event)),
+        "trail": trail,
         "health": lambda _deprived: RobotHealth(0, frozenset(), frozenset()),
     }  # fmt: skip
     gate = BundleGate(fleet, **parts)
@@ -120,7 +121,7 @@ def test_a_bundle_that_a_full_disk_rolled_back_is_not_in_force_and_is_tried_agai
         far.send(BundlePollReported(1.0, offered=True))
         await asyncio.sleep(60)
         assert state() == (_OFFERED.path, "", "")
-        assert said == ["bundle in force"]
+        assert trail.events == ["bundle in force"]
         running.cancel()
 
     run(story())

@@ -1,13 +1,12 @@
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import pytest
 
 from appliance.features.fleet.fleet_of_pair import compare_fleets
 from appliance.features.fleet.settings import Fleet
 from appliance.store.state_file import StateStore
-from appliance.telemetry.audit_trail import AuditTrail
+from tests.support.core import FakeTrail
 from tests.support.engines import InlineDatabase
 
 FILES: dict[str, Any] = {name: Path(name) for name in ("ca", "certificate", "key", "receipt_key")}
@@ -30,10 +29,9 @@ def test_an_appliance_that_did_not_join_raises_an_alarm(
     takeovers: list[tuple[str, Fleet]], alarms: int, tmp_path: Path
 ) -> None:
     store = StateStore(tmp_path, failed=lambda _reason: None, kind=InlineDatabase)
-    said: list[str] = []
-    trail = cast(AuditTrail, SimpleNamespace(happened=lambda _event, reason, **_detail: said.append(reason)))
+    trail = FakeTrail()
     for name, fleet in takeovers:
         compare_fleets(fleet, store, trail, name=name)
-    assert len(said) == alarms
+    assert len(trail.records) == alarms
     if alarms == 2:
-        assert "rosrv-fleet robot invite arm7 --appliance b" in said[0]
+        assert "rosrv-fleet robot invite arm7 --appliance b" in trail.records[0].reason

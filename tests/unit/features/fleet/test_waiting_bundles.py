@@ -19,6 +19,7 @@ from appliance.features.fleet.view import BundlesState
 from appliance.formats.bundle_archive import BundleContents
 from appliance.policy.policy import Policy
 from appliance.policy.policy_compiler import compile_policy
+from tests.support.core import FakeTrail
 from tests.support.memory_channel import memory_link
 
 pytestmark = pytest.mark.anyio
@@ -85,7 +86,7 @@ class _Robot:
     def __init__(self) -> None:
         self.policies, self.monitors = _Part(), _Part()
         self.hosts = SimpleNamespace(bundled="", take_bundle=self._take_hosts)
-        self.events: list[str] = []
+        self.trail = FakeTrail()
         self.stated: list[BundleStated] = []
 
         async def settled() -> None:
@@ -94,7 +95,7 @@ class _Robot:
         parts: Any = {
             "policies": self.policies, "monitors": self.monitors, "hosts": self.hosts,
             "store": SimpleNamespace(settings=dict, save_setting=lambda *_given: None, settled=settled),
-            "trail": SimpleNamespace(happened=lambda event, *_given, **_fields: self.events.append(event)),
+            "trail": self.trail,
             "health": lambda _deprived: _HEALTHY,
         }  # fmt: skip
         self.gate = BundleGate(_FLEET, **parts)
@@ -152,7 +153,7 @@ async def test_a_change_by_an_operator_during_commit_confirm_only_delays_the_bun
         await asyncio.sleep(_CONFIRM_SECONDS + 5)
         assert robot.stated[-1].in_force == _OFFER.path
         assert not robot.trouble
-        assert robot.events == ["bundle in force"]
+        assert robot.trail.events == ["bundle in force"]
 
 
 async def test_a_change_while_the_policy_is_prepared_only_delays_the_bundle(robot: _Robot) -> None:

@@ -13,6 +13,7 @@ from appliance.features.guards.driver_check import NAME, DriverChecks
 from appliance.features.guards.driver_outcomes import status_of
 from appliance.features.guards.guard_requests import DriverCheckBegin, DriverCheckWanted
 from appliance.specifications.specification_files import SpecificationsRefusedError
+from tests.support.core import FakeTrail
 from tests.support.virtual_clock import let_time_pass
 from tests.unit.features.guards.test_presets import compiled
 
@@ -55,15 +56,14 @@ class Manager:
 
 class Site:
     def __init__(self, manager: Manager) -> None:
-        self.said: list[tuple[str, str, dict[str, Any]]] = []
+        self.trail = FakeTrail()
         self.pid = 7
-        trail = SimpleNamespace(happened=lambda name, text, **detail: self.said.append((name, text, detail)))
         topics = [
             Topic("/cmd_vel", "geometry_msgs/Twist", True, [], [], []),
             Topic("/odom", "nav_msgs/Odometry", True, [], [], []),
         ]
         self.checks = DriverChecks(
-            manager, trail, lambda: Graph([], topics, []),  # type: ignore[arg-type]  # as much of them as checks need
+            manager, self.trail, lambda: Graph([], topics, []),  # type: ignore[arg-type]  # as much of them as checks need
             lambda: [SimpleNamespace(role="relay", pid=self.pid), SimpleNamespace(role="api", pid=9)],  # type: ignore[list-item]  # as much of them as checks need
         )  # fmt: skip
 
@@ -89,14 +89,14 @@ async def test_the_line_of_the_monitor_is_the_outcome(
     assert (begun.command, begun.outcome) == ("/cmd_vel", "")
     manager.says("driver check: stopped after 9.000 s", "other")
     await site.checks.look()
-    assert not manager.removed() and not site.said
+    assert not manager.removed() and not site.trail.records
     manager.says(f"driver check: {outcome} after {seconds:.3f} s")
     await site.checks.look()
     found = await site.checks.wanted(DriverCheckWanted())
     assert (found.outcome, found.seconds, status_of(found.outcome)) == (outcome, seconds, status)
     assert manager.removed()
-    [(name, text, detail)] = site.said
-    assert (name, text, detail["who"]) == ("driver checked", f"/cmd_vel: {found.text}", "eve")
+    [row] = site.trail.rows
+    assert (row["event"], row["reason"], row["who"]) == ("driver checked", f"/cmd_vel: {found.text}", "eve")
 
 
 async def test_its_monitor_is_removed_before_the_client_reads_the_outcome(
@@ -165,7 +165,7 @@ async def test_a_control_that_starts_removes_the_monitor_of_the_last_one(manager
     again = Site(manager)
     assert (await again.checks.wanted(DriverCheckWanted())).command == ""
     await again.checks.look()
-    assert manager.removed() and not again.said
+    assert manager.removed() and not again.trail.records
 
 
 async def test_a_removal_that_fails_is_tried_again(manager: Manager, site: Site) -> None:

@@ -1,7 +1,6 @@
 import ipaddress
 from dataclasses import replace
-from types import SimpleNamespace
-from typing import Any, cast, get_args, get_type_hints
+from typing import get_args, get_type_hints
 
 import msgspec
 import pytest
@@ -21,6 +20,7 @@ from appliance.policy.policy_compiler import compile_policy
 from appliance.policy.policy_settings import AT_ONCE
 from appliance.telemetry.audit_trail import rule_reference
 from distribution.audit_events_page import uses
+from tests.support.core import FakeTrail
 from tests.support.idle import idle
 
 HOST = "10.0.0.9"
@@ -41,12 +41,11 @@ def denied(event: str, reason: str = "because", **fields: object) -> AuditRecord
     return AuditRecord(id="1", time=1, event=event, reason=reason, **(about | fields))  # type: ignore[arg-type]  # fields of it
 
 
-def revoked(decision: Decision, category: str, call: str) -> tuple[str, str, dict[str, Any]]:
-    made: list[tuple[str, str, dict[str, Any]]] = []
-    trail = SimpleNamespace(happened=lambda event, reason, **fields: made.append((event, reason, fields)))
-    graph = RosGraph(idle(Registry), idle(Grants), cast(Any, trail))
+def revoked(decision: Decision, category: str, call: str) -> AuditRecord:
+    trail = FakeTrail()
+    graph = RosGraph(idle(Registry), idle(Grants), trail)
     graph.record_revocation(decision, HOST, "/it", category, "/x", call=call)
-    return made[0]
+    return trail.records[0]
 
 
 def why(record: AuditRecord, text: str = CLOSED) -> Why:
@@ -88,10 +87,7 @@ def test_every_denial_names_the_change_that_allows_it(event: str) -> None:
 def test_the_change_lets_a_revoked_grant_be_kept(call: str, category: str, *, namespace: bool) -> None:
     live = LiveRight(ipaddress.ip_address(HOST), "/it", call, "/x", namespace)
     decision = may_keep(compile_policy(CLOSED, file="p.ini"), live)
-    event, reason, fields = revoked(decision, category, call)
-    record = denied(
-        event, reason, category=category, rule=rule_reference(fields["rule"]), detail=fields["more"]
-    )
+    record = revoked(decision, category, call)
     text = CLOSED
     for _ in range(3):  # a parameter below a namespace may be denied next
         found = why(record, text)
@@ -108,7 +104,7 @@ def test_the_change_lets_a_revoked_grant_be_kept(call: str, category: str, *, na
 def test_denials_without_a_policy_are_not_blamed_on_it() -> None:
     live = LiveRight(ipaddress.ip_address(HOST), "/it", "registerPublisher", "/x")
     decision = may_keep(compile_policy(CLOSED, file="p.ini"), live)
-    assert not revoked(decision, "publication", "")[2]["more"]
+    assert not revoked(decision, "publication", "").detail
     found = why(denied("revoked", category="publication"))
     assert (allowing(found), "its recorded reason" in found.refusal) == ([], True)
 

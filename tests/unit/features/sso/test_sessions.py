@@ -1,6 +1,5 @@
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import pytest
 
@@ -17,7 +16,7 @@ from appliance.features.sso.quotas import SESSIONS
 from appliance.features.sso.sessions import SessionTable
 from appliance.signing.request_signing import keys_of, reading_key
 from appliance.store.state_file import StateStore
-from appliance.telemetry.audit_trail import AuditTrail
+from tests.support.core import FakeTrail
 from tests.support.ends import ends_of
 from tests.support.engines import InlineDatabase
 from tests.support.virtual_clock import let_time_pass, set_wall
@@ -42,19 +41,12 @@ def _person(
 
 class World:
     def __init__(self, home: Path) -> None:
-        self.records: list[tuple[str, dict[str, Any]]] = []
-        trail = SimpleNamespace(
-            obstacle=None,
-            happened=lambda event, reason, **more: self.records.append((event, more | {"reason": reason})),
-        )
-        self.trail = trail
+        self.trail = FakeTrail()
         self.changes = 0
         store = StateStore(home, failed=pytest.fail, kind=InlineDatabase)
         ends = ends_of(store, home)
-        self.sso = SsoOrders(cast(AuditTrail, trail), ends, self._changed, configured=True)
-        self.tokens = TokenOrders(
-            store, cast(AuditTrail, trail), ends, lambda: None, sessions=lambda: self.sso.sessions
-        )
+        self.sso = SsoOrders(self.trail, ends, self._changed, configured=True)
+        self.tokens = TokenOrders(store, self.trail, ends, lambda: None, sessions=lambda: self.sso.sessions)
         self.checks = RequestAuthenticator(self.tokens, require_proof=False)
         self.answer: Any = None
         self.sso.link.ask = self._ask  # type: ignore[method-assign, assignment]  # the process
@@ -72,7 +64,7 @@ class World:
         return await self.sso.complete(requests.SignOnComplete("s", "c", "", "10.0.0.9"))
 
     def events(self) -> list[str]:
-        return [event for event, _detail in self.records]
+        return self.trail.events
 
 
 @pytest.fixture
@@ -91,8 +83,8 @@ async def test_a_session_has_the_rights_of_its_role_and_is_recorded(world: World
     session = world.sso.sessions.of(f"{1:012x}")
     assert session is not None
     assert (session.name, session.role, session.groups) == ("sso:alice", "operator", ("floor",))
-    (event, detail), *_more = [one for one in world.records if one[0] == "signed on"]
-    assert (event, detail["who"], detail["subject"], detail["host"]) == (
+    detail, *_more = [row for row in world.trail.rows if row["event"] == "signed on"]
+    assert (detail["event"], detail["who"], detail["subject"], detail["host"]) == (
         "signed on",
         "sso:alice",
         "u-1",
@@ -199,7 +191,7 @@ async def test_a_failure_is_answered_and_recorded(
 
 
 async def test_no_session_opens_while_the_log_cannot_be_written(world: World) -> None:
-    world.trail.obstacle = "the audit log cannot be written"
+    world.trail.log.failure = "the disk is full"
     with pytest.raises(UnavailableError, match="the audit log cannot be written"):
         await world.sign_on(1)
     assert world.tokens.usable() == []
