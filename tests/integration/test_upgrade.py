@@ -27,10 +27,10 @@ NOBODY = "[Nodes]\n[Publishers]\n[Subscribers]\n[Commands]\n[Services]\n[Clients
 
 UNCHANGED = (
     "authority", "door", "door_ticket", "enrolment_token", "host", "host_block", "host_certificate",
-    "host_ports", "monitor_revision", "parameter_owner", "policy_revision", "policy_signature", "revocation",
+    "host_ports", "parameter_owner", "policy_revision", "policy_signature", "revocation",
     "revoked_certificate", "token", "token_keys",
 )  # fmt: skip
-"""The tables in which a start changes no row."""
+"""The tables in which a start changes no row. It adds the warnings of its specifications to their revision."""
 
 
 class Upgraded(NamedTuple):

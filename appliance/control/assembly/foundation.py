@@ -16,7 +16,7 @@ from appliance.control.assembly.host_authority import HostAuthority, make_host_t
 from appliance.control.assembly.host_blocks import BlockTable
 from appliance.control.assembly.listener_limits import HostQuotaClass, ListenerLimits
 from appliance.control.assembly.open_audit import open_audit
-from appliance.control.assembly.policies import Policies
+from appliance.control.assembly.policies import Policies, surroundings
 from appliance.control.assembly.robot import charged_to, robot_addresses
 from appliance.control.links.signer_requests import ReceiptFloor, SignerRequests
 from appliance.control.links.supervisor_link import ControlLifeline
@@ -128,22 +128,26 @@ async def make_foundation(
         features.policy_changed()
         return enforcement().policy_changed(policy)
 
+    robot = robot_addresses(settings, role.robot)
+
     policies = Policies(
         settings.policy,
         store,
         ends,
         trail,
         policy,
-        robot=robot_addresses(settings, role.robot),
-        own=lambda: lifeline.surroundings.machine,
-        hosts=lambda: {**tunnels().addresses, **features.addresses()},
-        blocks=lambda: blocks.reasons,
-        holders=features.holders,
-        approved=features.approved,
+        known=lambda: surroundings(
+            {**tunnels().addresses, **features.addresses()},
+            robot,
+            own=lifeline.surroundings.machine,
+            site_keys=settings.site_keys,
+            blocks=blocks.reasons,
+            holders=features.holders(),
+            approved=features.approved(),
+        ),
         live=lambda: enforcement().revocation.live(),  # noqa: PLW0108  it is assembled later
         changed=changed,
         carried_out=lambda: enforcement().relay.carried_out(),  # noqa: PLW0108  it is assembled later
-        site_keys=settings.site_keys,
     )
     policies.start(restarted=restarted or role.paired)
     return Foundation(

@@ -81,37 +81,25 @@ class Policies(Revisions[RevisionRow]):
         trail: AuditTrail,
         policy: CurrentPolicy,
         *,
-        robot: Collection[Address | Network],
-        own: Callable[[], Collection[Address]],
-        hosts: Callable[[], Mapping[str, Address]],
-        blocks: Callable[[], Mapping[Address, str]],
-        holders: Callable[[], Mapping[str, Address]],
-        approved: Callable[[], frozenset[Approval]],
+        known: Callable[[], PolicyContext],
         live: Callable[[], Iterable[LiveRight]],
         changed: Callable[[Policy, Policy], int],
         carried_out: Callable[[], Awaitable[None]],
-        site_keys: Sequence[str],
     ) -> None:
         """`start` brings a policy into force, and sets it in `policy`.
 
-        The owners of `hosts` and `own` call `hosts_changed`; those of `blocks`, `holders` and `approved` call
-        `decide_again`.
-        `changed(before, policy)` decides all live rights again, and returns the number of revocations.
+        `known()` returns the `surroundings` of now. The owners of its `hosts` and `own` call `hosts_changed`; those of
+        `blocks`, `holders` and `approved` call `decide_again`. `changed(before, policy)` decides all live rights again,
+        and returns the number of revocations.
         """
         nothing = RevisionRow(0, "", "", 0.0, "", "")
         super().__init__(store, ends, store.revisions, store.save_revision, nothing)
         self.file = file
         self._trail = trail
-        self._robot = robot
-        self._own = own
-        self._hosts = hosts
-        self._blocks = blocks
-        self._holders = holders
-        self._approved = approved
+        self._known = known
         self._live = live
         self._changed = changed
         self._carried_out = carried_out
-        self._site_keys = site_keys
         self.policy = policy
         self._labelled: Policy | None = None  # whose labels are kept
         self._labels: list[tuple[Network, str]] = []
@@ -267,15 +255,7 @@ class Policies(Revisions[RevisionRow]):
 
     @property
     def known(self) -> PolicyContext:
-        return PolicyContext(
-            dict(self._hosts()),
-            self._robot,
-            site_keys=self._site_keys,
-            blocks=self._blocks(),
-            holders=self._holders(),
-            approved=self._approved(),
-            own=self._own(),
-        )
+        return self._known()
 
     # --- inside ---
 
@@ -288,7 +268,8 @@ class Policies(Revisions[RevisionRow]):
             while True:
                 known = self.known
                 policy, signature = await asyncio.to_thread(self._tested, read, file, known, cases)
-                if (self._hosts(), self._own()) == (known.hosts, known.own):
+                now = self.known
+                if (now.hosts, now.own) == (known.hosts, known.own):
                     break
         except PolicyRefusedError as error:
             self._refused(error, who)
@@ -351,7 +332,8 @@ class Policies(Revisions[RevisionRow]):
         self._note_refused("")
         before = self.revision
         row = RevisionRow(before + 1, policy.text, policy.file, clock.wall(), who, note, signature)
-        lost = _losses(self._completed(policy), self.policy(), self._live()) if self.policy else []
+        known = self.known
+        lost = _losses(completed(policy, known), self.policy(), self._live()) if self.policy else []
         earlier = {"policy": self.policy().text} if self.policy else {}
         self._put_in_force(row, within)
         revoked = self._enforce(policy)
@@ -362,7 +344,7 @@ class Policies(Revisions[RevisionRow]):
             file=policy.file,
             sha256=fingerprint(policy.text),
             diff=changed_lines(earlier, {"policy": policy.text}),
-            signed_by=signer(self._site_keys, policy.text, signature),
+            signed_by=signer(known.site_keys, policy.text, signature),
             revoked=revoked,
             warnings=[*lost, *map(str, policy.warnings)][:100],
         )
@@ -370,14 +352,9 @@ class Policies(Revisions[RevisionRow]):
 
     def _enforce(self, policy: Policy) -> int:
         before = self.policy() if self.policy else None
-        self.policy.set(self._completed(policy))
+        self.policy.set(completed(policy, self.known))
         self._trail.revision = self.revision
         return 0 if before is None else self._changed(before, self.policy())
-
-    def _completed(self, policy: Policy) -> Policy:
-        return replace(
-            policy, blocks=dict(self._blocks()), holders=dict(self._holders()), approved=self._approved()
-        )
 
     def _loaded(self, before: int, revoked: int, lost: Sequence[str] = ()) -> Loaded:
         warnings = [*lost, *map(str, self.current.warnings)]
@@ -385,6 +362,38 @@ class Policies(Revisions[RevisionRow]):
 
     async def _go_back(self, revision: int) -> None:
         await self.rollback(revision, who=UNCONFIRMED)
+
+
+def surroundings(
+    hosts: Mapping[str, Address],
+    robot: Collection[Address | Network],
+    *,
+    own: Collection[Address] = (),
+    site_keys: Sequence[str] = (),
+    blocks: Mapping[Address, str],
+    holders: Mapping[str, Address],
+    approved: frozenset[Approval],
+) -> PolicyContext:
+    """Return all that is known beside a policy's text, as one value, which no later change of an owner reaches."""
+    return PolicyContext(
+        dict(hosts),
+        robot,
+        own=frozenset(own),
+        site_keys=site_keys,
+        blocks=dict(blocks),
+        holders=dict(holders),
+        approved=approved,
+    )
+
+
+def completed(policy: Policy, known: PolicyContext) -> Policy:
+    """Return the policy with the present blocks, holders of groups, and approvals."""
+    return replace(
+        policy,
+        blocks=known.blocks,
+        holders=known.holders or {},
+        approved=known.approved or frozenset(),
+    )
 
 
 def _losses(policy: Policy, before: Policy, live: Iterable[LiveRight]) -> list[str]:

@@ -18,12 +18,13 @@ from appliance.channel.admin import (
     PolicyRollback,
     PolicyWanted,
 )
-from appliance.control.assembly.policies import Policies, RevisionChangedError
+from appliance.control.assembly.policies import Policies, RevisionChangedError, completed, surroundings
 from appliance.control.assembly.policy_gate import PolicyRefusedError
 from appliance.policy import judgement
 from appliance.policy.live_rights import LiveRight
-from appliance.policy.model import Address, Category, Request
+from appliance.policy.model import Address, Category, Request, address_of
 from appliance.policy.policy import Approval, CurrentPolicy, Policy
+from appliance.policy.policy_compiler import compile_policy
 from appliance.store.state_file import StateStore
 from tests.support.control_parts import OPEN, Records
 from tests.support.ends import ends_of
@@ -66,9 +67,11 @@ class Appliance:
         self.records = Records()
         self.ends = ends_of(store, self.state)
         policies = Policies(
-            self.file, store, self.ends, cast(Any, self.records), CurrentPolicy(), robot=(), own=tuple, hosts=hosts,
-            blocks=blocks,
-            holders=holders, approved=approved, live=live, changed=changed, carried_out=at_once, site_keys=site_keys,
+            self.file, store, self.ends, cast(Any, self.records), CurrentPolicy(), live=live, changed=changed,
+            carried_out=at_once,
+            known=lambda: surroundings(
+                hosts(), (), blocks=blocks(), holders=holders(), approved=approved(), site_keys=site_keys
+            ),
         )  # fmt: skip
         policies.start(restarted=restarted)
         ending = asyncio.get_running_loop().create_task(self.ends.run())
@@ -468,3 +471,17 @@ async def test_revisions_have_their_authors_and_notes(tmp_path: Path) -> None:
         assert (await policies.text(PolicyWanted(2))).text == OTHER
         with pytest.raises(PolicyRefusedError):
             await policies.roll_back(PolicyRollback(7777), "bob")
+
+
+def test_a_policy_keeps_what_was_known_when_it_came_into_force() -> None:
+    host, blocks, holders = (
+        address_of("10.0.0.9"),
+        {address_of("10.0.0.7"): "odd"},
+        {"base": address_of("10.0.0.8")},
+    )
+    known = surroundings({}, (), blocks=blocks, holders=holders, approved=frozenset())
+    policy = completed(compile_policy(OPEN, file="site.ini"), known)
+    blocks[host], holders["arm"] = "odd", host
+    assert (len(policy.blocks), len(policy.holders)) == (1, 1)
+    assert not policy.decide(Request(address_of("10.0.0.7"), "/n", Category.PUBLISH, "/x")).allowed
+    assert policy.decide(Request(host, "/n", Category.PUBLISH, "/x")).allowed

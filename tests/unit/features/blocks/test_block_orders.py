@@ -25,6 +25,7 @@ from appliance.features.blocks.block_requests import (
 )
 from appliance.hosts.host_table import HostRefusedError
 from appliance.master.graph.registry import Kind
+from appliance.policy.judgement import PolicyContext
 from appliance.policy.model import Category, Request, address_of
 from appliance.policy.policy import CurrentPolicy, Policy
 from appliance.store.ends import EndTable
@@ -78,9 +79,8 @@ class Control(ControlParts):
         self.uses: list[str] = []
         self.policies = Policies(
             state / "policy.ini", self.state, self.ends, cast(Any, self.records), CurrentPolicy(),
-            robot=[ipaddress.ip_network(ROBOT)], own=tuple, hosts=dict, blocks=lambda: self.blocks.reasons,
-            holders=dict, approved=frozenset, live=list,
-            changed=self.changed, carried_out=at_once, site_keys=(),
+            known=lambda: PolicyContext(robot=[ipaddress.ip_network(ROBOT)], blocks=self.blocks.reasons),
+            live=list, changed=self.changed, carried_out=at_once,
         )  # fmt: skip
         self.policies.start(restarted=False)
         self.current = self.policies.current
