@@ -11,7 +11,7 @@ from functools import partial
 from typing import Any
 
 from appliance.cli.connection.admin_client import AdminSocket, NotRunningError
-from appliance.features.standby import standby_requests
+from appliance.features.standby import requests as standby_requests
 from tests.support.features.standby.standby_site import ADDRESSES, ROBOT, StandbySite
 from tests.support.processes import Process
 from tests.support.small_disk import filled

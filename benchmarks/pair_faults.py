@@ -29,7 +29,7 @@ from rich.console import Console
 from rich.table import Table
 
 from appliance.cli.connection.admin_client import AdminSocket, NotRunningError
-from appliance.features.standby import standby_requests
+from appliance.features.standby import requests as standby_requests
 from appliance.features.standby.membership import load_membership, path_of, save_membership
 from appliance.features.standby.standby_answers import StandbyState
 from appliance.features.standby.standby_summary import standby_troubles

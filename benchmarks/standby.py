@@ -27,7 +27,7 @@ from typing import Self
 from rich.console import Console
 from rich.table import Table
 
-from appliance.features.standby import standby_requests
+from appliance.features.standby import requests as standby_requests
 from examples.landshark.lab import Lab
 from tests.support.appliance import Appliance
 from tests.support.features.standby.standby_robot import StandbyRobot

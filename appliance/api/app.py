@@ -1,7 +1,6 @@
 """Build the REST application: its routes, the answers to errors, and the contract (OpenAPI)."""
 
 import asyncio
-import pkgutil
 from collections import ChainMap
 
 from fastapi import FastAPI, Request
@@ -20,7 +19,7 @@ from appliance.api.routes import operation_routes
 from appliance.api.routes.contract import contract_of
 from appliance.api.routes.contract_page import PATH, page_of
 from appliance.base.validation_messages import refusal
-from appliance.features.table import FEATURES
+from appliance.features.table import members
 
 _DESCRIPTION = """\
 The appliance's own interface for scripts and other programs. Every call but the health probes needs a bearer token
@@ -45,14 +44,10 @@ def build_app(services: Services) -> FastAPI:
             Exception: _defect,
         },
     )
-    answers = ChainMap(
-        *(pkgutil.resolve_name(feature.answers) for feature in FEATURES if feature.answers is not None)
-    )
-    app.include_router(operation_routes.routes(services, answers))
+    app.include_router(operation_routes.routes(services, ChainMap(*members("routes", "ANSWERS"))))
     app.include_router(health.routes(services))
-    for feature in FEATURES:
-        if feature.routes is not None:
-            app.include_router(pkgutil.resolve_name(feature.routes)(services))
+    for routes in members("routes", "routes"):
+        app.include_router(routes(services))
     app.include_router(console.routes(services.settings))
     app.openapi = lambda: contract_of(app)  # type: ignore[method-assign]  # FastAPI's own way to change the contract
 

@@ -4,9 +4,12 @@ from typing import TYPE_CHECKING, Any, Union
 
 from appliance.channel.admin import CORE_REQUESTS, AdminRequest, ChallengeWanted
 from appliance.channel.rest_operation import rows
-from appliance.features.table import FEATURES
+from appliance.features.table import members
 
-REQUESTS = (*CORE_REQUESTS, *(request for feature in FEATURES for request in feature.operations()))
+REQUESTS = (
+    *CORE_REQUESTS,
+    *(request for requests in members("requests", "REQUESTS") for request in requests),
+)
 OPERATIONS = tuple(operation for request in REQUESTS for operation in rows().get(request, ()))
 CHANGES = frozenset(operation.request for operation in OPERATIONS if operation.is_change)
 """The changes in the name of a token; for each, control requires the client's HTTP request."""

@@ -33,9 +33,9 @@ VERBS: Verbs = {
 
 
 def feature_verbs() -> tuple[Verbs, ...]:
-    from appliance.features.table import FEATURES  # noqa: PLC0415  most verbs of the core do not need it
+    from appliance.features.table import TOOLS  # noqa: PLC0415  most verbs of the core do not need it
 
-    return tuple(feature.verbs for feature in FEATURES)
+    return tuple(tool.verbs for tool in TOOLS)
 
 
 def all_verbs() -> Verbs:

@@ -100,6 +100,10 @@ class FeatureSection:
     def services(self) -> tuple[str, ...]:
         return ()
 
+    def on_page(self) -> dict[str, str]:
+        """Return what the console's page states, by the names of its attributes."""
+        return {}
+
 
 @dataclass(frozen=True)
 class Sections:

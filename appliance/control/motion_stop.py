@@ -3,8 +3,9 @@
 import asyncio
 from collections.abc import Awaitable, Callable, Iterable
 from dataclasses import dataclass
+from functools import partial
 
-from appliance.master.endpoints.relay_control import RelayControl
+from appliance.control.core import Core, RelayOrders
 from appliance.master.graph.registry import Kind
 from appliance.policy.model import Address, address_of
 from appliance.policy.policy import Policy
@@ -51,9 +52,22 @@ class MotionStop:
             text = f"no enabled guard has a safe message for {', '.join(commanded)}, so nothing stops the robot: {why}"
             self._record("motion not stopped", text, host, commanded)
 
-    async def at_start(self, lost: Commands, relay: RelayControl) -> None:
+    def of_published_before(
+        self, core: Core, wanted: Callable[[], bool], concerns: Callable[[Address, str], bool]
+    ) -> Callable[[], Awaitable[None]]:
+        """Return the work that stops the topics of earlier publishers, if the first policy wants it."""
+        lost: Commands = set()
+
+        def find() -> None:
+            if wanted():
+                lost.update(published_before(core.store, concerns))
+
+        core.policy.on_first(find)
+        return partial(self.at_start, lost, core.relay)
+
+    async def at_start(self, lost: Commands, relay: RelayOrders) -> None:
         """Stop topics whose hosts lost the right while control was away, once no relay serves these hosts."""
-        while lost and relay.presence != "connected":
+        while lost and not relay.ready():
             await asyncio.sleep(_READY_SECONDS)
         await relay.carried_out()
         while lost:

@@ -6,20 +6,34 @@ from typing import Any
 
 from appliance.channel.answers.status import AuditState
 from appliance.control.assembly.assembly import Parts
-from appliance.control.assembly.current import Current
+from appliance.control.assembly.current import Current, Provided
 from appliance.control.assembly.foundation import Foundation
+from appliance.control.core import Alarms, Bearers, Core, Links
+from appliance.control.core_assembly import make_core
+from appliance.control.feature_parts import FeatureParts
 from appliance.control.operators.administration import Administration
 from appliance.control.operators.clock_check import ClockCheck
 from appliance.control.operators.handled_alarms import HandledAlarms
-from appliance.control.operators.node_connections import NodeConnections
-from appliance.control.operators.overview import graph_of
 from appliance.control.operators.queries import Queries
 from appliance.control.operators.request_methods import request_methods
+from appliance.control.operators.sessions import Sessions
 from appliance.control.operators.switched_off import SwitchedOffWatch
 from appliance.control.operators.token_orders import TokenOrders
 from appliance.control.rest.rest import RestLink
 from appliance.control.rest.rest_certificate import RestCertificate
 from appliance.control.rest.rest_uses import RestUses
+
+
+@dataclass(frozen=True, slots=True)
+class QueryParts:
+    """The parts that answer queries, and the core of features, before a policy is in force."""
+
+    core: Core
+    queries: Queries
+    tokens: TokenOrders
+    clock: ClockCheck
+    switched_off: SwitchedOffWatch
+    rest: Current[RestLink]
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,86 +45,75 @@ class Operators:
     switched_off: SwitchedOffWatch
     administration: Administration
     rest: RestLink
+    links: Links
 
 
-def make_operators(base: Foundation, parts: Parts) -> Operators:
-    """Make the parts; the specifications must already be loaded."""
+def make_queries(base: Foundation, parts: Parts, features: FeatureParts) -> QueryParts:
     settings, trail, ends = base.settings, base.trail, parts.endpoints
-    rest = Current[RestLink]()
-    tokens = TokenOrders(
-        base.store, trail, base.ends, lambda: rest().state_tokens(), sessions=base.features.sessions
-    )
-    base.features.bearers.set(tokens.usable)
+    rest, sessions = Current[RestLink](), Provided[Sessions]()
+    tokens = TokenOrders(base.store, trail, base.ends, lambda: rest().state_tokens(), sessions=sessions)
     clock = ClockCheck(trail, lambda: base.audit.ids.ahead)
     switched_off = SwitchedOffWatch(
         parts.monitors, base.policies, base.store, trail, settings.forgotten_after
     )
-    core = parts.core
-    handled, looks = HandledAlarms(base.store, base.ends), Current[Queries]()
-    base.features.operate(
-        appliance=base.role.name,
-        store=base.store,
-        ends=base.ends,
-        policies=base.policies,
-        monitors=parts.monitors,
-        processes=lambda: base.lifeline.surroundings.processes,
-        received=base.receipts.received,
-        graph=partial(graph_of, parts),
-        tokens_changed=lambda: rest().state_tokens(),
-        status=lambda: looks().present(),
-        handled_alarms=handled,
-        connections=NodeConnections(core.registry, ends.subscribers.delivery, base.lifeline.surroundings),
-    )
+    handled = HandledAlarms(base.store, base.ends)
     queries = Queries(
         parts,
         trail,
         base.policies,
-        base.features.hosts(),
+        base.hosts,
         base.lifeline.surroundings,
-        features=base.features.state,
+        features=features.status,
         audit=partial(_audit_state, base),
         clock=clock.state,
         queued_deliveries=lambda: ends.subscribers.delivery.waiting,
-        live=core.revocation.live,
+        live=parts.core.revocation.live,
         switched_off=switched_off.rows,
-        blocks=base.blocks.state,
+        blocks=base.hosts.blocks.state,
         handled=handled.marked,
-        name=base.settings.name,
+        name=settings.name,
     )
-    looks.set(queries)
+    bearers = Bearers(tokens.usable, lambda: rest().state_tokens(), sessions)
+    core = make_core(base, parts, bearers, Alarms(queries.present, handled))
+    return QueryParts(core, queries, tokens, clock, switched_off, rest)
+
+
+def make_operators(base: Foundation, made: QueryParts, features: FeatureParts) -> Operators:
     administration = Administration(
-        queries,
-        base.features.methods()
+        made.queries,
+        features.methods()
         + request_methods(
-            queries=queries,
+            queries=made.queries,
             policies=base.policies,
-            monitors=parts.monitors,
-            tokens=tokens,
+            monitors=made.core.specifications,
+            tokens=made.tokens,
         ),
         durable=partial(_durable, base),
         require_room=base.store.database.require_room,
     )
-    uses = RestUses(lambda: base.blocks.reasons)
-    base.blocks.uses.add(uses.of)
-    base.blocks.on_change(lambda: rest().state_tokens())
-    rest.set(
+    blocks = base.hosts.blocks
+    uses = RestUses(lambda: blocks.reasons)
+    blocks.uses.add(uses.of)
+    blocks.on_change(lambda: made.rest().state_tokens())
+    made.rest.set(
         RestLink(
             administration,
-            tokens,
-            trail,
-            served=base.features.hosts().served_by,
-            certified=RestCertificate(base.store, trail, base.role.name).stated,
-            connected=base.features.connected,
-            require_proof=settings.api_require_proof,
+            made.tokens,
+            base.trail,
+            served=base.hosts.enrolment.served_by,
+            certified=RestCertificate(base.store, base.trail, base.role.name).stated,
+            connected=made.core.rest.connected,
+            require_proof=base.settings.api_require_proof,
             uses=uses,
         )
     )
     return Operators(
-        tokens=tokens,
-        clock=clock,
-        switched_off=switched_off,
+        tokens=made.tokens,
+        clock=made.clock,
+        switched_off=made.switched_off,
         administration=administration,
-        rest=rest(),
+        rest=made.rest(),
+        links=made.core.links,
     )
 
 

@@ -19,15 +19,17 @@ from appliance import __version__
 from appliance.base.background import run_always
 from appliance.channel import messages
 from appliance.configuration.settings import Settings, load_resolved
-from appliance.control.assembly.active_role import STATE_ERRORS, ActiveRole, StartGate
+from appliance.control.assembly.active_role import STATE_ERRORS, ActiveRole
 from appliance.control.assembly.assembly import Parts, assemble
 from appliance.control.assembly.current import Current
 from appliance.control.assembly.foundation import INNER, OWN, RVMASTER, Foundation, make_foundation
 from appliance.control.assembly.robot import master_address
+from appliance.control.feature_parts import FeatureParts
 from appliance.control.links.supervisor_link import ControlLifeline
-from appliance.control.operator_assembly import Operators, make_operators
+from appliance.control.operator_assembly import Operators, make_operators, make_queries
 from appliance.control.operators.admin_socket import AdminServer
 from appliance.control.spare_memory import return_spare_memory
+from appliance.control.start_gate import StartGate
 from appliance.control.supervisor_messages import SupervisorMessages
 from appliance.features.table import start_gate
 from appliance.hosts.tunnel_state import Tunnels
@@ -95,12 +97,17 @@ async def _start(
     if settings.monitors is not None:
         compiler.call_early()  # the compiler starts while the policy is read
     restarted = RVMASTER in lifeline.sockets
-    base = await make_foundation(settings, lifeline, compiler, tunnels, role, restarted=restarted)
+    base = await make_foundation(settings, lifeline, compiler, tunnels, role)
     parts = assemble(base)
+    features = FeatureParts()
+    queries = make_queries(base, parts, features)
+    await features.begin(queries.core)
+    base.policies.start(restarted=restarted or role.paired)
+    parts.endpoints.places.policy_changed(base.policies.current.ports)
+    base.policy_services.began()
     await parts.monitors.start(restarted=restarted, taken_over=role.paired)
-    base.features.add(await gate.begin(base, parts))
-    await base.features.inherit(base, parts)
-    control = _Control(base, parts, make_operators(base, parts))
+    features.add(await gate.begin(base, parts))
+    control = _Control(base, parts, features, make_operators(base, queries, features))
     await _restore(base, parts)
     await control.serve()
     await parts.reconciler.ready.wait()
@@ -111,11 +118,12 @@ async def _start(
 class _Control:
     """All parts of control, from the first served call to the end."""
 
-    def __init__(self, base: Foundation, parts: Parts, operators: Operators) -> None:
+    def __init__(self, base: Foundation, parts: Parts, features: FeatureParts, operators: Operators) -> None:
         self._base = base
         self._parts = parts
+        self._features = features
         self._operators = operators
-        self._messages = SupervisorMessages(base, parts, operators)
+        self._messages = SupervisorMessages(base, parts, operators, features.close)
         self._tasks: list[asyncio.Task[None]] = []
         self._admin: object = None
 
@@ -135,7 +143,7 @@ class _Control:
             self._admin = await AdminServer(operators.administration).start(sockets[_ADMIN].dup())
         if base.role.api is not None:
             operators.rest.attach(base.role.api)
-            base.features.hosts().served_by(base.role.pin)  # the api has stated it already
+            base.hosts.enrolment.served_by(base.role.pin)  # the api has stated it already
         base.lifeline.hear(self._messages.heard)
         work: dict[str, Callable[[], Awaitable[None]]] = {
             "the reconciliation with the ROS master": parts.reconciler.run,
@@ -149,7 +157,7 @@ class _Control:
             "the check of protection that is off": operators.switched_off.watch,
             "the storage of parameters": self._save_parameters,
             "the publications of monitors": partial(parts.publisher.run, parts.reconciler.ready),
-            **base.features.work(),
+            **self._features.work(),
         }
         loop = asyncio.get_running_loop()
         self._tasks += [loop.create_task(run_always(what, one)) for what, one in work.items()]

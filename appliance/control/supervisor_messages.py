@@ -2,7 +2,7 @@
 
 import asyncio
 import socket
-from collections.abc import Coroutine
+from collections.abc import Awaitable, Callable, Coroutine
 from typing import Any
 
 import structlog
@@ -30,7 +30,10 @@ _log = structlog.get_logger()
 class SupervisorMessages:
     """Passes the supervisor's links and reports to the parts of control."""
 
-    def __init__(self, base: Foundation, parts: Parts, operators: Operators) -> None:
+    def __init__(
+        self, base: Foundation, parts: Parts, operators: Operators, close: Callable[[], Awaitable[None]]
+    ) -> None:
+        self._close = close
         self._base = base
         self._parts = parts
         self._operators = operators
@@ -72,7 +75,7 @@ class SupervisorMessages:
 
     async def _agree_to_end(self) -> None:
         try:
-            await self._base.features.before_end()
+            await self._close()
         finally:
             self._base.lifeline.say(messages.EndAgreed())
 
@@ -98,18 +101,18 @@ class SupervisorMessages:
             case "api":
                 self._operators.rest.attach(self._base.lifeline.api_channel(sock.detach()))
             case "charon":
-                self._base.tunnels.attach(Channel(sock, messages.TunnelLink))
+                self._base.hosts.tunnels.attach(Channel(sock, messages.TunnelLink))
             case _:
                 self._feature_link(role, index, sock)
 
     def _feature_link(self, role: str, index: int, sock: socket.socket) -> None:
-        found = self._base.features.link(role, index)
-        if found is None:
+        attached = self._operators.links.of(role, index)
+        if attached is None:
             _log.error("a link leads to a process unknown to control", role=role)
             sock.close()
             return
-        link, accepted = found
-        link.attach(Channel(sock, accepted, longest=self._base.features.longest(role)))
+        link, accepted, longest = attached
+        link.attach(Channel(sock, accepted, longest=longest))
 
     def _relay_link(self, index: int, channel: Channel) -> None:
         ends, subscribers = self._parts.endpoints, self._parts.endpoints.subscribers
@@ -137,7 +140,7 @@ class SupervisorMessages:
             except StoreError as error:
                 _log.error("the policy is in force and not stored", reason=str(error))
             try:
-                await self._base.features.hosts().read_again(DISK)
+                await self._base.hosts.enrolment.read_again(DISK)
             except HostRefusedError as error:
                 _log.error("hosts.yaml was rejected", reason=str(error))
             except StoreError as error:

@@ -1,106 +1,91 @@
-"""List the features of the product. The core imports only this module and `feature.py` of the folder `features`.
+"""List the features and tools. The core imports only this module, `feature.py` and the views of the folder `features`.
 
-To remove a feature, remove its folder, and its imports and rows here and in `views.py`.
+To remove a feature, remove its folder and its name here, and its view in `views.py`.
 """
 
+import importlib
 import pkgutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from appliance.cli.verb_table import Group, Verb
-from appliance.configuration.sections import Sections
-from appliance.features.adopt.feature import ADOPT
-from appliance.features.alarms.feature import ALARMS
-from appliance.features.approvals.feature import APPROVALS
-from appliance.features.audit_tools.feature import AUDIT_TOOLS
-from appliance.features.authority.feature import AUTHORITY
-from appliance.features.backup.feature import BACKUP
-from appliance.features.blocks.feature import BLOCKS
-from appliance.features.demo.feature import DEMO
-from appliance.features.doors.feature import DOORS
-from appliance.features.evidence.feature import EVIDENCE
-from appliance.features.feature import Feature
-from appliance.features.fleet.feature import FLEET
-from appliance.features.guards.feature import GUARDS
-from appliance.features.limits.feature import LIMITS
-from appliance.features.live.feature import LIVE
-from appliance.features.logbook.feature import LOGBOOK
-from appliance.features.metrics.feature import METRICS
-from appliance.features.monitor_tools.feature import MONITOR_TOOLS
-from appliance.features.policy_tools.feature import POLICY_TOOLS
-from appliance.features.recorder.feature import RECORDER
-from appliance.features.selftest.feature import SELFTEST
-from appliance.features.sign.feature import SIGN
-from appliance.features.sso.feature import SSO
-from appliance.features.standby.feature import STANDBY
-from appliance.features.survey.feature import SURVEY
-from appliance.features.syslog.feature import SYSLOG
-from appliance.features.tokens.feature import TOKENS
-from appliance.features.topics.feature import TOPICS
-from appliance.features.tunnels.feature import TUNNELS
-from appliance.supervisor.role import SharedMemory
+from appliance.features.feature import Feature, Tool
 
 if TYPE_CHECKING:
     from appliance.supervisor.machine_work import MachineWork
     from appliance.supervisor.service_gate import Pairing
 
-FEATURES: tuple[Feature, ...] = (
-    AUDIT_TOOLS,
-    POLICY_TOOLS,
-    MONITOR_TOOLS,
-    ALARMS,
-    LIMITS,
-    BLOCKS,
-    SIGN,
-    TOPICS,
-    TUNNELS,
-    SYSLOG,
-    EVIDENCE,
-    RECORDER,
-    STANDBY,
-    FLEET,
-    DOORS,
-    GUARDS,
-    BACKUP,
-    TOKENS,
-    SELFTEST,
-    DEMO,
-    SURVEY,
-    LOGBOOK,
-    ADOPT,
-    SSO,
-    AUTHORITY,
-    APPROVALS,
-    METRICS,
-    LIVE,
+NAMES = (
+    "audit_tools",
+    "policy_tools",
+    "monitor_tools",
+    "alarms",
+    "limits",
+    "blocks",
+    "sign",
+    "topics",
+    "tunnels",
+    "syslog",
+    "evidence",
+    "recorder",
+    "standby",
+    "fleet",
+    "doors",
+    "guards",
+    "backup",
+    "tokens",
+    "selftest",
+    "demo",
+    "survey",
+    "logbook",
+    "adopt",
+    "sso",
+    "authority",
+    "approvals",
+    "metrics",
+    "live",
 )
 
 
-def memories(sections: Sections, relays: int) -> tuple[SharedMemory, ...]:
-    return tuple(filter(None, (feature.memory(sections, relays) for feature in FEATURES)))
+def _folder(name: str) -> Tool:
+    folder: Tool = importlib.import_module(f"{__package__}.{name}.feature").FEATURE
+    return folder
+
+
+TOOLS = tuple(map(_folder, NAMES))
+"""All of them: a feature is also a tool."""
+FEATURES = tuple(folder for folder in TOOLS if isinstance(folder, Feature))
+
+
+def members(file: str, name: str) -> list[Any]:
+    """Return what the files of this name define under a name, in the order of the table."""
+    return [member for tool in TOOLS if (member := tool.member(file, name)) is not None]
 
 
 def recorded_messages() -> Any:
-    return next((pkgutil.resolve_name(one.recorded) for one in FEATURES if one.recorded is not None), None)
+    """Return the function that gives `rosrv monitor replay` the messages of a period; None without a recorder."""
+    return next(iter(members("replay_input", "recorded_messages")), None)
 
 
 def verb_function(group: str, name: str) -> Any:
     """Return the function of a feature's verb, for another feature; None without that feature."""
-    verbs = (one.verbs[group] for one in FEATURES if group in one.verbs)
-    found = (one.verbs[name] for one in verbs if isinstance(one, Group) and name in one.verbs)
-    return next((pkgutil.resolve_name(one.path) for one in found if isinstance(one, Verb)), None)
+    groups = (tool.verbs[group] for tool in TOOLS if group in tool.verbs)
+    verbs = (verbs.verbs[name] for verbs in groups if isinstance(verbs, Group) and name in verbs.verbs)
+    return next((pkgutil.resolve_name(verb.path) for verb in verbs if isinstance(verb, Verb)), None)
 
 
 def pairing_in(state: Path) -> "Pairing | None":
-    found = (feature.pairing(state) for feature in FEATURES if feature.pairing is not None)
-    return next(filter(None, found), None)
+    """Return what the start of one of two appliances needs, or None on a single one. Raises `StartError`."""
+    pairings: list[Callable[[Path], Pairing | None]] = members("pairing", "pairing_in")
+    return next(filter(None, (pairing(state) for pairing in pairings)), None)
 
 
 def machine_work_in(state: Path) -> "MachineWork | None":
-    named = (feature.machine for feature in FEATURES if feature.machine is not None)
-    return next((pkgutil.resolve_name(name)(state) for name in named), None)
+    """Return what a feature does on the machine in the supervisor, or None."""
+    return next((machine(state) for machine in members("machine_side", "machine")), None)
 
 
 def start_gate() -> Any:
-    named = (feature.may_start for feature in FEATURES if feature.may_start is not None)
-    return next((pkgutil.resolve_name(name)() for name in named), None)
+    """Return the feature's `StartGate`; None: nothing decides when control may serve."""
+    return next((gate() for gate in members("gate", "GATE")), None)

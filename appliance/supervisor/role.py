@@ -75,7 +75,8 @@ class Role:
     `secret` is a file that the role's user may not read: the last argument of `entry` is its descriptor or None.
     `inputs` are files of the operator, which the supervisor opens. `ended_early` is the `oom_score_adj`, and
     `slice_ns` is the length of its turns if it may not have its niceness (0: the kernel's). `receiver` is the only
-    other machine that the user can reach.
+    other machine that the user can reach. `memory` names a function (`module:function`) that gets the sections and the
+    number of relays, and makes the memory that they share, or returns None.
     """
 
     name: str
@@ -109,6 +110,7 @@ class Role:
     paired: bool = False
     configured: Callable[[Sections], bool] = lambda _sections: True
     receiver: Callable[[Sections], RemoteReceiver | None] = lambda _sections: None
+    memory: str = ""
 
     @property
     def serves_robot(self) -> bool:

@@ -1,5 +1,6 @@
 """The table of processes, with the user, the permissions and the start of each process."""
 
+import pkgutil
 import shutil
 from collections.abc import Mapping
 from functools import partial
@@ -10,7 +11,7 @@ from appliance.configuration.sections import DEFAULTS, Sections
 from appliance.features.table import FEATURES
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.port_check import first_free
-from appliance.supervisor.role import ExternalProgram, Facts, Role
+from appliance.supervisor.role import ExternalProgram, Facts, Role, SharedMemory
 from appliance.supervisor.sandbox.folders import executables_of, folders_of
 from appliance.supervisor.sandbox.sandbox_plan import NETWORK, ROUTES, SandboxPlan
 
@@ -131,6 +132,12 @@ def roles_of(
         for role in ROLES
         if wanted.get(role.name, True) and role.configured(sections) and (paired or not role.paired)
     )
+
+
+def memories(sections: Sections, relays: int) -> tuple[SharedMemory, ...]:
+    """Make the memory of all roles. Raises `StartError`."""
+    made = (pkgutil.resolve_name(role.memory)(sections, relays) for role in ROLES if role.memory)
+    return tuple(memory for memory in made if memory is not None)
 
 
 def require_programs(packages: Mapping[Path, str]) -> None:

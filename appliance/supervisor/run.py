@@ -13,7 +13,7 @@ import structlog
 
 from appliance.configuration.config_sources import plain
 from appliance.configuration.settings import Settings, Unasked
-from appliance.features.table import machine_work_in, memories
+from appliance.features.table import machine_work_in
 from appliance.network.close_ports import local_port_range
 from appliance.network.firewall.firewall_rules import PeerAccess
 from appliance.network.firewall.iptables import load_modules
@@ -29,6 +29,7 @@ from appliance.supervisor.port_wait import built_when_free
 from appliance.supervisor.privileges import drop_unused_capabilities, raise_file_limit, raise_priority
 from appliance.supervisor.restore_mark import refuse_half_restored
 from appliance.supervisor.role import Facts, Role
+from appliance.supervisor.roles import memories
 from appliance.supervisor.sandbox.private_view import (
     PrivateView,
     program_folders,

@@ -20,7 +20,7 @@ from collections.abc import Collection, Iterable
 from pathlib import Path
 
 from appliance.base.atomic_files import remove_unfinished, write_whole
-from appliance.features.table import FEATURES
+from appliance.features.table import members
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.role import Role
 from appliance.supervisor.users import account_of
@@ -37,7 +37,9 @@ def foreign(path: Path) -> str | None:
     if not path.is_dir():
         return None
     found = sorted(entry.name for entry in path.iterdir() if entry.name != _OF_THE_DISK)
-    prepared = any((path / name).is_file() for feature in FEATURES for name in feature.state_files)
+    prepared = any(
+        (path / name).is_file() for names in members("state_files", "STATE_FILES") for name in names
+    )
     if not found or _has_lock(path) or (path / _RESTORED).is_file() or prepared:
         return None
     more = " …" if len(found) > _SHOWN else ""

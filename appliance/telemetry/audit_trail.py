@@ -41,7 +41,7 @@ class AuditTrail:
     """
 
     def __init__(self, log: AuditLog, *, strict: bool, deny_when_failed: bool) -> None:
-        self._log = log
+        self.log = log
         self._ids = log.ids
         self.strict = strict
         self._deny_when_failed = deny_when_failed
@@ -55,29 +55,29 @@ class AuditTrail:
     @property
     def obstacle(self) -> str | None:
         """Return why nothing can be granted now; the text is safe to show to unknown hosts."""
-        if self._deny_when_failed and self._log.failed is not None:
+        if self._deny_when_failed and self.log.failed is not None:
             return NOT_RECORDED
         return None
 
     def shut_out(self, host: str) -> str:
-        return self._log.budget.shut_out(host)
+        return self.log.budget.shut_out(host)
 
     def owing(self, host: str) -> str:
-        return self._log.budget.owing(host)
+        return self.log.budget.owing(host)
 
     async def still_owing(self, host: str) -> str:
         if self.owing(host):
-            await self._log.wait_durable()
+            await self.log.wait_durable()
         return self.owing(host)
 
     def pause(self, host: str) -> float:
-        return self._log.budget.pause(host)
+        return self.log.budget.pause(host)
 
     async def durable(self) -> str | None:
         """Return None once all records so far are on disk, or, with `deny_when_failed`, the reason why they are
         not.
         """
-        failure = await self._log.wait_durable()
+        failure = await self.log.wait_durable()
         return failure if self._deny_when_failed else None
 
     def decided(
@@ -127,7 +127,7 @@ class AuditTrail:
             folds=reads and word == "allow",
         )
         self.meter.decided(category, word, taken / 1e9, "" if unknown else asker.host)
-        return self._log.record(record)
+        return self.log.record(record)
 
     def happened(
         self,
@@ -155,7 +155,7 @@ class AuditTrail:
         for details in self._completing(decision, severity):
             detail |= details(event, decision, severity, host, now)
         unknown = self._marked(host, decision, detail)
-        return self._log.record(
+        return self.log.record(
             AuditRecord(
                 id=self._ids.next(),
                 time=now,
@@ -179,7 +179,7 @@ class AuditTrail:
         return self._details if decision == "deny" or severity not in _ORDINARY else ()
 
     def _marked(self, host: str | None, decision: str | None, detail: dict[str, Any]) -> bool:
-        if host is None or decision != "deny" or self._log.budget.quota_class(host) is not QuotaClass.UNKNOWN:
+        if host is None or decision != "deny" or self.log.budget.quota_class(host) is not QuotaClass.UNKNOWN:
             return False
         detail["unknown_host"] = True
         return True

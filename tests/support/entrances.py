@@ -236,7 +236,7 @@ LISTENERS = {
 SECRETS = {
     "appliance/control/operators/token_orders.py": "REST with a token",
     "appliance/store/access_tokens.py": "REST with a token",
-    "appliance/features/doors/control_part.py": "door's ticket",
+    "appliance/features/doors/door_orders.py": "door's ticket",
     "appliance/features/doors/door_tickets.py": "door's ticket",
     "appliance/features/doors/door_visits.py": "door's ticket",
     "appliance/features/sso/sign_on.py": "sign-on",
@@ -288,12 +288,11 @@ COLLECTOR_ROUTES = (
 """The files with routes of the collector; they all come through `connections.py`."""
 
 HOOKS = {
-    "called": "node API",
-    "connected": "door's ticket",
-    "sessions": "sign-on",
-    "hosts": "tunnel",
-    "links": "- of our own processes",
-    "hold_call": "RVMaster",
-    "approve": "relay",
+    "own_services.provide": "node API",
+    "rest.websocket": "door's ticket",
+    "bearers.provide": "sign-on",
+    "hosts.provide": "tunnel",
+    "links.attach": "- of our own processes",
+    "relay.hold": "RVMaster, relay",
 }
-"""The parts of a feature by which others come in; all other parts are listed in the test."""
+"""The services of a feature by which others come in; all other services are listed in the test."""

@@ -1,42 +1,136 @@
+import tempfile
+from pathlib import Path
 from typing import Any
 
 from appliance.audit.log.log import AuditLog
 from appliance.channel.answers.graph_answers import Graph
 from appliance.channel.answers.status import Status
-from appliance.configuration.sections import DEFAULTS
+from appliance.configuration.config_sources import read
+from appliance.control.assembly.active_role import ActiveRole
+from appliance.control.assembly.current import Provided
+from appliance.control.assembly.host_authority import HostAuthority, make_host_table
+from appliance.control.assembly.host_blocks import BlockTable
+from appliance.control.assembly.hosts import SiteHosts
 from appliance.control.assembly.policies import Policies
+from appliance.control.assembly.registrar import Registrar
+from appliance.control.assembly.services import CallHolder, OwnServiceTable, PolicyServices
+from appliance.control.core import (
+    Alarms,
+    Bearers,
+    Core,
+    GraphFacts,
+    Links,
+    OwnServices,
+    PolicyFacts,
+    RelayOrders,
+    ResourceUses,
+    RestServices,
+)
+from appliance.control.feature_parts import FeatureParts
+from appliance.control.links.supervisor_link import ControlLifeline
 from appliance.control.operators.handled_alarms import HandledAlarms
 from appliance.control.operators.node_connections import NodeConnections
-from appliance.features.feature import Feature, FeatureContext
-from appliance.features.parts import FeatureParts
-from appliance.features.table import FEATURES
+from appliance.features.table import TOOLS
+from appliance.hosts.appliances import Appliances
+from appliance.hosts.stored_authority import StoredAuthority
+from appliance.hosts.tunnel_state import Tunnels
+from appliance.master.calls.parameter_calls import ParameterCalls
+from appliance.master.endpoints.host_signs import HostSigns
+from appliance.master.endpoints.relay_control import RelayControl
+from appliance.master.endpoints.topic_taps_control import TapRequests
+from appliance.master.graph.graph import RosGraph
+from appliance.master.graph.registry import Registry
+from appliance.master.reconcile.subscribers import Subscribers
 from appliance.specifications.specification_manager import SpecificationManager
-from appliance.store.ends import EndTable
-from appliance.store.state_file import StateStore
+from appliance.store.state_file import RevisionRow, StateStore
 from appliance.telemetry.audit_trail import AuditTrail
+from tests.support.ends import ends_of
+from tests.support.engines import InlineDatabase
 from tests.support.idle import idle
 
 
-def idle_parts() -> FeatureParts:
-    store, monitors, ends = idle(StateStore), idle(SpecificationManager), idle(EndTable)
-    store.settings = dict  # type: ignore[method-assign]  # an idle store has no settings
-    early = FeatureContext(
-        DEFAULTS, idle(AuditTrail), idle(AuditLog), "", charged_to=lambda host: host, in_force=lambda: (0, 0)
+def idle_core(state: Path) -> Core:
+    """Return a core whose parts do nothing, with an empty store."""
+    settings = read({"state": str(state)})
+    store = StateStore(state, failed=print, kind=InlineDatabase)
+    ends = ends_of(store, state)
+    policies, trail, relay = idle(Policies), idle(AuditTrail), idle(RelayControl)
+    policies.in_force = RevisionRow(0, "", "", 0.0, "", "")
+    trail.log, relay.taps = idle(AuditLog), idle(TapRequests)
+    return Core(
+        settings=settings,
+        role=ActiveRole(),
+        trail=trail,
+        store=store,
+        ends=ends,
+        links=Links(idle(ControlLifeline), lambda _sequence: None),
+        policy=PolicyFacts(policies, PolicyServices(), str),
+        specifications=idle(SpecificationManager),
+        hosts=SiteHosts(
+            BlockTable(store, ends),
+            make_host_table(settings, store),
+            idle(Tunnels),
+            HostAuthority(idle(StoredAuthority), idle(Appliances)),
+        ),
+        graph=GraphFacts(
+            present=lambda: Graph([], [], []),
+            host_of=lambda _node: None,
+            name_of=str,
+            machines=dict,
+            connected=tuple,
+            live_rights=list,
+            expel=lambda _host, _reason: 0,
+            signs=HostSigns(lambda _host: False, lambda _host, _names: 0.0),
+            master_port=11311,
+            connections=idle(NodeConnections),
+            registrar=_idle_registrar(),
+        ),
+        relay=RelayOrders(relay, CallHolder()),
+        rest=RestServices(),
+        own_services=OwnServices(OwnServiceTable()),
+        bearers=Bearers(list, lambda: None, Provided()),
+        limits=ResourceUses(tuple),
+        alarms=Alarms(lambda: idle(Status), idle(HandledAlarms)),
     )
-    parts = FeatureParts(early)
-    parts.operate(
-        appliance="", store=store, ends=ends, policies=idle(Policies), monitors=monitors, processes=tuple,
-        received=lambda _sequence: None, graph=lambda: Graph([], [], []), tokens_changed=lambda: None,
-        status=lambda: idle(Status), handled_alarms=idle(HandledAlarms),
-        connections=idle(NodeConnections),
-    )  # fmt: skip
-    return parts
 
 
-def answered_later() -> list[tuple[Feature, type[Any]]]:
+def _idle_registrar() -> Registrar:
+    async def call(*_call: Any) -> int:
+        return 0
+
+    async def ready() -> None: ...
+
+    return Registrar(
+        registry=Registry(),
+        graph=idle(RosGraph),
+        subscribers=idle(Subscribers),
+        parameters=idle(ParameterCalls),
+        flush=lambda: None,
+        call=call,
+        ready=ready,
+        silence=lambda: None,
+        speak=lambda: None,
+    )
+
+
+def idle_parts() -> FeatureParts:
+    parts = FeatureParts()
+    with tempfile.TemporaryDirectory() as folder:
+        core = idle_core(Path(folder))
+        beginning = parts.begin(core)
+        try:
+            beginning.send(None)  # nothing waits, so there is no loop
+        except StopIteration:
+            core.store.close(0)
+            return parts
+    raise AssertionError("a part of control waits before a policy is in force")
+
+
+def answered_later() -> list[type[Any]]:
+    """Return the requests that the gate of a feature answers."""
     return [
-        (feature, request)
-        for feature in FEATURES
-        if feature.operate is None and (feature.inherit is not None or feature.may_start is not None)
-        for request in feature.operations()
+        request
+        for tool in TOOLS
+        if tool.member("gate", "GATE") is not None
+        for request in tool.member("requests", "REQUESTS")
     ]

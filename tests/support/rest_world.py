@@ -129,10 +129,8 @@ class RestWorld:
             [
                 *(replace(method, answer=self.carried.out) for method in methods),
                 *(
-                    RequestMethod(
-                        request, self.carried.out, who=request in CHANGES, order=feature.may_start is None
-                    )
-                    for feature, request in answered_later()
+                    RequestMethod(request, self.carried.out, who=request in CHANGES, order=False)
+                    for request in answered_later()
                 ),
             ],
             durable=self.trail.durable,

@@ -1,16 +1,18 @@
 """No way into the appliance without its row, and no cell without a test or a reason."""
 
 import ast
-import dataclasses
+import inspect
 import re
 import tomllib
+import typing
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
 import pytest
 
 from appliance.api.front.request_gate import PUBLIC
-from appliance.features.feature import FeaturePart
+from appliance.control.assembly.hosts import SiteHosts
+from appliance.control.core import Core
 from appliance.supervisor.roles import ROLES as PROCESSES
 from tests.support import entrances
 from tests.support.entrances import CELLS, RULES
@@ -22,18 +24,7 @@ _LISTENS = re.compile(
 _SECRET = re.compile(r"secrets\.(token|randbelow)|make_token\(|new_ticket\(")
 _ROUTES = re.compile(r"APIRouter\(|Routes\(\)|Route\(")
 _NO_WAY_IN = frozenset(
-    {
-        "methods",
-        "longest",
-        "status_fields",
-        "limits",
-        "details",
-        "holders",
-        "approved",
-        "policy_changed",
-        "before_end",
-        "work",
-    }
+    {"links.start", "links.kill", "policy.provide", "policy.on_change", "policy.on_first", "limits.provide"}
 )
 
 
@@ -83,9 +74,16 @@ def test_every_route_of_the_collector_is_known() -> None:
     assert found == {*entrances.COLLECTOR_ROUTES}
 
 
-def test_every_part_of_a_feature_is_an_entrance_or_none() -> None:
-    fields = {field.name for field in dataclasses.fields(FeaturePart)}
-    assert fields == entrances.HOOKS.keys() | _NO_WAY_IN
+def test_every_service_of_a_feature_is_an_entrance_or_none() -> None:
+    """A method of the core without a result takes what a feature provides."""
+    services = {
+        f"{field}.{name}"
+        for field, kind in typing.get_type_hints(Core).items()
+        if kind.__module__ in (Core.__module__, SiteHosts.__module__)
+        for name, method in inspect.getmembers(kind, inspect.isfunction)
+        if not name.startswith("_") and typing.get_type_hints(method).get("return") is type(None)
+    }
+    assert services == entrances.HOOKS.keys() | _NO_WAY_IN
 
 
 def test_the_rows_name_entrances_of_the_table() -> None:

@@ -4,7 +4,7 @@ import grimp
 import pytest
 
 _MOST_IMPORTS = 25
-_LIST = "appliance.features.table"  # it imports each feature
+_LIST = "appliance.control.core"  # it names each part of control that features use
 
 
 @pytest.fixture(scope="module")

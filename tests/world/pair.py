@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from appliance.channel import admin
-from appliance.features.standby import standby_requests, witness
+from appliance.features.standby import requests as standby_requests
+from appliance.features.standby import witness
 from appliance.features.standby.membership import PORT, Membership
 from tests.world import robot
 from tests.world.appliance import MASTER_PORT, Appliance

@@ -94,7 +94,11 @@ def routes(settings: Settings) -> APIRouter:
                 "lock-seconds": f"{settings.api_lock_seconds:g}",
                 "notice": settings.api_notice,
                 "robot": settings.name,
-                **{name: text for one in FEATURES for name, text in one.page(settings.sections).items()},
+                **{
+                    name: text
+                    for section in settings.sections.values.values()
+                    for name, text in section.on_page().items()
+                },
             },
         ).encode(),
         served[_PAGE].media_type,

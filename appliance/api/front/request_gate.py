@@ -28,12 +28,12 @@ from appliance.base import clock
 from appliance.channel.messages.api import ClientRequest, LongRequest
 from appliance.channel.rest_meaning import is_dry_run
 from appliance.configuration.settings import ApiLimits
-from appliance.features.table import FEATURES
+from appliance.features.table import members
 from appliance.signing.request_signing import HEADER
 
 _log = structlog.get_logger()
 Network = ipaddress.IPv4Network | ipaddress.IPv6Network
-_OF_FEATURES = frozenset(path for feature in FEATURES for path in feature.without_token)
+_OF_FEATURES = frozenset(path for paths in members("requests", "PUBLIC") for path in paths)
 PUBLIC = _OF_FEATURES | {
     "/healthz", "/readyz", "/v1/healthz", "/v1/readyz", "/v1/openapi.json", "/v1/openapi.html",
     "/v1/enrol", "/v1/revocations", "/v1/authority",

@@ -1,22 +1,16 @@
 """The role in which control serves. A single appliance serves from its start to its end."""
 
-import asyncio
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable
 from pathlib import Path
-from typing import Any
 
 from appliance.base.age_clock import AgeClock
 from appliance.channel.channel import Channel
 from appliance.channel.link import Link
-from appliance.configuration.settings import Settings
 from appliance.control.assembly.host_authority import HostAuthority, make_host_authority
 from appliance.control.assembly.policy_gate import PolicyRefusedError
 from appliance.control.errors import StateError
-from appliance.control.links.supervisor_link import ControlLifeline
-from appliance.features.feature import FeaturePart
 from appliance.hosts.host_table import HostTable
 from appliance.hosts.tunnel_state import Tunnels
-from appliance.specifications.compiler_link import SpecificationCompiler
 from appliance.specifications.specification_files import SpecificationsRefusedError
 from appliance.store.ends import EndTable
 from appliance.store.state_file import StateStore
@@ -73,25 +67,3 @@ class ActiveRole:
 
     def close(self) -> None:
         """End the role; a change that is not answered yet gets no answer."""
-
-
-class StartGate:
-    """Decides when control may serve."""
-
-    links: Mapping[str, tuple[Callable[[Channel], None], Any]] = {}
-
-    async def role(
-        self,
-        config: Path,
-        settings: Settings,
-        lifeline: ControlLifeline,
-        compiler: SpecificationCompiler,
-        stopping: asyncio.Event,
-    ) -> ActiveRole | None:
-        """Wait until control may serve; return None if it is stopped first. Raises `STATE_ERRORS`."""
-        del config, settings, lifeline, compiler, stopping
-        return ActiveRole()
-
-    async def begin(self, base: Any, parts: Any) -> FeaturePart | None:
-        del base, parts
-        return None

@@ -4,10 +4,10 @@ from dataclasses import dataclass
 from functools import partial
 
 from appliance.channel import messages
-from appliance.control.assembly.core import Core, make_core
 from appliance.control.assembly.endpoints import Endpoints, make_endpoints
 from appliance.control.assembly.foundation import INNER, RVMASTER, Foundation
 from appliance.control.assembly.listener_limits import value_limits
+from appliance.control.assembly.master_core import MasterCore, make_master_core
 from appliance.control.assembly.monitor_states import published_now
 from appliance.master import rosout
 from appliance.master.calls.arrivals import Arrivals, ServeNode
@@ -33,7 +33,7 @@ from appliance.specifications.specification_manager import SpecificationManager
 class Parts:
     """The parts of RVMaster. `table` is the Master API."""
 
-    core: Core
+    core: MasterCore
     endpoints: Endpoints
     reconciler: Reconciler
     reminders: Reminders
@@ -46,7 +46,7 @@ class Parts:
 
 
 def assemble(base: Foundation) -> Parts:
-    core = make_core(base)
+    core = make_master_core(base)
     ends = make_endpoints(base, core)
     settings = base.settings
     reminders = Reminders(core.registry, ends.subscribers)
@@ -131,7 +131,7 @@ def assemble(base: Foundation) -> Parts:
 
 
 def _make_monitors(
-    base: Foundation, core: Core, ends: Endpoints, publisher: OwnPublisher, reminders: Reminders
+    base: Foundation, core: MasterCore, ends: Endpoints, publisher: OwnPublisher, reminders: Reminders
 ) -> SpecificationManager:
     settings, compiler = base.settings, base.compiler
     log = rosout.Rosout(
@@ -160,7 +160,9 @@ def _make_monitors(
     )
 
 
-def _make_pipeline(base: Foundation, core: Core, ends: Endpoints, parameters: ParameterCalls) -> Pipeline:
+def _make_pipeline(
+    base: Foundation, core: MasterCore, ends: Endpoints, parameters: ParameterCalls
+) -> Pipeline:
     settings, trail, offload = base.settings, base.trail, int(base.settings.limits.offload_bytes)
     execution = Execution(
         gate=core.gate,
@@ -171,7 +173,7 @@ def _make_pipeline(base: Foundation, core: Core, ends: Endpoints, parameters: Pa
         liveness=ends.liveness,
         parameters=parameters,
         redecide_for=ends.enforcement.redecide_for,
-        hold_call=base.features.hold_call,
+        hold_call=base.calls.call,
         large=offload,
         large_writes=LargeWrites(offload, base.quota_class, base.role.before_answer),
     )

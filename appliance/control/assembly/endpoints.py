@@ -4,10 +4,10 @@ from dataclasses import dataclass
 from ipaddress import ip_address, ip_network
 
 from appliance.channel import messages
-from appliance.control.assembly.core import Core
 from appliance.control.assembly.current import Current
 from appliance.control.assembly.foundation import INNER, RVMASTER, Foundation
 from appliance.control.assembly.listener_limits import value_limits
+from appliance.control.assembly.master_core import MasterCore
 from appliance.control.monitor_call_gate import MonitorCallGate, own_host
 from appliance.master import rosout
 from appliance.master.endpoints.delivery import Delivery, NodeApiClient
@@ -43,11 +43,11 @@ class Endpoints:
     liveness: Liveness
 
 
-def make_endpoints(base: Foundation, core: Core) -> Endpoints:
-    settings, policies = base.settings, base.policies
+def make_endpoints(base: Foundation, core: MasterCore) -> Endpoints:
+    settings = base.settings
     places = NodePorts(
         settings.listen_address[0],
-        policies.current.ports,
+        range(0),  # those of the policy, once it is in force
         keep=base.lifeline.keep,
         drop=base.lifeline.drop,
         policy=core.policy,
@@ -126,9 +126,13 @@ def make_endpoints(base: Foundation, core: Core) -> Endpoints:
 
 
 def _make_relay(
-    base: Foundation, core: Core, places: NodePorts, nodes: NodeApiClient, gate: Current[MonitorCallGate]
+    base: Foundation,
+    core: MasterCore,
+    places: NodePorts,
+    nodes: NodeApiClient,
+    gate: Current[MonitorCallGate],
 ) -> RelayControl:
-    settings, features = base.settings, base.features
+    settings = base.settings
     return RelayControl(
         core.registry,
         core.grants,
@@ -143,9 +147,9 @@ def _make_relay(
         own_call=lambda asked: (
             gate().answer(asked)
             if isinstance(asked, messages.MonitorCallWanted)
-            else features.approve(asked)
-            if isinstance(asked, messages.ApprovalWanted)
-            else features.called(asked)
+            else base.own_services.called(asked)
+            if isinstance(asked, messages.OwnServiceCalled)
+            else base.calls.request(asked)
         ),
         relay_all=settings.relaying == "all",
         stand_ins=settings.mediation == "full",

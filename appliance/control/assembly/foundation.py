@@ -12,17 +12,16 @@ from appliance.audit.log.log import AuditLog
 from appliance.configuration.settings import Settings
 from appliance.control.assembly.active_role import ActiveRole
 from appliance.control.assembly.current import Current
-from appliance.control.assembly.host_authority import HostAuthority, make_host_table
+from appliance.control.assembly.host_authority import make_host_table
 from appliance.control.assembly.host_blocks import BlockTable
+from appliance.control.assembly.hosts import SiteHosts
 from appliance.control.assembly.listener_limits import HostQuotaClass, ListenerLimits
 from appliance.control.assembly.open_audit import open_audit
 from appliance.control.assembly.policies import Policies, surroundings
-from appliance.control.assembly.robot import charged_to, robot_addresses
+from appliance.control.assembly.robot import robot_addresses
+from appliance.control.assembly.services import CallHolder, OwnServiceTable, PolicyServices
 from appliance.control.links.signer_requests import ReceiptFloor, SignerRequests
 from appliance.control.links.supervisor_link import ControlLifeline
-from appliance.features.feature import FeatureContext
-from appliance.features.parts import FeatureParts
-from appliance.hosts.host_table import HostTable
 from appliance.hosts.tunnel_state import Tunnels
 from appliance.master.graph.registry import Registry
 from appliance.master.reconcile.sinks import Enforcement
@@ -42,23 +41,22 @@ _log = structlog.get_logger()
 
 @dataclass(frozen=True, slots=True)
 class Foundation:
-    """The durable state, the policy and the listeners."""
+    """The durable state, the policy, the listeners, and the services that features provide."""
 
     settings: Settings
     lifeline: ControlLifeline
     compiler: SpecificationCompiler
     signing: SignerRequests
-    host_authority: HostAuthority
     audit: AuditLog
-    receipts: ReceiptFloor
     trail: AuditTrail
-    features: FeatureParts
+    receipts: ReceiptFloor
+    policy_services: PolicyServices
+    calls: CallHolder
+    own_services: OwnServiceTable
     monitors: Current[SpecificationManager]
     store: StateStore
     ends: EndTable
-    blocks: BlockTable
-    table: HostTable
-    tunnels: Tunnels
+    hosts: SiteHosts
     policies: Policies
     registry: Registry
     quota_class: HostQuotaClass
@@ -78,10 +76,8 @@ async def make_foundation(
     compiler: SpecificationCompiler,
     tunnels: Current[Tunnels],
     role: ActiveRole,
-    *,
-    restarted: bool,
 ) -> Foundation:
-    """Make the foundation. Raises `PolicyRefusedError`, `StoreError`, and `OSError` if an address is in use.
+    """Make the foundation; no policy is in force yet. Raises `StoreError`, and `OSError` if an address is in use.
 
     `tunnels` is set here, before the supervisor can report about tunnels.
     """
@@ -89,23 +85,13 @@ async def make_foundation(
     quota_class = HostQuotaClass(policy, registry.registrations_of)
     monitors, enforcement = Current[SpecificationManager](), Current[Enforcement]()
     signing, receipts, audit, trail = _open_log(settings, lifeline, quota_class)
-    features = FeatureParts(
-        FeatureContext(
-            settings.sections,
-            trail,
-            audit,
-            settings.name,
-            charged_to=lambda host: charged_to(policy(), host),
-            in_force=lambda: (trail.revision, monitors().revision),
-        )
-    )
+    services = PolicyServices()
     store = StateStore(
         settings.state / "control", failed=lambda reason: _log.error("state is not written", reason=reason)
     )
     role.inherit(store)
     ends = role.ends(store, settings.state / "control" / "age")
     blocks = BlockTable(store, ends)
-    await features.keep(store, lifeline)
     # The policy names hosts by address. These addresses are reliable only once clear text from them is blocked, so
     # start the tunnels before the policy.
     table = make_host_table(settings, store)
@@ -125,7 +111,7 @@ async def make_foundation(
     await tunnels().start()
 
     def changed(_before: Policy, policy: Policy) -> int:
-        features.policy_changed()
+        services.changed()
         return enforcement().policy_changed(policy)
 
     robot = robot_addresses(settings, role.robot)
@@ -137,35 +123,33 @@ async def make_foundation(
         trail,
         policy,
         known=lambda: surroundings(
-            {**tunnels().addresses, **features.addresses()},
+            {**tunnels().addresses, **services.all_hosts()},
             robot,
             own=lifeline.surroundings.machine,
             site_keys=settings.site_keys,
             blocks=blocks.reasons,
-            holders=features.holders(),
-            approved=features.approved(),
+            holders=services.all_holders(),
+            approved=services.all_approvals(),
         ),
         live=lambda: enforcement().revocation.live(),  # noqa: PLW0108  it is assembled later
         changed=changed,
         carried_out=lambda: enforcement().relay.carried_out(),  # noqa: PLW0108  it is assembled later
     )
-    policies.start(restarted=restarted or role.paired)
     return Foundation(
         settings=settings,
         lifeline=lifeline,
         compiler=compiler,
         signing=signing,
-        host_authority=host_authority,
         audit=audit,
-        receipts=receipts,
         trail=trail,
-        features=features,
+        receipts=receipts,
+        policy_services=services,
+        calls=CallHolder(),
+        own_services=OwnServiceTable(),
         monitors=monitors,
         store=store,
         ends=ends,
-        blocks=blocks,
-        table=table,
-        tunnels=tunnels(),
+        hosts=SiteHosts(blocks, table, tunnels(), host_authority),
         policies=policies,
         registry=registry,
         quota_class=quota_class,

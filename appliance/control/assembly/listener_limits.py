@@ -198,7 +198,12 @@ class HostQuotaClass:
         self._registrations = registrations
 
     def __call__(self, host: Address) -> QuotaClass:
-        """Return the quota class of a host; in audit-only mode, even an unknown host can have registrations."""
+        """Return the quota class of a host; in audit-only mode, even an unknown host can have registrations.
+
+        Before the first policy, every host counts as named.
+        """
+        if not self._policy:
+            return QuotaClass.NAMED
         # The policy need not name loopback, from which the appliance's own nodes call.
         if not (host.is_loopback or self._policy().standing(host).known):
             return QuotaClass.UNKNOWN
@@ -207,7 +212,7 @@ class HostQuotaClass:
     def of_text(self, host: str) -> QuotaClass:
         """Return the quota class of a host in text form; a text that is not an address counts as named."""
         try:
-            return self(address_of(host)) if self._policy else QuotaClass.NAMED
+            return self(address_of(host))
         except ValueError:
             return QuotaClass.NAMED
 

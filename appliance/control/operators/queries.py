@@ -24,13 +24,13 @@ from appliance.channel.answers.status import (
     SwitchedOff,
 )
 from appliance.control.assembly.assembly import Parts
+from appliance.control.assembly.hosts import SiteHosts
 from appliance.control.assembly.monitor_states import monitors_of, monitors_status
 from appliance.control.assembly.policies import Policies
 from appliance.control.links.supervisor_link import Surroundings
 from appliance.control.operators.measurements import measures_of
 from appliance.control.operators.overview import graph_of
 from appliance.features.views import states_in
-from appliance.hosts.tunnel_hosts import TunnelHosts
 from appliance.master.graph.registry import Kind, Life
 from appliance.policy.live_rights import LiveRight
 from appliance.policy.sections import DECIDERS
@@ -46,7 +46,7 @@ class Queries:
     parts: Parts
     trail: AuditTrail
     policies: Policies
-    hosts: TunnelHosts
+    hosts: SiteHosts
     surroundings: Surroundings
     features: Callable[[], dict[str, Any]]
     audit: Callable[[dict[str, Any]], AuditState]
@@ -70,7 +70,7 @@ class Queries:
         sandbox = {process.role: process.sandbox for process in around.processes if process.sandbox}
         used = InUse(
             firewall=around.firewall.report.backend,
-            esp=self.hosts.status().esp,
+            esp=self.hosts.enrolment.status().esp,
             sandbox=sandbox,
             lacks=sorted({lack for process in around.processes for lack in process.lacks}),
         )
@@ -84,7 +84,11 @@ class Queries:
 
     async def metrics(self, _request: admin.MetricsWanted) -> Measures:
         return measures_of(
-            self.parts, self.trail.meter, self.present(), self.hosts.rows(), self.queued_deliveries()
+            self.parts,
+            self.trail.meter,
+            self.present(),
+            self.hosts.enrolment.rows(),
+            self.queued_deliveries(),
         )
 
     async def registrations(self, _request: admin.RegistrationsWanted) -> Registrations:
@@ -115,7 +119,7 @@ class Queries:
             firewall=self.surroundings.firewall.report,
             probe=self.surroundings.probe,
             policy=self._policy(),
-            ipsec=self.hosts.status(),
+            ipsec=self.hosts.enrolment.status(),
             monitors=monitors_status(parts.monitors),
             rosmaster="reachable" if parts.endpoints.rosmaster.whole else "being rebuilt",
             relay=relay.presence,

@@ -19,8 +19,8 @@ from appliance.cli.standing import NotStandingError, wait_until_standing
 from appliance.features.adopt.adopt_answers import AdoptState, TakeOverReport
 from appliance.features.adopt.adopt_check import CheckedRobot, CheckLine, check_lines
 from appliance.features.adopt.adopt_record import load_record, save_record
-from appliance.features.adopt.adopt_requests import AdoptOrder, AdoptStatus
 from appliance.features.adopt.machine_side import wanted_record
+from appliance.features.adopt.requests import AdoptOrder, AdoptStatus
 from appliance.features.adopt.robot_side import (
     link_address,
     make_audit_only,

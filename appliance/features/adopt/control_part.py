@@ -3,22 +3,22 @@
 import asyncio
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from typing import TYPE_CHECKING, NoReturn
+from typing import NoReturn
 
 import msgspec
 import structlog
 
 from appliance.base import clock
+from appliance.control.core import ControlPart, Core
 from appliance.control.errors import SenselessError, UnavailableError
 from appliance.control.links.supervisor_link import MachineWorkFailedError
 from appliance.control.operators.request_method import RequestMethod
 from appliance.features.adopt.adopt_answers import AdoptState, GiveBackReport, TakeOverReport
 from appliance.features.adopt.adopt_record import Phase
-from appliance.features.adopt.adopt_requests import AdoptOrder, AdoptStatus, ReleaseOrder
 from appliance.features.adopt.graph_side import AdoptedGraph
 from appliance.features.adopt.machine_facts import MachineFacts
+from appliance.features.adopt.requests import AdoptOrder, AdoptStatus, ReleaseOrder
 from appliance.features.adopt.takeover import AdoptError, AdoptOperation
-from appliance.features.feature import FeaturePart
 from appliance.master.calls.call import Caller
 from appliance.master.calls.parameter_calls import ParameterCalls, ParameterWrite
 from appliance.master.graph.registry import Life
@@ -26,14 +26,10 @@ from appliance.master.graph.revocation import ROSOUT
 from appliance.policy.model import Address, address_of
 from appliance.rpc.master_reader import Entry, MasterReader
 from appliance.rpc.server import Peer
+from appliance.store.state_file import StateStore
 from appliance.supervisor.machine_work import Found
 from roswire.uris import NodeUri
-from roswire.xmlrpc import MethodCall, Value
-
-if TYPE_CHECKING:
-    from appliance.control.assembly.assembly import Parts
-    from appliance.control.assembly.foundation import Foundation
-    from appliance.store.state_file import StateStore
+from roswire.xmlrpc import Value
 
 _SETTING = "adopt"
 _AGAIN_SECONDS = 5.0
@@ -52,25 +48,25 @@ class AdoptMemory(msgspec.Struct):
     missing: dict[str, str] = {}
 
 
-async def inherit(base: "Foundation", parts: "Parts") -> FeaturePart:
-    obstacle = _NO_NETNS if base.settings.isolation != "netns" else _PAIRED if base.role.paired else ""
+async def begin(core: Core) -> ControlPart:
+    obstacle = _NO_NETNS if core.settings.isolation != "netns" else _PAIRED if core.role.paired else ""
     if obstacle:
         refused = RefusedAdoption(obstacle)
-        return FeaturePart(methods=(
+        return ControlPart((
             RequestMethod(AdoptStatus, refused.refuse, order=False),
             RequestMethod(AdoptOrder, refused.refuse),
             RequestMethod(ReleaseOrder, refused.refuse),
         ))  # fmt: skip
-    part = AdoptPart(base, parts)
-    return FeaturePart(
-        methods=(
+    part = AdoptPart(core)
+    return ControlPart(
+        (
             RequestMethod(AdoptStatus, part.status, order=False),
             RequestMethod(AdoptOrder, part.adopt, full_disk=True),
             RequestMethod(ReleaseOrder, part.release, full_disk=True),
         ),
-        status_fields=part.status_fields,
-        before_end=part.before_end,
-        work={"the adoption of the robot's graph": part.run},
+        {"the adoption of the robot's graph": part.run},
+        part.status_fields,
+        part.before_end,
     )
 
 
@@ -87,26 +83,24 @@ class RefusedAdoption:
 class AdoptPart:
     """The adoption, one operation at a time."""
 
-    def __init__(self, base: "Foundation", parts: "Parts") -> None:
-        self._base, self._parts = base, parts
-        ends, core = parts.endpoints, parts.core
-        parameters = parts.table["setParam"].part
-        assert isinstance(parameters, ParameterCalls)  # noqa: S101  the table says so
+    def __init__(self, core: Core) -> None:
+        self._core, self._registrar = core, core.graph.registrar
+        registrar = self._registrar
         self._graph = AdoptedGraph(
-            core.registry, core.graph, ends.subscribers, base.trail, self._order, ends.sinks.flush,
-            frozenset({ROSOUT, base.settings.publish_as}),
+            registrar.registry, registrar.graph, registrar.subscribers, core.trail, self._order, registrar.flush,
+            frozenset({ROSOUT, core.settings.publish_as}),
         )  # fmt: skip
         self._parameters = ParameterOrders(
-            parameters, lambda: self._facts.link if self._facts else "127.0.0.1"
+            registrar.parameters, lambda: self._facts.link if self._facts else "127.0.0.1"
         )
         self._operation = AdoptOperation(
             self._machine,
             self._reader,
             self._graph,
             self._parameters,
-            waiting=lambda: ends.subscribers.delivery.waiting,
-            silence=self._silence,
-            speak=self._speak,
+            waiting=lambda: registrar.subscribers.delivery.waiting,
+            silence=registrar.silence,
+            speak=registrar.speak,
             passed=self._passed,
         )
         self._one = asyncio.Lock()
@@ -118,9 +112,9 @@ class AdoptPart:
     # --- at the start, and while the appliance runs ---
 
     async def run(self) -> None:
-        await self._parts.reconciler.ready.wait()
+        await self._registrar.ready()
         self._remember()
-        while self._parts.endpoints.relay.presence != "connected":
+        while not self._core.relay.ready():
             await asyncio.sleep(_READY_SECONDS)
         while True:
             async with self._one:
@@ -146,7 +140,7 @@ class AdoptPart:
     def _note_obstacle(self, reason: str) -> None:
         if reason != self._obstacle:
             self._obstacle = reason
-            self._base.trail.happened("adoption failed", reason)
+            self._core.trail.happened("adoption failed", reason)
 
     def _taken(self, report: TakeOverReport) -> None:
         self._settled = True
@@ -231,30 +225,18 @@ class AdoptPart:
 
     async def _machine(self, work: str, /, **terms: object) -> Found:
         try:
-            return await self._base.lifeline.machine_work("adopt", work, **terms)
+            return await self._core.links.machine_work("adopt", work, **terms)
         except MachineWorkFailedError as error:
             raise AdoptError(str(error)) from None
 
     def _reader(self, facts: MachineFacts) -> MasterReader:
-        _host, port = self._base.settings.listen_address
+        _host, port = self._core.settings.listen_address
         return MasterReader(NodeUri("http", facts.link, port, "/"))
 
     async def _order(self, host: Address, method: str, /, *params: Value) -> list[Value]:
-        parts = self._parts
         local = self._facts.appliance if self._facts is not None else str(host)
-        answer = await parts.pipeline.ordered(
-            parts.table, Peer(host, str(host), local), MethodCall(method, params)
-        )
+        answer = await self._registrar.call(host, local, method, params)
         return answer if isinstance(answer, list) else [0, "no answer", 0]
-
-    def _silence(self) -> None:
-        self._parts.reminders.close()
-        self._parts.endpoints.subscribers.delivery.silence()
-
-    def _speak(self) -> None:
-        ends = self._parts.endpoints
-        ends.subscribers.delivery.speak()
-        ends.subscribers.remind_all()
 
     async def _passed(self, step: str) -> None:
         log.info("adoption", step=step)
@@ -264,10 +246,10 @@ class AdoptPart:
 
     def _remember(self) -> None:
         """Restore what an earlier control knew, now that the registry is restored."""
-        memory = _memory(self._base.store)
+        memory = _memory(self._core.store)
         self._missing = memory.missing
         self._graph.denied.update(memory.denied)
-        registry = self._parts.core.registry
+        registry = self._registrar.registry
         self._graph.subscribers.unasked.update(filter(None, map(registry.by_key, memory.nodes)))
 
     def _save(self) -> None:
@@ -276,7 +258,7 @@ class AdoptPart:
             list(self._graph.denied.items()),
             self._missing,
         )
-        self._base.store.save_setting(_SETTING, msgspec.json.encode(memory).decode())
+        self._core.store.save_setting(_SETTING, msgspec.json.encode(memory).decode())
 
 
 class ParameterOrders:
@@ -300,7 +282,7 @@ class ParameterOrders:
         ]
 
 
-def _memory(store: "StateStore") -> AdoptMemory:
+def _memory(store: StateStore) -> AdoptMemory:
     try:
         return msgspec.json.decode(store.settings().get(_SETTING, "{}"), type=AdoptMemory)
     except ValueError:

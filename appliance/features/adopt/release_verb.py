@@ -15,8 +15,8 @@ from appliance.cli.output import say_json, usage_error
 from appliance.cli.standing import NotStandingError, wait_until_standing
 from appliance.features.adopt.adopt_answers import GiveBackReport
 from appliance.features.adopt.adopt_record import load_record
-from appliance.features.adopt.adopt_requests import ReleaseOrder
 from appliance.features.adopt.dead_release import release_dead
+from appliance.features.adopt.requests import ReleaseOrder
 from appliance.features.adopt.robot_side import MASTER_PORT, link_address, remove_drop_in, running_settings
 from appliance.network.namespaces import NetworkError
 from rosmop.tool.terminal import say

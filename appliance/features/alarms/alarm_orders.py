@@ -2,41 +2,25 @@
 silences.
 """
 
-from collections.abc import Callable
-
 from appliance.channel.alarms import AlarmList, activity, open_alarms
-from appliance.channel.answers.status import Status
+from appliance.control.core import Alarms
 from appliance.control.errors import SenselessError, UnknownThingError
-from appliance.control.operators.handled_alarms import HandledAlarms
-from appliance.control.operators.request_method import RequestMethod
-from appliance.features.alarms.alarm_requests import (
+from appliance.features.alarms.requests import (
     LONGEST_SILENCE_SECONDS,
     AlarmAcknowledge,
     AlarmSilence,
     AlarmsWanted,
 )
-from appliance.features.feature import FeaturePart, OperatorContext
 from appliance.telemetry.audit_trail import AuditTrail
 
 
-def operate(context: OperatorContext) -> FeaturePart:
-    orders = AlarmOrders(context.handled_alarms, context.core.trail, context.status)
-    return FeaturePart(
-        methods=(
-            RequestMethod(AlarmsWanted, orders.listed, order=False),
-            RequestMethod(AlarmAcknowledge, orders.acknowledge, who=True),
-            RequestMethod(AlarmSilence, orders.silence, who=True),
-        )
-    )
-
-
 class AlarmOrders:
-    """Answers requests about the alarms in `status()`."""
+    """Answers requests about the alarms in the status."""
 
-    def __init__(self, handled: HandledAlarms, trail: AuditTrail, status: Callable[[], Status]) -> None:
-        self._handled = handled
+    def __init__(self, alarms: Alarms, trail: AuditTrail) -> None:
+        self._handled = alarms.handled
         self._trail = trail
-        self._status = status
+        self._status = alarms.status
 
     async def listed(self, _request: AlarmsWanted) -> AlarmList:
         return self._list()

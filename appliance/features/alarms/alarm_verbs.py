@@ -9,7 +9,7 @@ from appliance.channel.alarms import AlarmList
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.durations import span_given
 from appliance.cli.output import say_json, usage_error
-from appliance.features.alarms.alarm_requests import (
+from appliance.features.alarms.requests import (
     LONGEST_SILENCE_SECONDS,
     AlarmAcknowledge,
     AlarmSilence,

@@ -18,7 +18,7 @@ from appliance.channel.messages import ApprovalAnswered, ApprovalWanted
 from appliance.channel.messages.api import TokenKept
 from appliance.control.errors import SenselessError, UnknownThingError
 from appliance.control.motion_stop import MotionStop
-from appliance.features.approvals import approval_requests as requests
+from appliance.features.approvals import requests
 from appliance.features.approvals.approval_table import (
     WAIT_SECONDS,
     ApprovalEntry,

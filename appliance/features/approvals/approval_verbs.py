@@ -10,7 +10,7 @@ from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.durations import span_given
 from appliance.cli.output import say_json, usage_error
 from appliance.features.approvals import approval_watch
-from appliance.features.approvals.approval_requests import (
+from appliance.features.approvals.requests import (
     Approval,
     ApprovalsWanted,
     ApproveCall,

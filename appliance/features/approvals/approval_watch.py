@@ -10,7 +10,7 @@ from appliance.cli.audit.audit_errors import note
 from appliance.cli.connection.admin_client import AccessDeniedError, NotRunningError
 from appliance.cli.connection.target import Appliance
 from appliance.cli.output import say_json
-from appliance.features.approvals.approval_requests import Approval, ApprovalsWanted
+from appliance.features.approvals.requests import Approval, ApprovalsWanted
 from rosmop.tool.terminal import printable, say
 
 _EVERY_SECONDS = 0.5

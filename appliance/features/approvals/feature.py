@@ -1,7 +1,5 @@
 """Define the feature approvals."""
 
-from typing import TYPE_CHECKING, Any
-
 from appliance.cli.verb_table import Verb
 from appliance.configuration.sections import Sections
 from appliance.features.approvals.quotas import ROWS
@@ -11,17 +9,8 @@ from appliance.supervisor.role import Facts, RemoteReceiver, Role
 from appliance.supervisor.sandbox.folders import folders_of
 from appliance.supervisor.sandbox.sandbox_plan import ROUTES, SandboxPlan
 
-if TYPE_CHECKING:
-    from appliance.channel.admin import AdminRequest
-
 _PLACE = "appliance.features.approvals."
 HOOK = "hook"
-
-
-def _operations() -> "tuple[type[AdminRequest[Any]], ...]":
-    from appliance.features.approvals.approval_requests import REQUESTS  # noqa: PLC0415  few processes need it
-
-    return REQUESTS
 
 
 def _configured(sections: Sections) -> bool:
@@ -44,7 +33,7 @@ def _sandbox(facts: Facts) -> SandboxPlan:
     )
 
 
-APPROVALS = Feature(
+FEATURE = Feature(
     "approvals",
     settings=ApprovalHook,
     roles=(
@@ -55,7 +44,6 @@ APPROVALS = Feature(
             configured=_configured, receiver=_receiver,
         ),
     ),
-    operations=_operations,
     console=(
         ConsolePart("banner", "bar.js", "WaitingCalls"),
         ConsolePart("situation", "panel.js", "Waits", order=3),
@@ -63,5 +51,4 @@ APPROVALS = Feature(
     ),
     verbs={"approve": Verb(f"{_PLACE}approval_verbs:approve", after="drive")},
     quotas=ROWS,
-    inherit=f"{_PLACE}control_part:inherit",
 )  # fmt: skip

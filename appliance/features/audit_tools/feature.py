@@ -1,14 +1,13 @@
-"""Define the feature audit tools."""
+"""Define the tool audit tools."""
 
 from appliance.cli.verb_table import Group, Verb
-from appliance.features.feature import Feature
+from appliance.features.feature import Tool
 
 _PLACE = "appliance.features.audit_tools."
 _VERBS = f"{_PLACE}audit_verbs"
 
-AUDIT_TOOLS = Feature(
+FEATURE = Tool(
     "audit_tools",
-    routes=f"{_PLACE}audit_routes:routes",
     verbs={
         "audit": Group(
             "Review the audit log and verify that it is complete.",

@@ -13,7 +13,7 @@ from appliance.base.withdrawal import take_effect
 from appliance.channel.messages import OwnServiceAnswered, OwnServiceCalled
 from appliance.control.errors import SenselessError, UnavailableError, UnknownThingError
 from appliance.control.motion_stop import MotionStop
-from appliance.features.authority import drive_requests as requests
+from appliance.features.authority import requests
 from appliance.features.authority.group_holders import GroupHolders, Holding
 from appliance.master.endpoints.host_signs import HostSigns
 from appliance.policy.actions import BadWordError, find_host

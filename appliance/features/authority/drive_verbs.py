@@ -6,7 +6,7 @@ import typer
 
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.output import say_json
-from appliance.features.authority.drive_requests import (
+from appliance.features.authority.requests import (
     DriveAsk,
     DriveGive,
     DriveStatus,

@@ -1,11 +1,11 @@
-"""Define the feature backup."""
+"""Define the tool backup."""
 
 from appliance.cli.verb_table import Verb
-from appliance.features.feature import Feature
+from appliance.features.feature import Tool
 
 _VERBS = "appliance.features.backup.backup_verbs"
 
-BACKUP = Feature(
+FEATURE = Tool(
     "backup",
     verbs={
         "backup": Verb(f"{_VERBS}:backup", after="certificate"),

@@ -11,21 +11,16 @@ from msgspec.structs import asdict, replace
 from appliance.base import clock
 from appliance.base.counted import counted
 from appliance.base.withdrawal import caller_host, take_effect
-from appliance.control.assembly.assembly import Parts
-from appliance.control.assembly.foundation import Foundation
 from appliance.control.assembly.host_blocks import BLOCKS, BlockTable
 from appliance.control.assembly.policies import Policies
 from appliance.control.errors import SenselessError, UnknownThingError
-from appliance.control.operators.overview import hosts_connected
-from appliance.control.operators.request_method import RequestMethod
-from appliance.features.blocks import block_requests as requests
-from appliance.features.blocks.block_requests import (
+from appliance.features.blocks import requests
+from appliance.features.blocks.requests import (
     LONGEST_BLOCK_SECONDS,
     HostBlock,
     HostBlocks,
     HostUnblock,
 )
-from appliance.features.feature import FeaturePart
 from appliance.hosts.host_table import HostRefusedError
 from appliance.policy.host_names import HostNames, UnknownHostNameError
 from appliance.policy.live_rights import LiveRight
@@ -48,32 +43,6 @@ _REGISTERED = {
     "registerService": "services",
     "subscribeParam": "parameters",
 }
-
-
-async def inherit(base: Foundation, parts: Parts) -> FeaturePart:
-    orders = BlockOrders(
-        base.blocks,
-        base.policies,
-        base.store,
-        base.trail,
-        base.ends,
-        live=parts.core.revocation.live,
-        connected=lambda: hosts_connected(parts),
-        enrolled=lambda: {
-            **{row.name: row.address for row in base.table.enrolled()},
-            **{name: str(address) for name, address in base.features.addresses().items()},
-        },
-        remotes=lambda: {name: seen.remote for name, seen in base.tunnels.seen.items()},
-        uses=base.blocks.uses.of,
-        carried_out=parts.endpoints.relay.carried_out,
-    )
-    return FeaturePart(
-        methods=(
-            RequestMethod(HostBlock, orders.block, who=True, full_disk=True),
-            RequestMethod(HostUnblock, orders.unblock, who=True),
-            RequestMethod(HostBlocks, orders.listed, order=False),
-        ),
-    )
 
 
 class BlockOrders:

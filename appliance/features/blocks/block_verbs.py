@@ -12,7 +12,7 @@ from appliance.cli import output
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.durations import span_given
 from appliance.cli.output import moment, say_json, say_row
-from appliance.features.blocks.block_requests import (
+from appliance.features.blocks.requests import (
     LONGEST_BLOCK_SECONDS,
     BlockedHost,
     BlockEnded,

@@ -1,6 +1,6 @@
-"""Define the feature demo."""
+"""Define the tool demo."""
 
 from appliance.cli.verb_table import Verb
-from appliance.features.feature import Feature
+from appliance.features.feature import Tool
 
-DEMO = Feature("demo", verbs={"demo": Verb("appliance.features.demo.demo:demo", after="selftest")})
+FEATURE = Tool("demo", verbs={"demo": Verb("appliance.features.demo.demo:demo", after="selftest")})

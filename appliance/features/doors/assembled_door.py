@@ -4,12 +4,12 @@ from collections.abc import Awaitable, Callable
 
 from msgspec import Raw
 
+from appliance.features.doors.client_requests import CallOfService
 from appliance.features.doors.door_memory import ClientMemory
 from appliance.features.doors.door_node import DoorNode, present_time
 from appliance.features.doors.known_types import KnownTypes
 from appliance.features.doors.lookout import HostsOf, Lookout
 from appliance.features.doors.message_writer import Now
-from appliance.features.doors.requests import CallOfService
 from appliance.features.doors.rosapi import MasterSight, Rosapi
 from roswire.node import RosNode
 

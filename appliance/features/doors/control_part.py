@@ -1,328 +1,51 @@
-"""Answer requests about doors in control, and pass people's connections to the processes of doors."""
-
-import asyncio
-import contextlib
-from typing import Any
+"""Build the part of control for doors."""
 
 import structlog
 
-from appliance.base.withdrawal import take_effect
-from appliance.channel.answers.limit_answers import LimitUse
-from appliance.configuration.sections import Sections
-from appliance.control.assembly.active_role import ActiveRole
-from appliance.control.assembly.foundation import Foundation
-from appliance.control.errors import SenselessError, UnavailableError, UnknownThingError
-from appliance.control.links.supervisor_link import ControlLifeline
-from appliance.features.doors import door_requests
-from appliance.features.doors.door_link import node_name
-from appliance.features.doors.door_processes import ROLE, DoorProcesses
+from appliance.control.core import ControlPart, Core
+from appliance.control.operators.request_method import RequestMethod
+from appliance.features.doors import requests
+from appliance.features.doors.door_orders import DoorOrders
+from appliance.features.doors.door_processes import DoorProcesses
 from appliance.features.doors.door_table import DoorTable
-from appliance.features.doors.door_tickets import DoorTickets, left_by_its_maker
+from appliance.features.doors.door_tickets import DoorTickets
 from appliance.features.doors.door_visits import DoorVisits
-from appliance.features.doors.kept_doors import KeptDoors
-from appliance.features.doors.own_doors import OwnDoors
-from appliance.features.doors.settings import MOST_DOORS, Doors
-from appliance.features.doors.view import DoorsState
-from appliance.features.feature import FeaturePart
-from appliance.policy.model import address_of
-from appliance.store.door_tables import DoorRow, TicketRow
-from appliance.store.state_file import StateStore
+from appliance.features.doors.settings import Doors
 
-_LOOK_SECONDS = 1.0
-_RETRY_SECONDS = 10
 _log = structlog.get_logger()
 
 
-async def keep(sections: Sections, store: StateStore, lifeline: ControlLifeline) -> KeptDoors:
-    """Read the doors, and let the firewall reserve their addresses before the policy names them."""
-    settings = sections.of(Doors)
-    table = DoorTable(store, settings)
+async def begin(core: Core) -> ControlPart:
+    """Let the firewall reserve the addresses of doors before the policy names them."""
+    settings, blocks = core.settings.of(Doors), core.hosts.blocks
+    table = DoorTable(core.store, settings)
     if table.live():
-        table.closed = await lifeline.open_own_network(settings.network, table.ports())
+        table.closed = await core.links.open_own_network(settings.network, table.ports())
         if table.problem:
             _log.error("doors cannot be used", reason=table.problem)
-    return KeptDoors(table)
-
-
-async def inherit(base: Foundation, parts: Any) -> FeaturePart:
-    kept = base.features.kept["doors"]
-    assert isinstance(kept, KeptDoors)  # noqa: S101  `keep` made it
-    table = kept.table
-    tickets = DoorTickets(base.store, base.ends)
-    visits = DoorVisits(base.ends, lambda: {row.id: row.name for row in base.features.bearers()()})
+    tickets = DoorTickets(core.store, core.ends)
+    visits = DoorVisits(core.ends, lambda: {row.id: row.name for row in core.bearers.usable()})
     processes = DoorProcesses(
-        base,
+        core,
         table,
         tickets=lambda door: [row.id for row in (*tickets.valid(door), *visits.present(door))],
         left=visits.left,
-        definitions=lambda: parts.monitors.sources.definitions,
-        host_of=lambda node: None if (held := parts.core.registry.holder(node)) is None else held.host,
     )
-    base.blocks.on_change(processes.blocks_changed)
-    base.blocks.uses.add(processes.uses_of)
-    orders = kept.orders = DoorOrders(base, parts, table, tickets=tickets, visits=visits, processes=processes)
-    return FeaturePart(
-        links=processes.links(),
-        longest={ROLE: 1 << 16},
-        limits=orders.limits,
-        status_fields=orders.state,
-        connected=orders.enter,
-        work={"the doors": orders.watch},
-    )
-
-
-class DoorOrders:
-    """Answers operators, signed-in people, and connections that show a ticket."""
-
-    def __init__(
-        self,
-        base: Foundation,
-        parts: Any,
-        table: DoorTable,
-        *,
-        tickets: DoorTickets,
-        visits: DoorVisits,
-        processes: DoorProcesses,
-    ) -> None:
-        self._base = base
-        self._parts = parts
-        self._table = table
-        self._tickets = tickets
-        self._visits = visits
-        self._processes = processes
-        self._own = OwnDoors(table, base.features.sessions)
-        self._one = asyncio.Lock()
-        # By ticket: the door to which connections were passed, also by an earlier control.
-        self._used = {row.id: row.door for row in tickets.valid()}
-
-    async def listed(self, _request: door_requests.DoorsWanted) -> door_requests.DoorList:
-        return door_requests.DoorList([self._shown(row) for row in self._table.live()])
-
-    async def add(self, request: door_requests.DoorAdd, who: str) -> door_requests.DoorState:
-        async with self._one:
-            if self._table.stray:
-                raise UnavailableError(self._table.stray)
-            row = self._table.planned(request.name, request.port, request.source)
-            if row.port is not None and row.port in self._base.policies.current.ports:
-                raise SenselessError(f"port {row.port} is in [Ports] range of the policy: choose another one")
-            problem = await self._open([*self._table.ports(), *([row.port] if row.port is not None else [])])
-            if problem:
-                raise UnavailableError(problem)
-            take_effect()
-            self._table.save(row)
-            self._base.policies.hosts_changed()
-            self._processes.start()
-            self._base.trail.happened(
-                "door added",
-                f"{row.name} has the address {row.address}",
-                host=row.address,
-                whole=True,
-                resource=row.name,
-                who=who,
-                port=row.port,
-                source=row.source,
-            )
-            await self._base.store.settled()
-            return self._shown(row)
-
-    async def remove(self, request: door_requests.DoorRemove, who: str) -> door_requests.DoorState:
-        async with self._one:
-            shown = self._shown(self._table.of(request.name))
-            take_effect()
-            row = self._table.remove(request.name)
-            self._tickets.forget(row.name)
-            self._visits.forget(row.name)
-            self._processes.end(row)
-            self._base.policies.hosts_changed()
-            enforcement = self._parts.endpoints.enforcement
-            revoked = enforcement.expel(address_of(row.address), f"the door {row.name} was removed")
-            self._base.trail.happened(
-                "door removed",
-                f"{row.name} was removed; {row.address} stays reserved for this name",
-                host=row.address,
-                whole=True,
-                resource=row.name,
-                who=who,
-                revoked=revoked,
-            )
-            if row.port is not None and (problem := await self._open(self._table.ports())):
-                _log.error("the port of a door stays open in the firewall", port=row.port, reason=problem)
-            await self._base.store.settled()
-            await self._parts.endpoints.relay.carried_out()
-            return shown
-
-    async def ticket(self, request: door_requests.DoorTicket, who: str) -> door_requests.NewTicket:
-        door = self._table.of(request.name)
-        take_effect()
-        row, text = self._tickets.make(door.name, request.seconds, who)
-        self._record_ticket(
-            door, row, f"ticket {row.id} opens the door {door.name} for {request.seconds:g} s"
-        )
-        await self._base.store.settled()
-        return _new_ticket(row, text)
-
-    # --- the caller's own door ---
-
-    async def own(self, _request: door_requests.OwnDoorWanted, who: str) -> door_requests.OwnDoor:
-        name, row, reason = self._own.of(who)
-        return door_requests.OwnDoor(name=name, door=None if row is None else self._shown(row), reason=reason)
-
-    async def visit(self, _request: door_requests.DoorVisit, who: str) -> door_requests.NewTicket:
-        _name, door, reason = self._own.of(who)
-        if door is None:
-            raise UnknownThingError(reason)
-        take_effect()
-        row, text = self._visits.make(door.name, who)
-        self._record_ticket(
-            door, row, f"ticket {row.id} opens the door {door.name} once, for the session of {who}"
-        )
-        return _new_ticket(row, text)
-
-    def _record_ticket(self, door: DoorRow, row: TicketRow, text: str) -> None:
-        self._base.trail.happened(
-            "door ticket made",
-            text,
-            host=door.address,
-            whole=True,
-            resource=door.name,
-            who=row.who,
-            ticket=row.id,
-            expires=row.expires,
-        )
-
-    # --- connections ---
-
-    async def _open(self, ports: list[int]) -> str:
-        problem = await self._base.lifeline.open_own_network(self._base.settings.of(Doors).network, ports)
-        if not problem:
-            self._table.closed = ""
-        return problem
-
-    def enter(self, door: str, ticket: str, peer: str, descriptor: int) -> tuple[int, str]:
-        if self._base.policies.current.blocked(address_of(peer)) is not None:
-            self._refuse_entry(peer, door, "the host is blocked by an operator")
-            return 403, "this host is blocked by an operator"
-        row = next((one for one in self._table.live() if one.name == door), None)
-        visit = self._visits.find(door, ticket)
-        found = visit or self._tickets.find(door, ticket)
-        if row is None or found is None:
-            self._refuse_entry(peer, door, "the ticket is wrong, over, or for another door")
-            return 401, "the ticket is wrong or over: ask the operator for a new one (rosrv door ticket NAME)"
-        if not self._processes.pass_on(row, descriptor, peer, found.id):
-            return 503, self._processes.state(row)[1] or "the door is busy: try again"
-        if visit is None:
-            self._used[found.id] = row.name
-        else:
-            self._visits.opened(found.id)
-        return 101, ""
-
-    def _refuse_entry(self, peer: str, door: str, reason: str) -> None:
-        self._base.trail.happened(
-            "door entry refused", reason, host=peer, decision="deny", category="rest", resource=door[:31]
-        )
-
-    async def watch(self) -> None:
-        self._processes.start()
-        for number in range(1 << 62):
-            await asyncio.sleep(_LOOK_SECONDS)
-            self._processes.define()
-            self._processes.end_overdue()
-            ended = {row.id: row.door for row in self._visits.ended()}
-            ended |= {one: self._used.pop(one) for one in [*self._used] if self._tickets.ended(one)}
-            for ticket, name in ended.items():
-                for row in [one for one in self._table.live() if one.name == name]:
-                    self._processes.end_ticket(row, ticket)
-            if number % _RETRY_SECONDS == 0:
-                with contextlib.suppress(OSError):
-                    self._processes.retry()
-
-    def state(self) -> dict[str, Any]:
-        rows = self._table.live()
-        return {"doors": DoorsState([self._processes.health(row) for row in rows]) if rows else None}
-
-    def limits(self) -> tuple[LimitUse, ...]:
-        rows = self._table.live()
-        counts = {row.address: self._processes.state(row)[0].connections for row in rows}
-        most = max(counts, key=lambda address: counts[address], default="")
-        allowed = self._base.settings.of(Doors).connections
-        return (
-            LimitUse("doors", len(rows), MOST_DOORS, ""),
-            LimitUse(
-                "connections of doors",
-                sum(counts.values()),
-                None,
-                "doors.connections",
-                most,
-                counts.get(most, 0),
-                allowed,
-            ),
-        )
-
-    def _shown(self, row: DoorRow) -> door_requests.DoorState:
-        counts, trouble = self._processes.state(row)
-        return door_requests.DoorState(
-            name=row.name,
-            address=row.address,
-            node=node_name(row.name),
-            added=row.added,
-            port=row.port,
-            source=row.source,
-            trouble=trouble,
-            warning=missing_port(row.port, self._base.role),
-            connections=counts.connections,
-            received=counts.received,
-            sent=counts.sent,
-            dropped=counts.dropped,
-            refused=counts.refused,
-            tickets=self._valid_tickets(row),
-            clients=self._clients(row),
-        )
-
-    def _valid_tickets(self, row: DoorRow) -> list[door_requests.Ticket]:
-        bearers = {one.name for one in self._base.features.bearers()()}
-        return [
-            door_requests.Ticket(
-                one.id, one.created, one.expires, one.who, warning=left_by_its_maker(one, bearers)
-            )
-            for one in self._tickets.valid(row.name)
-        ]
-
-    def _clients(self, row: DoorRow) -> list[door_requests.ConnectedClient]:
-        makers = {
-            one.id: one.who for one in (*self._tickets.valid(row.name), *self._visits.present(row.name))
-        }
-        return [
-            door_requests.ConnectedClient(
-                address=one.peer[:64],
-                since=one.since,
-                protocol=one.protocol[:32],
-                ticket=one.ticket[:12],
-                who=makers.get(one.ticket, ""),
-                received=one.received,
-                sent=one.sent,
-                refused=one.refusals,
-            )
-            for one in self._processes.clients(row)
-        ]
-
-
-def _new_ticket(row: TicketRow, text: str) -> door_requests.NewTicket:
-    return door_requests.NewTicket(
-        id=row.id,
-        created=row.created,
-        expires=row.expires,
-        who=row.who,
-        door=row.door,
-        ticket=text,
-        path=f"/door/{row.door}?ticket={text}",
-    )
-
-
-def missing_port(port: int | None, role: ActiveRole) -> str:
-    if port is None or role.ports is None or any(port in ports for ports in role.ports):
-        return ""
-    there = ", ".join(f"{one[0]}-{one[-1]}" if len(one) > 1 else str(one[0]) for one in role.ports)
-    return (
-        f"port {port} does not exist at {role.address}, the fixed address of the two appliances, so an agent there is"
-        f" cut off: use a free port of {there}, or make new kits: rosrv standby join … --again --ports …"
+    orders = DoorOrders(core, table, tickets=tickets, visits=visits, processes=processes)
+    core.policy.provide(hosts=table.addresses)
+    blocks.on_change(processes.blocks_changed)
+    blocks.uses.add(processes.uses_of)
+    core.rest.websocket(orders.enter)
+    core.limits.provide(orders.limits)
+    return ControlPart(
+        (
+            RequestMethod(requests.DoorsWanted, orders.listed),
+            RequestMethod(requests.DoorAdd, orders.add, who=True),
+            RequestMethod(requests.DoorRemove, orders.remove, who=True, full_disk=True),
+            RequestMethod(requests.DoorTicket, orders.ticket, who=True),
+            RequestMethod(requests.OwnDoorWanted, orders.own, who=True),
+            RequestMethod(requests.DoorVisit, orders.visit, who=True, full_disk=True),
+        ),
+        {"the doors": orders.watch},
+        orders.state,
     )

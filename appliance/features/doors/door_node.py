@@ -16,15 +16,7 @@ from msgspec import Raw
 
 from appliance.base import clock
 from appliance.base.counted import counted
-from appliance.features.doors.door_memory import ClientMemory
-from appliance.features.doors.door_parameters import TOO_MANY_CALLS, DoorParameters, ParameterClient
-from appliance.features.doors.heard_topic import HeardTopic, one_type
-from appliance.features.doors.host_shares import check_share, of_hosts
-from appliance.features.doors.known_types import DoorMessage, KnownType, KnownTypes, SharedFrames, TypeKey
-from appliance.features.doors.lingering import Lingering
-from appliance.features.doors.message_writer import MessageWriter, Now
-from appliance.features.doors.quotas import DOOR_CALLS, DOOR_SERVICES, DOOR_TOPICS
-from appliance.features.doors.requests import (
+from appliance.features.doors.client_requests import (
     AdvertiseTopic,
     AnswerCall,
     CallOfService,
@@ -40,6 +32,14 @@ from appliance.features.doors.requests import (
     WithdrawService,
     WriteParameter,
 )
+from appliance.features.doors.door_memory import ClientMemory
+from appliance.features.doors.door_parameters import TOO_MANY_CALLS, DoorParameters, ParameterClient
+from appliance.features.doors.heard_topic import HeardTopic, one_type
+from appliance.features.doors.host_shares import check_share, of_hosts
+from appliance.features.doors.known_types import DoorMessage, KnownType, KnownTypes, SharedFrames, TypeKey
+from appliance.features.doors.lingering import Lingering
+from appliance.features.doors.message_writer import MessageWriter, Now
+from appliance.features.doors.quotas import DOOR_CALLS, DOOR_SERVICES, DOOR_TOPICS
 from roswire.errors import DefinitionError, LimitExceededError, PeerError, ProtocolError, RosError
 from roswire.node import (
     MasterDenialError,

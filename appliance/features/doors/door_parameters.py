@@ -15,15 +15,15 @@ from weakref import WeakValueDictionary
 import msgspec
 
 from appliance.base.counted import counted
-from appliance.features.doors.door_memory import ClientMemory
-from appliance.features.doors.host_shares import check_share
-from appliance.features.doors.quotas import DOOR_PARAMETERS
-from appliance.features.doors.requests import (
+from appliance.features.doors.client_requests import (
     ReadParameters,
     SubscribeParameter,
     UnsubscribeParameter,
     WriteParameter,
 )
+from appliance.features.doors.door_memory import ClientMemory
+from appliance.features.doors.host_shares import check_share
+from appliance.features.doors.quotas import DOOR_PARAMETERS
 from roswire.errors import LimitExceededError, ProtocolError, RosError, quoted
 from roswire.node import MasterDenialError, RosNode
 from roswire.node.network import OwnedTasks

@@ -22,7 +22,8 @@ from appliance.base.counted import counted
 from appliance.channel import messages
 from appliance.channel.channel import Channel, ChannelFullError
 from appliance.channel.link import Link
-from appliance.control.assembly.foundation import RVMASTER, Foundation
+from appliance.configuration.settings import Settings
+from appliance.control.core import Core
 from appliance.features.doors import door_link
 from appliance.features.doors.door_table import DoorTable
 from appliance.features.doors.settings import MOST_DOORS, Doors
@@ -34,6 +35,7 @@ from appliance.store.door_tables import DoorRow
 ROLE = "door"
 _CONNECT_SECONDS = 5.0
 _END_SECONDS = 5.0
+_LONGEST = 1 << 16  # bytes of a message
 _MOST_PENDING = 64
 _BACKLOG = 128
 _MOST_DEATHS = 16
@@ -68,36 +70,28 @@ class DoorProcesses:
 
     def __init__(
         self,
-        base: Foundation,
+        core: Core,
         table: DoorTable,
         *,
         tickets: Callable[[str], list[str]],
         left: Callable[[str, str], None],  # called after connections of a door with a ticket ended
-        definitions: Callable[[], Mapping[str, str]],
-        host_of: Callable[[str], Address | None],  # of a node
     ) -> None:
-        self._base = base
+        self._core = core
         self._table = table
         self._tickets = tickets
         self._left = left
-        self._definitions = definitions
-        self._host_of = host_of
         self._host_numbers: dict[Address, int] = {}
-        self._settings = base.settings.of(Doors)
+        self._settings = core.settings.of(Doors)
         self._tasks: set[asyncio.Task[None]] = set()
-        self._revision = base.policies.revision
+        self._revision = core.policy.revision
         self._slots = [
             _Slot(Link(partial(self._heard, number), partial(self._lost, number)))
             for number in range(MOST_DOORS)
         ]
-        host = base.settings.listen_address[0]
+        for number, slot in enumerate(self._slots):
+            core.links.attach(ROLE, slot.link, door_link.DoorLink, index=number, longest=_LONGEST)
+        host = core.settings.listen_address[0]
         self._appliance = self._settings.gateway if host in _EVERYWHERE else host
-
-    def links(self) -> dict[str, tuple[Link, Any]]:
-        return {
-            f"{ROLE}-{number + 1}" if number else ROLE: (slot.link, door_link.DoorLink)
-            for number, slot in enumerate(self._slots)
-        }
 
     def state(self, row: DoorRow) -> tuple[door_link.DoorCounted, str]:
         slot = self._slots[row.slot or 0]
@@ -132,7 +126,7 @@ class DoorProcesses:
         for row in self._table.live():
             slot = self._slots[row.slot or 0]
             if not self._table.problem and slot.link.channel is None:
-                self._base.lifeline.say(messages.ProcessWanted(ROLE, row.slot or 0))
+                self._core.links.start(ROLE, row.slot or 0)
 
     def end(self, row: DoorRow) -> None:
         slot = self._slots[row.slot or 0]
@@ -151,7 +145,7 @@ class DoorProcesses:
                 slot.leaving = None
             elif slot.leaving is not None and clock.now() - slot.leaving >= _END_SECONDS:
                 slot.leaving = None
-                self._base.lifeline.say(messages.ProcessOverdue(ROLE, number))
+                self._core.links.kill(ROLE, number)
                 self.start()
 
     def end_ticket(self, row: DoorRow, ticket: str) -> None:
@@ -197,7 +191,7 @@ class DoorProcesses:
                 slot.link.close()
 
     def _host_number(self, node: str) -> int:
-        host = self._host_of(node)
+        host = self._core.graph.host_of(node)
         if host is None:
             return -1
         if len(self._host_numbers) >= _MOST_HOSTS:
@@ -225,8 +219,8 @@ class DoorProcesses:
             row.name,
             row.added,
             row.address,
-            self._base.port(RVMASTER),
-            [*self._settings.origins, *self._own_origins()],
+            self._core.graph.master_port,
+            [*self._settings.origins, *_own_origins(self._core.settings)],
             self._settings.connections,
             self._settings.connections_in_ten_seconds,
             self._tickets(row.name),
@@ -243,7 +237,7 @@ class DoorProcesses:
                 self._send(slot, door_link.BlocksGiven(self._blocked()))
 
     def _blocked(self) -> list[str]:
-        return [*map(str, self._base.blocks.reasons)]
+        return [*map(str, self._core.hosts.blocks.reasons)]
 
     def uses_of(self, host: Address) -> Iterator[str]:
         """Yield the connections of a host to each door."""
@@ -253,7 +247,7 @@ class DoorProcesses:
                 yield f"{counted(count, 'connection')} to the door {row.name}"
 
     def define(self) -> None:
-        changed, self._revision = self._revision != self._base.policies.revision, self._base.policies.revision
+        changed, self._revision = self._revision != self._core.policy.revision, self._core.policy.revision
         for slot in self._slots:
             if slot.started:
                 self._define(slot)
@@ -261,20 +255,13 @@ class DoorProcesses:
                     self._send(slot, door_link.PolicyChanged())
 
     def _define(self, slot: _Slot) -> None:
-        now = self._definitions()
+        now = self._core.specifications.sources.definitions
         if now != slot.definitions and self._send(slot, door_link.TypesGiven(dict(now))):
             slot.definitions = now
 
-    def _own_origins(self) -> list[str]:
-        address = self._base.settings.api_address
-        if address is None:
-            return []
-        scheme = "https" if self._base.settings.api_tls else "http"
-        return [f"{scheme}://{name}:{address[1]}" for name in self._base.settings.rest_names]
-
     def _listen(self, slot: _Slot, row: DoorRow, port: int) -> None:
         try:
-            listener = listen(self._base.settings.listen_address[0], port)
+            listener = listen(self._core.settings.listen_address[0], port)
         except OSError as error:
             if not slot.trouble:
                 slot.trouble = (
@@ -287,7 +274,7 @@ class DoorProcesses:
             self._send(slot, door_link.AgentListener(row.source), listener.fileno())
 
     def _failed(self, row: DoorRow, reason: str) -> None:
-        self._base.trail.happened("door failed", reason, host=row.address, resource=row.name)
+        self._core.trail.happened("door failed", reason, host=row.address, resource=row.name)
 
     def retry(self) -> None:
         for row in self._table.live():
@@ -299,7 +286,7 @@ class DoorProcesses:
     # --- sockets ---
 
     def _make(self, slot: _Slot, row: DoorRow, request: int, port: int) -> None:
-        allowed = port in (0, self._base.port(RVMASTER)) or port in self._base.policies.current.ports
+        allowed = port in (0, self._core.graph.master_port) or port in self._core.policy.current().ports
         if not allowed or slot.pending >= _MOST_PENDING:
             reason = "too many connections are being made" if allowed else "doors do not connect to this port"
             self._send(slot, door_link.SocketRefused(request, reason))
@@ -333,7 +320,7 @@ class DoorProcesses:
 
     def _record(self, row: DoorRow, change: door_link.ConnectionsChanged) -> None:
         happened = partial(
-            self._base.trail.happened, host=row.address, resource=row.name, reads=True, peer=change.peer[:64]
+            self._core.trail.happened, host=row.address, resource=row.name, reads=True, peer=change.peer[:64]
         )
         ticket = {"ticket": change.ticket[:12]} if change.ticket else None
         if change.began:
@@ -346,7 +333,7 @@ class DoorProcesses:
         if change.ended or change.refused:
             self._left(row.name, change.ticket)
         if change.refused:  # of the peer, so unknown hosts are folded as everywhere
-            self._base.trail.happened(
+            self._core.trail.happened(
                 "door entry refused",
                 f"{counted(change.refused, 'connection')} to {row.name} refused: {change.reason}",
                 host=change.peer[:64] or None,
@@ -364,3 +351,10 @@ class DoorProcesses:
                 more=ticket,
                 count=change.ended,
             )
+
+
+def _own_origins(settings: Settings) -> list[str]:
+    if settings.api_address is None:
+        return []
+    scheme = "https" if settings.api_tls else "http"
+    return [f"{scheme}://{name}:{settings.api_address[1]}" for name in settings.rest_names]

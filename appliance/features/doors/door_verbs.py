@@ -8,7 +8,7 @@ from appliance.base.counted import counted
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.durations import span_given
 from appliance.cli.output import moment, say_json
-from appliance.features.doors.door_requests import (
+from appliance.features.doors.requests import (
     ConnectedClient,
     DoorAdd,
     DoorRemove,

@@ -1,34 +1,17 @@
 """Define the feature doors, which is off until a door is added."""
 
-from typing import TYPE_CHECKING, Any
-
 from appliance.cli.verb_table import Group, Verb
 from appliance.features.doors.quotas import ROWS
 from appliance.features.doors.settings import MOST_DOORS, Doors
-from appliance.features.feature import ConsolePart, Feature, FeaturePart, OperatorContext
+from appliance.features.feature import ConsolePart, Feature
 from appliance.supervisor.role import Role
 from appliance.supervisor.sandbox.sandbox_plan import SandboxPlan
-
-if TYPE_CHECKING:
-    from appliance.channel.admin import AdminRequest
 
 _VERBS = "appliance.features.doors.door_verbs"
 _PART = "appliance.features.doors.control_part"
 
 
-def _operations() -> "tuple[type[AdminRequest[Any]], ...]":
-    from appliance.features.doors.door_requests import REQUESTS  # noqa: PLC0415  few processes need it
-
-    return REQUESTS
-
-
-def _operate(context: OperatorContext) -> FeaturePart:
-    from appliance.features.doors.kept_doors import operate  # noqa: PLC0415  only control needs it
-
-    return operate(context)
-
-
-DOORS = Feature(
+FEATURE = Feature(
     "doors",
     settings=Doors,
     roles=(
@@ -39,7 +22,6 @@ DOORS = Feature(
             sandbox=lambda _facts: SandboxPlan(allowlist=True),
         ),
     ),
-    operations=_operations,
     console=(
         ConsolePart("robot", "own.js", "OwnDoor", order=4),
         ConsolePart("robot", "panel.js", "Doors", order=4),
@@ -56,8 +38,5 @@ DOORS = Feature(
             after="fleet",
         )
     },
-    operate=_operate,
     quotas=ROWS,
-    keep=f"{_PART}:keep",
-    inherit=f"{_PART}:inherit",
 )  # fmt: skip

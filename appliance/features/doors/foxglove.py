@@ -14,6 +14,19 @@ from msgspec import UNSET, Raw
 
 from appliance.base.counted import counted
 from appliance.features.doors.client_frames import ClientFrame, binary_frame, frame_size, text_frame
+from appliance.features.doors.client_requests import (
+    AdvertiseTopic,
+    CallOfService,
+    DoorRequest,
+    PublishMessage,
+    ReadParameters,
+    SubscribeParameter,
+    SubscribeTopic,
+    UnadvertiseTopic,
+    UnsubscribeParameter,
+    UnsubscribeTopic,
+    WriteParameter,
+)
 from appliance.features.doors.foxglove_frames import (
     FOXGLOVE_OPERATION,
     FoxgloveAdvertise,
@@ -33,19 +46,6 @@ from appliance.features.doors.foxglove_frames import (
 )
 from appliance.features.doors.known_types import DoorMessage
 from appliance.features.doors.png_frames import DoorFrame
-from appliance.features.doors.requests import (
-    AdvertiseTopic,
-    CallOfService,
-    DoorRequest,
-    PublishMessage,
-    ReadParameters,
-    SubscribeParameter,
-    SubscribeTopic,
-    UnadvertiseTopic,
-    UnsubscribeParameter,
-    UnsubscribeTopic,
-    WriteParameter,
-)
 from appliance.features.doors.surroundings import DoorSurroundings, SeenService, SeenTopic
 from appliance.features.doors.viewer_queue import ViewerQueue
 from roswire.errors import PeerError, quoted

@@ -2,8 +2,8 @@
 
 from dataclasses import dataclass, field
 
+from appliance.features.doors.client_requests import ClientId
 from appliance.features.doors.door_memory import ClientMemory
-from appliance.features.doors.requests import ClientId
 from appliance.features.doors.rosbridge_frames import FragmentOp, OperationError
 
 _OVERHEAD = 200  # bytes that a fragment takes besides its text

@@ -10,8 +10,8 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
+from appliance.features.doors.client_requests import SubscribeTopic
 from appliance.features.doors.known_types import KnownType, KnownTypes, TypeKey
-from appliance.features.doors.requests import SubscribeTopic
 from appliance.features.doors.values import MessageCodec
 from roswire.errors import DefinitionError, ProtocolError
 

@@ -11,9 +11,9 @@ from urllib.parse import urlsplit
 import msgspec
 from msgspec import Raw, Struct
 
+from appliance.features.doors.client_requests import CallOfService
 from appliance.features.doors.known_types import KnownTypes
 from appliance.features.doors.message_writer import Now
-from appliance.features.doors.requests import CallOfService
 from appliance.features.doors.surroundings import DoorSurroundings, VisibleGraph
 from roswire.definitions import Definitions
 from roswire.errors import ProtocolError, quoted

@@ -15,10 +15,7 @@ from msgspec import Raw
 
 from appliance.base.counted import counted
 from appliance.features.doors.client_frames import frame_size
-from appliance.features.doors.fragments import FragmentStore
-from appliance.features.doors.known_types import DoorMessage
-from appliance.features.doors.png_frames import DoorFrame, PngFrame
-from appliance.features.doors.requests import (
+from appliance.features.doors.client_requests import (
     AdvertiseTopic,
     AnswerCall,
     CallOfService,
@@ -31,6 +28,9 @@ from appliance.features.doors.requests import (
     UnsubscribeTopic,
     WithdrawService,
 )
+from appliance.features.doors.fragments import FragmentStore
+from appliance.features.doors.known_types import DoorMessage
+from appliance.features.doors.png_frames import DoorFrame, PngFrame
 from appliance.features.doors.rosbridge_frames import (
     AdvertiseOp,
     AdvertiseServiceOp,

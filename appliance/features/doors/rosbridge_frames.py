@@ -9,9 +9,9 @@ from msgspec import Meta, Raw, Struct
 
 from appliance.features.doors.cbor_frames import json_of_cbor
 from appliance.features.doors.client_frames import ClientFrame, binary_frame, text_frame
+from appliance.features.doors.client_requests import ClientId
 from appliance.features.doors.known_types import DoorMessage
 from appliance.features.doors.png_frames import DoorFrame, PngFrame
-from appliance.features.doors.requests import ClientId
 from appliance.features.doors.values import cbor
 from roswire.errors import PeerError, quoted
 

@@ -35,6 +35,13 @@ from websockets.server import ServerProtocol
 from websockets.typing import Subprotocol
 
 from appliance.features.doors.client_frames import ClientFrame, content, frame_size, is_text
+from appliance.features.doors.client_requests import (
+    AdvertiseTopic,
+    CallOfService,
+    DoorRequest,
+    PublishMessage,
+    UnadvertiseTopic,
+)
 from appliance.features.doors.connections import ClientWriter
 from appliance.features.doors.door_memory import ClientMemory
 from appliance.features.doors.door_node import DoorNode
@@ -43,13 +50,6 @@ from appliance.features.doors.lookout import Lookout
 from appliance.features.doors.origins import rejection
 from appliance.features.doors.png_frames import DoorFrame, PngFrame
 from appliance.features.doors.refusal_counts import MOST_REFUSALS, REFUSAL_SECONDS, RefusalCounts
-from appliance.features.doors.requests import (
-    AdvertiseTopic,
-    CallOfService,
-    DoorRequest,
-    PublishMessage,
-    UnadvertiseTopic,
-)
 from appliance.features.doors.surroundings import DoorSurroundings
 from appliance.features.doors.viewer_queue import ViewerStalledError
 from roswire.errors import LimitExceededError, ProtocolError, RosError

@@ -35,9 +35,9 @@ from appliance.channel.admin import (
     Trouble,
 )
 from appliance.channel.operations import request_named
-from appliance.features.evidence.evidence_requests import EvidenceExported, LogSealed
 from appliance.features.evidence.page import Names, Page
 from appliance.features.evidence.recorded import RecordingSummary
+from appliance.features.evidence.requests import EvidenceExported, LogSealed
 from appliance.formats import bundle_verifier
 from appliance.signing import log_proof
 from appliance.signing.fingerprints import file_name

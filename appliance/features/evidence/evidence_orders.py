@@ -5,7 +5,7 @@ import asyncio
 from appliance.audit.log.log import AuditLog
 from appliance.base.counted import counted
 from appliance.control.errors import UnavailableError
-from appliance.features.evidence.evidence_requests import EvidenceExported, LogSealed, Sealed
+from appliance.features.evidence.requests import EvidenceExported, LogSealed, Sealed
 from appliance.telemetry.audit_trail import AuditTrail
 
 SEAL_SECONDS = 10.0

@@ -121,7 +121,7 @@ class BundleGate:
         *,
         policies: Policies,
         monitors: SpecificationManager,
-        hosts: TunnelHosts,
+        hosts: Callable[[], TunnelHosts],
         store: StateStore,
         trail: AuditTrail,
         # The health without denials of hosts for which the given function returns true.
@@ -225,10 +225,10 @@ class BundleGate:
         if record.content:
             return self._content() != record.content
         there = (self._policies.revision, self._monitors.revision)
-        return there != (record.policy, record.monitors) or not self._hosts.bundled
+        return there != (record.policy, record.monitors) or not self._hosts().bundled
 
     def _content(self) -> str:
-        policies, monitors, hosts = self._policies, self._monitors, self._hosts
+        policies, monitors, hosts = self._policies, self._monitors, self._hosts()
         switches = monitors.switches.states_of(monitors.checked)
         given = (policies.revision, monitors.revision, switches, hosts.bundled)
         if self._fingerprinted[0] != given:
@@ -273,7 +273,7 @@ class BundleGate:
             offered.sha256,
             self._policies.revision,
             self._monitors.revision,
-            self._hosts.bundled,
+            self._hosts().bundled,
             fingerprint(contents.hosts or "\n"),
         )
         try:
@@ -324,7 +324,7 @@ class BundleGate:
         await self._monitors.take_bundle(_sources(contents), trial.who, "of the bundle")
         load = admin.PolicyLoad(contents.policy, "of the bundle", signature=contents.policy_signature)
         await self._policies.load_with(load, trial.who, _cases(contents))
-        await self._hosts.take_bundle(contents.hosts or "\n", trial.who)
+        await self._hosts().take_bundle(contents.hosts or "\n", trial.who)
 
     async def _watched(self, before: RobotHealth) -> str:
         deadline = clock.now() + self._fleet.bundles.confirm_seconds
@@ -386,10 +386,10 @@ class BundleGate:
                     await self._policies.roll_back(admin.PolicyRollback(trial.policy_back), UNCONFIRMED)
                 if self._monitors.in_force.who == trial.who and self._monitors.revision > trial.monitors_back:
                     await self._monitors.roll_back(admin.MonitorRollback(trial.monitors_back), UNCONFIRMED)
-                if fingerprint(self._hosts.bundled) == trial.hosts_sha256 and (
-                    self._hosts.bundled != trial.hosts_back
+                if fingerprint(self._hosts().bundled) == trial.hosts_sha256 and (
+                    self._hosts().bundled != trial.hosts_back
                 ):
-                    await self._hosts.take_bundle(trial.hosts_back, UNCONFIRMED)
+                    await self._hosts().take_bundle(trial.hosts_back, UNCONFIRMED)
             except (*_REFUSALS, *_OUTDATED, StoreError) as error:
                 _log.error("a bundle cannot be rolled back yet", bundle=trial.path, error=str(error))
                 await asyncio.sleep(_AGAIN_SECONDS)

@@ -2,7 +2,7 @@
 
 from appliance.cli.verb_table import Group, Verb
 from appliance.configuration.sections import Sections
-from appliance.features.feature import Feature, FeaturePart, OperatorContext
+from appliance.features.feature import Feature
 from appliance.features.fleet.settings import POLLER, PUSHER, Fleet
 from appliance.supervisor.role import Facts, RemoteReceiver, Role
 from appliance.supervisor.sandbox.folders import folders_of
@@ -26,13 +26,7 @@ def _sandbox(facts: Facts, *, log: bool) -> SandboxPlan:
     )
 
 
-def _operate(context: OperatorContext) -> FeaturePart:
-    from appliance.features.fleet.part import make_part  # noqa: PLC0415  only control needs it
-
-    return make_part(context)
-
-
-FLEET = Feature(
+FEATURE = Feature(
     "fleet",
     settings=Fleet,
     roles=(
@@ -60,5 +54,4 @@ FLEET = Feature(
             after="standby",
         )
     },
-    operate=_operate,
 )  # fmt: skip

@@ -24,9 +24,9 @@ from appliance.control.operators.request_method import RequestMethod
 from appliance.features.guards.driver_outcomes import sentence_of
 from appliance.features.guards.guard_answers import DriverCheck
 from appliance.features.guards.guard_facts import facts_of
-from appliance.features.guards.guard_requests import DriverCheckBegin, DriverCheckWanted
 from appliance.features.guards.plans import planned
 from appliance.features.guards.presets import DRIVER_CHECK, GuardError, described, text_of
+from appliance.features.guards.requests import DriverCheckBegin, DriverCheckWanted
 from appliance.specifications.specification_files import SpecificationsRefusedError
 from appliance.specifications.specification_manager import SpecificationManager
 from appliance.store.writer_thread import StoreError

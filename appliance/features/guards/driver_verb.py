@@ -11,7 +11,7 @@ from appliance.cli.durations import span_given
 from appliance.cli.output import say_json, usage_error
 from appliance.features.guards.driver_outcomes import CONSENT, QUESTION, REQUEST, RESTARTED, status_of
 from appliance.features.guards.guard_answers import DriverCheck
-from appliance.features.guards.guard_requests import DriverCheckBegin, DriverCheckWanted
+from appliance.features.guards.requests import DriverCheckBegin, DriverCheckWanted
 from rosmop.tool.terminal import say
 
 _VERB = "rosrv guard check-driver"

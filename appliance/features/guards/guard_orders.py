@@ -13,8 +13,7 @@ from appliance.channel.answers.monitor_answers import Replacement
 from appliance.channel.messages import GivenValue
 from appliance.control.errors import SenselessError, UnknownThingError
 from appliance.control.operators.request_method import RequestMethod
-from appliance.features.feature import ConnectedNodes
-from appliance.features.guards import guard_requests
+from appliance.features.guards import requests as guard_requests
 from appliance.features.guards.evidence import guard_digest
 from appliance.features.guards.guard_answers import (
     GuardList,
@@ -27,7 +26,7 @@ from appliance.features.guards.guard_answers import (
 )
 from appliance.features.guards.guard_facts import facts_of, preset_row, values_of
 from appliance.features.guards.guard_order import Placed, faults, statements
-from appliance.features.guards.placement import Placement
+from appliance.features.guards.placement import ConnectedNodes, Placement
 from appliance.features.guards.plans import planned
 from appliance.features.guards.presets import (
     PRESETS,

@@ -8,10 +8,9 @@
 
 import asyncio
 from collections.abc import Callable, Iterable, Iterator
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 from appliance.channel.answers.graph_answers import Graph
-from appliance.features.feature import ConnectedNodes
 from appliance.features.guards.guard_facts import facts_of
 from appliance.features.guards.robot_graph import RobotGraph
 from appliance.features.guards.view import BypassedGuard
@@ -28,6 +27,16 @@ class GuardedDriver(NamedTuple):
     topic: str
     node: str
     host: str
+
+
+class ConnectedNodes(Protocol):
+    """The core's knowledge of nodes' machines and connections (`control/operators/node_connections.py`)."""
+
+    def is_here(self, host: str) -> bool | None:
+        """Return whether a host is the appliance's machine, or null if the appliance cannot know."""
+
+    async def unknown_publishers(self, node: str, topic: str) -> list[str] | None:
+        """Return the URIs of a node's publishers that the appliance did not give it, or null without an answer."""
 
 
 class Placement:

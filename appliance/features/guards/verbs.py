@@ -19,13 +19,6 @@ from appliance.cli.monitor_changes import say_replaced, say_shadow_deadline
 from appliance.cli.output import moment, say_json
 from appliance.features.guards.guard_answers import GuardList, GuardRow, Suggestion
 from appliance.features.guards.guard_facts import preset_row, values_of
-from appliance.features.guards.guard_requests import (
-    GuardNew,
-    GuardSuggestionsWanted,
-    GuardsWanted,
-    GuardTry,
-    GuardUpgrade,
-)
 from appliance.features.guards.presets import (
     PRESETS,
     GuardError,
@@ -34,6 +27,13 @@ from appliance.features.guards.presets import (
     file_of,
     preset_of,
     with_values,
+)
+from appliance.features.guards.requests import (
+    GuardNew,
+    GuardSuggestionsWanted,
+    GuardsWanted,
+    GuardTry,
+    GuardUpgrade,
 )
 from appliance.features.table import verb_function
 from rosmop.tool.tables import say_table, table_of

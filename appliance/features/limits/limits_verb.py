@@ -3,7 +3,7 @@
 from appliance.channel.answers.limit_answers import LimitUse
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.output import say_json, say_row
-from appliance.features.limits.limit_requests import LimitsWanted
+from appliance.features.limits.requests import LimitsWanted
 from appliance.policy.host_names import HostInWords
 
 _NEARLY = 0.8  # of a limit: the row is marked

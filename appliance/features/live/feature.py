@@ -1,5 +1,5 @@
-"""Define the feature live."""
+"""Define the tool live."""
 
-from appliance.features.feature import Feature
+from appliance.features.feature import Tool
 
-LIVE = Feature("live", routes="appliance.features.live.live:routes")
+FEATURE = Tool("live")

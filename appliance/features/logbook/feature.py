@@ -1,11 +1,11 @@
-"""Define the feature logbook: `rosrv report interventions` and `rosrv who-drove`."""
+"""Define the tool logbook: `rosrv report interventions` and `rosrv who-drove`."""
 
 from appliance.cli.verb_table import Group, Verb
-from appliance.features.feature import Feature
+from appliance.features.feature import Tool
 
 _PLACE = "appliance.features.logbook."
 
-LOGBOOK = Feature(
+FEATURE = Tool(
     "logbook",
     verbs={
         "report": Group(

@@ -1,5 +1,5 @@
-"""Define the feature metrics. Control measures; `metric_table.py` has the names."""
+"""Define the tool metrics. Control measures; `metric_table.py` has the names."""
 
-from appliance.features.feature import Feature
+from appliance.features.feature import Tool
 
-METRICS = Feature("metrics", routes="appliance.features.metrics.metrics_route:routes")
+FEATURE = Tool("metrics")

@@ -1,16 +1,14 @@
-"""Define the feature monitor tools."""
+"""Define the tool monitor tools."""
 
 from appliance.cli.verb_table import CONFIRM, Group, Verb
-from appliance.features.feature import Feature
+from appliance.features.feature import Tool
 from rosmop.tool.summaries import SUMMARIES
 
 _PLACE = "appliance.features.monitor_tools."
 _LANGUAGE, _LIVE, _REVISIONS = f"{_PLACE}verbs", f"{_PLACE}in_force", f"{_PLACE}revision_verbs"
 
-MONITOR_TOOLS = Feature(
+FEATURE = Tool(
     "monitor_tools",
-    routes=f"{_PLACE}monitor_routes:routes",
-    answers=f"{_PLACE}monitor_routes:ANSWERS",
     verbs={
         "monitor": Group(
             "Check specifications, test them on recordings, and run them as monitors on the robot.",

@@ -1,14 +1,12 @@
-"""Define the feature policy tools: `rosrv policy`, and the explanation of records."""
+"""Define the tool policy tools: `rosrv policy`, and the explanation of records."""
 
 from appliance.cli.verb_table import CONFIRM, FIRST, Group, Verb
-from appliance.features.feature import Feature
+from appliance.features.feature import Tool
 
 _PLACE = "appliance.features.policy_tools."
 
-POLICY_TOOLS = Feature(
+FEATURE = Tool(
     "policy_tools",
-    routes=f"{_PLACE}policy_tool_routes:routes",
-    answers=f"{_PLACE}policy_routes:ANSWERS",
     verbs={
         "host": Group("", {"show": Verb(f"{_PLACE}policy_verbs:show_host", after=FIRST)}, after="config"),
         "audit": Group("", {"why": Verb(f"{_PLACE}grant_verb:why", after=FIRST)}),

@@ -3,37 +3,37 @@
 from typing import Any
 
 from appliance.audit.log.ids import IdSource
+from appliance.control.core import ControlPart, Core
 from appliance.control.operators.request_method import RequestMethod
-from appliance.features.feature import FeatureContext, FeaturePart
-from appliance.features.recorder import recording_requests
+from appliance.features.recorder import requests
+from appliance.features.recorder.feature import ROLE
 from appliance.features.recorder.recorder_link import RecorderLink
 from appliance.features.recorder.recording_orders import RecordingOrders
 from appliance.features.recorder.recording_plan import RecordingPlan
 from appliance.features.recorder.settings import RecorderRules
 
 
-def make(core: FeatureContext) -> FeaturePart:
-    rules = core.sections.of(RecorderRules)
-    plan = RecordingPlan(rules, core.charged_to, IdSource().next)
-    orders = RecordingOrders(rules, core.trail, core.in_force, plan)
-    return FeaturePart(
-        links={"recorder": (orders.link, RecorderLink)},
-        methods=request_methods(orders),
-        limits=orders.limits,
-        details=plan.detail,
-        called={"record_now": orders.called},
-        status_fields=lambda: {"recorder": orders.state()},
+async def begin(core: Core) -> ControlPart:
+    rules = core.settings.of(RecorderRules)
+    plan = RecordingPlan(rules, core.policy.charged_to, IdSource().next)
+    orders = RecordingOrders(
+        rules, core.trail, lambda: (core.trail.revision, core.specifications.revision), plan
     )
+    core.links.attach(ROLE, orders.link, RecorderLink)
+    core.limits.provide(orders.limits)
+    core.trail.add_details(plan.detail)
+    core.own_services.provide("record_now", orders.called)
+    return ControlPart(request_methods(orders), status=lambda: {"recorder": orders.state()})
 
 
 def request_methods(orders: RecordingOrders) -> tuple[RequestMethod[Any], ...]:
     """Orders are accepted on a full disk, because the recorder checks its own disk space."""
     return (
-        RequestMethod(recording_requests.RecordingsWanted, orders.recordings),
-        RequestMethod(recording_requests.RecordingWanted, orders.recording),
-        RequestMethod(recording_requests.RecordNow, orders.now, who=True, full_disk=True),
-        RequestMethod(recording_requests.RecordingFetch, orders.fetch, who=True),
-        RequestMethod(recording_requests.RecordingRead, orders.read, who=True),
-        RequestMethod(recording_requests.RecordingOfMemory, orders.of_memory, who=True, full_disk=True),
-        RequestMethod(recording_requests.RecordingRemove, orders.remove, who=True, full_disk=True),
+        RequestMethod(requests.RecordingsWanted, orders.recordings),
+        RequestMethod(requests.RecordingWanted, orders.recording),
+        RequestMethod(requests.RecordNow, orders.now, who=True, full_disk=True),
+        RequestMethod(requests.RecordingFetch, orders.fetch, who=True),
+        RequestMethod(requests.RecordingRead, orders.read, who=True),
+        RequestMethod(requests.RecordingOfMemory, orders.of_memory, who=True, full_disk=True),
+        RequestMethod(requests.RecordingRemove, orders.remove, who=True, full_disk=True),
     )

@@ -21,7 +21,7 @@ from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.durations import span_given
 from appliance.cli.message_lines import lines_of
 from appliance.cli.output import say_json, usage_error
-from appliance.features.recorder import recording_requests
+from appliance.features.recorder import requests as recording_requests
 from appliance.features.recorder.bag_reader import MessagePosition
 from appliance.features.recorder.mcap import as_mcap
 from appliance.features.recorder.recording_answers import RecordedMessages, Recording, Sender, Timeline

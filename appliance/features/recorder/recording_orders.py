@@ -14,7 +14,8 @@ from appliance.channel.answers.limit_answers import LimitUse
 from appliance.channel.channel import ChannelClosedError, ChannelFullError
 from appliance.channel.link import Link
 from appliance.control.errors import SenselessError, UnavailableError, UnknownThingError
-from appliance.features.recorder import recorder_link, recording_requests
+from appliance.features.recorder import recorder_link
+from appliance.features.recorder import requests as recording_requests
 from appliance.features.recorder.recording_answers import (
     OPERATORS,
     OpenRecording,

@@ -14,6 +14,7 @@ from pydantic import ByteSize
 
 from appliance.base import clock
 from appliance.channel.messages import MemoryGiven
+from appliance.configuration.sections import Sections
 from appliance.features.recorder.excluded_topics import known_sums
 from appliance.features.recorder.recorder_link import RingTerms
 from appliance.features.recorder.settings import RecorderRules
@@ -57,6 +58,11 @@ class RecorderRings:
             os.close(writable)
             os.close(readable)
         self._rings.clear()
+
+
+def memory_of(sections: Sections, relays: int) -> RecorderRings | None:
+    rules = sections.of(RecorderRules)
+    return RecorderRings(rules, relays) if rules.enabled else None
 
 
 def _left() -> ByteSize:

@@ -1,9 +1,9 @@
-"""Define the feature selftest."""
+"""Define the tool selftest."""
 
 from appliance.cli.verb_table import Verb
-from appliance.features.feature import Feature
+from appliance.features.feature import Tool
 
-SELFTEST = Feature(
+FEATURE = Tool(
     "selftest",
     verbs={"selftest": Verb("appliance.features.selftest.verb:selftest", after="limits")},
 )

@@ -1,6 +1,6 @@
-"""Define the feature sign. The core checks the signatures."""
+"""Define the tool sign. The core checks the signatures."""
 
 from appliance.cli.verb_table import Verb
-from appliance.features.feature import Feature
+from appliance.features.feature import Tool
 
-SIGN = Feature("sign", verbs={"sign": Verb("appliance.features.sign.sign_verb:sign", after="monitor")})
+FEATURE = Tool("sign", verbs={"sign": Verb("appliance.features.sign.sign_verb:sign", after="monitor")})

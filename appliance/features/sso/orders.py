@@ -8,7 +8,7 @@ from appliance.channel.channel import ChannelClosedError, ChannelFullError
 from appliance.channel.link import Link
 from appliance.control.errors import TokenRefusedError, UnavailableError, UnknownThingError
 from appliance.control.operators.sessions import Session
-from appliance.features.sso import sso_requests as requests
+from appliance.features.sso import requests
 from appliance.features.sso.link import (
     SignOnBegun,
     SignOnConfirmed,

@@ -18,7 +18,7 @@ from appliance.channel.answers.field_docs import doc
 from appliance.channel.rest_bodies import WHOLE
 from appliance.features.sso.link import SessionKeys
 from appliance.features.sso.places import SignOnPlaces, SignOnRates
-from appliance.features.sso.sso_requests import SignedOn, SignOnBegin, SignOnComplete, SignOnPlace
+from appliance.features.sso.requests import SignedOn, SignOnBegin, SignOnComplete, SignOnPlace
 
 _KEY = r"^[A-Za-z0-9_-]{43}$"
 _FAILS: Responses = {

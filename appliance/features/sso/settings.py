@@ -212,6 +212,9 @@ class Sso(FeatureSection):
             return {}
         return {"proxy" if self.proxy else "address": (self.proxy or self.address, self.destination[0])}
 
+    def on_page(self) -> dict[str, str]:
+        return {"sign-on": self.name} if self.issuer is not None else {}
+
     def role_of(self, values: frozenset[str]) -> TokenRole | None:
         return next(
             (role for role in _RANKING if values.intersection(_in_form_c(self.roles.get(role, ())))), None

@@ -7,7 +7,7 @@ import typer
 from appliance.base.counted import counted
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.output import moment, say_json, say_row
-from appliance.features.sso.sso_requests import SessionsEnd, SessionsWanted
+from appliance.features.sso.requests import SessionsEnd, SessionsWanted
 from rosmop.tool.terminal import say
 
 

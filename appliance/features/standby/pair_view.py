@@ -9,14 +9,14 @@ from appliance.features.view import PairView, Samples
 
 if TYPE_CHECKING:
     from appliance.audit.proof.chain_findings import Verification
-    from appliance.features.standby.standby_requests import StandbyWanted
+    from appliance.features.standby.requests import StandbyWanted
 
 
 class StandbyPairView(PairView):
     """The views of an appliance that can be one of two."""
 
     def request(self) -> "StandbyWanted":
-        from appliance.features.standby.standby_requests import StandbyWanted  # noqa: PLC0415  it imports the views
+        from appliance.features.standby.requests import StandbyWanted  # noqa: PLC0415  it imports the views
 
         return StandbyWanted()
 

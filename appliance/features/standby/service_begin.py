@@ -11,9 +11,10 @@ from appliance.base import clock
 from appliance.channel.status_summary import no_relay
 from appliance.control.assembly.assembly import Parts
 from appliance.control.assembly.foundation import Foundation
+from appliance.control.core import ControlPart
 from appliance.control.operators.request_method import RequestMethod
-from appliance.features.feature import FeaturePart
-from appliance.features.standby import lease_link, standby_requests
+from appliance.features.standby import lease_link
+from appliance.features.standby import requests as standby_requests
 from appliance.features.standby.inheritance import StateCopies, inherited_state, keep_state, leave_state
 from appliance.features.standby.paired_role import PairedRole
 from appliance.features.standby.replication import Pair
@@ -59,7 +60,7 @@ _SEAL_SECONDS = 0.5  # the robot waits
 _log = structlog.get_logger()
 
 
-async def begin(base: Foundation, parts: Parts) -> FeaturePart:
+async def begin(base: Foundation, parts: Parts) -> ControlPart:
     role = base.role
     if not isinstance(role, PairedRole):
         return _part(StandbyOrders(SingleAppliance(), base.trail))
@@ -101,11 +102,11 @@ async def begin(base: Foundation, parts: Parts) -> FeaturePart:
         "the replication of checkpoints": recorder.follow,
         "the reports to the lease": report_service,
     }
-    return replace(_part(orders), status_fields=lambda: {"standby": active.state()}, work=work)
+    return replace(_part(orders), status=lambda: {"standby": active.state()}, work=work)
 
 
-def _part(orders: StandbyOrders) -> FeaturePart:
-    return FeaturePart(
+def _part(orders: StandbyOrders) -> ControlPart:
+    return ControlPart(
         methods=(
             RequestMethod(standby_requests.StandbyWanted, orders.state, order=False),
             RequestMethod(

@@ -9,7 +9,7 @@ import structlog
 from appliance.channel import admin
 from appliance.channel.admin import A
 from appliance.control.errors import UnknownThingError
-from appliance.features.standby import standby_requests
+from appliance.features.standby import requests as standby_requests
 from appliance.features.standby.lease_client import HandOverError
 from appliance.features.standby.replication import Replication
 from appliance.features.standby.standby_answers import StandbyState

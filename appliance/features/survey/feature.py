@@ -1,8 +1,6 @@
-"""Define the feature survey. It needs nothing of the appliance, and runs where no appliance is."""
+"""Define the tool survey. It needs nothing of the appliance, and runs where no appliance is."""
 
 from appliance.cli.verb_table import Verb
-from appliance.features.feature import Feature
+from appliance.features.feature import Tool
 
-SURVEY = Feature(
-    "survey", verbs={"survey": Verb("appliance.features.survey.survey_verb:survey", after="demo")}
-)
+FEATURE = Tool("survey", verbs={"survey": Verb("appliance.features.survey.survey_verb:survey", after="demo")})

@@ -1,7 +1,7 @@
 """Define the feature syslog."""
 
 from appliance.configuration.sections import Sections
-from appliance.features.feature import Feature, FeatureContext, FeaturePart
+from appliance.features.feature import Feature
 from appliance.features.syslog.settings import Syslog
 from appliance.supervisor.role import Facts, RemoteReceiver, Role
 from appliance.supervisor.sandbox.folders import folders_of
@@ -25,19 +25,7 @@ def _sandbox(facts: Facts) -> SandboxPlan:
     )
 
 
-def _make(core: FeatureContext) -> FeaturePart:
-    from appliance.channel import messages  # noqa: PLC0415  only control needs it
-    from appliance.control.links.forwarder_link import ForwarderLink  # noqa: PLC0415  as above
-
-    wanted = core.sections.of(Syslog)
-    forwarded = ForwarderLink(wanted.to, wanted.send, core.trail)
-    return FeaturePart(
-        {ROLE: (forwarded.link, messages.ForwardingLink)},
-        status_fields=lambda: {"forwarding": forwarded.status()},
-    )
-
-
-SYSLOG = Feature(
+FEATURE = Feature(
     "syslog",
     settings=Syslog,
     roles=(
@@ -48,5 +36,4 @@ SYSLOG = Feature(
             sandbox=_sandbox, configured=lambda sections: sections.of(Syslog).to is not None, receiver=_receiver,
         ),
     ),
-    make=_make,
 )  # fmt: skip

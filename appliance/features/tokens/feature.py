@@ -1,11 +1,11 @@
-"""Define the feature tokens."""
+"""Define the tool tokens."""
 
 from appliance.cli.verb_table import Group, Verb
-from appliance.features.feature import Feature
+from appliance.features.feature import Tool
 
 _VERBS = "appliance.features.tokens.token_verbs"
 
-TOKENS = Feature(
+FEATURE = Tool(
     "tokens",
     verbs={
         "token": Group(

@@ -2,13 +2,9 @@
 
 from appliance.base.clock import now
 from appliance.base.validation_messages import meant
-from appliance.control.assembly.assembly import Parts
-from appliance.control.assembly.foundation import Foundation
+from appliance.control.core import GraphFacts, RelayOrders
 from appliance.control.errors import SenselessError, UnknownThingError
-from appliance.control.operators.overview import graph_of
-from appliance.control.operators.request_method import RequestMethod
-from appliance.features.feature import FeaturePart
-from appliance.features.topics.look_request import TopicLook, TopicMessage, TopicMessages
+from appliance.features.topics.requests import TopicLook, TopicMessage, TopicMessages
 from appliance.telemetry.audit_trail import AuditTrail
 
 MOST_MESSAGES = 20
@@ -19,23 +15,19 @@ ONE_LOOK = 60.0
 """The seconds for which all queries of one token for one topic make only one audit record."""
 
 
-async def inherit(base: Foundation, parts: Parts) -> FeaturePart:
-    looks = TopicLooks(parts, base.trail)
-    return FeaturePart(methods=(RequestMethod(TopicLook, looks.messages, who=True, order=False),))
-
-
 class TopicLooks:
     """Answers `TopicLook`."""
 
-    def __init__(self, parts: Parts, trail: AuditTrail) -> None:
-        self._parts = parts
+    def __init__(self, graph: GraphFacts, relay: RelayOrders, trail: AuditTrail) -> None:
+        self._graph = graph
+        self._relay = relay
         self._trail = trail
         self._shown: dict[tuple[str, str], float] = {}
 
     async def messages(self, request: TopicLook, who: str) -> TopicMessages:
         if not 1 <= request.messages <= MOST_MESSAGES or not 0 < request.seconds <= LONGEST_LOOK:
             raise SenselessError(f"ask for 1 to {MOST_MESSAGES} messages, within {LONGEST_LOOK:g} seconds")
-        topics = {topic.name: topic for topic in graph_of(self._parts).topics}
+        topics = {topic.name: topic for topic in self._graph.present().topics}
         topic = topics.get(request.topic)
         if topic is None:
             near = meant(request.topic, topics)
@@ -45,15 +37,13 @@ class TopicLooks:
                 f"the messages of {topic.name} do not pass the appliance (relaying: monitored), so it cannot show them"
             )
         self._record_look(topic.name, who)
-        seen = await self._parts.endpoints.relay.taps.look(
-            topic.name, request.messages, request.seconds, latched=request.latched
-        )
-        registry = self._parts.core.registry
-        rows = []
-        for message in seen:
-            node = registry.by_key(message.key)
-            name = node.name if node is not None else ""
-            rows.append(TopicMessage(message.time, name, message.size, message.fields, message.why))
+        seen = await self._relay.look(topic.name, request.messages, request.seconds, latched=request.latched)
+        rows = [
+            TopicMessage(
+                message.time, self._graph.name_of(message.key), message.size, message.fields, message.why
+            )
+            for message in seen
+        ]
         return TopicMessages(
             topic.name,
             seen[0].type if seen else topic.type,

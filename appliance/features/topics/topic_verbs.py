@@ -20,8 +20,8 @@ from appliance.cli.audit.audit_errors import Errors
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.message_lines import lines_of
 from appliance.cli.output import say_json, usage_error
-from appliance.features.topics.look_request import TopicLook, TopicMessage
 from appliance.features.topics.publishers import publishers_at
+from appliance.features.topics.requests import TopicLook, TopicMessage
 from rosmop.tool.terminal import printable, refused, say
 from roswire.errors import InvalidNameError
 from roswire.message_view import CUT

@@ -12,7 +12,7 @@ from typing import Any
 
 from appliance.base import clock
 from appliance.channel.messages import CertificateMade
-from appliance.features.tunnels import host_requests
+from appliance.features.tunnels import requests as host_requests
 from appliance.features.tunnels.enrolment_tokens import EnrolmentTokens
 from appliance.features.tunnels.host_answers import AuthorityCertificate, KitParts, RevocationList
 from appliance.features.tunnels.host_view import soon

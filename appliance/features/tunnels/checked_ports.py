@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 from appliance.audit.log.record import Severity
 from appliance.base import clock
-from appliance.features.tunnels import host_requests
+from appliance.features.tunnels import requests as host_requests
 from appliance.features.tunnels.certification import Certification
 from appliance.features.tunnels.host_answers import PortsReport
 from appliance.features.tunnels.host_view import HostView

@@ -2,62 +2,59 @@
 
 from functools import partial
 
-from appliance.control.assembly.assembly import Parts
-from appliance.control.assembly.foundation import Foundation
+from appliance.control.core import ControlPart, Core
 from appliance.control.operators.request_method import RequestMethod
-from appliance.features.feature import FeaturePart
-from appliance.features.tunnels import host_requests
+from appliance.features.tunnels import requests
 from appliance.features.tunnels.certification import Certification
 from appliance.features.tunnels.enrolment import HostEnrolment, find_endpoint
 from appliance.features.tunnels.rest_address import rest_address
 
 
-def machines(base: Foundation, parts: Parts) -> dict[str, int]:
+def machines(core: Core) -> dict[str, int]:
     """Return the number of live nodes by address, without nodes of doors, which run on the appliance."""
-    doors = {str(address) for address in base.features.addresses().values()}
-    nodes = parts.core.registry.machines()
-    return {address: number for address, number in nodes.items() if address not in doors}
+    doors = {str(address) for address in core.policy.hosts().values()}
+    return {address: number for address, number in core.graph.machines().items() if address not in doors}
 
 
-async def inherit(base: Foundation, parts: Parts) -> FeaturePart:
-    settings = base.settings
+async def begin(core: Core) -> ControlPart:
+    settings = core.settings
     certification = Certification(
-        base.store,
-        base.trail,
-        base.host_authority.authority,
-        base.table,
-        base.tunnels,
-        appliances=base.host_authority.appliances,
+        core.store,
+        core.trail,
+        core.hosts.authority.authority,
+        core.hosts.table,
+        core.hosts.tunnels,
+        appliances=core.hosts.authority.appliances,
         master_port=settings.listen_address[1],
         rest=rest_address(settings),
-        ends=base.ends,
-        changed=base.policies.hosts_changed,
+        ends=core.ends,
+        changed=core.policy.hosts_changed,
     )
     hosts = HostEnrolment(
         certification,
-        partial(find_endpoint, settings, base.lifeline.endpoint),
-        expel=parts.endpoints.enforcement.expel,
-        carried_out=parts.endpoints.relay.carried_out,
-        machines=partial(machines, base, parts),
-        in_words=base.policies.in_words,
+        partial(find_endpoint, settings, core.links.endpoint),
+        expel=core.graph.expel,
+        carried_out=core.relay.carried_out,
+        machines=partial(machines, core),
+        in_words=core.policy.in_words,
     )
-    return FeaturePart(
-        methods=(
-            RequestMethod(host_requests.HostList, hosts.listed),
-            RequestMethod(host_requests.HostEndpoint, hosts.endpoint),
-            RequestMethod(host_requests.HostKit, hosts.kit),
-            RequestMethod(host_requests.HostAdd, hosts.add, who=True),
-            RequestMethod(host_requests.HostRenew, hosts.renew, who=True),
-            RequestMethod(host_requests.HostToken, hosts.token, who=True),
-            RequestMethod(host_requests.HostRevoke, hosts.revoke, who=True, full_disk=True),
-            RequestMethod(host_requests.HostsReload, hosts.reload, who=True),
-            RequestMethod(host_requests.HostEnrol, hosts.itself.enrol),
-            RequestMethod(host_requests.HostRenewItself, hosts.itself.renew),
-            RequestMethod(host_requests.HostRenewed, hosts.itself.renewed),
-            RequestMethod(host_requests.HostPorts, hosts.ports.tell, who=True),
-            RequestMethod(host_requests.RevocationsWanted, certification.revocations),
-            RequestMethod(host_requests.AuthorityWanted, certification.authority),
+    core.hosts.provide(hosts)
+    return ControlPart(
+        (
+            RequestMethod(requests.HostList, hosts.listed),
+            RequestMethod(requests.HostEndpoint, hosts.endpoint),
+            RequestMethod(requests.HostKit, hosts.kit),
+            RequestMethod(requests.HostAdd, hosts.add, who=True),
+            RequestMethod(requests.HostRenew, hosts.renew, who=True),
+            RequestMethod(requests.HostToken, hosts.token, who=True),
+            RequestMethod(requests.HostRevoke, hosts.revoke, who=True, full_disk=True),
+            RequestMethod(requests.HostsReload, hosts.reload, who=True),
+            RequestMethod(requests.HostEnrol, hosts.itself.enrol),
+            RequestMethod(requests.HostRenewItself, hosts.itself.renew),
+            RequestMethod(requests.HostRenewed, hosts.itself.renewed),
+            RequestMethod(requests.HostPorts, hosts.ports.tell, who=True),
+            RequestMethod(requests.RevocationsWanted, certification.revocations),
+            RequestMethod(requests.AuthorityWanted, certification.authority),
         ),
-        hosts=hosts,
-        work={"the tunnels": partial(base.tunnels.run, certification.each_hour)},
+        {"the tunnels": partial(core.hosts.tunnels.run, certification.each_hour)},
     )

@@ -18,7 +18,7 @@ from appliance.channel.answers.status import IpsecState
 from appliance.channel.messages import EndpointFound
 from appliance.configuration.settings import Settings
 from appliance.features.tunnels import host_answers as answers
-from appliance.features.tunnels import host_requests
+from appliance.features.tunnels import requests as host_requests
 from appliance.features.tunnels.certification import Certification
 from appliance.features.tunnels.checked_ports import PortChecks
 from appliance.features.tunnels.enrolment_kit import filled

@@ -1,25 +1,14 @@
 """Define the feature tunnels."""
 
-from typing import TYPE_CHECKING, Any
-
 from appliance.cli.verb_table import FIRST, Group, Verb
 from appliance.features.feature import ConsolePart, Feature
 from appliance.supervisor.role import Role
 from appliance.supervisor.sandbox.sandbox_plan import ROUTES, SandboxPlan
 
-if TYPE_CHECKING:
-    from appliance.channel.admin import AdminRequest
-
 _PLACE = "appliance.features.tunnels."
 
 
-def _operations() -> "tuple[type[AdminRequest[Any]], ...]":
-    from appliance.features.tunnels.host_requests import REQUESTS  # noqa: PLC0415  few processes need it
-
-    return REQUESTS
-
-
-TUNNELS = Feature(
+FEATURE = Feature(
     "tunnels",
     roles=(
         Role(
@@ -33,11 +22,7 @@ TUNNELS = Feature(
             ),
         ),
     ),
-    operations=_operations,
-    answers=f"{_PLACE}host_routes:ANSWERS",
-    routes=f"{_PLACE}enrol_routes:routes",
     console=(ConsolePart("view", "view.js", "Hosts", "Hosts"),),
-    inherit=f"{_PLACE}control_part:inherit",
     verbs={
         "protect": Verb(
             f"{_PLACE}protect_verb:protect",

@@ -13,7 +13,10 @@ from appliance.cli import completion
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.durations import span_given
 from appliance.cli.output import moment, say_json, say_row
-from appliance.features.tunnels.host_requests import (
+from appliance.features.tunnels.kit_output import key_and_request, placed, wishes_of, write_kit, write_script
+from appliance.features.tunnels.kits import KitOptions
+from appliance.features.tunnels.private_output import new_output, usage_error
+from appliance.features.tunnels.requests import (
     HostAdd,
     HostList,
     HostRenew,
@@ -21,9 +24,6 @@ from appliance.features.tunnels.host_requests import (
     HostsReload,
     HostToken,
 )
-from appliance.features.tunnels.kit_output import key_and_request, placed, wishes_of, write_kit, write_script
-from appliance.features.tunnels.kits import KitOptions
-from appliance.features.tunnels.private_output import new_output, usage_error
 from rosmop.tool.terminal import printable, say
 
 _Name = Annotated[

@@ -16,7 +16,7 @@ from appliance.base.counted import counted
 from appliance.channel.admin import StatusWanted
 from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.target import Appliance, speaks_with
-from appliance.features.tunnels.host_requests import HostPorts
+from appliance.features.tunnels.requests import HostPorts
 from appliance.network import close_ports as protection
 from appliance.network import scan as scanner
 from appliance.network.firewall.firewall_rules import PortRange

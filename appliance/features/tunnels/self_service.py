@@ -13,7 +13,7 @@ import ipaddress
 
 from appliance.base import clock
 from appliance.base.withdrawal import WithdrawnError, take_effect
-from appliance.features.tunnels import host_requests
+from appliance.features.tunnels import requests as host_requests
 from appliance.features.tunnels.certification import Certification
 from appliance.features.tunnels.enrolment_tokens import BadEnrolmentTokenError
 from appliance.features.tunnels.host_answers import KitParts, NewCertificate, Renewed

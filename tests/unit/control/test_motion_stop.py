@@ -35,12 +35,12 @@ async def test_a_new_control_stops_what_was_commanded_once_the_relays_have_its_o
     async def carried_out() -> None:
         done.append("carried out")
 
-    relay = SimpleNamespace(presence="away", carried_out=carried_out)
+    relay = SimpleNamespace(ready=lambda: False, carried_out=carried_out)
     trail = FakeTrail(lambda record: done.append((record.event, record.host)))
     work = MotionStop(stop, trail, cast(Any, None)).at_start(lost, cast(Any, relay))
     task = asyncio.ensure_future(work)
     await asyncio.sleep(10)
     assert done == []
-    relay.presence = "connected"
+    relay.ready = lambda: True
     await task
     assert done == ["carried out", "/cmd_vel", ("motion stopped", "10.0.0.7")]

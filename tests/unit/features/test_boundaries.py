@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from appliance.features.table import FEATURES
+from appliance.features.table import TOOLS
 
 ROOT = Path(__file__).parents[3]
 FOLDERS = sorted(path.parent.name for path in (ROOT / "appliance/features").glob("*/feature.py"))
@@ -13,7 +13,7 @@ WORLD = ROOT / "tests/world"  # simulates the whole product, also as one of two 
 
 
 def test_each_folder_is_a_row() -> None:
-    assert sorted(feature.name for feature in FEATURES) == FOLDERS
+    assert sorted(tool.name for tool in TOOLS) == FOLDERS
 
 
 @pytest.mark.parametrize("name", FOLDERS)

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import pytest
 
-from appliance.features.authority.drive_requests import DriveStatus, GroupState
+from appliance.features.authority.requests import DriveStatus, GroupState
 from examples.landshark.lab import Host, Lab
 from tests.support.appliance import Appliance
 from tests.support.nodes import RosSession

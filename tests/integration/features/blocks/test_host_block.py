@@ -3,7 +3,7 @@ from typing import NamedTuple
 
 import pytest
 
-from appliance.features.blocks.block_requests import HostBlocks, HostUnblock
+from appliance.features.blocks.requests import HostBlocks, HostUnblock
 from examples.landshark.lab import Host, Lab
 from tests.support.appliance import Appliance
 from tests.support.nodes import Client, RosSession

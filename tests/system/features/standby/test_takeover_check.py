@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from appliance.channel import admin
-from appliance.features.standby import standby_requests
+from appliance.features.standby import requests as standby_requests
 from examples.landshark.lab import Lab
 from tests.support.appliance import OPEN_POLICY
 from tests.support.features.standby.standby_site import StandbySite

@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from appliance.channel import admin
-from appliance.features.standby import standby_requests
+from appliance.features.standby import requests as standby_requests
 from appliance.features.standby.lease_watch import PAUSED
 from appliance.features.standby.membership import PORT
 from appliance.features.standby.witness import EXPIRY

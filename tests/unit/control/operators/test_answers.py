@@ -26,7 +26,7 @@ CLASSES: dict[str, Any] = {
     "tokens": TokenOrders,
 }
 METHODS = idle_parts().methods() + request_methods(**CLASSES)
-OF_FEATURES = [request for _feature, request in answered_later()]
+OF_FEATURES = answered_later()
 REQUESTS: tuple[type[Any], ...] = tuple(dict.fromkeys([*get_args(AnyRequest), *get_args(RestRequest)]))
 # Exceptions: a record's fields depend on its event, a child's readiness on its role, a memory's terms on its feature.
 OPEN = {

@@ -7,10 +7,11 @@ import pytest
 from appliance.base.clock import using
 from appliance.channel.alarms import Alarm
 from appliance.channel.answers.status import Status
+from appliance.control.core import Alarms
 from appliance.control.errors import SenselessError, UnknownThingError
 from appliance.control.operators.handled_alarms import HandledAlarms
 from appliance.features.alarms.alarm_orders import AlarmOrders
-from appliance.features.alarms.alarm_requests import AlarmAcknowledge, AlarmSilence, AlarmsWanted
+from appliance.features.alarms.requests import AlarmAcknowledge, AlarmSilence, AlarmsWanted
 from appliance.store.state_file import StateStore
 from tests.support.answers import example
 from tests.support.core import FakeTrail
@@ -33,7 +34,8 @@ class Robot:
         store = StateStore(self.state, failed=pytest.fail, kind=InlineDatabase)
         self.ends = ends_of(store, self.state)
         handled = HandledAlarms(store, self.ends)
-        self.orders = AlarmOrders(handled, self.trail, lambda: handled.marked(example(Status, **self.fields)))
+        alarms = Alarms(lambda: handled.marked(example(Status, **self.fields)), handled)
+        self.orders = AlarmOrders(alarms, self.trail)
 
     @property
     def events(self) -> list[str]:

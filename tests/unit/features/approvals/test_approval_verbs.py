@@ -8,8 +8,8 @@ import pytest
 from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.target import Appliance
 from appliance.features.approvals import approval_verbs, approval_watch
-from appliance.features.approvals.approval_requests import Approval, Approvals
 from appliance.features.approvals.approval_watch import changes
+from appliance.features.approvals.requests import Approval, Approvals
 
 REST = ("10.0.0.7", "/agent", "call", "/log", "roscpp/SetLoggerLevel", "4bf5")
 

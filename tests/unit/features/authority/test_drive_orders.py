@@ -9,7 +9,7 @@ from appliance.base import clock
 from appliance.channel.messages import OwnServiceCalled
 from appliance.control.errors import SenselessError, UnavailableError, UnknownThingError
 from appliance.features.authority.drive_orders import CHECK_SECONDS, DriveOrders
-from appliance.features.authority.drive_requests import (
+from appliance.features.authority.requests import (
     DriveAsk,
     DriveGive,
     DriveStatus,

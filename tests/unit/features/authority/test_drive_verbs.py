@@ -7,7 +7,7 @@ import typer
 
 from appliance.cli.output import say_json
 from appliance.features.authority import drive_verbs
-from appliance.features.authority.drive_requests import GroupState, GroupStates
+from appliance.features.authority.requests import GroupState, GroupStates
 
 ROWS = [GroupState(name, [], "", None, 5.0, None, []) for name in ("arm", "base")]
 

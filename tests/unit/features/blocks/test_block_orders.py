@@ -16,7 +16,7 @@ from appliance.control.assembly import host_blocks
 from appliance.control.assembly.policies import Policies
 from appliance.control.errors import SenselessError, UnknownThingError
 from appliance.features.blocks.block_orders import BlockOrders
-from appliance.features.blocks.block_requests import (
+from appliance.features.blocks.requests import (
     BlockEnded,
     HostBlock,
     HostBlocked,

@@ -3,7 +3,7 @@ from typing import Any, cast
 
 import pytest
 
-from appliance.features.doors.control_part import DoorOrders
+from appliance.features.doors.door_orders import DoorOrders
 from appliance.policy.model import Address
 from appliance.store.door_tables import DoorRow
 from tests.support.core import FakeTrail
@@ -33,8 +33,8 @@ def test_a_ticket_opens_a_door_for_hosts_that_are_not_blocked(
     orders = DoorOrders.__new__(DoorOrders)
     row = SimpleNamespace(id="1")
     orders.__dict__ |= {
-        "_base": SimpleNamespace(
-            policies=SimpleNamespace(current=SimpleNamespace(blocked=blocked)),
+        "_core": SimpleNamespace(
+            policy=SimpleNamespace(current=lambda: SimpleNamespace(blocked=blocked)),
             trail=trail,
         ),
         "_table": SimpleNamespace(live=lambda: [ALICE]),

@@ -7,7 +7,8 @@ import pytest
 from appliance.base import clock
 from appliance.channel import messages
 from appliance.channel.channel import ChannelFullError
-from appliance.control.assembly.foundation import Foundation
+from appliance.control.core import Core, Links
+from appliance.control.links.supervisor_link import ControlLifeline
 from appliance.features.doors import door_link, door_processes
 from appliance.features.doors.door_processes import DoorProcesses
 from appliance.features.doors.door_table import DoorTable
@@ -34,15 +35,10 @@ class Bench:
             listen_address=("0.0.0.0", 11311),
             api_address=None,
         )
-        base = SimpleNamespace(
-            settings=settings,
-            port=lambda _name: 11311,
-            policies=SimpleNamespace(current=SimpleNamespace(ports=range(19001, 20001)), revision=7),
-            blocks=SimpleNamespace(reasons={}),
-            lifeline=SimpleNamespace(say=self.asked.append),
-            trail=self.trail,
-        )
-        self.policies = base.policies
+        self.policy = SimpleNamespace(current=lambda: SimpleNamespace(ports=range(19001, 20001)), revision=7)
+        self.links: list[SimpleNamespace] = []
+        self.blocks = self.sources = self
+        self.reasons: dict[str, str] = {}
         self.rows = [ALICE]
         table = SimpleNamespace(
             problem="",
@@ -51,19 +47,30 @@ class Bench:
         )
         monkeypatch.setattr(door_processes, "Link", self._link)
         self.definitions: dict[str, str] = {}
+        core = SimpleNamespace(
+            settings=settings,
+            links=Links(
+                cast(ControlLifeline, SimpleNamespace(say=self.asked.append)), lambda _sequence: None
+            ),
+            policy=self.policy,
+            trail=self.trail,
+            hosts=self,
+            graph=SimpleNamespace(master_port=11311, host_of=lambda _node: None),
+            specifications=self,
+        )
         self.processes = DoorProcesses(
-            cast(Foundation, base),
+            cast(Core, core),
             cast(DoorTable, table),
             tickets=lambda _door: ["3f9a0c5d17e2"],
             left=lambda *left: self.left.append(left),
-            definitions=lambda: self.definitions,
-            host_of=lambda _node: None,
         )
-        self.link = cast(Any, self.processes.links()["door"][0])
+        self.link = cast(Any, self.links[0])
         monkeypatch.setattr(self.processes, "_given", self._given)
 
     def _link(self, heard: Any, lost: Any) -> SimpleNamespace:
-        return SimpleNamespace(heard=heard, lost=lost, send=self._send, channel=object(), close=self._close)
+        link = SimpleNamespace(heard=heard, lost=lost, send=self._send, channel=object(), close=self._close)
+        self.links.append(link)
+        return link
 
     def _close(self) -> None:
         self.link.channel = None
@@ -153,7 +160,7 @@ def test_a_process_that_does_not_end_in_time_is_killed_once(bench: Bench, loses:
             bench.link.lost("")
         elif loses == "patience":
             bench.full = True
-            bench.policies.revision += 1
+            bench.policy.revision += 1
             bench.processes.define()
         else:
             bench.hears(door_link.DoorStarted("bob", 1.0, True))
@@ -208,7 +215,7 @@ def test_a_process_learns_of_another_policy_once(bench: Bench) -> None:
     bench.hears(NEW)
     bench.sent.clear()
     for revision in (7, 8, 8):
-        bench.policies.revision = revision
+        bench.policy.revision = revision
         bench.processes.define()
     assert bench.sent == [door_link.PolicyChanged()]
 

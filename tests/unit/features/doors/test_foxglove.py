@@ -6,15 +6,15 @@ from typing import Any
 import pytest
 
 from appliance.features.doors.client_frames import content, is_text
-from appliance.features.doors.foxglove import SUBPROTOCOLS, Foxglove, FoxgloveLimits
-from appliance.features.doors.png_frames import PngFrame
-from appliance.features.doors.quotas import DOOR_BYTES
-from appliance.features.doors.requests import (
+from appliance.features.doors.client_requests import (
     DoorRequest,
     PublishMessage,
     SubscribeTopic,
     UnsubscribeTopic,
 )
+from appliance.features.doors.foxglove import SUBPROTOCOLS, Foxglove, FoxgloveLimits
+from appliance.features.doors.png_frames import PngFrame
+from appliance.features.doors.quotas import DOOR_BYTES
 from appliance.features.doors.surroundings import DoorSurroundings, SeenTopic, VisibleGraph
 from appliance.features.doors.viewer_queue import ViewerQueue
 from roswire.definitions import Definitions

@@ -6,9 +6,9 @@ from typing import Any
 import pytest
 from msgspec import Raw
 
+from appliance.features.doors.client_requests import CallOfService
 from appliance.features.doors.known_types import KnownType, KnownTypes
 from appliance.features.doors.lookout import Lookout
-from appliance.features.doors.requests import CallOfService
 from appliance.features.doors.rosapi import Rosapi
 from appliance.features.doors.surroundings import VisibleGraph
 from appliance.features.doors.values import ValueLimits

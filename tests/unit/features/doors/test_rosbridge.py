@@ -10,10 +10,7 @@ import cbor2
 import pytest
 
 from appliance.features.doors.client_frames import content, is_text
-from appliance.features.doors.door_memory import DoorMemory
-from appliance.features.doors.known_types import DoorMessage
-from appliance.features.doors.png_frames import PngFrame
-from appliance.features.doors.requests import (
+from appliance.features.doors.client_requests import (
     AdvertiseTopic,
     AnswerCall,
     CallOfService,
@@ -25,6 +22,9 @@ from appliance.features.doors.requests import (
     UnsubscribeTopic,
     WithdrawService,
 )
+from appliance.features.doors.door_memory import DoorMemory
+from appliance.features.doors.known_types import DoorMessage
+from appliance.features.doors.png_frames import PngFrame
 from appliance.features.doors.rosbridge import Rosbridge, RosbridgeLimits
 from appliance.features.doors.values import MessageCodec, ValueLimits
 from appliance.features.doors.viewer_queue import ViewerQueue, ViewerStalledError

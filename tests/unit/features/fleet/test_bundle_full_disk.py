@@ -95,7 +95,7 @@ def test_a_bundle_that_a_full_disk_rolled_back_is_not_in_force_and_is_tried_agai
         collector="https://10.0.0.9:8444", robot="arm7", ca=file, certificate=file, key=file, bundles=bundles
     )
     parts: Any = {
-        "policies": policies, "monitors": monitors, "hosts": hosts, "store": disk,
+        "policies": policies, "monitors": monitors, "hosts": lambda: hosts, "store": disk,
         "trail": trail,
         "health": lambda _deprived: RobotHealth(0, frozenset(), frozenset()),
     }  # fmt: skip

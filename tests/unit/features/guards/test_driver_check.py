@@ -11,7 +11,7 @@ from appliance.control.errors import SenselessError
 from appliance.features.guards import driver_outcomes as sentences
 from appliance.features.guards.driver_check import NAME, DriverChecks
 from appliance.features.guards.driver_outcomes import status_of
-from appliance.features.guards.guard_requests import DriverCheckBegin, DriverCheckWanted
+from appliance.features.guards.requests import DriverCheckBegin, DriverCheckWanted
 from appliance.specifications.specification_files import SpecificationsRefusedError
 from tests.support.core import FakeTrail
 from tests.support.virtual_clock import let_time_pass

@@ -12,7 +12,8 @@ from appliance.channel.answers.graph_answers import Graph, Node, Publisher, Topi
 from appliance.channel.answers.monitor_answers import Replacement
 from appliance.channel.messages import MonitorEvent
 from appliance.control.errors import SenselessError, UnknownThingError
-from appliance.features.guards import guard_orders, guard_requests
+from appliance.features.guards import guard_orders
+from appliance.features.guards import requests as guard_requests
 from appliance.features.guards.guard_answers import LastStop
 from appliance.features.guards.guard_orders import GuardOrders
 from appliance.features.guards.presets import PRESETS, Guard, text_of

@@ -21,14 +21,14 @@ from appliance.features.guards.guard_answers import (
     Suggestion,
     Suggestions,
 )
-from appliance.features.guards.guard_requests import (
+from appliance.features.guards.presets import PRESETS, Guard, GuardError, text_of
+from appliance.features.guards.requests import (
     GuardNew,
     GuardSuggestionsWanted,
     GuardsWanted,
     GuardTry,
     GuardUpgrade,
 )
-from appliance.features.guards.presets import PRESETS, Guard, GuardError, text_of
 
 
 class Robot:

@@ -9,7 +9,7 @@ from appliance.base import clock
 from appliance.base.metric import BOUNDS
 from appliance.channel.answers.measures import Measures
 from appliance.features.metrics.metric_table import METRICS, markdown
-from appliance.features.metrics.metrics_route import rendered
+from appliance.features.metrics.routes import rendered
 from appliance.telemetry.metrics import Meter
 from tests.support.answers import example
 

@@ -6,7 +6,7 @@ import pytest
 
 from appliance.configuration.config_sources import ConfigError, resolve
 from appliance.configuration.sections import Sections
-from appliance.features.recorder.feature import RECORDER
+from appliance.features.recorder.feature import FEATURE
 from appliance.features.recorder.rings import USED_BY
 from appliance.features.recorder.settings import RecorderRules
 from appliance.supervisor.roles import ROLES, roles_of
@@ -24,8 +24,10 @@ def test_the_recorder_runs_only_if_configured() -> None:
 
 
 def test_each_function_that_is_named_exists() -> None:
-    named = [RECORDER.routes, RECORDER.recorded, USED_BY]
-    assert all(callable(pkgutil.resolve_name(str(place))) for place in named)
+    assert all(
+        callable(pkgutil.resolve_name(place))
+        for place in (*filter(None, [role.memory for role in FEATURE.roles]), USED_BY)
+    )
 
 
 def test_a_similar_key_of_the_section_is_proposed(tmp_path: Path) -> None:

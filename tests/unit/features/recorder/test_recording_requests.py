@@ -4,7 +4,7 @@ import pytest
 
 from appliance.channel.messages.api import ClientRequest
 from appliance.channel.rest_meaning import NoOrderError, meant
-from appliance.features.recorder.recording_requests import RecordingOfMemory
+from appliance.features.recorder.requests import RecordingOfMemory
 
 
 @pytest.mark.parametrize("text", ["1h", "yesterday", "2026-13-01"])

@@ -10,7 +10,7 @@ from appliance.api.front.access import Bearer
 from appliance.api.front.problems import ProblemError
 from appliance.api.front.services import Services
 from appliance.channel.admin import AdminAnswer
-from appliance.features.recorder import recording_routes
+from appliance.features.recorder import routes as recording_routes
 from appliance.features.recorder.bag_writer import BagMessage, BagWriter
 from appliance.features.recorder.mcap import as_mcap
 from appliance.features.recorder.recording_answers import Recording

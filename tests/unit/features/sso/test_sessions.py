@@ -9,7 +9,7 @@ from appliance.channel.messages.api import RequestMade
 from appliance.control.errors import TokenRefusedError, UnavailableError, UnknownThingError
 from appliance.control.operators.token_orders import TokenOrders
 from appliance.control.rest.rest_proof import RequestAuthenticator, UnprovenError
-from appliance.features.sso import sso_requests as requests
+from appliance.features.sso import requests
 from appliance.features.sso.link import SessionKeys, SignedInPerson, SignOnConfirmed, SignOnFailed
 from appliance.features.sso.orders import SsoOrders
 from appliance.features.sso.quotas import SESSIONS

@@ -5,7 +5,7 @@ import pytest
 from appliance.audit.log.record import AuditRecord
 from appliance.channel import admin
 from appliance.control.errors import UnknownThingError
-from appliance.features.standby import standby_requests
+from appliance.features.standby import requests as standby_requests
 from appliance.features.standby.lease_client import HandOverError
 from appliance.features.standby.standby_answers import StandbyState
 from appliance.features.standby.standby_orders import SingleAppliance, StandbyAdministration, StandbyOrders

@@ -6,7 +6,7 @@ from pydantic import ValidationError
 
 from appliance.configuration.config_sources import ConfigError, read, resolve
 from appliance.configuration.sections import Sections
-from appliance.features.syslog.feature import SYSLOG
+from appliance.features.syslog.feature import FEATURE
 from appliance.features.syslog.settings import Syslog
 from appliance.supervisor.roles import ROLES, roles_of
 
@@ -44,7 +44,7 @@ def test_an_invalid_syslog_receiver_is_rejected(syslog: dict[str, object], why: 
 
 
 def test_the_forwarder_runs_only_if_configured() -> None:
-    (forwarder,) = SYSLOG.roles
+    (forwarder,) = FEATURE.roles
     wanted = Sections({Syslog: Syslog(to="tls://10.0.0.9:6514")})
     assert forwarder in roles_of(sections=wanted)
     assert forwarder not in roles_of()

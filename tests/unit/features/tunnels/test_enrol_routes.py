@@ -1,7 +1,7 @@
 import pytest
 
 from appliance.api.front.problems import ProblemError
-from appliance.features.tunnels.enrol_routes import _Patience
+from appliance.features.tunnels.routes import _Patience
 
 
 def test_hosts_that_send_wrong_tokens_have_to_wait() -> None:

@@ -35,7 +35,7 @@ from appliance.features.tunnels.host_answers import (
     Reloaded,
     Revoked,
 )
-from appliance.features.tunnels.host_requests import (
+from appliance.features.tunnels.requests import (
     AuthorityWanted,
     HostAdd,
     HostEnrol,

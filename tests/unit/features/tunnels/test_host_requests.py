@@ -2,7 +2,7 @@ from appliance.channel import admin
 from appliance.channel.admin import operation_of
 from appliance.channel.messages.api import ClientRequest
 from appliance.channel.rest_meaning import meant
-from appliance.features.tunnels.host_requests import HostPorts, HostToken
+from appliance.features.tunnels.requests import HostPorts, HostToken
 
 
 def test_a_kind_of_request_can_have_several_ways() -> None:

@@ -4,12 +4,13 @@ import asyncio
 from pathlib import Path
 
 from appliance.configuration.settings import Settings
-from appliance.control.assembly.active_role import ActiveRole, StartGate
+from appliance.control.assembly.active_role import ActiveRole
 from appliance.control.assembly.assembly import Parts
 from appliance.control.assembly.foundation import Foundation
+from appliance.control.core import ControlPart
 from appliance.control.errors import StateError
 from appliance.control.links.supervisor_link import ControlLifeline
-from appliance.features.feature import FeaturePart
+from appliance.control.start_gate import StartGate
 from appliance.features.standby.lease_client import LeaseClient
 from appliance.features.standby.lease_link import LeaseLink
 from appliance.features.standby.membership import LINK_FILE, MembershipError, load_membership
@@ -43,5 +44,8 @@ class StandbyGate(StartGate):
         pair = await until_activated(membership, settings, lifeline, self._lease, compiler, stopping=stopping)
         return None if pair is None else PairedRole(pair, settings)
 
-    async def begin(self, base: Foundation, parts: Parts) -> FeaturePart:
+    async def begin(self, base: Foundation, parts: Parts) -> ControlPart:
         return await begin(base, parts)
+
+
+GATE = StandbyGate

@@ -2,7 +2,7 @@
 
 import shutil
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,31 +10,21 @@ from typing import Any
 from appliance.channel.answers.limit_answers import LimitUse
 from appliance.configuration.settings import Settings
 from appliance.control.assembly.assembly import Parts
-from appliance.control.assembly.foundation import Foundation
 from appliance.control.assembly.listener_limits import ListenerLimits
-from appliance.control.operators.request_method import RequestMethod
-from appliance.features.feature import FeaturePart
-from appliance.features.limits.limit_requests import LimitList, LimitsWanted
 from appliance.quotas.pool import Pool
 from appliance.quotas.table import NAMES, RELAY_FRAMES, RELAY_LATCHED, RELAY_QUEUES, QuotaRow
 
 
-async def inherit(base: Foundation, parts: Parts) -> FeaturePart:
-    queries = LimitQueries(parts, base.settings, base.listener_limits, base.features.limits)
-    return FeaturePart(methods=(RequestMethod(LimitsWanted, queries.use, order=False),))
-
-
 @dataclass(frozen=True)
-class LimitQueries:
-    """Answers `LimitsWanted`; `features()` returns the resources of features."""
+class OwnUses:
+    """The resources of the core."""
 
     parts: Parts
     settings: Settings
     listeners: ListenerLimits
-    features: Callable[[], Iterable[LimitUse]]
 
-    async def use(self, _request: LimitsWanted) -> LimitList:
-        return LimitList([*self._registry(), *self._pools(), *self._relays(), *self._stored()])
+    def __call__(self) -> Iterator[LimitUse]:
+        yield from (*self._registry(), *self._pools(), *self._relays(), *self._stored())
 
     def _registry(self) -> Iterator[LimitUse]:
         registry, limits = self.parts.core.registry, self.settings.limits
@@ -73,7 +63,6 @@ class LimitQueries:
         kept = None if audit.retention_bytes is None else int(audit.retention_bytes)
         allowed = size + shutil.disk_usage(folder).free if kept is None else kept
         yield LimitUse("bytes of audit records", size, allowed, "audit.retention_bytes, or the disk")
-        yield from self.features()
 
 
 _MEMORY: dict[str, tuple[str, QuotaRow]] = {

@@ -32,3 +32,6 @@ class EvidenceExported(WaitingRequest[Sealed], frozen=True, tag="evidence export
     until: int
     records: int
     recording: str = ""
+
+
+REQUESTS = (LogSealed, EvidenceExported)

@@ -83,3 +83,8 @@ class SessionsEnd(AdminRequest[SignedOnList], frozen=True, tag="sso end"):
     name: Annotated[
         str, parameter("name of the person", min_length=1, max_length=140, examples=["sso:alice@example.org"])
     ]
+
+
+REQUESTS = (SignOnBegin, SignOnComplete, SessionsWanted, SignOut, SessionsEnd)
+PUBLIC = ("/v1/sso/begin", "/v1/sso/complete")
+"""The paths that need no token."""

@@ -39,6 +39,9 @@ _NO_GRANT: Responses = {409: {"description": "No line of a policy grants it."}}
 _MOST_SHOWN = 1000
 
 
+ANSWERS = policy_routes.ANSWERS
+
+
 def routes(services: Services) -> Routes:
     router = Routes(prefix="/v1")
     router.include_router(policy_routes.routes(services))

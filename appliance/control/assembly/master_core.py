@@ -22,7 +22,7 @@ from roswire.parameter_tree import Tree
 
 
 @dataclass(frozen=True, slots=True)
-class Core:
+class MasterCore:
     """The core of RVMaster."""
 
     policy: Callable[[], Policy]
@@ -38,7 +38,7 @@ class Core:
     monitors: Current[SpecificationManager]
 
 
-def make_core(base: Foundation) -> Core:
+def make_master_core(base: Foundation) -> MasterCore:
     settings, registry = base.settings, base.registry
     policy = base.policies.policy
 
@@ -53,7 +53,7 @@ def make_core(base: Foundation) -> Core:
 
     graph = RosGraph(registry, grants, base.trail)
     limits = HostLimits(settings.limits.topics_per_host)
-    return Core(
+    return MasterCore(
         policy=policy,
         registry=registry,
         watchlist=watchlist,

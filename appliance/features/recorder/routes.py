@@ -20,7 +20,7 @@ from appliance.api.front.routing import Responses, Routes, file
 from appliance.api.front.services import Services
 from appliance.api.front.streams import StreamResponse, Work, in_thread
 from appliance.audit.log.log_database import LogUnreadableError
-from appliance.features.recorder import recording_requests
+from appliance.features.recorder import requests as recording_requests
 from appliance.features.recorder.bag_reader import MessagePosition
 from appliance.features.recorder.mcap import as_mcap
 from appliance.features.recorder.recording_answers import (

@@ -25,10 +25,10 @@ from appliance.base import clock
 from appliance.channel.admin import A, AdminRequest
 from appliance.channel.answers.field_docs import Moment, doc
 from appliance.channel.rest_bodies import WHOLE
-from appliance.features.tunnels import host_requests
+from appliance.features.tunnels import requests as host_requests
 from appliance.features.tunnels.enrolment_kit import archive, members
 from appliance.features.tunnels.host_answers import NewCertificate
-from appliance.features.tunnels.host_routes import OneName, add_host_routes
+from appliance.features.tunnels.host_routes import ANSWERS, OneName, add_host_routes
 from appliance.features.tunnels.kits import KitOptions, kit_of
 from appliance.features.tunnels.rest_bodies import SigningRequest
 
@@ -83,6 +83,9 @@ _TUNNEL: Responses = {
 _PEM: Responses = file("application/x-pem-file", "PEM") | {
     503: {"description": "The appliance cannot answer now."}
 }
+
+
+__all__ = ["ANSWERS", "routes"]
 
 
 def routes(services: Services) -> Routes:

@@ -1,4 +1,3 @@
-import asyncio
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -7,8 +6,7 @@ import pytest
 
 from appliance.channel.answers.limit_answers import LimitUse
 from appliance.configuration.config_sources import read
-from appliance.features.limits.limit_requests import LimitsWanted
-from appliance.features.limits.limit_use import LimitQueries
+from appliance.control.operators.limit_use import OwnUses
 from appliance.quotas.pool import Bounds, Pool, QuotaClass
 
 
@@ -29,10 +27,7 @@ def used(state: Path, memory: dict[int, dict[str, int]]) -> dict[str, LimitUse]:
     parts: Any = SimpleNamespace(core=core, endpoints=SimpleNamespace(places=SimpleNamespace(taken=pool)))
     listeners: Any = SimpleNamespace(connection_table=SimpleNamespace(connected=pool))
     settings = read({"state": str(state), "audit": {"retention_bytes": 4 << 20}, "relays": 2})
-    queries = LimitQueries(
-        parts, settings, listeners, lambda: (LimitUse("bytes of a feature", 12, 99, "its.setting"),)
-    )
-    return {row.resource: row for row in asyncio.run(queries.use(LimitsWanted())).limits}
+    return {row.resource: row for row in OwnUses(parts, settings, listeners)()}
 
 
 def test_each_resource_has_its_use_and_the_host_with_most(tmp_path: Path) -> None:
@@ -48,7 +43,6 @@ def test_each_resource_has_its_use_and_the_host_with_most(tmp_path: Path) -> Non
     assert (fullest.used, fullest.allowed) == (9, 512 << 20)
     records = rows["bytes of audit records"]
     assert (records.used, records.allowed) == (1024, 4 << 20)
-    assert rows["bytes of a feature"].used == 12
 
 
 def test_a_log_file_that_ends_while_it_is_measured_has_no_size(
