@@ -41,7 +41,7 @@ class AuditTrail:
     """
 
     def __init__(self, log: AuditLog, *, strict: bool, deny_when_failed: bool) -> None:
-        self.log = log
+        self.audit = log
         self._ids = log.ids
         self.strict = strict
         self._deny_when_failed = deny_when_failed
@@ -55,29 +55,29 @@ class AuditTrail:
     @property
     def obstacle(self) -> str | None:
         """Return why nothing can be granted now; the text is safe to show to unknown hosts."""
-        if self._deny_when_failed and self.log.failed is not None:
+        if self._deny_when_failed and self.audit.failed is not None:
             return NOT_RECORDED
         return None
 
     def shut_out(self, host: str) -> str:
-        return self.log.budget.shut_out(host)
+        return self.audit.budget.shut_out(host)
 
     def owing(self, host: str) -> str:
-        return self.log.budget.owing(host)
+        return self.audit.budget.owing(host)
 
     async def still_owing(self, host: str) -> str:
         if self.owing(host):
-            await self.log.wait_durable()
+            await self.audit.wait_durable()
         return self.owing(host)
 
     def pause(self, host: str) -> float:
-        return self.log.budget.pause(host)
+        return self.audit.budget.pause(host)
 
     async def durable(self) -> str | None:
         """Return None once all records so far are on disk, or, with `deny_when_failed`, the reason why they are
         not.
         """
-        failure = await self.log.wait_durable()
+        failure = await self.audit.wait_durable()
         return failure if self._deny_when_failed else None
 
     def decided(
@@ -127,7 +127,7 @@ class AuditTrail:
             folds=reads and word == "allow",
         )
         self.meter.decided(category, word, taken / 1e9, "" if unknown else asker.host)
-        return self.log.record(record)
+        return self.audit.record(record)
 
     def happened(
         self,
@@ -155,7 +155,7 @@ class AuditTrail:
         for details in self._completing(decision, severity):
             detail |= details(event, decision, severity, host, now)
         unknown = self._marked(host, decision, detail)
-        return self.log.record(
+        return self.audit.record(
             AuditRecord(
                 id=self._ids.next(),
                 time=now,
@@ -179,7 +179,11 @@ class AuditTrail:
         return self._details if decision == "deny" or severity not in _ORDINARY else ()
 
     def _marked(self, host: str | None, decision: str | None, detail: dict[str, Any]) -> bool:
-        if host is None or decision != "deny" or self.log.budget.quota_class(host) is not QuotaClass.UNKNOWN:
+        if (
+            host is None
+            or decision != "deny"
+            or self.audit.budget.quota_class(host) is not QuotaClass.UNKNOWN
+        ):
             return False
         detail["unknown_host"] = True
         return True

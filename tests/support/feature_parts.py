@@ -56,7 +56,7 @@ def idle_core(state: Path) -> Core:
     ends = ends_of(store, state)
     policies, trail, relay = idle(Policies), idle(AuditTrail), idle(RelayControl)
     policies.in_force = RevisionRow(0, "", "", 0.0, "", "")
-    trail.log, relay.taps = idle(AuditLog), idle(TapRequests)
+    trail.audit, relay.taps = idle(AuditLog), idle(TapRequests)
     return Core(
         settings=settings,
         role=ActiveRole(),

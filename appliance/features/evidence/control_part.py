@@ -7,7 +7,7 @@ from appliance.features.evidence.requests import EvidenceExported, LogSealed
 
 
 async def begin(core: Core) -> ControlPart:
-    orders = EvidenceOrders(core.trail.log, core.trail, core.settings.name)
+    orders = EvidenceOrders(core.trail.audit, core.trail, core.settings.name)
     return ControlPart(
         (
             RequestMethod(LogSealed, orders.seal),

@@ -28,11 +28,14 @@ CLASSES: dict[str, Any] = {
 METHODS = idle_parts().methods() + request_methods(**CLASSES)
 OF_FEATURES = answered_later()
 REQUESTS: tuple[type[Any], ...] = tuple(dict.fromkeys([*get_args(AnyRequest), *get_args(RestRequest)]))
-# Exceptions: a record's fields depend on its event, a child's readiness on its role, a memory's terms on its feature.
+# Exceptions: a record's fields depend on its event, a child's readiness on its role, the terms of a memory and of work
+# on the machine on their feature.
 OPEN = {
     ("MonitorEvent", "detail"),
     ("Ready", "detail"),
     ("MemoryGiven", "terms"),
+    ("MachineWorkWanted", "terms"),
+    ("MachineWorkDone", "found"),
     ("MessageSeen", "fields"),  # a message of any type
 }
 OPEN_OF_FEATURES = {("TopicMessage", "fields")}
