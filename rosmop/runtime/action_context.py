@@ -216,10 +216,10 @@ class Context:
         self.turn.published.append(Published(self.monitor, topic, kind, data, site, is_call))
 
     def _measure(self, size: int, site: int) -> None:
+        """Measure the live values. It costs nothing, as it depends on earlier messages: `allocate` has paid for it."""
         held = size + sum(len(message.data) for message in self.turn.published)
         held += sum(map(self._held, self._live()))
         self._allocated = 0
-        self.spend(held // (BYTES_PER_INSTRUCTION * 16), site)
         if held > MAX_BYTES:
             raise FaultError(site, f"{_TOO_LARGE}: {held} bytes")
 

@@ -69,3 +69,19 @@ def test_a_hurried_message_has_a_part_of_the_time() -> None:
     monitors.limit_time(ticking([]), 0.010)
     monitors.hurry(0.1)
     assert "more than 1 ms" in monitors.process("/t", bytearray(TEXT), 1).faults[0].text
+
+
+def test_a_message_costs_the_same_whatever_came_before() -> None:
+    """The values are measured after some messages; so the proofs know the budget that a message leaves."""
+    text = (
+        """a() { std::string kept; event e(std::string s) /t std_msgs/String '{data:s}' { kept = s + s; } }"""
+    )
+    monitors = MonitorSet.of(compiled_from({"a.rv": text}, standard_definitions()))
+    monitors.start(0)
+    [context] = monitors.interpreter.contexts.values()
+    data = message("std_msgs/String", data="x" * 300_000)
+    rests = set()
+    for time in range(1, 8):
+        assert not monitors.process("/t", bytearray(data), time).faults
+        rests.add(context.budget)
+    assert len(rests) == 1
