@@ -1,3 +1,4 @@
+import errno
 import json
 import os
 import subprocess
@@ -9,7 +10,9 @@ from typing import Any, Final
 import pytest
 
 from appliance.supervisor.errors import StartError
-from appliance.supervisor.sandbox.private_view import PrivateView, require_view, view_of
+from appliance.supervisor.sandbox import private_view
+from appliance.supervisor.sandbox.private_view import PrivateView, ViewError, enter, require_view, view_of
+from appliance.supervisor.users import Account
 from tests.support.requirements import need_root
 
 USER: Final = 61099
@@ -122,3 +125,13 @@ def test_without_mounts_a_closed_program_is_an_error_with_the_remedy(home: Path)
     with pytest.raises(StartError, match=r"cannot read the program in .*appliance; .*chmod -R go\+rX"):
         require_view(view_of([home / "x y/appliance"], home / "state"), may_mount=False)
     assert require_view(view_of([], home / "state"), may_mount=False) is None
+
+
+def test_in_a_chroot_without_a_mount_the_error_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(what: str, *_arguments: object) -> None:
+        if what.startswith("mount(/"):
+            raise OSError(errno.EINVAL, f"{what}: Invalid argument")
+
+    monkeypatch.setattr(private_view, "libc_call", refused)
+    with pytest.raises(ViewError, match=r"not a mount point, as in a chroot.* `mount --bind DIR DIR`"):
+        enter(PrivateView(("/root",), (), (), None), Account("other", USER, USER))
