@@ -344,9 +344,10 @@ class Isolation:
         in_use = sorted(self._host.run(listening_ports))
         clashes = [port for span in ranges for port in in_use if span.first <= port <= span.last]
         if clashes:
-            raise PortsInUseError(
-                f"{self._host.run(lambda: described(clashes))}: stop it, or give the appliance other ports"
-            )
+            remedy = "stop it, or give the appliance other ports"
+            if clashes[0] == self.settings.master:
+                remedy = "`sudo rosrv adopt` takes its graph over, or stop it"
+            raise PortsInUseError(f"{self._host.run(lambda: described(clashes))}; {remedy}")
 
     def _take_lock(self) -> None:
         if self._lock is not None:

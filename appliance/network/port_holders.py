@@ -2,13 +2,13 @@
 
 import os
 import re
-from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
 from appliance.network.listening_sockets import listening_inodes
 from appliance.network.namespaces import NetworkError
+from appliance.network.socket_owners import owners_of
 
 _INTERPRETER = re.compile(r"(?:python|perl|ruby|node|sh|bash)[0-9.]{0,8}")
 _UNITS = (".service", ".scope")
@@ -42,13 +42,10 @@ class PortHolder(NamedTuple):
         return f"{self.program} ({_shown(self.unit) or f'process {self.pid}'})"
 
 
-def port_holder(port: int, proc: Path = Path("/proc")) -> PortHolder | None:
+def port_holder(port: int) -> PortHolder | None:
     """Return a process that listens on the port in the thread's network namespace; None if none is visible."""
-    inodes = {f"socket:[{inode}]" for inode in listening_inodes(port)}
-    for process in proc.iterdir() if inodes else ():
-        if process.name.isdigit() and not inodes.isdisjoint(_sockets(process)):
-            return _described(process)
-    return None
+    owners = owners_of(listening_inodes(port))
+    return next((_described(Path("/proc", str(owner.pid))) for owner in owners.values()), None)
 
 
 def described(ports: list[int]) -> str:
@@ -68,13 +65,6 @@ def _described(process: Path) -> PortHolder:
         unit = next((name for name in reversed(groups) if name.endswith(_UNITS)), "")
     words = command.rstrip(b"\0").decode("utf-8", "replace").split("\0")
     return PortHolder(int(process.name), tuple(words if command else ()), unit)
-
-
-def _sockets(process: Path) -> Iterator[str]:
-    with suppress(OSError):
-        for descriptor in (process / "fd").iterdir():
-            with suppress(OSError):
-                yield str(descriptor.readlink())
 
 
 def _shown(text: str) -> str:

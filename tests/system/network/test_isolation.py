@@ -106,7 +106,7 @@ def test_the_master_is_forwarded_only_when_it_answers_and_no_other_listens(
     isolation = Isolation(bare.namespace, late)
     with (
         serving(bare.namespace, MASTER),
-        pytest.raises(PortsInUseError, match=rf"pytest.* holds TCP {MASTER}:"),
+        pytest.raises(PortsInUseError, match=rf"pytest.* holds TCP {MASTER}; `sudo rosrv adopt`"),
     ):
         isolation.up()
     isolation.up()
@@ -309,7 +309,7 @@ def test_a_port_in_use_on_the_host_is_named(bare: Host, tmp_path: Path) -> None:
     before = state(bare)
     with (
         serving(bare.namespace, MASTER),
-        pytest.raises(NetworkError, match=r"pytest.* holds TCP 11311: stop it"),
+        pytest.raises(NetworkError, match=r"pytest.* holds TCP 11311; stop it"),
     ):
         Isolation(bare.namespace, settings(tmp_path)).up()
     assert state(bare) == before
