@@ -193,9 +193,11 @@ class Supervisor:
         if self.failure is not None or not self.is_ready or not self._work.takes_over():
             return
         self._tell_control(messages.EndAnnounced())
-        with suppress(TimeoutError):
+        try:
             async with asyncio.timeout(_AGREED_SECONDS):
                 await self._end_agreed.wait()
+        except TimeoutError:
+            log.error("control did not give the robot's graph back: sudo rosrv release --dead")
 
     # --- starting -----------------------------------------------------------------------------------------
 

@@ -19,13 +19,14 @@ ip -n visitor link set eth0 up
 _DRIVES = "until ROS_MASTER_URI=http://localhost:11311 rosnode ping -c 1 /drive; do sleep 1; done"
 
 
-def test_the_page_is_true(package: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("page", ["quickstart.md", "quickstart-running.md"])
+def test_the_page_is_true(page: str, package: Path, tmp_path: Path) -> None:
     record = "ID"
     with clean_machine(
-        tmp_path, package, {package.name: package}, more=("sudo",), name="quickstart"
+        tmp_path, package, {package.name: package}, more=("sudo", "python3-rosmaster"), name="quickstart"
     ) as machine:
         machine.run("bash", "-euc", _NETWORK)
-        for step in steps("quickstart.md"):
+        for step in steps(page):
             command = ["bash", "-euo", "pipefail", "-c", step.script.replace(" ID ", f" {record} ")]
             if step.host == "visitor":
                 command = ["ip", "netns", "exec", "visitor", *command]

@@ -30,7 +30,7 @@ class Phase(StrEnum):
 
 class AdoptRecord(msgspec.Struct, frozen=True):
     """The record. `unit` and `user` identify the robot's own master; `group` is its control group, if it has one
-    for itself.
+    for itself. `stand_in` is the process of a master that a release has started.
     """
 
     wanted: bool = False
@@ -41,9 +41,14 @@ class AdoptRecord(msgspec.Struct, frozen=True):
     user: str = ""
     program: str = ""
     group: str = ""
+    stand_in: int = 0
 
     def now(self, boot: str) -> "AdoptRecord":
-        return self if boot == self.boot else msgspec.structs.replace(self, phase=Phase.FREE, boot=boot)
+        return (
+            self
+            if boot == self.boot
+            else msgspec.structs.replace(self, phase=Phase.FREE, boot=boot, stand_in=0)
+        )
 
 
 def boot_id() -> str:

@@ -40,7 +40,9 @@ class MachineFacts(msgspec.Struct, frozen=True):
     def foreign_master(self) -> str:
         """Why the present master is not the recorded one; empty if it is, or if there is none."""
         found, record = self.master, self.record
-        if found is None or not record.wanted or (found.unit, found.user) == (record.unit, record.user):
+        if found is None or not record.wanted or found.pid == record.stand_in:
+            return ""
+        if (found.unit, found.user) == (record.unit, record.user):
             return ""
         recorded = f"{record.program} ({record.unit or 'no unit'}, user {record.user})"
         return f"{found.program} ({found.unit or 'no unit'}, user {found.user}) is not the recorded master {recorded}"

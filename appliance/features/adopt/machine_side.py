@@ -34,9 +34,9 @@ from appliance.supervisor.users import account_of
 STAND_IN_UNIT = "rosrv-left-master"
 ROSMASTER = "/usr/bin/rosmaster"
 _SYSTEMD = Path("/run/systemd/system")
-_MOST_NAMES, _MOST_PORTS = 64, 20_000
+_MOST_NAMES, _MOST_PORTS = 500, 20_000
 _NAME = re.compile(r"[A-Za-z0-9_.-]{1,253}")
-_RESOLVE_SECONDS = 2.0
+_NAME_SECONDS, _NAMES_SECONDS = 2.0, 10.0
 _LOOKUP_SECONDS = 0.1
 _CALL_SECONDS = 0.25  # of an ordinary service call under way, which is not cut
 _START_SECONDS = 10.0
@@ -166,7 +166,9 @@ class AdoptWork:
         port = _master_port(side)
         if master_of(side.host, port) is not None:
             return {"started": False}
-        start_stand_in(side.host, port, load_record(self._state))
+        record = load_record(self._state)
+        stand_in = start_stand_in(side.host, port, record)
+        save_record(self._state, msgspec.structs.replace(record, stand_in=stand_in))
         return {"started": True}
 
     def _withdraw(self, side: Isolation, _terms: Terms) -> Found:
@@ -220,8 +222,8 @@ def _of_roscore(line: str) -> bool:
     return not words or any(word in {"roscore", "rosmaster", "rosout"} for word in words[:3])
 
 
-def start_stand_in(host: Namespace, port: int, record: AdoptRecord) -> None:
-    """Start a ROS master that outlives the appliance, and wait until it listens. Raises `NetworkError`."""
+def start_stand_in(host: Namespace, port: int, record: AdoptRecord) -> int:
+    """Start a ROS master that outlives the appliance, and return its process once it listens. Raises `NetworkError`."""
     user, uid, gid = _stand_in_user(record.user)
     command = [ROSMASTER, "--core", "-p", str(port)]
     if _SYSTEMD.is_dir() and (run := shutil.which("systemd-run")):
@@ -242,11 +244,12 @@ def start_stand_in(host: Namespace, port: int, record: AdoptRecord) -> None:
             stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
         )  # fmt: skip
     until, pause = clock.now() + _START_SECONDS, threading.Event()
-    while host.run(lambda: port_holder(port)) is None:
+    while (holder := host.run(lambda: port_holder(port))) is None:
         if clock.now() > until:
             raise NetworkError(f"{ROSMASTER} does not listen on TCP {port}")
         pause.wait(_LOOK_SECONDS)
     log.warning("a ROS master was started for the robot", unit=STAND_IN_UNIT, user=user, port=port)
+    return holder.pid
 
 
 def _stand_in_user(recorded: str) -> tuple[str, int, int]:
@@ -262,18 +265,22 @@ def _stand_in_user(recorded: str) -> tuple[str, int, int]:
 def resolved(host: Namespace, names: Iterable[str]) -> dict[str, list[str]]:
     """Return the addresses of host names, as the machine resolves them; an unknown name has none.
 
-    The names come from nodes. `getent` is killed after some seconds, so a slow name server costs no more.
+    The names come from nodes. The machine's own file comes first, so that no slow name of a hostile node delays a name
+    in it, and name servers get some seconds for all.
     """
+    until = clock.now() + _NAMES_SECONDS
 
-    def addresses(name: str) -> list[str]:
-        if not _NAME.fullmatch(name):
+    def addresses(name: str, *service: str) -> list[str]:
+        seconds = min(_NAME_SECONDS, until - clock.now())
+        if not _NAME.fullmatch(name) or seconds <= 0:
             return []
         with suppress(subprocess.TimeoutExpired, OSError):
             with host.popen(
-                ["getent", "ahosts", "--", name], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
-            ) as asked:
+                ["getent", *service, "ahosts", "--", name],
+                stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
+            ) as asked:  # fmt: skip
                 try:
-                    text, _ = asked.communicate(timeout=_RESOLVE_SECONDS)
+                    text, _ = asked.communicate(timeout=seconds)
                 finally:
                     asked.kill()
             return list(dict.fromkeys(line.split()[0] for line in text.splitlines() if line.split()))
@@ -281,7 +288,12 @@ def resolved(host: Namespace, names: Iterable[str]) -> dict[str, list[str]]:
 
     wanted = sorted(set(names))
     with ThreadPoolExecutor(8, "resolver") as threads:
-        return dict(zip(wanted, threads.map(addresses, wanted), strict=True))
+        found = dict(
+            zip(wanted, threads.map(lambda name: addresses(name, "-s", "files"), wanted), strict=True)
+        )
+        others = [name for name in wanted if not found[name]]
+        found.update(zip(others, threads.map(addresses, others), strict=True))
+    return found
 
 
 def _master_port(side: Isolation) -> int:

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
 
+from appliance.base import clock
 from appliance.features.adopt.machine_facts import MachineFacts
 from appliance.policy.model import Address
 from appliance.rpc.master_reader import CALLER
@@ -15,6 +16,7 @@ from roswire.uris import NodeUri, parse_node_uri
 from roswire.xmlrpc import Value, XmlRpcLimits
 
 _SECONDS = 2.0
+_WHOLE_SECONDS = 30.0
 _AT_ONCE = 16
 _LIMITS = XmlRpcLimits(body=256 << 10)
 
@@ -67,10 +69,15 @@ def names_to_resolve(uris: Iterable[NodeUri]) -> list[str]:
 async def find_places(nodes: Mapping[str, str], facts: MachineFacts, call: NodeCaller = call_node) -> Places:
     """Return the places of nodes. `facts` has the sockets of their ports and the addresses of their hosts."""
     uris, missing = parsed(nodes)
-    turns = asyncio.Semaphore(_AT_ONCE)
+    turns, until = asyncio.Semaphore(_AT_ONCE), clock.now() + _WHOLE_SECONDS
 
     async def one(name: str, uri: NodeUri) -> tuple[str, NodePlace | str]:
         async with turns:
+            if clock.now() > until:
+                return (
+                    name,
+                    f"it was not asked within {_WHOLE_SECONDS:g} s, because too many nodes do not answer",
+                )
             return name, await _place(nodes[name], uri, facts, call)
 
     found: dict[str, NodePlace] = {}

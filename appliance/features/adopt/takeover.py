@@ -301,7 +301,13 @@ class AdoptOperation:
     # --- giving back ---
 
     async def give(self) -> GiveBackReport:
-        """Give the graph back. Raises `AdoptError`; RVMaster then serves on."""
+        """Give the graph back. Raises `AdoptError`; while the rules are in force, RVMaster then serves on."""
+        try:
+            return await self._give()
+        except MasterReadError as error:
+            raise AdoptError(f"the robot's master cannot be read: {error}") from None
+
+    async def _give(self) -> GiveBackReport:
         began, facts = clock.now(), await self.facts()
         self.silence()
         if facts.record.phase is Phase.GIVEN:  # a kill came before the nodes were forgotten

@@ -199,7 +199,7 @@ class RobotWorld:
             case "stand in":
                 if self.holder is None:
                     self.holder = RobotMaster(8, "/usr/bin/rosmaster", "robot", "rosrv-left-master.service")
-                    self.record = msgspec.structs.replace(self.record, unit="rosrv-left-master.service")
+                    self.record = msgspec.structs.replace(self.record, stand_in=8)
                     self.master.entries.clear()
                     self.master.alive = True
                     return {"started": True}

@@ -334,6 +334,19 @@ def test_a_robot_without_a_master_gets_one_with_its_whole_graph() -> None:
     require_given(run(story))
 
 
+def test_a_master_that_a_release_has_started_is_known_at_the_next_start() -> None:
+    async def story(world: RobotWorld) -> None:
+        await world.until_settled()
+        world.holder = None
+        await world.operation.give()  # an ordered stop: the adoption stays wanted
+        require_given(world)
+        world.began.clear()
+        await world.until_settled()
+        require_taken(world)
+
+    run(story)
+
+
 def test_a_node_that_was_restarted_under_the_rules_is_given_back_with_its_new_uri() -> None:
     async def story(world: RobotWorld) -> None:
         await world.until_settled()
