@@ -7,7 +7,7 @@ import { iso, Moment } from "../moments.js";
 import { Badge, Outcome, requested } from "../parts/badge.js";
 import { Copy } from "../parts/copy.js";
 import { Given } from "../parts/given.js";
-import { Host } from "../parts/host.js";
+import { Host, Sentence } from "../parts/host.js";
 import { Icon } from "../parts/icon.js";
 import { Failure, Loading } from "../parts/notice.js";
 import { useResource } from "../parts/resource.js";
@@ -48,7 +48,7 @@ function Shown(/** @type {{shown: any, filter: Record<string, string>}} */ { sho
   const detail = Object.entries(record.detail).filter(([name]) => !SHOWN_APART.has(name));
   return html`<div class="panel-body stack">
     <div class="stack-tight"><div class="row"><${Outcome} record=${record} /><strong><${Given} value=${record.event} /></strong><span class="muted"><${Moment} at=${record.time} /></span></div>
-      <p class="record-reason"><${Given} value=${record.reason} most=${1000} none="no reason given" /></p></div>
+      <p class="record-reason"><${Sentence} value=${record.reason} most=${1000} none="no reason given" /></p></div>
     <dl class="facts">
       <dt>Node</dt><dd><${Given} value=${record.caller_id} mono most=${300} /></dd><dt>Host</dt><dd><${Host} value=${record.host} /></dd>
       <dt>Category</dt><dd><${Given} value=${record.category} /></dd><dt>Resource</dt><dd><${Given} value=${record.resource} mono most=${300} /></dd>

@@ -4,7 +4,7 @@ import { html } from "../html.js";
 import { Moment } from "../moments.js";
 import { Outcome, requested } from "../parts/badge.js";
 import { actor, Given } from "../parts/given.js";
-import { Host } from "../parts/host.js";
+import { Host, Sentence } from "../parts/host.js";
 import { go } from "../router.js";
 import { auditPath } from "./filters.js";
 import { Count, othersOf, Range, shownOf } from "./rows.js";
@@ -40,7 +40,7 @@ function Row(/** @type {{record: any, others?: number, callers?: number, time: a
     <td class=${`nowrap${record.host ? "" : " bare"}`} data-label="Host"><${Host} value=${record.host} /></td>
     <td data-label="Resource" class=${record.resource ? "" : "bare"}><${Given} value=${record.resource} most=${60} mono />${others > 0 && html` <span class="muted small nowrap">and ${others} more</span>`}</td>
     <td data-label="Rule" class=${`wide-only${record.rule ? "" : " bare"}`}>${record.rule ? html`<${Given} value=${`[${record.rule.section}]`} most=${22} mono /> <${Given} value=${record.rule.key} most=${40} mono />` : html`<span class="muted">–</span>`}</td>
-    <td data-label="Reason" class=${`wide-only reason${reason ? "" : " bare"}`}><${Given} value=${reason} most=${240} /></td></tr>`;
+    <td data-label="Reason" class=${`wide-only reason${reason ? "" : " bare"}`}><${Sentence} value=${reason} most=${240} /></td></tr>`;
 }
 
 /** Whether a row is about a request. Of the records behind a row, those that count repetitions have their own words. */

@@ -5,7 +5,7 @@ import { Moment } from "../moments.js";
 import { bytes, count, counted, rate } from "../numbers.js";
 import { Badge } from "../parts/badge.js";
 import { Given } from "../parts/given.js";
-import { Host } from "../parts/host.js";
+import { Host, Sentence } from "../parts/host.js";
 import { Icon } from "../parts/icon.js";
 import { Rule } from "../parts/rule.js";
 import { Link } from "../router.js";
@@ -65,7 +65,7 @@ function Ends(/** @type {{title: string, ends: {line: any, end: any}[], choose: 
 function Attempt(/** @type {{records: any[]}} */ { records }) {
   const first = records[0];
   return html`<div class="stack-tight"><div class="row"><${Badge} word=${first.decision} /><span class="muted small">${counted(records.length, "time")}, last <${Moment} at=${first.time} /></span></div>
-      <p><${Given} value=${first.reason} most=${500} /></p></div>
+      <p><${Sentence} value=${first.reason} most=${500} /></p></div>
     <dl class="facts"><dt>Who</dt><dd><${Given} value=${first.caller_id} mono none="no name" /></dd><dt>Host</dt><dd><${Host} value=${first.host} /></dd><dt>Wanted</dt><dd>${first.category} <${Given} value=${first.resource} mono /></dd>
       <dt>Rule</dt><dd><${Rule} rule=${first.rule} revision=${first.revision} /></dd></dl>
     <div class="row"><${Link} class="button" to=${`/console/audit/${first.id}`}>Open the record</${Link}>

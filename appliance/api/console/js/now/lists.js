@@ -8,7 +8,7 @@ import { Moment } from "../moments.js";
 import { notable } from "../notable.js";
 import { Badge, requested } from "../parts/badge.js";
 import { Given } from "../parts/given.js";
-import { Host } from "../parts/host.js";
+import { Host, Sentence } from "../parts/host.js";
 import { Empty, Loading } from "../parts/notice.js";
 import { Link } from "../router.js";
 import { useStore } from "../store.js";
@@ -47,7 +47,7 @@ function denied(/** @type {import("../audit/rows.js").Row} */ row, /** @type {an
   const one = shownOf(row);
   return html`<span class="event-badge"><${Badge} word=${one.decision} /></span><div class="event-body">
     <div><${Given} value=${one.caller_id} most=${60} mono none="no name" /> <span class="muted">of</span> <${Host} value=${one.host} none="no address" /> <span class="muted"><${Given} value=${isSelftest(one) ? "rosrv selftest" : one.resource ? requested(one) : one.event} none="" /></span> <${Given} value=${one.resource} most=${80} mono none="" />${othersOf(row) > 0 && html` <span class="muted">and ${othersOf(row)} more</span>`}${count}</div>
-    <div class="event-reason"><${Link} to=${`/console/audit/${one.id}`}><${Given} value=${value || one.reason || one.event} most=${220} /></${Link}></div></div>`;
+    <div class="event-reason"><${Link} to=${`/console/audit/${one.id}`}><${Sentence} value=${value || one.reason || one.event} most=${220} /></${Link}></div></div>`;
 }
 
 function done(/** @type {import("../audit/rows.js").Row} */ row, /** @type {any} */ count) {

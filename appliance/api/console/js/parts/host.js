@@ -8,6 +8,8 @@ import { Given } from "./given.js";
 
 const V4 = /^(\d{1,3})\.(\d{1,3})\.(\d{1,3})\.(\d{1,3})$/;
 
+const IN_TEXT = /(?<![(\d./:])\d{1,3}(?:\.\d{1,3}){3}(?![\d/:]|\.\d)/g; // neither a network, nor with a port, nor behind its name
+
 const labels = createStore(/** @type {{network: string, name: string}[]} */ ([]));
 
 /** Fetch the names again after each change of the policy or of the enrolled hosts. */
@@ -38,6 +40,13 @@ export function nameOf(address, known) {
 export function useShown() {
   const known = useStore(labels);
   return useMemo(() => (/** @type {string} */ address) => [nameOf(address, known), address].filter(Boolean).join(" "), [known]);
+}
+
+/** A sentence of the appliance, with the names of the hosts whose addresses it has. @param {{value: string, most: number, none?: string}} given */
+export function Sentence({ value, most, none }) {
+  const known = useStore(labels);
+  const named = (value ?? "").replace(IN_TEXT, (address) => [nameOf(address, known), address].filter(Boolean).join(" "));
+  return html`<${Given} value=${named} most=${most} none=${none} />`;
 }
 
 /** The names of all hosts that have one. @returns {string[]} */
