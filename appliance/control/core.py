@@ -193,14 +193,14 @@ class RelayOrders:
         self.look = relay.taps.look
         self.stop = relay.taps.stop
         """Lets the monitors of a topic send their safe messages, and returns their names."""
-        self.guards = relay.taps.guards
+        self.stoppers = relay.taps.stoppers
         """Returns the monitors that have a safe message for a topic; None: its relay does not answer."""
         self.carried_out = relay.carried_out
 
     def hold(
         self,
         call: Callable[[Request], str],
-        request: Callable[[messages.ApprovalWanted], Awaitable[messages.ApprovalAnswered]],
+        request: Callable[[messages.RequestHeld], Awaitable[messages.HeldRequestDecided]],
     ) -> None:
         """Take all calls that need an approval.
 

@@ -160,13 +160,13 @@ class ControlLink:
                 gone.remove_done_callback(withdraw)
         return answer
 
-    async def hand_over(self, door: str, ticket: str, peer: str, descriptor: int) -> tuple[int, str]:
+    async def hand_over(self, name: str, ticket: str, peer: str, descriptor: int) -> tuple[int, str]:
         """Return the status, and the reason for refusing the WebSocket. Raises `ControlAwayError`."""
         if self.paused:
             raise ControlAwayError(self.paused)
         try:
             answer: ConnectionAnswered = await self._link.ask(
-                lambda number: ConnectionPassed(number, door, ticket, peer), ANSWER_SECONDS, (descriptor,)
+                lambda number: ConnectionPassed(number, name, ticket, peer), ANSWER_SECONDS, (descriptor,)
             )
         except (TimeoutError, ChannelFullError, ChannelClosedError):
             raise ControlAwayError("the appliance does not answer now: try again in a second") from None

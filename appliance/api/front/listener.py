@@ -101,12 +101,12 @@ class _Connection(Front, asyncio.Protocol):
 
     def pause_writing(self) -> None:
         if self._websocket is not None:
-            self._websocket.hold_door(held=True)
+            self._websocket.hold_service(held=True)
         self._uvicorn.pause_writing()
 
     def resume_writing(self) -> None:
         if self._websocket is not None:
-            self._websocket.hold_door(held=False)
+            self._websocket.hold_service(held=False)
         self._uvicorn.resume_writing()
 
     def on_url(self, url: bytes) -> None:

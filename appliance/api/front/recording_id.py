@@ -10,12 +10,12 @@ OneId = Annotated[
 ]
 
 
-class _RecordingId(StringConvertor):
+class _HexId(StringConvertor):
     """Matches a recording's id, but not the word `memory`."""
 
     regex = "[0-9a-f]{20}"
 
 
-register_url_convertor("recording", _RecordingId())
+register_url_convertor("recording", _HexId())
 CONVERTORS = {"{recording_id}": "{recording_id:recording}"}
 """The name of each converter in the contract, and as Starlette matches it."""

@@ -69,7 +69,7 @@ _PROBLEMS = {
     "busy": (503, "busy"),
     "failed": (503, "not-available"),
 }
-_STANDBY_SECONDS = 2  # until a client may ask a standby again
+_PASSIVE_SECONDS = 2  # until a client may ask a standby again
 
 
 async def ask(control: ControlLink, request: AdminRequest[A], bearer: Bearer) -> A:
@@ -90,7 +90,7 @@ def answered(answer: AdminAnswer[A]) -> A:
     if answer.ok:
         return answer.given()
     if answer.trouble == "standby":
-        raise only_standby(answer.error, answer.active)
+        raise only_passive(answer.error, answer.active)
     raise problem_of(answer.trouble, "\n".join([answer.error, *answer.findings]))
 
 
@@ -99,5 +99,5 @@ def problem_of(trouble: Trouble, detail: str) -> ProblemError:
     return ProblemError(status, kind, detail)
 
 
-def only_standby(detail: str, active: str) -> ProblemError:
-    return ProblemError(503, "standby", detail, retry_after=_STANDBY_SECONDS, active=active)
+def only_passive(detail: str, active: str) -> ProblemError:
+    return ProblemError(503, "standby", detail, retry_after=_PASSIVE_SECONDS, active=active)

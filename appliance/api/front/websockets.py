@@ -31,7 +31,7 @@ class WebSocketPassage(asyncio.Protocol):
         self.target = target
         self.note: Callable[[], None] = lambda: None
         self._noted = clock.now()
-        self._door: asyncio.Transport | None = None
+        self._service: asyncio.Transport | None = None
         self._held: list[bytes] = []
 
     @property
@@ -39,22 +39,22 @@ class WebSocketPassage(asyncio.Protocol):
         return str(self.client.get_extra_info("peername")[0])
 
     def from_client(self, data: bytes) -> None:
-        if self._door is None:
+        if self._service is None:
             self.client.pause_reading()  # until the door takes the connection
             self._held.append(data)
         else:
-            self._door.write(data)
+            self._service.write(data)
             if clock.now() - self._noted > _NOTE_SECONDS:  # so that no flood of unknown peers displaces it
                 self._noted = clock.now()
                 self.note()
 
     def client_left(self) -> None:
-        if self._door is not None:
-            self._door.close()
+        if self._service is not None:
+            self._service.close()
 
-    def hold_door(self, *, held: bool) -> None:
-        if self._door is not None and not self._door.is_closing():
-            (self._door.pause_reading if held else self._door.resume_reading)()
+    def hold_service(self, *, held: bool) -> None:
+        if self._service is not None and not self._service.is_closing():
+            (self._service.pause_reading if held else self._service.resume_reading)()
 
     def refuse(self, status: str, reason: str) -> None:
         body = f"{reason}\n".encode()
@@ -65,16 +65,16 @@ class WebSocketPassage(asyncio.Protocol):
     # --- the door's end ---
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        self._door = cast(asyncio.Transport, transport)
+        self._service = cast(asyncio.Transport, transport)
         if self.client.is_closing():
-            self._door.close()
+            self._service.close()
 
     def begin(self, head: bytes) -> None:
-        if self._door is None:
+        if self._service is None:
             return
-        self._door.write(head)
+        self._service.write(head)
         for data in self._held:
-            self._door.write(data)
+            self._service.write(data)
         self._held.clear()
         if not self.client.is_closing():
             self.client.resume_reading()
@@ -108,11 +108,11 @@ class WebSocketHandover:
         try:
             self._gate.admit_websocket(host, PREFIX.decode())
             self._doorkeeper.require_patience(host)
-            door, ticket = _entry_of(passage.target)
+            name, ticket = _entry_of(passage.target)
             here, there = socket.socketpair()
             with there:
                 try:
-                    status, reason = await self._control.hand_over(door, ticket, host, there.fileno())
+                    status, reason = await self._control.hand_over(name, ticket, host, there.fileno())
                     if reason:
                         raise ProblemError(status, "not-recognised", reason)
                     here.setblocking(False)
@@ -130,7 +130,7 @@ class WebSocketHandover:
             return
         self._doorkeeper.noted(host, valid=True)
         passage.note = partial(self._doorkeeper.noted, host, valid=True)
-        passage.begin(_without_ticket(head, door))
+        passage.begin(_without_ticket(head, name))
 
 
 def _entry_of(target: bytes) -> tuple[str, str]:
@@ -140,14 +140,14 @@ def _entry_of(target: bytes) -> tuple[str, str]:
         ticket = parse_qs(parts.query).get("ticket", [""])[0]
     except ValueError:
         raise ProblemError(400, "bad-input", "the URL is not valid") from None
-    door = parts.path.removeprefix(PREFIX.decode())
-    if not ticket or max(len(ticket), len(door)) > _LONGEST:
+    name = parts.path.removeprefix(PREFIX.decode())
+    if not ticket or max(len(ticket), len(name)) > _LONGEST:
         raise ProblemError(
             401, "not-recognised", "the URL has no ticket: use the one of `rosrv door ticket NAME`"
         )
-    return door, ticket
+    return name, ticket
 
 
-def _without_ticket(head: bytes, door: str) -> bytes:
+def _without_ticket(head: bytes, name: str) -> bytes:
     _line, _end, rest = head.partition(b"\n")
-    return b"GET /door/" + door.encode("ascii") + b" HTTP/1.1\r\n" + rest
+    return b"GET /door/" + name.encode("ascii") + b" HTTP/1.1\r\n" + rest

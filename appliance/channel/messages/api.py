@@ -56,7 +56,7 @@ class ConnectionPassed(Message):
 
     descriptors: ClassVar[int] = 1
     number: int
-    door: str
+    name: str
     ticket: str
     peer: str
 

@@ -122,7 +122,7 @@ class GrantRevoked(Message):
 
 
 class ClientGranted(Message):
-    """A host and caller id may call the service; `asks`: control approves each request (`ApprovalWanted`)."""
+    """A host and caller id may call the service; `asks`: control approves each request (`RequestHeld`)."""
 
     key: str
     service: str
@@ -465,8 +465,8 @@ class OwnServiceAnswered(Message):
     repeats: bool = True
 
 
-class ApprovalWanted(Message):
-    """A client's service request waits for `ApprovalAnswered`.
+class RequestHeld(Message):
+    """A client's service request waits for `HeldRequestDecided`.
 
     `digest` is the SHA-256 of the request, `shown` its first bytes, and `size` its length.
     """
@@ -481,7 +481,7 @@ class ApprovalWanted(Message):
     size: int
 
 
-class ApprovalAnswered(Message):
+class HeldRequestDecided(Message):
     """A request is approved, or `refused` has the reason."""
 
     number: int
@@ -623,5 +623,5 @@ RelayLink = (
     | MonitorSwitched | MonitorGiven | MonitorResumed | OwnHeaderStated | OwnPublished | SpecificationsTaken
     | SpecificationsRefused | PublicationRefused | MonitorsReported | MonitorsCounted | LookWanted | LookEnded
     | MessageSeen | OrdersAsked | OrdersCarriedOut | OwnServiceCalled | OwnServiceAnswered
-    | MonitorCallWanted | MonitorCallAnswered | ApprovalWanted | ApprovalAnswered | StopWanted | StopBegun
+    | MonitorCallWanted | MonitorCallAnswered | RequestHeld | HeldRequestDecided | StopWanted | StopBegun
 )  # fmt: skip

@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 class RestWay:
     """Sends the requests of `AdminSocket` over REST, with the same answers."""
 
-    def __init__(self, url: str, token: str | None, authority: Path | None) -> None:
+    def __init__(self, url: str, token: str | None, ca_file: Path | None) -> None:
         """Raises `ValueError` if a token must not be sent to this URL."""
-        self.client = RestClient(url, token, authority)
+        self.client = RestClient(url, token, ca_file)
 
     def ask(self, request: AdminRequest[A]) -> AdminAnswer[A]:
         encoded(request)  # rejects text that the socket would also reject

@@ -45,16 +45,16 @@ class RestProblemError(Exception):
 class RestClient:
     """A client of REST; the methods raise `NotRunningError` and `RestProblemError`."""
 
-    def __init__(self, url: str, token: str | None, authority: Path | None) -> None:
+    def __init__(self, url: str, token: str | None, ca_file: Path | None) -> None:
         """Raises `ValueError` if a token must not be sent to this URL."""
         self.url, secure = _place_of(url)
         self._token = _checked_token(token)
-        if authority is not None and not secure:
+        if ca_file is not None and not secure:
             raise ValueError(f"--api-ca is for https, but {self.url} is clear text")
         self._client = httpx.Client(
             base_url=self.url,
             headers={"Authorization": f"Bearer {reading_key(self._token)}", "User-Agent": "rosrv"},
-            verify=_context(authority) if secure else False,
+            verify=_context(ca_file) if secure else False,
             timeout=httpx.Timeout(SECONDS, connect=_CONNECT_SECONDS),
             trust_env=False,
             follow_redirects=False,
@@ -217,14 +217,14 @@ def _checked_token(token: str | None) -> str:
     return text
 
 
-def _context(authority: Path | None) -> ssl.SSLContext:
+def _context(ca_file: Path | None) -> ssl.SSLContext:
     try:
-        if authority is None:
+        if ca_file is None:
             return ssl.create_default_context()
         # An empty string would select the system's authorities.
-        text = read_given_text(authority, "ascii", "ignore") or "no certificate"
+        text = read_given_text(ca_file, "ascii", "ignore") or "no certificate"
         return ssl.create_default_context(cadata=text)
     except ssl.SSLError:
-        raise ValueError(f"--api-ca {authority}: has no certificate in PEM") from None
+        raise ValueError(f"--api-ca {ca_file}: has no certificate in PEM") from None
     except OSError as error:
-        raise ValueError(f"--api-ca {authority}: {error.strerror}") from None
+        raise ValueError(f"--api-ca {ca_file}: {error.strerror}") from None

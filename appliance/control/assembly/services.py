@@ -48,7 +48,7 @@ class HeldCalls:
     """
 
     call: Callable[[Request], str]
-    request: Callable[[messages.ApprovalWanted], Awaitable[messages.ApprovalAnswered]]
+    request: Callable[[messages.RequestHeld], Awaitable[messages.HeldRequestDecided]]
 
 
 _NO_APPROVALS = "no operator can approve calls on this appliance"
@@ -64,10 +64,10 @@ class CallHolder:
         held = self.held()
         return _NO_APPROVALS if held is None else held.call(request)
 
-    async def request(self, wanted: messages.ApprovalWanted) -> messages.ApprovalAnswered:
+    async def request(self, wanted: messages.RequestHeld) -> messages.HeldRequestDecided:
         held = self.held()
         if held is None:
-            return messages.ApprovalAnswered(wanted.number, _NO_APPROVALS)
+            return messages.HeldRequestDecided(wanted.number, _NO_APPROVALS)
         return await held.request(wanted)
 
 

@@ -51,7 +51,7 @@ _TEXT = 300
 _DENIED = (401, 403, 421, 429)
 _METHODS = ("POST", "PUT", "PATCH", "DELETE")  # a rejected request with one of these methods changed nothing
 _MOST_SLOW = 16
-NO_DOORS = (503, "this appliance opens no doors now")
+NO_WEBSOCKETS = (503, "this appliance opens no doors now")
 
 
 class RestLink:
@@ -71,7 +71,7 @@ class RestLink:
         certified: Callable[[str], None],
         require_proof: bool,
         uses: RestUses,
-        connected: Callable[[str, str, str, int], tuple[int, str]] = lambda *_connection: NO_DOORS,
+        connected: Callable[[str, str, str, int], tuple[int, str]] = lambda *_connection: NO_WEBSOCKETS,
     ) -> None:
         self._administration = administration
         self._tokens = tokens
@@ -126,7 +126,7 @@ class RestLink:
     def _took(self, message: object, descriptors: tuple[int, ...]) -> None:
         try:
             if isinstance(message, ConnectionPassed):
-                status, reason = self._connected(message.door, message.ticket, message.peer, descriptors[0])
+                status, reason = self._connected(message.name, message.ticket, message.peer, descriptors[0])
                 self._send(ConnectionAnswered(message.number, status, reason))
         finally:
             for descriptor in descriptors:

@@ -14,7 +14,7 @@ from appliance.base.actors import OPERATOR
 from appliance.base.withdrawal import take_effect
 from appliance.channel.answers.limit_answers import LimitUse
 from appliance.channel.answers.token_answers import may
-from appliance.channel.messages import ApprovalAnswered, ApprovalWanted
+from appliance.channel.messages import HeldRequestDecided, RequestHeld
 from appliance.channel.messages.api import TokenKept
 from appliance.control.errors import SenselessError, UnknownThingError
 from appliance.control.motion_stop import MotionStop
@@ -89,8 +89,8 @@ class ApprovalOrders:
         call = HeldCall(request.host, request.category, request.resource)
         return self._held(call, request.caller_id)
 
-    async def approve_call(self, wanted: ApprovalWanted) -> ApprovalAnswered:
-        answer = partial(ApprovalAnswered, wanted.number)
+    async def approve_call(self, wanted: RequestHeld) -> HeldRequestDecided:
+        answer = partial(HeldRequestDecided, wanted.number)
         if obstacle := self._trail.obstacle or self._trail.shut_out(wanted.host):
             return answer(obstacle)
         asker = Asker(wanted.host, wanted.caller_id, clock.now_ns())
@@ -105,7 +105,7 @@ class ApprovalOrders:
             return answer(NOT_RECORDED)
         return answer("")
 
-    def _decided(self, decision: Decision, wanted: ApprovalWanted, host: Address) -> Decision:
+    def _decided(self, decision: Decision, wanted: RequestHeld, host: Address) -> Decision:
         call = HeldCall(host, Category.CALL, wanted.service, wanted.digest)
         entry = self._table.find(call)
         approved = entry is not None and entry.state is ApprovalState.APPROVED

@@ -34,7 +34,7 @@ async def begin(core: Core) -> ControlPart:
         decide_again=policy.decide_again,
         carried_out=core.relay.carried_out,
         bearers=core.bearers.usable,
-        guards=core.relay.guards,
+        guards=core.relay.stoppers,
         held=hook.notify,
     )
     at_start = stop.of_published_before(

@@ -17,7 +17,7 @@ from appliance.api.front.control import ControlAwayError
 from appliance.api.front.history import BUSY_SECONDS, LastSample, Sample
 from appliance.api.front.moments import in_full
 from appliance.api.front.problems import ProblemError
-from appliance.api.front.route_roles import VIEWER, Viewer, ask, only_standby
+from appliance.api.front.route_roles import VIEWER, Viewer, ask, only_passive
 from appliance.api.front.routing import Routes, file
 from appliance.api.front.services import Services
 from appliance.api.front.streams import StreamResponse, Streams, peer_of
@@ -86,7 +86,7 @@ def routes(services: Services) -> Routes:
         if seen.active:  # the state is at most `history.IDLE_SECONDS` old
             seen = await services.history.again(_PATIENCE_SECONDS)
         if seen.active:
-            raise only_standby(seen.away or "", seen.active)
+            raise only_passive(seen.away or "", seen.active)
         give_back = streams.take(bearer, "clients follow")
         following = _follow(services, bearer, graph, peer_of(request))
         return StreamResponse(EventSourceResponse(following, ping=_PING_SECONDS), give_back)

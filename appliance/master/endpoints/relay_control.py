@@ -69,8 +69,8 @@ class RelayOutbox(Link):
 
 
 RELAY_NAME = "/rosrv"
-OwnCall = messages.OwnServiceCalled | messages.MonitorCallWanted | messages.ApprovalWanted
-OwnAnswer = messages.OwnServiceAnswered | messages.MonitorCallAnswered | messages.ApprovalAnswered
+OwnCall = messages.OwnServiceCalled | messages.MonitorCallWanted | messages.RequestHeld
+OwnAnswer = messages.OwnServiceAnswered | messages.MonitorCallAnswered | messages.HeldRequestDecided
 _AGAIN_SECONDS = 0.1
 _KINDS = {TOPIC: Kind.PUBLICATION, SERVICE: Kind.SERVICE}
 _WORDS = {kind: word for word, kind in _KINDS.items()}

@@ -52,7 +52,7 @@ class TapRequests:
         """Return the names of the monitors that have a safe message and send it."""
         return await self._safe_messages(topic, begin=True) or []
 
-    async def guards(self, topic: str) -> list[str] | None:
+    async def stoppers(self, topic: str) -> list[str] | None:
         """Return the names of monitors with a safe message; None if the relay does not answer."""
         return await self._safe_messages(topic, begin=False)
 

@@ -10,12 +10,12 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from appliance.channel.messages import (
-    ApprovalAnswered,
+    HeldRequestDecided,
     MonitorCallAnswered,
     MonitorCallWanted,
     OwnServiceAnswered,
 )
-from appliance.relay.connections.call_approvals import CallApprovals
+from appliance.relay.connections.held_requests import HeldRequests
 from appliance.relay.connections.own_service import OwnService
 from appliance.relay.context import RelayContext
 from appliance.relay.loop import LoopTimer
@@ -26,7 +26,7 @@ from roswire.tcpros import HeaderParser, ServiceReplyParser, encode_frame, encod
 if TYPE_CHECKING:
     from rosmop.run.outcomes import Published
 
-OwnAnswer = OwnServiceAnswered | MonitorCallAnswered | ApprovalAnswered
+OwnAnswer = OwnServiceAnswered | MonitorCallAnswered | HeldRequestDecided
 MOST, MOST_OF_MONITOR = 64, 4
 """The most calls under way in a relay, and of one monitor, so that no monitor takes the calls of the others."""
 
@@ -48,7 +48,7 @@ class ServiceCalls:
 
     def __init__(self, context: RelayContext) -> None:
         self.own = OwnService(context.loop, context.reporter.send)
-        self.approvals = CallApprovals(context.loop, context.reporter.send)
+        self.held_requests = HeldRequests(context.loop, context.reporter.send)
         self._context = context
         self._calls: dict[int, _Call] = {}
         self._number = 0
@@ -77,8 +77,8 @@ class ServiceCalls:
         if isinstance(message, OwnServiceAnswered):
             self.own.answered(message)
             return
-        if isinstance(message, ApprovalAnswered):
-            self.approvals.answered(message)
+        if isinstance(message, HeldRequestDecided):
+            self.held_requests.answered(message)
             return
         call, number = self._calls.get(message.number), message.number
         if call is None:
@@ -110,7 +110,7 @@ class ServiceCalls:
     def attach(self, connected: bool) -> None:
         self._connected = connected
         self.own.control_gone()
-        self.approvals.attach(connected)
+        self.held_requests.attach(connected)
         for number, call in list(self._calls.items()):
             if call.sock is None:
                 self._end(number, "the appliance's control has ended")

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from appliance.channel.messages import Message, OwnServiceAnswered, OwnServiceCalled
-from appliance.relay.connections.call_approvals import AWAY
+from appliance.relay.connections.held_requests import AWAY
 from appliance.relay.loop import EventLoop
 from roswire.tcpros import HeaderParser, encode_header, encode_service_reply
 

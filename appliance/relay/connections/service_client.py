@@ -178,7 +178,7 @@ class ServiceClient:
         if not data:
             self._server_ended("the service closed the connection")
         elif self._greeted:
-            self._guard(self._exchange.from_service, data)
+            self._safely(self._exchange.from_service, data)
         else:
             self._header_received(data)
 
@@ -207,7 +207,7 @@ class ServiceClient:
         )
         self._traffic.connected(1)
         self._client.send(encode_header(to_client(header, self.service.node)))
-        self._guard(self._exchange.from_service, self._parser.rest)
+        self._safely(self._exchange.from_service, self._parser.rest)
 
     def _judge(self, part: str, body: bytes) -> ServiceReply:
         service = self.service
@@ -219,10 +219,12 @@ class ServiceClient:
         if not self._context.table.asks(*self.grant[1:]):
             return False
         caller = self.service.service, self.host, self.caller_id
-        self._question = self._calls.approvals.ask(caller, self._header.get("type", ""), body, self._approved)
+        self._question = self._calls.held_requests.ask(
+            caller, self._header.get("type", ""), body, self._decided
+        )
         return True
 
-    def _approved(self, refused: str) -> None:
+    def _decided(self, refused: str) -> None:
         if self._live:
             self._exchange.settle(refused)
             self._advance()
@@ -231,9 +233,9 @@ class ServiceClient:
         if not data:
             self.cut("")
         else:
-            self._guard(self._exchange.from_client, data)
+            self._safely(self._exchange.from_client, data)
 
-    def _guard(self, feed: Callable[[bytes], None], data: bytes) -> None:
+    def _safely(self, feed: Callable[[bytes], None], data: bytes) -> None:
         try:
             feed(data)
         except PeerError as error:
@@ -297,7 +299,7 @@ class ServiceClient:
 
     def _release(self) -> None:
         self._live = False
-        self._calls.approvals.forget(self._question)
+        self._calls.held_requests.forget(self._question)
         if self._timer is not None:
             self._timer.cancel()
         if self._server is not None:

@@ -11,7 +11,7 @@ from typing import Any, cast
 import pytest
 
 from appliance.base import clock
-from appliance.channel.messages import ApprovalWanted
+from appliance.channel.messages import RequestHeld
 from appliance.channel.messages.api import TokenKept
 from appliance.control.errors import SenselessError, UnknownThingError
 from appliance.features.approvals.approval_orders import CHECK_SECONDS, LEASE_SECONDS, ApprovalOrders
@@ -109,7 +109,7 @@ class Site:
 
     async def call(self, body: bytes = b"", host: Address = AGENT, service: str = "/home") -> str:
         digest = hashlib.sha256(body).hexdigest()
-        wanted = ApprovalWanted(1, service, str(host), "/it", "std_srvs/SetBool", digest, body, len(body))
+        wanted = RequestHeld(1, service, str(host), "/it", "std_srvs/SetBool", digest, body, len(body))
         return (await self.orders.approve_call(wanted)).refused
 
     def publish(self, topic: str, category: Category = Category.PUBLISH) -> str:

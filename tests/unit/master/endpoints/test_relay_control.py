@@ -169,7 +169,7 @@ async def test_a_relay_that_hangs_delays_only_what_it_carries(world: World) -> N
     relay, (first, second) = world.relay, world.links
     world.put(a=0, b=1)
     every, other = (asyncio.ensure_future(relay.carried_out(topics)) for topics in (None, ["/b"]))
-    asked = asyncio.ensure_future(relay.taps.guards("/a"))
+    asked = asyncio.ensure_future(relay.taps.stoppers("/a"))
     await asyncio.sleep(0)
     for _ in range(2):
         second.say(messages.OrdersCarriedOut(), ())

@@ -9,7 +9,7 @@ import hashlib
 from collections.abc import Callable
 from itertools import islice
 
-from appliance.channel.messages import ApprovalAnswered, ApprovalWanted, Message
+from appliance.channel.messages import HeldRequestDecided, Message, RequestHeld
 from appliance.relay.loop import EventLoop
 
 AWAY = "the appliance's control is not running: this call had no effect"
@@ -20,7 +20,7 @@ Answered = Callable[[str], None]
 """Called with the reason for a refusal, or with an empty string if the request is approved."""
 
 
-class CallApprovals:
+class HeldRequests:
     """The requests that wait for control, at most one for each client."""
 
     def __init__(self, loop: EventLoop, send: Callable[[Message], None]) -> None:
@@ -28,7 +28,7 @@ class CallApprovals:
         self._send = send
         self._connected = False
         self._open: dict[int, tuple[str, Answered]] = {}  # by number: the host, and who waits
-        self._queues: dict[str, dict[int, ApprovalWanted]] = {}  # by host; control has the first ones
+        self._queues: dict[str, dict[int, RequestHeld]] = {}  # by host; control has the first ones
         self._number = 0
 
     def ask(self, caller: tuple[str, str, str], type_: str, body: bytes, answered: Answered) -> int:
@@ -41,11 +41,11 @@ class CallApprovals:
         self._open[number] = host, answered
         if self._connected:
             queue = self._queues.setdefault(host, {})
-            queue[number] = ApprovalWanted(number, *caller, type_, digest, body[:_SHOWN], len(body))
+            queue[number] = RequestHeld(number, *caller, type_, digest, body[:_SHOWN], len(body))
             if len(queue) <= MOST_OF_HOST:
                 self._send(queue[number])
         else:
-            self._loop.after(0, lambda: self.answered(ApprovalAnswered(number, AWAY)))
+            self._loop.after(0, lambda: self.answered(HeldRequestDecided(number, AWAY)))
         return number
 
     def forget(self, number: int) -> None:
@@ -56,7 +56,7 @@ class CallApprovals:
         else:
             queue.pop(number, None)
 
-    def answered(self, answer: ApprovalAnswered) -> None:
+    def answered(self, answer: HeldRequestDecided) -> None:
         host, waiting = self._open.pop(answer.number, ("", None))
         if waiting is None:
             return
@@ -72,4 +72,4 @@ class CallApprovals:
         self._connected = connected
         self._queues.clear()
         for number in list(self._open):
-            self.answered(ApprovalAnswered(number, AWAY))
+            self.answered(HeldRequestDecided(number, AWAY))

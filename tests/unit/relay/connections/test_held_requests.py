@@ -2,9 +2,9 @@ from typing import Any, cast
 
 import pytest
 
-from appliance.channel.messages import ApprovalAnswered
-from appliance.relay.connections.call_approvals import AWAY, CallApprovals
+from appliance.channel.messages import HeldRequestDecided
 from appliance.relay.connections.exchange import ServiceExchange
+from appliance.relay.connections.held_requests import AWAY, HeldRequests
 from roswire.errors import ProtocolError
 from roswire.tcpros import ServiceReply, encode_frame, encode_service_error, encode_service_reply
 
@@ -15,7 +15,7 @@ class Relay:
         self.later: list[Any] = []
         self.asked: list[Any] = []
         self.service, self.client = bytearray(), bytearray()
-        self.approvals = CallApprovals(cast(Any, self), self.asked.append)
+        self.approvals = HeldRequests(cast(Any, self), self.asked.append)
         self.exchange = ServiceExchange(
             1000,
             persistent=True,
@@ -55,15 +55,15 @@ def test_a_held_request_reaches_the_service_only_when_approved() -> None:
         "/it",
         b"\x01",
     )
-    relay.approvals.answered(ApprovalAnswered(wanted.number + 1, ""))
+    relay.approvals.answered(HeldRequestDecided(wanted.number + 1, ""))
     assert not relay.service, "the answer to another request"
-    relay.approvals.answered(ApprovalAnswered(wanted.number, ""))
-    relay.approvals.answered(ApprovalAnswered(wanted.number, ""))
+    relay.approvals.answered(HeldRequestDecided(wanted.number, ""))
+    relay.approvals.answered(HeldRequestDecided(wanted.number, ""))
     assert relay.service == encode_frame(b"\x01")
     relay.exchange.from_service(encode_service_reply(b"done"))
     relay.exchange.advance()
     assert relay.asked[1].digest != wanted.digest
-    relay.approvals.answered(ApprovalAnswered(relay.asked[1].number, "held for approval 17"))
+    relay.approvals.answered(HeldRequestDecided(relay.asked[1].number, "held for approval 17"))
     assert relay.service == encode_frame(b"\x01")
     assert relay.client.endswith(encode_service_error("held for approval 17"))
 
@@ -107,10 +107,10 @@ def test_control_gets_few_questions_of_a_host_at_once() -> None:
     for number in numbers[1:-1]:  # one of them is with control
         relay.approvals.forget(number)
     for number in (other, *numbers[:2]):
-        relay.approvals.answered(ApprovalAnswered(number, ""))
+        relay.approvals.answered(HeldRequestDecided(number, ""))
     assert [one.number for one in relay.asked[3:]] == [numbers[-1]]
     relay.approvals.attach(False)
     relay.approvals.attach(True)
     fresh = [relay.question("10.0.0.66") for _ in range(3)]
-    relay.approvals.answered(ApprovalAnswered(numbers[-1], ""))
+    relay.approvals.answered(HeldRequestDecided(numbers[-1], ""))
     assert [one.number for one in relay.asked[4:]] == fresh[:2]
