@@ -5,7 +5,9 @@
    of both appliances' clocks, or back by the time that a killed process had not saved.
 3. A right may end too early, and never too late: a long time off, which the age clock counts only later, counts at
    once for it. An end that is `late`, as that of a block, is never too early.
-4. `passed` is exact. The owner of a kind is called soon after an end, and again until it forgets or sets the end.
+4. A credential is `dated`: it also ends when the system clock shows its date. Only so time off counts on a machine
+   whose clock is right only some time after its start.
+5. `passed` is exact. The owner of a kind is called soon after an end, and again until it forgets or sets the end.
 
 The names of kinds are stored, so a kind keeps its name.
 """
@@ -48,6 +50,8 @@ class EndKind:
     """Whether it may end too late, and never too early: it protects. All others give a right, or lift a protection."""
     stored: bool = True
     """Whether it survives a restart of control."""
+    dated: bool = False
+    """Whether its date ends it too: a credential."""
 
 
 class _Reading(msgspec.Struct, frozen=True):
@@ -63,6 +67,7 @@ class _End(NamedTuple):
     since: int
     late: bool
     stored: bool
+    date: int | None  # by the system clock
 
 
 class EndTable:
@@ -90,8 +95,9 @@ class EndTable:
     # --- setting ends ---
 
     def set(self, kind: EndKind, name: str, seconds: float) -> None:
-        now = self._now()
-        self._put(kind.name, name, _End(now + int(seconds * _SECOND), now, kind.late, kind.stored))
+        now, length = self._now(), int(seconds * _SECOND)
+        date = clock.wall_ns() + length if kind.dated else None
+        self._put(kind.name, name, _End(now + length, now, kind.late, kind.stored, date))
 
     def forget(self, kind: EndKind, *names: str) -> None:
         for name in names:
@@ -114,7 +120,10 @@ class EndTable:
     def date(self, kind: EndKind, name: str) -> float | None:
         """Return the end in seconds since the epoch by the present system clock, for people."""
         end = self._ends.get(kind.name, {}).get(name)
-        return None if end is None or self._offset is None else (end.at + self._offset) / _SECOND
+        if end is None or self._offset is None:
+            return None
+        by_age = end.at + self._offset
+        return (by_age if end.date is None else min(end.date, by_age)) / _SECOND
 
     def names(self, kind: EndKind) -> list[str]:
         return list(self._ends.get(kind.name, {}))
@@ -170,7 +179,8 @@ class EndTable:
 
     def _left(self, end: _End) -> int:
         uncounted = 0 if end.late else self._age.uncounted(end.since)
-        return end.at - self._now() - uncounted
+        left = end.at - self._now() - uncounted
+        return left if end.date is None else min(left, end.date - clock.wall_ns())
 
     def _all(self) -> Iterator[_End]:
         return (end for ends in self._ends.values() for end in ends.values())
@@ -202,9 +212,9 @@ class EndTable:
             self._store.save_setting(_IMPORTED, "1")
             self._store.forget_time_left()
         for row in [*self._store.ends(), *imported]:
-            end = _End(row.at, row.since, bool(row.late), stored=True)
+            end = _End(row.at, row.since, bool(row.late), stored=True, date=row.date)
             if last is not None and taken_over:
-                end = _inherited(end, now - last.age, away_seconds, now)
+                end = _inherited(end, last, away_seconds, now)
             elif last is not None and now < last.age:
                 end = end._replace(at=end.at + now - last.age, since=end.since + now - last.age)
             self._ends.setdefault(row.kind, {})[row.name] = end
@@ -227,23 +237,30 @@ def replicated_ends(connection: sqlite3.Connection, kind: EndKind) -> dict[str, 
     )
     if _IMPORTED not in settings:
         return None
-    age = msgspec.json.decode(settings[_READING], type=_Reading).age
-    rows = connection.execute("SELECT name, at FROM ends WHERE kind = ?", (kind.name,))
-    return {name: (at, (at - age) / _SECOND) for name, at in rows}
+    last = msgspec.json.decode(settings[_READING], type=_Reading)
+    rows = connection.execute("SELECT name, at, date FROM ends WHERE kind = ?", (kind.name,))
+    return {
+        name: (at, min((at - last.age) / _SECOND, math.inf if date is None else date / _SECOND - last.wall))
+        for name, at, date in rows
+    }
 
 
 def _row(kind: str, name: str, end: _End) -> EndRow:
-    return EndRow(kind, name, end.at, end.since, int(end.late))
+    return EndRow(kind, name, end.at, end.since, int(end.late), end.date)
 
 
-def _inherited(end: _End, ahead: int, away_seconds: float | None, now: int) -> _End:
-    """Return the end of another appliance by this one's clock, which is `ahead` of the other's last reading.
+def _inherited(end: _End, last: _Reading, away_seconds: float | None, now: int) -> _End:
+    """Return the end of another appliance, with its last reading, by the clocks of this one.
 
-    If this appliance did not follow the other one before, `ahead` may include time off. Then an end that may be late
-    continues from the last reading, and a right has no more time than by either clock.
+    If this appliance did not follow the other one before, the difference of the clocks may include time off. Then an
+    end that may be late continues from the last reading, and a right has no more time than by either clock.
     """
+    ahead = now - last.age
     if away_seconds is not None:
-        return end._replace(at=end.at + ahead - int(away_seconds * _SECOND), since=now)
+        away, date = int(away_seconds * _SECOND), end.date
+        if date is not None:
+            date += clock.wall_ns() - int(last.wall * _SECOND) - away
+        return end._replace(at=end.at + ahead - away, since=now, date=date)
     if end.late:
         return end._replace(at=end.at + ahead, since=now)
     moved = min(ahead, 0)

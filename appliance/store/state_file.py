@@ -55,7 +55,7 @@ CREATE TABLE IF NOT EXISTS token_use (id TEXT PRIMARY KEY, used REAL NOT NULL) W
 CREATE TABLE IF NOT EXISTS token_left (id TEXT PRIMARY KEY, seconds REAL NOT NULL) WITHOUT ROWID;
 CREATE TABLE IF NOT EXISTS ends (
     kind TEXT NOT NULL, name TEXT NOT NULL, at INTEGER NOT NULL, since INTEGER NOT NULL, late INTEGER NOT NULL,
-    PRIMARY KEY (kind, name)
+    date INTEGER, PRIMARY KEY (kind, name)
 ) WITHOUT ROWID;
 CREATE TABLE IF NOT EXISTS monitor_state (
     relay INTEGER PRIMARY KEY, epoch INTEGER NOT NULL, content BLOB NOT NULL
@@ -130,13 +130,17 @@ class MonitorRevisionRow(NamedTuple):
 
 
 class EndRow(NamedTuple):
-    """An end and its beginning by the age clock, in nanoseconds; `late` is 0 or 1 (see `EndKind`)."""
+    """An end and its beginning by the age clock, in nanoseconds; `late` is 0 or 1 (see `EndKind`).
+
+    `date` is the end of a credential by the system clock, in nanoseconds since the epoch.
+    """
 
     kind: str
     name: str
     at: int
     since: int
     late: int
+    date: int | None = None
 
 
 class StateStore:

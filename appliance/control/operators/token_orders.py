@@ -20,7 +20,7 @@ from appliance.store.state_file import StateStore
 from appliance.store.writer_thread import StoreError
 from appliance.telemetry.audit_trail import AuditTrail
 
-TOKENS = EndKind("token")
+TOKENS = EndKind("token", dated=True)
 FIRST_NAME = "first"
 _UNTOLD = "first token untold"  # this setting exists while the first token has not been shown
 _USES_SINCE = "token uses since"

@@ -19,7 +19,7 @@ from appliance.store.state_file import StateStore
 
 _FORM = re.compile(r"([0-9a-f]{12})\.([A-Za-z0-9_-]{43})", re.ASCII)
 _MOST = 1000
-TICKETS = EndKind("door ticket")
+TICKETS = EndKind("door ticket", dated=True)
 LONGEST_SECONDS = 30 * 86_400.0
 
 

@@ -16,7 +16,7 @@ from appliance.store.host_tables import EnrolmentTokenRow, HostTables
 _FORM = re.compile(r"rosrv-enrol_([0-9a-f]{12})_([A-Za-z0-9_-]{43})")
 LONGEST_SECONDS = 7 * 86_400.0
 MOST = 1000
-ENROLMENT = EndKind("enrolment")
+ENROLMENT = EndKind("enrolment", dated=True)
 
 
 class BadEnrolmentTokenError(Exception):

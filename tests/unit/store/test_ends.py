@@ -132,13 +132,26 @@ async def test_each_thing_has_its_time(site: Site) -> None:
     await site.end_after(lambda _kind: 3000.0)
 
 
-async def test_no_clock_that_is_set_while_control_runs_moves_an_end(site: Site) -> None:
+async def test_a_clock_that_is_set_while_control_runs_ends_credentials_early_and_moves_no_other_end(
+    site: Site,
+) -> None:
     await begun(site)
-    for ahead in (HOUR, -HOUR, -YEAR, YEAR):
+    for ahead in (-HOUR, -YEAR, 0.0):
         site.clocks["a"].set_wall(WALL + ahead)
         site.run(10.0)
         assert len(await site.lasting()) == len(OWNERS)
-    await site.end_after(lambda _kind: 2960.0)
+    for ahead in (HOUR, YEAR, 0.0):
+        site.clocks["a"].set_wall(WALL + ahead)
+        site.run(10.0)
+        assert await site.lasting() == {owner.kind.name for owner in OWNERS if not owner.kind.dated}
+    await site.end_after(lambda kind: 0.0 if kind.dated else 2940.0)
+
+
+async def test_time_off_that_a_late_correction_of_the_clock_shows_counts_for_credentials(site: Site) -> None:
+    await begun(site)
+    site.off(2400.0, ahead=-2400.0)  # a machine without a clock of its own begins where it ended
+    site.clocks["a"].set_wall(WALL + 3000.0)
+    await site.end_after(lambda kind: (600.0 if kind.dated else 3000.0) if kind.stored else 0.0)
 
 
 @pytest.mark.parametrize(

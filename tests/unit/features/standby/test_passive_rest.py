@@ -144,8 +144,8 @@ def test_keys_and_tokens_are_of_the_same_time(tmp_path: Path, monkeypatch: pytes
                 assert row.keys
                 database.execute("INSERT INTO token_keys VALUES (?, ?, ?)", (row.id, *row.keys))
                 database.execute("INSERT INTO token VALUES (?, ?, ?, ?, ?, ?, ?, ?)", row[:-1])
-                end = ("token", row.id, 1 << 62, 0, 0)
-                database.execute("INSERT INTO ends VALUES (?, ?, ?, ?, ?)", end)
+                end = ("token", row.id, 1 << 62, 0, 0, None)
+                database.execute("INSERT INTO ends VALUES (?, ?, ?, ?, ?, ?)", end)
         return TokenKeys(*columns)
 
     monkeypatch.setattr(passive_rest, "TokenKeys", keys)
