@@ -15,6 +15,7 @@ from appliance.base.validation_messages import refusal
 from appliance.cli.help_panels import in_order, panel_of
 from appliance.cli.verb_table import Group, Verb, Verbs, joined
 from rosmop.tool.renamed_options import renamed
+from rosmop.tool.terminal import flowed
 
 _HELP_OPTIONS = ["-h", "--help"]
 
@@ -127,7 +128,7 @@ def loaded(verb: Verb, name: str) -> Any:
     function, kind = (
         (found.function, found.command) if isinstance(found, GroupedVerb) else (found, TyperCommand)
     )
-    words = "\n\n".join(filter(None, (verb.first, inspect.getdoc(function))))
+    words = flowed("\n\n".join(filter(None, (verb.first, inspect.getdoc(function)))))
     app.command(name, cls=kind, help=words)(function)  # type: ignore[arg-type]  # typer only calls `cls`
     command = typer.main.get_command(app)
     # click keeps the help option of the first context that asks for it

@@ -1,6 +1,5 @@
 """The commands `check`, `run`, `learn` and `coverage`, for `rosmop` and for `rosrv monitor`."""
 
-import inspect
 from collections.abc import Callable
 from pathlib import Path
 
@@ -32,6 +31,7 @@ from rosmop.tool.options import (
 )
 from rosmop.tool.renamed_options import RenamedCommand
 from rosmop.tool.summaries import SUMMARIES
+from rosmop.tool.terminal import flowed
 
 
 def commands_of(program: CommandContext) -> dict[str, Callable[..., None]]:
@@ -120,7 +120,7 @@ def commands_of(program: CommandContext) -> dict[str, Callable[..., None]]:
         ("learn", learn, "--bag monday.bag --bag tuesday.bag --output learnt.rv"),
         ("coverage", coverage, "monitors/*.rv --bag drive.bag --fail-under 80"),
     ):
-        more = [inspect.cleandoc(command.__doc__)] if command.__doc__ else []
+        more = [flowed(command.__doc__)] if command.__doc__ else []
         command.__doc__ = "\n\n".join([*more, f"Example: {program.name} {name} {example}"])
         commands[name] = command
     return commands

@@ -3,6 +3,7 @@
 Control characters of untrusted strings are escaped, and nothing is read as markup.
 """
 
+import inspect
 import json
 import sys
 from collections.abc import Iterable
@@ -36,3 +37,9 @@ def say(line: str, style: str = "") -> None:
 
 def say_json(fields: Any) -> None:
     sys.stdout.write(json.dumps(msgspec.to_builtins(fields)) + "\n")
+
+
+def flowed(text: str) -> str:
+    """Return help with each paragraph on one line, which a terminal of any width then breaks; `\\b` keeps its lines."""
+    paragraphs = inspect.cleandoc(text).split("\n\n")
+    return "\n\n".join(one if one.startswith("\b\n") else " ".join(one.split()) for one in paragraphs)
