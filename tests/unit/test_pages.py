@@ -9,6 +9,7 @@ from rosrv_fleet.cli import app as fleet_app
 
 from appliance.channel.operations import OPERATIONS
 from appliance.configuration.settings import Settings
+from appliance.policy.policy_compiler import compile_policy
 from appliance.supervisor.role import Facts
 from appliance.supervisor.roles import ROLES
 from appliance.supervisor.sandbox.sandbox_plan import NETWORK, ROUTES, UNIX
@@ -44,6 +45,12 @@ def test_links_lead_somewhere(page: Path) -> None:
     linked = [page.parent / link for link in re.findall(r"\]\((?!https?:|#)([^)#]+)", prose)]
     named = [ROOT / name for name in re.findall(r"\bdocs/[\w/-]+\.md", text)]
     assert [place for place in linked + named if not place.exists()] == []
+
+
+@pytest.mark.parametrize("page", WITH_LINKS, ids=lambda page: page.name)
+def test_each_policy_of_a_page_loads(page: Path) -> None:
+    for block in re.findall(r"^```ini\n(.*?)^```", page.read_text(), re.DOTALL | re.MULTILINE):
+        assert compile_policy(block, file=page.name).text == block  # raises PolicyError for a mistake
 
 
 @pytest.mark.parametrize("page", WITH_LINKS, ids=lambda page: page.name)
