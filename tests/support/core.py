@@ -1,7 +1,7 @@
 """The core for tests: real parts, of which only the disk and the clock are replaced.
 
-A test that needs a part makes it with `Core`: a real policy, registry, state and trail, in virtual time. So there is no
-double of the trail: `FakeTrail` is the real one, on a log in memory.
+`Core` has a real registry, state, ends and trail, in the test's virtual time. There is no double of the trail:
+`FakeTrail` is the real one, on a log in memory.
 """
 
 from collections.abc import Callable
@@ -17,15 +17,11 @@ from appliance.audit.log.log import AuditLog
 from appliance.audit.log.record import AuditRecord
 from appliance.base.age_clock import AgeClock
 from appliance.master.graph.registry import Registry
-from appliance.policy.policy import Policy
-from appliance.policy.policy_compiler import compile_policy
 from appliance.quotas.pool import QuotaClass
 from appliance.store.ends import EndTable
 from appliance.store.state_file import StateStore
 from appliance.telemetry.audit_trail import AuditTrail
 from tests.support.engines import InlineDatabase
-
-OPEN = "[Nodes]\ndefault=*\n[Publishers]\ndefault=*\n[Subscribers]\ndefault=*\n[Commands]\ndefault=*\n"
 
 
 class MemoryLog(AuditLog):
@@ -84,12 +80,11 @@ class FakeTrail(AuditTrail):
 
 
 class Core:
-    """The parts that most of control needs. `restart` makes them again over the same state."""
+    """The parts that most of control needs. `restart` opens the state again, as a new process does."""
 
-    def __init__(self, folder: Path, policy: str = OPEN) -> None:
+    def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.trail = FakeTrail()
-        self.policy: Policy = compile_policy(policy, file="policy.ini")
         self.registry = Registry()
         self.restart()
 

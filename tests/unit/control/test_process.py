@@ -13,7 +13,7 @@ from appliance.master.graph.registry import Incarnation, Kind, Registry
 from appliance.master.reconcile.sinks import StoredGraph
 from appliance.store.state_file import StateStore
 from roswire.uris import parse_node_uri
-from tests.support.core import FakeTrail
+from tests.support.core import Core
 from tests.support.engines import InlineDatabase
 from tests.support.idle import idle
 
@@ -29,24 +29,23 @@ class Restored:
     """Control after a restart with a stored node that published /secret."""
 
     def __init__(self, folder: Path) -> None:
-        self.store = StateStore(folder, failed=fail, kind=InlineDatabase)
+        self.core = Core(folder)
         before, host = Registry(), ipaddress.ip_address("10.0.0.5")
         node = Incarnation("key", "/n", host, parse_node_uri(URI), URI, "10.0.0.1", 19001, 19002)
         before.add(node)
         before.register(node, Kind.PUBLICATION, "/secret", "std_msgs/String")
-        StoredGraph(idle(Grants), self.store).flush(before.take_changes())
-        self.registry, self.refusal = Registry(), ""
+        StoredGraph(idle(Grants), self.core.store).flush(before.take_changes())
+        self.refusal = ""
         self.decided: list[tuple[object, list[str]]] = []
-        self.trail = FakeTrail()
 
     async def restore(self) -> None:
-        await self.store.settled()
+        await self.core.store.settled()
         grants = Grants(lambda _row: None, set)
         parts = SimpleNamespace(
             core=SimpleNamespace(
-                registry=self.registry,
+                registry=self.core.registry,
                 grants=grants,
-                graph=RosGraph(self.registry, grants, self.trail),
+                graph=RosGraph(self.core.registry, grants, self.core.trail),
             ),
             serve=lambda _node: None,
             endpoints=SimpleNamespace(
@@ -56,9 +55,9 @@ class Restored:
             ),
         )
         policies = SimpleNamespace(current="the new policy")
-        base = SimpleNamespace(sockets={}, store=self.store, policies=policies)
+        base = SimpleNamespace(sockets={}, store=self.core.store, policies=policies)
         await _restore(cast(Any, base), cast(Any, parts))
-        self.store.close()
+        self.core.store.close()
 
     async def _reopen(self, _node: Incarnation, _handler: object) -> None:
         if self.refusal:
@@ -66,10 +65,12 @@ class Restored:
 
     @property
     def records(self) -> list[tuple[str, str, str | None]]:
-        return [(record.event, record.reason, record.caller_id) for record in self.trail.records]
+        return [(record.event, record.reason, record.caller_id) for record in self.core.trail.records]
 
     def _changed(self, policy: object) -> int:
-        self.decided.append((policy, [resource.resource for _node, resource in self.registry.in_order()]))
+        self.decided.append(
+            (policy, [resource.resource for _node, resource in self.core.registry.in_order()])
+        )
         return 1
 
 
@@ -83,7 +84,7 @@ async def test_a_node_that_finds_no_port_is_recorded_as_lost(tmp_path: Path) -> 
     control = Restored(tmp_path)
     control.refusal = "all ports are in use"
     await control.restore()
-    assert control.registry.all() == []
+    assert control.core.registry.all() == []
     assert control.records == [("node lost", "all ports are in use", "/n")]
 
 

@@ -19,10 +19,7 @@ from appliance.control.operators.token_orders import TokenOrders
 from appliance.control.rest.rest import RestLink
 from appliance.control.rest.rest_uses import RestUses
 from appliance.signing.request_signing import proof_of, reading_key, statement
-from appliance.store.state_file import StateStore
-from tests.support.core import FakeTrail
-from tests.support.ends import ends_of
-from tests.support.engines import InlineDatabase
+from tests.support.core import Core
 from tests.support.heard import Heard
 from tests.support.memory_channel import memory_link
 
@@ -34,16 +31,15 @@ LOAD = ClientRequest("10.0.0.1", "POST", "/v1/policy", '"3"', "text/plain", "", 
 
 class World:
     def __init__(self, directory: Path) -> None:
-        self.store = StateStore(directory, failed=lambda _text: None, kind=InlineDatabase)
-        self.ends = ends_of(self.store, directory)
+        self.core = Core(directory)
+        self.trail = self.core.trail
         self.done: list[tuple[AnyRequest, str]] = []
-        self.trail = FakeTrail()
         self.apis: list[Api] = []
-        self.tokens = TokenOrders(self.store, self.trail, self.ends, self.token_changed)
+        self.tokens = TokenOrders(self.core.store, self.trail, self.core.ends, self.token_changed)
         self.begin(require_proof=False)
 
     def begin(self, *, require_proof: bool) -> None:
-        self.tokens = TokenOrders(self.store, self.trail, self.ends, self.token_changed)
+        self.tokens = TokenOrders(self.core.store, self.trail, self.core.ends, self.token_changed)
         parts: Any = self
         self.link = RestLink(
             parts,
@@ -109,7 +105,7 @@ def world(tmp_path: Path) -> Iterator[World]:
     yield world
     for api in world.apis:
         api.close()
-    world.store.close()
+    world.core.store.close()
 
 
 @pytest.fixture
@@ -165,7 +161,7 @@ async def test_a_signed_order_is_valid_once(world: World, token: str) -> None:
     api = Api(world)
     assert "already used" in (await api.ask(order, shown, seen)).error
     api.close()
-    await world.store.settled()
+    await world.core.store.settled()
     world.begin(require_proof=False)
     api = Api(world)
     for old in (seen, kept_back):
@@ -251,7 +247,7 @@ async def test_bare_tokens_are_accepted_by_configuration_only(
     world: World, token: str, *, require_proof: bool
 ) -> None:
     """With `api_require_proof`, a bare token still opens the views."""
-    await world.store.settled()
+    await world.core.store.settled()
     world.begin(require_proof=require_proof)
     api = Api(world)
     order = admin.PolicyLoad("[Nodes]\n", expected=3)
@@ -266,8 +262,8 @@ async def test_bare_tokens_are_accepted_by_configuration_only(
 async def test_a_token_of_an_earlier_version_stays_valid(world: World) -> None:
     row = await world.tokens.add(TokenAdd("alice", "admin", 600))
     token = row.token
-    world.store.database.delete("token_keys", id=row.id)
-    await world.store.settled()
+    world.core.store.database.delete("token_keys", id=row.id)
+    await world.core.store.settled()
     world.begin(require_proof=False)
     api = Api(world)
     order = admin.PolicyLoad("[Nodes]\n", expected=3)

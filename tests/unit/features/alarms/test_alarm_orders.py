@@ -12,11 +12,8 @@ from appliance.control.errors import SenselessError, UnknownThingError
 from appliance.control.operators.handled_alarms import HandledAlarms
 from appliance.features.alarms.alarm_orders import AlarmOrders
 from appliance.features.alarms.requests import AlarmAcknowledge, AlarmSilence, AlarmsWanted
-from appliance.store.state_file import StateStore
 from tests.support.answers import example
-from tests.support.core import FakeTrail
-from tests.support.ends import ends_of
-from tests.support.engines import InlineDatabase
+from tests.support.core import Core
 from tests.support.virtual_clock import VirtualClock
 
 GOOD: dict[str, Any] = {"probe": "passed", "relay": "connected", "rosmaster": "reachable"}
@@ -25,21 +22,19 @@ BAD = {**GOOD, "rosmaster": "being rebuilt"}
 
 class Robot:
     def __init__(self, state: Path) -> None:
-        self.state = state
+        self.core = Core(state)
         self.fields = BAD
-        self.trail = FakeTrail()
         self.restart()
 
     def restart(self) -> None:
-        store = StateStore(self.state, failed=pytest.fail, kind=InlineDatabase)
-        self.ends = ends_of(store, self.state)
-        handled = HandledAlarms(store, self.ends)
+        self.core.restart()
+        handled = HandledAlarms(self.core.store, self.core.ends)
         alarms = Alarms(lambda: handled.marked(example(Status, **self.fields)), handled)
-        self.orders = AlarmOrders(alarms, self.trail)
+        self.orders = AlarmOrders(alarms, self.core.trail)
 
     @property
     def events(self) -> list[str]:
-        return [f"{row['event']} by {row['who']}: {row['reason']}" for row in self.trail.rows]
+        return [f"{row['event']} by {row['who']}: {row['reason']}" for row in self.core.trail.rows]
 
     def alarm(self) -> Alarm | None:
         alarms = asyncio.run(self.orders.listed(AlarmsWanted())).alarms

@@ -16,7 +16,7 @@ from appliance.features.sso.quotas import SESSIONS
 from appliance.features.sso.sessions import SessionTable
 from appliance.signing.request_signing import keys_of, reading_key
 from appliance.store.state_file import StateStore
-from tests.support.core import FakeTrail
+from tests.support.core import Core
 from tests.support.ends import ends_of
 from tests.support.engines import InlineDatabase
 from tests.support.virtual_clock import let_time_pass, set_wall
@@ -41,12 +41,13 @@ def _person(
 
 class World:
     def __init__(self, home: Path) -> None:
-        self.trail = FakeTrail()
+        core = Core(home)
+        self.trail = core.trail
         self.changes = 0
-        store = StateStore(home, failed=pytest.fail, kind=InlineDatabase)
-        ends = ends_of(store, home)
-        self.sso = SsoOrders(self.trail, ends, self._changed, configured=True)
-        self.tokens = TokenOrders(store, self.trail, ends, lambda: None, sessions=lambda: self.sso.sessions)
+        self.sso = SsoOrders(core.trail, core.ends, self._changed, configured=True)
+        self.tokens = TokenOrders(
+            core.store, core.trail, core.ends, lambda: None, sessions=lambda: self.sso.sessions
+        )
         self.checks = RequestAuthenticator(self.tokens, require_proof=False)
         self.answer: Any = None
         self.sso.link.ask = self._ask  # type: ignore[method-assign, assignment]  # the process
