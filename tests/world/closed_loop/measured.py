@@ -45,6 +45,7 @@ class MeasuredWorld(World):
         self.live = r.random() < 0.2
         self.silent = round(r.uniform(0.1, 0.6), 2)
         self.fault = ""
+        self.quiet = r.random() < 0.5  # it commands zero once
         self.measure: tuple[int, float, float] = (NEVER, math.nan, math.nan)
         self.bad_from = NEVER
         """Since when each measurement is not a number."""
@@ -74,12 +75,14 @@ class MeasuredWorld(World):
         r = self.random
         stands = self.now < 800 or (not self.live and r.random() < 0.06)
         for_a_while = not self.live and (self.now // 1500) % 3 == 1
+        if for_a_while and self.quiet and not self.moves(self.force[1]):
+            return
         self.drive(STILL if stands or for_a_while else straight(0.4, r.choice((0.0, 0.2))))
 
     def _pushes(self) -> None:
         r = self.random
         self.push = r.choice(((1.0, 0.0), (0.3, 0.0), (0.0, 2.5), (-1.5, 0.5)))
-        self.trace(f"the base moves by itself: {self.push}")
+        self.trace(f"the base moves without a command: {self.push}")
         self.after(self.now + r.uniform(300, 2500), self._ends_push)
 
     def _ends_push(self) -> None:

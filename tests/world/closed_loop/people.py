@@ -44,9 +44,12 @@ class SwitchWorld(World):
             def send(node: int = node, stubborn: bool = stubborn) -> None:
                 stands = self.stands() or (not self.live and not stubborn and r.random() < 0.12)
                 turning = 0.0 if self.live else r.choice((0.0, 0.0, 0.4))
-                self.drive(STILL if stands else straight(r.choice(speeds), turning), node)
+                self.drive(STILL if stands else self.motion(r.choice(speeds), turning), node)
 
             self.every(lambda period=period: period * r.uniform(0.8, 1.2), send, first=r.uniform(0, 100))  # type: ignore[misc]  # bound now
+
+    def motion(self, speed: float, turning: float) -> Legs:
+        return straight(speed, turning)
 
     def stands(self) -> bool:
         """Whether an honest node stands now."""
@@ -214,6 +217,12 @@ class ModeWorld(SwitchWorld):
             self._switch(node)
         if not self.live:
             self.interrupt("hold restart switch cut", 0.35)
+
+    def motion(self, speed: float, turning: float) -> Legs:
+        if self.live or self.kind.startswith("ackermann"):
+            return straight(speed, turning)
+        angle = self.random.uniform(-math.pi, math.pi)
+        return (speed * math.cos(angle), speed * math.sin(angle), 0.0, 0.0, 0.0, turning)
 
     def stands(self) -> bool:
         return self.live and self.now < 1500

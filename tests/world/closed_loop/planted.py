@@ -9,7 +9,7 @@ python -m tests.world.closed_loop.planted [WORD]   print the first seed that fin
 import contextlib
 import re
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 from unittest import mock
@@ -214,6 +214,108 @@ FAULTS: Mapping[str, Fault] = {
     "a restarted guard sends no stop": Fault("L6", "speed", patch=(RunningGuard, "restart", _left_as_it_was)),
 }
 """The first of each law; a fault of a law is found by a violation of any law."""
+
+_ROWS: Sequence[tuple[str, str, str, str, str]] = (
+    # law, preset, what is wrong, a regular expression, its replacement
+    ("L1", "mode", "limits the x axis alone", r"sqrt\(x \* x \+ y \* y \+ z \* z\)", "fabs(x)"),
+    ("L1", "mode", "limits no turn", r"w <= wMax \? 1 :", "true ? 1 :"),
+    ("L1", "mode", "shortens x alone", r"x \*= straight; y \*= straight; z \*= straight;", "x *= straight;"),
+    ("L1", "mode", "limits no linear velocity", r"v <= vMax \? 1 :", "true ? 1 :"),
+    ("L1", "speed", "limits no turn", r"share\(w, [^;]*;", "1;"),
+    ("L1", "speed", "turns about z alone", r"sqrt\(rx \* rx \+ ry \* ry \+ rz \* rz\)", "fabs(rz)"),
+    ("L1", "speed", "lets a turn grow at once", r"alphaMax \* passed", "wMax"),
+    ("L1", "speed", "lets the velocity grow from any direction",
+     r"\(x \* lastX \+ y \* lastY \+ z \* lastZ\) / v", "vMax"),
+    ("L1", "zone", "limits the x axis alone", r"sqrt\(x \* x \+ y \* y \+ z \* z\)", "fabs(x)"),
+    ("L1", "fence", "counts x alone", r"double v = sqrt\(x \* x \+ y \* y\)", "double v = fabs(x)"),
+    ("L1", "fence", "shortens x alone", r"x \*= part; y \*= part;", "x *= part;"),
+    ("L1", "joints", "has no limits", r"return p >= low && p <= high;", "return true;"),
+    ("L1", "joints", "limits no velocity between points",
+     r"fabs\(p - points\[i - 1\].positions\[j\]\) <= vMax", "0 <= vMax"),
+    ("L1", "joints", "limits no velocity of a point", r"fabs\(points\[i\].velocities\[j\]\) <= vMax", "true"),
+    ("L1", "joints", "limits no acceleration", r"fabs\(points\[i\].accelerations\[j\]\) <= aMax", "true"),
+    ("L1", "joints", "takes times in any order", r"at > before \|\|", "true ||"),
+    ("L2", "enable", "hears no silence", r"now - heard\[(\w+)\] <= silent", "true"),
+    ("L2", "mode", "hears no silence", r"silent > 0 && !\(now - heard\[i\] <= silent\)", "false"),
+    ("L2", "mode", "begins in automatic mode", r"manual = nodes.size\(\) == 0 \|\| crowded", "manual = crowded"),
+    ("L2", "overspeed", "takes NaN for slow", r"!\(v <= vMax && w <= wMax\)", "v > vMax || w > wMax"),
+    ("L2", "overspeed", "hears no silence", r"return since <= silent &&", "return"),
+    ("L2", "standstill", "takes NaN for known", r"known = isfinite\(v\) && isfinite\(w\);", "known = true;"),
+    ("L2", "standstill", "hears no silence", r"sinceMeasure <= silent &&", ""),
+    ("L2", "zone", "hears no silence", r"!\(sinceScan <= silent\) \|\|", ""),
+    ("L2", "zone", "takes NaN for free", r"blankIsFree && !\(r < 0\)", "!(r < 0)"),
+    ("L2", "zone", "does not ask whether rays cover it", r"\|\| !covers\([^)]*\)[^)]*\)", ""),
+    ("L2", "agree", "hears no silence", r"since <= silent && sinceOther <= silent", "true"),
+    ("L2", "arm", "hears no silence", r"battery <= silent &&", ""),
+    ("L2", "sensor", "hears no silence", r"since <= silent &&", ""),
+    ("L3", "enable", "does not stop at a release",
+     r"(?s)(heard\[place\] = now;\s*\}\s*)if \(judge\(now\)\) \{ STOP; \}", r"\1judge(now);"),
+    ("L3", "mode", "does not stop at a change",
+     r"(?s)(heard\[place\] = now; \}\s*)if \(judge\(now\)\) \{ STOP; \}", r"\1judge(now);"),
+    ("L3", "overspeed", "does not stop at a measurement", r"(?s)(fast = true;\s*passed = false;\s*)STOP;", r"\1"),
+    ("L3", "standstill", "waits twice as long", r"now - since <= settle", "now - since <= 2 * settle"),
+    ("L3", "standstill", "stops once", r"pause == 0 && !slow && age\(measure\) <= silent", "false"),
+    ("L3", "zone", "does not stop at a scan", r"(?s)(rays end in the zone[^}]*?)STOP;", r"\1"),
+    ("L3", "joints", "permits any jump", r"fabs\(p - positions(Too)?\[row(Too)?\]\) <= jump", "0 <= jump"),
+    ("L3", "fence", "never ends a motion", r"until = fmax\(since, fmin\(1.5 \* gap, silent\)\)", "until = silent"),
+    ("L3", "rate", "drops a stop", r"if \(moves && !slower &&", "if (!slower &&"),
+    ("L4", "enable", "has one device", r"node = caller\(device\)", 'node = "a device"'),
+    ("L4", "mode", "has one switch", r"node = caller\(change\)", 'node = "a switch"'),
+    ("L4", "enable", "asks the first device alone", r"i < devices.size\(\)", "i < 1"),
+    ("L4", "mode", "asks the first switch alone", r"i < nodes.size\(\)", "i < 1"),
+    *(
+        ("L4", preset, "does not see another node", r"!\(sinceForeign <= 1\)", "true")
+        for preset in ("overspeed", "standstill")
+    ),
+    *(
+        ("L4", preset, "does not see another node", r"(since|age\()[fF]oreign\)? <= 1", "false")
+        for preset in ("separation", "fence", "zone")
+    ),
+    *(
+        ("L4", preset, "takes any node for its source", r'source == "" \|\| caller\(\w+\) == source', "true")
+        for preset in ("separation", "fence", "zone", "overspeed", "standstill")
+    ),
+    ("L4", "agree", "takes any node for its second source",
+     r'otherSource == "" \|\| caller\(two\) == otherSource', "true"),
+    ("L6", "enable", "needs no zero", r"else if \(zeroFirst\)", "else if (false)"),
+    ("L6", "enable", "takes the zero of any node", r"standing == node \|\| standingToo == node", 'standing != ""'),
+    ("L6", "enable", "takes a zero from before the stop",
+     r'if \(!enabled\) \{ standing = ""; standingToo = ""; \}', ""),
+    ("L6", "enable", "takes a device that is tied down", r"else if \(state\[place\] == 1\)", "else"),
+    ("L6", "overspeed", "needs no zero", r"fast && good && slow && !moves", "fast && good && slow"),
+    ("L6", "overspeed", "asks not whether the base stands",
+     r"fast && good && slow && !moves", "fast && good && !moves"),
+    ("L6", "standstill", "needs no zero", r"escaped && !moves && good && slow", "escaped && good && slow"),
+    ("L6", "standstill", "asks not whether the base stands",
+     r"escaped && !moves && good && slow", "escaped && !moves && good"),
+    ("L6", "zone", "needs no zero", r"\|\| standing != node && standingToo != node", ""),
+    ("L6", "zone", "takes the zero of any node", r"standing != node && standingToo != node\)\)", 'standing == "")'),
+    ("L6", "zone", "takes a zero from before the stop",
+     r'if \(there\) \{ standing = ""; standingToo = ""; \}', "if (there) { }"),
+    ("L6", "zone", "is free at once", r"\|\| !\(now - freeSince >= clear\)", "|| !(now - freeSince >= 0)"),
+    ("L6", "mode", "needs no slow command first", r"free && isfinite\(v\)", "isfinite(v)"),
+    ("L6", "mode", "takes a slow command from before", r'if \(manual\) \{ slow = ""; slowToo = ""; \}', ""),
+)  # fmt: skip
+FAULTS = {
+    **FAULTS,
+    **{f"{preset} {what}": Fault(law, preset, replaced(old, to)) for law, preset, what, old, to in _ROWS},
+    **{
+        f"a hold of {preset} holds nothing": Fault("L5", preset, patch=(RunningGuard, "hold", lambda _guard: None))
+        for preset in (
+            "speed", "separation", "fence", "sensor", "estop", "arm", "agree", "sane", "enable", "mode", "overspeed",
+            "standstill", "zone",
+        )
+    },
+    **{
+        f"a hold of {preset} drops observed messages": Fault("L5", preset, patch=(RunningGuard, "tell", _deaf))
+        for preset in ("sensor", "zone")
+    },
+    **{
+        f"a restarted {preset} sends no stop": Fault("L6", preset, patch=(RunningGuard, "restart", _left_as_it_was))
+        for preset in ("sane", "rate")
+    },
+}  # fmt: skip
+"""All of them: one by one, rows of `_ROWS`, and a kind of fault in several presets."""
 
 
 def main(words: list[str], write: Callable[[str], object] = sys.stdout.write) -> None:

@@ -576,7 +576,7 @@ class AgreeWorld(EvidenceWorld):
             self._source(given, period)
 
     def _fail(self) -> None:
-        self.fault = self.one_of(("x", "y", "turn", "opposite turn", "NaN", "dead", "both NaN"))
+        self.fault = self.one_of(("x", "y", "turn", "opposite turn", "NaN", "dead", "dead by", "both NaN"))
         self.trace(f"it fails: {self.fault}")
         self.count = dict.fromkeys(self.count, 0)
 
@@ -584,7 +584,7 @@ class AgreeWorld(EvidenceWorld):
         r = self.random
 
         def say() -> None:
-            if self.fault == "dead" and given == "other":
+            if self.fault == {"other": "dead", "by": "dead by"}[given]:
                 return
             velocity = [1.0 + r.uniform(-0.02, 0.02), 0.2, 0.0, 0.0, 0.0, 0.5]
             if given == "other":
@@ -611,7 +611,7 @@ class AgreeWorld(EvidenceWorld):
         for given, at in self.heard.items():
             if self.now > at + self.silent * 1000:
                 return f"{given} is silent since {at} ms"
-        if self.fault not in {"", "dead"} and min(self.count.values()) > 2 * self.samples + 1:
+        if self.fault not in {"", "dead", "dead by"} and min(self.count.values()) > 2 * self.samples + 1:
             return f"the two do not agree: {self.fault}"
         return ""
 

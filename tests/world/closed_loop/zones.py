@@ -99,7 +99,7 @@ class ZoneWorld(SeparationWorld):
     def _mute(self) -> None:
         self.trace("the zone is to be muted")
         self.say("mute", boolean(False), 6)
-        self.muted_from, self.muted_until = self.now, self.now + int(MUTED * 1000) + self.tick + SLACK
+        self.muted_from, self.muted_until = self.now, self.now + 50 + int(MUTED * 1000) + self.tick + SLACK
         for at in range(self.now + 50, self.now + 4000, 200):
             self.after(at, lambda: void(self.say("mute", boolean(True), 6)))
 
