@@ -387,8 +387,7 @@ class Supervisor:
 
     def _feature_said(self, process: ProcessHandle, message: messages.Message) -> None:
         match message:
-            case messages.MachineWorkWanted(number, feature, work, terms):
-                log.info("control orders work", feature=_printable(feature), work=_printable(work))
+            case messages.MachineWorkWanted(number, _feature, work, terms):
                 self._answer(process, self._carry_out(process, number, work, terms))
             case messages.OwnNetworkWanted(network, ports):
                 self._answer(process, self._open_own_network(process, network, ports))

@@ -32,7 +32,7 @@ from roswire.uris import NodeUri
 from roswire.xmlrpc import Value
 
 _SETTING = "adopt"
-_AGAIN_SECONDS = 5.0
+_AGAIN_SECONDS, _LOOK_SECONDS = 5.0, 60.0
 _READY_SECONDS = 0.05
 _NO_NETNS = "a graph is adopted only with `isolation: netns`, on the robot's own computer"
 _PAIRED = "a graph is not adopted by one of two appliances"
@@ -119,16 +119,19 @@ class AdoptPart:
         while True:
             async with self._one:
                 await self._settle()
-            await asyncio.sleep(_AGAIN_SECONDS)
+            await asyncio.sleep(_AGAIN_SECONDS if self._obstacle else _LOOK_SECONDS)
 
     async def _settle(self) -> None:
         """Bring the graph to what the record wants; note the obstacle if that fails."""
         try:
             facts = self._facts = await self._operation.facts()
             report = await self._operation.settle(facts, settled=self._settled)
+            if report is None:
+                self._obstacle = ""
+                return
             if isinstance(report, TakeOverReport):
                 self._taken(report)
-            elif report is not None:
+            else:
                 self._given()
         except AdoptError as error:
             self._note_obstacle(str(error))

@@ -83,6 +83,8 @@ class AdoptWork:
         }
         if work not in steps:
             raise ValueError(f"adopt does not do {work[:40]!r}")
+        if work != "look":
+            log.info("control orders a step of an adoption", step=work)
         return steps[work](robot_side, terms)
 
     # --- facts ---

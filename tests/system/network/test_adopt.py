@@ -217,3 +217,22 @@ def test_a_service_that_waits_for_the_robots_master_takes_its_graph_over(
     robot.hears()
     assert robot.graph() == graph
     assert robot.lives() == lives
+
+
+@pytest.mark.nightly
+def test_a_kill_of_everything_in_the_middle_ends_as_ordered(robot: Robot, appliance: Appliance) -> None:
+    graph, lives = robot.graph(), robot.lives()
+    rosrv(robot, appliance, "adopt")
+    for step in ("register", "forward", "cut", "taken"):
+        appliance.start()
+        assert appliance.process is not None
+        appliance.process.wait_for_error(f'"step": "{step}"')
+        crash(appliance)
+    appliance.start()
+    until_taken(robot, appliance)
+    robot.hears()
+    assert robot.graph() == graph
+    appliance.stop()
+    assert robot.graph() == graph
+    robot.hears()
+    assert robot.lives() == lives

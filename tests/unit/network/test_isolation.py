@@ -22,6 +22,17 @@ def test_each_range_is_forwarded_on_both_families() -> None:
     ]
 
 
+def test_only_new_connections_to_the_master_are_forwarded() -> None:
+    """A node's old connection to its own master must see its end, and not a reset of the appliance."""
+    added = set(isolation_rules(SETTINGS, ENDS, (), master=(PortRange.one(11312),))) - set(
+        isolation_rules(SETTINGS, ENDS, ())
+    )
+    assert {(str(rule.tcp_ports), rule.to, rule.opening) for rule in added} == {
+        ("11312", "10.111.0.2", True),
+        ("11312", "fd52::2", True),
+    }
+
+
 def test_tunnels_are_forwarded_on_request() -> None:
     udp = (PortRange.one(500), PortRange.one(4500))
     added = set(isolation_rules(SETTINGS, ENDS, (), udp=udp)) - set(isolation_rules(SETTINGS, ENDS, ()))
