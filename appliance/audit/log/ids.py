@@ -3,6 +3,7 @@
 The last 4 of the 20 hexadecimal digits are random, and differ between sources.
 """
 
+import re
 import secrets
 import threading
 from collections.abc import Callable
@@ -10,6 +11,8 @@ from collections.abc import Callable
 from appliance.base import clock
 
 ID_LENGTH = 20
+ID_OR_SEQUENCE = re.compile("[0-9a-f]{1,20}")
+"""The id of a record, or its number in the log."""
 _TIME_DIGITS = 16
 
 

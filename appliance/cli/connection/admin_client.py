@@ -23,6 +23,19 @@ UNKNOWN = (
 )
 
 
+class RestProblemError(Exception):
+    """REST denied or rejected a request; the first of `lines` is a summary."""
+
+    def __init__(
+        self, status: int, kind: str, lines: list[str], findings: list[dict[str, Any]] | None = None
+    ) -> None:
+        super().__init__(lines[0])
+        self.findings = findings
+        self.status = status
+        self.kind = kind
+        self.lines = lines
+
+
 class NotRunningError(Exception):
     """No appliance answers, or it rejects this user or token."""
 

@@ -1,7 +1,6 @@
 """Read the running appliance's audit log over REST."""
 
 import json
-import re
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -9,19 +8,19 @@ from typing import Any
 
 import msgspec
 
+from appliance.audit.log.ids import ID_OR_SEQUENCE
 from appliance.audit.log.record_format import LogEntry, entry_of, rfc3339
 from appliance.audit.proof.chain_findings import Verification
 from appliance.audit.proof.copies import SignedCheckpoint
 from appliance.audit.search.denial_summary import DenialSummary
 from appliance.audit.search.query import Filter, FilterError
 from appliance.audit.search.search import RecordInContext, SearchPage
-from appliance.cli.connection.admin_client import NotRunningError
+from appliance.cli.connection.admin_client import NotRunningError, RestProblemError
 from appliance.cli.connection.audit_file import Progress
-from appliance.cli.connection.rest_session import RestClient, RestProblemError
+from appliance.cli.connection.rest_session import RestClient
 
 _PATH = "/v1/audit"
 _PAGE = 1000
-ID = re.compile("[0-9a-f]{1,20}")  # a record's id or sequence
 _VERIFY_SECONDS = 3600.0
 _SILENCE_SECONDS = 60.0  # a stream sends at least a comment every 15 s
 _AGAIN_SECONDS = 1.0
@@ -55,7 +54,7 @@ class RestLog:
             return msgspec.convert(self._get("/summary", parameters), DenialSummary)
 
     def show(self, record_id: str, neighbours: int) -> RecordInContext | None:
-        if not ID.fullmatch(record_id):
+        if not ID_OR_SEQUENCE.fullmatch(record_id):
             return None
         try:
             with self._refusals():

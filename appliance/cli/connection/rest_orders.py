@@ -9,8 +9,8 @@ from appliance.channel import admin
 from appliance.channel.admin import A, AdminAnswer, AdminRequest, Trouble, operation_of
 from appliance.channel.answers.graph_answers import Graph, Registration, Registrations
 from appliance.channel.rest_meaning import call_of
-from appliance.cli.connection.admin_client import NotRunningError, encoded
-from appliance.cli.connection.rest_session import RestClient, RestProblemError
+from appliance.cli.connection.admin_client import NotRunningError, RestProblemError, encoded
+from appliance.cli.connection.rest_session import RestClient
 
 if TYPE_CHECKING:
     from appliance.cli.connection.audit_over_rest import RestLog

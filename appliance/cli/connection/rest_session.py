@@ -19,7 +19,13 @@ import httpx
 
 from appliance.base.input_files import read_given_text
 from appliance.base.system_errors import without_number
-from appliance.cli.connection.admin_client import SECONDS, UNKNOWN, AccessDeniedError, NotRunningError
+from appliance.cli.connection.admin_client import (
+    SECONDS,
+    UNKNOWN,
+    AccessDeniedError,
+    NotRunningError,
+    RestProblemError,
+)
 from appliance.configuration.sections import is_loopback
 from appliance.signing.request_signing import HEADER, proof_of, reading_key, statement
 from appliance.store.access_tokens import parse_token
@@ -27,19 +33,6 @@ from appliance.store.access_tokens import parse_token
 _CONNECT_SECONDS = 10.0
 _LONGEST_ERROR = 1 << 20
 _MAKE = "make one on its machine: rosrv token add NAME"
-
-
-class RestProblemError(Exception):
-    """REST denied or rejected a request; the first of `lines` is a summary."""
-
-    def __init__(
-        self, status: int, kind: str, lines: list[str], findings: list[dict[str, Any]] | None = None
-    ) -> None:
-        super().__init__(lines[0])
-        self.findings = findings
-        self.status = status
-        self.kind = kind
-        self.lines = lines
 
 
 class RestClient:

@@ -19,7 +19,12 @@ import typer
 from appliance.api.routes.named_hosts import HostLabels, host_in_words
 from appliance.base.option_group import GroupedCommand, GroupedVerb, OptionGroup
 from appliance.channel.admin import A, AdminAnswer, AdminRequest, PolicyWanted
-from appliance.cli.connection.admin_client import QUICK_SECONDS, AdminSocket, NotRunningError
+from appliance.cli.connection.admin_client import (
+    QUICK_SECONDS,
+    AdminSocket,
+    NotRunningError,
+    RestProblemError,
+)
 from appliance.cli.output import Json, say_json, usage_error
 from appliance.policy.host_names import HostInWords, in_words
 from rosmop.tool.terminal import printable
@@ -47,8 +52,6 @@ def _named_by_socket(state: Path) -> HostInWords:
 
 
 def _named_by_rest(way: "RestWay") -> HostInWords:
-    from appliance.cli.connection.rest_session import RestProblemError  # noqa: PLC0415  imports httpx
-
     try:
         found = msgspec.convert(way.client.call("GET", "/v1/policy/hosts"), HostLabels)
     except (NotRunningError, RestProblemError, msgspec.ValidationError):  # an earlier version has no names

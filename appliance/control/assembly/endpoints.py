@@ -19,6 +19,7 @@ from appliance.master.reconcile.subscribers import Subscribers
 from appliance.master.rosmaster import MasterRegistrations, RosMaster, limits_of_answers
 from appliance.specifications.allocation import Allocation
 from appliance.specifications.specification_manager import ALLOCATION
+from roswire.standard import standard_definitions
 
 _REFUSALS = 2
 _REFUSALS_OF_A_ROBOT = (
@@ -157,6 +158,4 @@ def _make_relay(
 
 
 def _header_of_rosout() -> messages.OwnHeaderStated:
-    from roswire.standard import standard_definitions  # noqa: PLC0415  only where it is configured
-
     return rosout.header(standard_definitions())

@@ -17,7 +17,9 @@ from appliance.features.approvals.requests import (
     RefuseCall,
 )
 from rosmop.tool.terminal import say
+from roswire.errors import DefinitionError
 from roswire.message_view import read_bytes, read_fields, rest_of
+from roswire.standard import standard_definitions
 
 
 @speaks
@@ -96,9 +98,6 @@ def _arguments(one: Approval) -> str:
 
 def _fields(service: str, data: bytes) -> tuple[dict[str, Any] | None, bytes]:
     """Return the fields of a request, and the bytes behind the last one; None for a type that is not known."""
-    from roswire.errors import DefinitionError  # noqa: PLC0415  few calls need the definitions
-    from roswire.standard import standard_definitions  # noqa: PLC0415  as above
-
     try:
         definitions = standard_definitions()
         name = definitions.service(service).request.name

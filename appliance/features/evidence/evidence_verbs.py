@@ -19,9 +19,8 @@ from appliance.base.atomic_files import name_to_make
 from appliance.base.timestamps import parse_timestamp
 from appliance.cli import completion
 from appliance.cli.audit.audit_errors import Errors, fail
-from appliance.cli.connection.admin_client import AdminSocket
+from appliance.cli.connection.admin_client import AdminSocket, RestProblemError
 from appliance.cli.connection.rest_orders import RestWay
-from appliance.cli.connection.rest_session import RestProblemError
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.output import Json, say_json, usage_error
 from appliance.features.evidence.bundle import (

@@ -14,6 +14,7 @@ from appliance.channel.answers.monitor_answers import Monitors, MonitorState, Re
 from appliance.channel.messages import GivenValue
 from appliance.cli import completion
 from appliance.cli.commit_confirm import ConfirmWithin, seconds_within
+from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.monitor_changes import say_replaced, say_shadow_deadline
 from appliance.cli.output import moment, say_json
@@ -380,8 +381,6 @@ def _undo(guard: GuardRow) -> str:
 
 
 def _runs(appliance: Appliance) -> bool:
-    from appliance.cli.connection.admin_client import NotRunningError  # noqa: PLC0415  only for this verb
-
     try:
         return appliance.ask(admin.MonitorsWanted()).ok
     except NotRunningError:

@@ -8,6 +8,8 @@ from appliance.api.front.problems import Finding
 from appliance.api.routes.specification_findings import findings_of
 from appliance.channel.answers.monitor_answers import Monitors
 from appliance.features.monitor_tools.monitor_models import EventShown, PropertyShown
+from roswire.definitions import Definitions
+from roswire.standard import standard_definitions
 
 if TYPE_CHECKING:
     from rosmop.run.engine import MonitorSet
@@ -73,8 +75,6 @@ class Compiler:
 def _compiled(loaded: Monitors) -> MonitorSet:
     from rosmop.check.sources import compiled_from  # noqa: PLC0415  the compiler: see the head
     from rosmop.run.engine import MonitorSet  # noqa: PLC0415  the compiler: see the head
-    from roswire.definitions import Definitions  # noqa: PLC0415  the compiler: see the head
-    from roswire.standard import standard_definitions  # noqa: PLC0415  the compiler: see the head
 
     known = standard_definitions().extended(Definitions.from_files(loaded.definitions or {}))
     return MonitorSet.of(compiled_from(loaded.files or {}, known, topics=loaded.topics or {}))

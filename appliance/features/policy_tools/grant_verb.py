@@ -7,6 +7,7 @@ from typing import Annotated, Any, NoReturn
 import msgspec
 import typer
 
+from appliance.audit.log.ids import ID_OR_SEQUENCE
 from appliance.audit.log.record_format import LogEntry
 from appliance.base.counted import counted
 from appliance.base.input_files import read_given
@@ -15,7 +16,7 @@ from appliance.channel.answers.policy_answers import Granted, Why
 from appliance.cli.audit.audit_errors import Errors, fail
 from appliance.cli.audit.record_argument import RecordArgument
 from appliance.cli.commit_confirm import ConfirmWithin, seconds_within
-from appliance.cli.connection.admin_client import AdminSocket, NotRunningError
+from appliance.cli.connection.admin_client import AdminSocket, NotRunningError, RestProblemError
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.output import say_json, usage_error, write_told
 from appliance.features.policy_tools.live_verbs import say_loaded
@@ -164,10 +165,7 @@ def _unknown(record: str) -> NoReturn:
 
 
 def _over_rest(appliance: Appliance, record: str, what: str, *, tool: bool = False) -> dict[str, Any]:
-    from appliance.cli.connection.audit_over_rest import ID  # noqa: PLC0415  as below
-    from appliance.cli.connection.rest_session import RestProblemError  # noqa: PLC0415  httpx is not imported for the socket
-
-    if not ID.fullmatch(record):
+    if not ID_OR_SEQUENCE.fullmatch(record):
         _unknown(record)
     with Errors():
         try:

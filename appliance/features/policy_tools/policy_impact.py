@@ -12,6 +12,7 @@ from msgspec.structs import asdict
 
 from appliance.base.owner_access import is_named_there
 from appliance.channel.admin import PolicyWanted
+from appliance.cli.connection.admin_client import RestProblemError
 from appliance.cli.connection.target import Appliance
 from appliance.features.policy_tools.policy_input import known_of, live_now, read_text
 from appliance.policy.judgement import PolicyContext, judge
@@ -51,8 +52,6 @@ def cases_beside(file: Path) -> Path:
 
 
 def _by_dry_run(appliance: Appliance, file: Path) -> PolicyImpact:
-    from appliance.cli.connection.rest_session import RestProblemError  # noqa: PLC0415  httpx is not imported for the socket
-
     query, text = {"dry_run": "1"}, {"text": read_text(file), "signature": read_signature(file)}
     try:
         report = appliance.rest.call("POST", "/v1/policy", params=query, body=text, order=False)

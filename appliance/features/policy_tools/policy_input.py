@@ -18,7 +18,7 @@ from appliance.base.input_files import read_given_text
 from appliance.channel.admin import PolicyWanted, RegistrationsWanted
 from appliance.channel.answers.policy_answers import PolicyInForce
 from appliance.cli import output
-from appliance.cli.connection.admin_client import NotRunningError
+from appliance.cli.connection.admin_client import NotRunningError, RestProblemError
 from appliance.cli.connection.target import Appliance
 from appliance.policy.actions import BadWordError, find_host
 from appliance.policy.host_sets import Network, canonical_address, canonical_network
@@ -105,8 +105,6 @@ def running_robot(appliance: Appliance) -> list[Network]:
 
 
 def _over_rest(appliance: Appliance) -> PolicyInForce:
-    from appliance.cli.connection.rest_session import RestProblemError  # noqa: PLC0415  httpx is not imported for the socket
-
     try:
         return msgspec.convert(appliance.rest.call("GET", "/v1/policy"), PolicyInForce)
     except msgspec.ValidationError as error:

@@ -7,6 +7,8 @@ claim with the right md5sum may still be false, so each recording lists the topi
 from collections.abc import Collection, Iterable, Mapping
 from fnmatch import fnmatchcase
 
+from roswire.standard import standard_definitions
+
 NAMED = "recorder.never lists its name"
 
 _SHIPPED = {
@@ -22,8 +24,6 @@ _SHIPPED = {
 def known_sums(never: Collection[str]) -> dict[str, str]:
     if all(glob in _SHIPPED or glob.startswith("/") for glob in never):
         return {name: md5sum for name, md5sum in _SHIPPED.items() if name in never}
-    from roswire.standard import standard_definitions  # noqa: PLC0415  only where it is configured
-
     definitions = standard_definitions()
     known = {name: definitions.md5sum(name) for name in definitions.message_types if fits(never, name)}
     return known | {name: md5sum for name, md5sum in _SHIPPED.items() if fits(never, name)}

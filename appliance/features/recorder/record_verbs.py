@@ -16,7 +16,7 @@ from appliance.base.atomic_files import name_to_make
 from appliance.base.counted import counted
 from appliance.base.timestamps import local_text, parse_timestamp
 from appliance.cli import completion
-from appliance.cli.connection.admin_client import AdminSocket, NotRunningError
+from appliance.cli.connection.admin_client import AdminSocket, NotRunningError, RestProblemError
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.durations import span_given
 from appliance.cli.message_lines import lines_of
@@ -263,8 +263,6 @@ def bag_of(appliance: Appliance, recording: str, part: Path) -> Path:
     way = appliance.way
     if isinstance(way, AdminSocket):
         return _bag(way, appliance.ask_or_exit(recording_requests.RecordingFetch(recording)))
-    from appliance.cli.connection.rest_session import RestProblemError  # noqa: PLC0415  httpx is not imported for the socket
-
     try:
         with way.client.streamed("GET", f"/v1/recordings/{recording}/bag") as answer, part.open("wb") as file:
             for piece in answer.iter_bytes():
@@ -279,8 +277,6 @@ def _bag(way: AdminSocket, recording: Recording) -> Path:
 
 
 def _asked(way: "RestWay", path: str, query: dict[str, Any], kind: type[_T]) -> _T:
-    from appliance.cli.connection.rest_session import RestProblemError  # noqa: PLC0415  httpx is not imported for the socket
-
     given = {name: value for name, value in query.items() if value is not None}
     try:
         return msgspec.convert(way.client.call("GET", f"/v1/recordings/{path}", params=given), kind)

@@ -9,9 +9,9 @@ from appliance.audit.log.record import AuditRecord
 from appliance.audit.log.record_format import LogEntry, as_object
 from appliance.audit.search.query import Filter, FilterError
 from appliance.cli.connection import audit_over_rest as audit_rest
-from appliance.cli.connection.admin_client import NotRunningError
+from appliance.cli.connection.admin_client import NotRunningError, RestProblemError
 from appliance.cli.connection.audit_over_rest import RestLog
-from appliance.cli.connection.rest_session import RestClient, RestProblemError
+from appliance.cli.connection.rest_session import RestClient
 
 END = 'data: {"reason": "the token has expired"}'
 
