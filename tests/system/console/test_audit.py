@@ -408,3 +408,13 @@ def test_equal_records_are_one_row_that_opens(opened: Callable[..., Reader]) -> 
     entry.get_by_role("button", name="9 times").press("Enter")
     expect(entry.get_by_role("listitem")).to_have_count(3)
     assert reader.axe() == []
+
+
+def test_rows_are_in_the_order_of_the_times_that_they_show(opened: Callable[..., Reader]) -> None:
+    page = opened().go("audit")
+    ordered = """async (times) => {
+      const { inOrder } = await import("/console/static/js/audit/rows.js");
+      return inOrder(times.map((ended) => ({ last: { equality: { ended } } }))).map((row) => row.last.equality.ended);
+    }"""
+    folded, newer, older = (f"2026-11-28T14:03:0{second}.000000000Z" for second in (4, 9, 1))
+    assert page.evaluate(ordered, [folded, newer, older]) == [newer, folded, older]

@@ -166,6 +166,7 @@ def test_a_waiting_call_is_decided_by_one_click_on_any_page(
         page.mouse.move(5, 5)
         expect(bar(page)).to_have_count(0)
         assert "call waits" not in page.title()
+    advertise(appliance, TABLET, "/guarded")
     viewed = opened(token("viewer"), width=390).go("now")
     advertise(appliance, AGENT, "/arm")
     expect(bar(viewed).get_by_role("button", name="Refuse")).to_have_attribute(
@@ -173,6 +174,7 @@ def test_a_waiting_call_is_decided_by_one_click_on_any_page(
     )
     assert windows[1].axe() == []
     see(windows, lambda page: fact(page, "Waits"), "1 call waits for you")
+    see(windows, lambda page: fact(page, "Denied"), re.compile("tablet.*publish /guarded"))
     [row] = approvals(appliance, "waits")
     appliance.rosrv("approve", str(row["number"]), "--refuse")
 
