@@ -4,7 +4,7 @@ import subprocess
 import sys
 import tomllib
 import zipfile
-from email import message_from_bytes
+from email import message_from_string
 from email.message import Message
 from importlib.metadata import distribution
 from pathlib import Path
@@ -37,7 +37,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def metadata(wheel: Path) -> Message:
     with zipfile.ZipFile(wheel) as archive:
         name = next(name for name in archive.namelist() if name.endswith(".dist-info/METADATA"))
-        return message_from_bytes(archive.read(name))
+        return message_from_string(archive.read(name).decode())
 
 
 @pytest.mark.parametrize("requirement", sorted({*RUNS, *LANGUAGE_RUNS}, key=str), ids=lambda one: one.name)
