@@ -257,7 +257,7 @@ _ROWS: Sequence[tuple[str, str, str, str, str]] = (
     ("L3", "standstill", "stops once", r"pause == 0 && !slow && age\(measure\) <= silent", "false"),
     ("L3", "zone", "does not stop at a scan", r"(?s)(rays end in the zone[^}]*?)STOP;", r"\1"),
     ("L3", "joints", "permits any jump", r"fabs\(p - positions(Too)?\[row(Too)?\]\) <= jump", "0 <= jump"),
-    ("L3", "fence", "never ends a motion", r"until = fmax\(since, fmin\(1.5 \* gap, silent\)\)", "until = silent"),
+    ("L3", "fence", "judges no tick", r"lastV > 0 && \(!\(age\(pose\)", "false && (!(age(pose)"),
     ("L3", "rate", "drops a stop", r"if \(moves && !slower &&", "if (!slower &&"),
     ("L4", "enable", "has one device", r"node = caller\(device\)", 'node = "a device"'),
     ("L4", "mode", "has one switch", r"node = caller\(change\)", 'node = "a switch"'),
@@ -267,10 +267,7 @@ _ROWS: Sequence[tuple[str, str, str, str, str]] = (
         ("L4", preset, "does not see another node", r"!\(sinceForeign <= 1\)", "true")
         for preset in ("overspeed", "standstill")
     ),
-    *(
-        ("L4", preset, "does not see another node", r"(since|age\()[fF]oreign\)? <= 1", "false")
-        for preset in ("separation", "fence", "zone")
-    ),
+    ("L4", "estop", "asks the first button alone", r"i < buttons.size\(\)", "i < buttons.size() && i < 1"),
     *(
         ("L4", preset, "takes any node for its source", r'source == "" \|\| caller\(\w+\) == source', "true")
         for preset in ("separation", "fence", "zone", "overspeed", "standstill")
