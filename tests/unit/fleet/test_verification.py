@@ -16,8 +16,6 @@ from appliance.formats.segments import write_segment
 from tests.support.audit import decision, settle
 from tests.unit.audit.conftest import MakeLog, Notary, key, make_log, notary, path
 
-pytestmark = pytest.mark.nightly
-
 __all__ = ["MakeLog", "Notary", "key", "make_log", "notary", "path"]  # fixtures and their types
 
 _OLD = 1_500_000_000 * 10**9

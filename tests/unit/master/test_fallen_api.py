@@ -23,7 +23,7 @@ from tests.support.core import Core
 from tests.support.heard import Heard
 from tests.support.memory_channel import memory_link
 
-pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
+pytestmark = pytest.mark.anyio
 
 REMOVE = ClientRequest("10.0.0.1", "DELETE", "/v1/monitors/laptop", '"3"', "", "", b"")
 LOAD = ClientRequest("10.0.0.1", "POST", "/v1/policy", '"3"', "text/plain", "", b"[Nodes]\n")

@@ -10,7 +10,7 @@ from appliance.specifications.specification_manager import SpecificationManager
 from tests.support.site_key import LINE, signed
 from tests.unit.specifications.monitor_desk import A, Desk
 
-pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
+pytestmark = pytest.mark.anyio
 
 TEXT = """cap() given { double vMax = 0.22 m/s in 0..2; int n = 3 in 1..5; bool on = true; topic command = /cmd; } {
     event e() command std_msgs/String '{}' when (on && n > vMax) { } }"""
@@ -37,6 +37,7 @@ def stated(monitors: SpecificationManager) -> dict[str, Any]:
     return monitors.statement(0).given.get("cap", {})
 
 
+@pytest.mark.nightly
 async def test_a_value_is_set_recorded_and_kept(desk: Desk) -> None:
     monitors = await loaded(desk)
     before, sha = (

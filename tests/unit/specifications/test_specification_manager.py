@@ -24,7 +24,7 @@ from tests.support.site_key import LINE, NAME, OTHER_KEY, OTHER_LINE, signed
 from tests.unit.specifications.monitor_desk import A, B, C, Desk, Dialogue, here
 from tests.unit.transcripts import played, transcripts
 
-pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
+pytestmark = pytest.mark.anyio
 
 
 @pytest.fixture
@@ -37,6 +37,7 @@ def desk(tmp_path: Path) -> Iterator[Desk]:
 ORDERS = transcripts(Path(__file__).with_name("orders.txt"))
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("title", ORDERS, ids=ORDERS)
 async def test_orders(desk: Desk, title: str) -> None:
     assert await played(ORDERS[title], Dialogue(desk).say) == ORDERS[title]
@@ -91,6 +92,7 @@ def first(count: int, write: Callable[[str, str], None]) -> Callable[[str, str],
     return lambda name, value: write(name, value) if next(left, None) is not None else None
 
 
+@pytest.mark.nightly
 async def test_a_time_off_survives_restarts_and_ends_with_a_switch(desk: Desk) -> None:
     monitors = await desk.monitors()
     await monitors.load(admin.MonitorLoad({"b.rv": B}), "eve")

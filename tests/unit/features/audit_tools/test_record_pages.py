@@ -6,11 +6,10 @@ from tests.support.audit import decision, settle
 from tests.unit.api.front.test_streams import bearer
 from tests.unit.audit.conftest import MakeLog, key, make_log, notary, path
 
-pytestmark = pytest.mark.nightly
-
 __all__ = ["key", "make_log", "notary", "path"]
 
 
+@pytest.mark.nightly
 def test_a_viewers_page_reveals_nothing_that_is_withheld(make_log: MakeLog) -> None:
     log = make_log()
     said = {"monitor": "m", "before_fields": {"data": "password"}}

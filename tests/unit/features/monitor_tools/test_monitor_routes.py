@@ -4,8 +4,6 @@ from appliance.features.monitor_tools.routes import records_of
 from tests.support.audit import decision, settle
 from tests.unit.audit.conftest import MakeLog, key, make_log, notary, path
 
-pytestmark = pytest.mark.nightly
-
 __all__ = ["key", "make_log", "notary", "path"]
 
 

@@ -27,8 +27,6 @@ from tests.support.engines import InlineDatabase
 from tests.support.features.standby.replication import SCHEMA, tables_of
 from tests.support.small_disk import small_disk
 
-pytestmark = pytest.mark.nightly
-
 BEGIN = SnapshotBegin(3, "h", 7)
 
 
@@ -58,6 +56,7 @@ def names(tmp_path: Path) -> list[str]:
     return [row[0] for row in tables_of(tmp_path / "state.db")["thing"]]
 
 
+@pytest.mark.nightly
 def test_changes_and_their_number_are_stored_together(tmp_path: Path) -> None:
     replica = begun(tmp_path)
     replica.take(changes(thing("a"), thing("b")))
@@ -208,6 +207,7 @@ def test_repeated_rows_of_a_snapshot_need_no_further_space(replica: Replica, tmp
     assert sum(path.stat().st_size for path in tmp_path.iterdir()) < 8 << 20
 
 
+@pytest.mark.nightly
 def test_a_full_disk_keeps_the_last_good_state(tmp_path: Path) -> None:
     with small_disk(tmp_path / "disk", "1m") as place:
         replica = Replica(place / "state.db", SCHEMA, failed=pytest.fail)

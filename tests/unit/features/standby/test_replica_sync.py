@@ -9,7 +9,7 @@ from appliance.features.standby.replica_sync import ReplicaSync
 from appliance.store.state_file import SCHEMA
 from tests.support.processes import LIMIT
 
-pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
+pytestmark = pytest.mark.anyio
 
 
 @pytest.fixture

@@ -72,7 +72,7 @@ from tests.support.engines import InlineDatabase, open_log
 from tests.support.near_authority import NearAuthority
 from tests.support.virtual_clock import VirtualClock
 
-pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
+pytestmark = pytest.mark.anyio
 
 
 class Bench:
@@ -662,6 +662,7 @@ async def test_removing_a_host_answers_once_its_connections_are_closed(
     await asked
 
 
+@pytest.mark.nightly
 async def test_only_configurations_of_this_control_count_as_taken(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -690,6 +691,7 @@ async def test_only_configurations_of_this_control_count_as_taken(
         one.close()
 
 
+@pytest.mark.nightly
 async def test_the_tunnel_of_a_blocked_host_is_closed_until_the_block_ends(bench: Bench) -> None:
     ours, theirs = socket.socketpair()
     link, charon = Channel(ours, TunnelLink), Channel(theirs, TunnelLink)
