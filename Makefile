@@ -10,7 +10,7 @@ BIN := .venv/bin
 PYTEST := $(BIN)/pytest
 CHECKED := conftest.py appliance roswire rosmop fleet tests examples benchmarks distribution
 LONG_PROOFS := $(addprefix tests/proofs/test_,insertion_mutants.py insertion_traces.py insertion_at_large.py lease.py lease_mutants.py lease_traces.py certifier.py events.py)
-# What takes longer than a second waits for `make test`; the rules on the source, tests/unit/test_*.py, do not wait.
+# What takes longer than half a second waits for `make test`; the rules on the source, tests/unit/test_*.py, do not wait.
 LONG_UNIT := $(filter-out tests/unit/test_% tests/unit/support/%,$(shell grep '^tests/unit\|^tests/world\|^rosmop' tests/long.txt))
 DETERMINISTIC := -m "not nightly and not real" tests/unit tests/world rosmop/tests
 # Files with tests that are marked `real`.

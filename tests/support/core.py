@@ -52,7 +52,7 @@ class MemoryLog(AuditLog):
 class FakeTrail(AuditTrail):
     """The trail of control on a log in memory.
 
-    `note` gets each record when it is made; `on_disk` is called when somebody waits until all records are written.
+    `note` gets each record when it is made; `on_disk` is called at each wait for all records to be written.
     """
 
     def __init__(

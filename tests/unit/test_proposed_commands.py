@@ -30,7 +30,7 @@ NAMED = {
 PROSE = {
     "again", "on", "says", "shows", "there", "and", "or", "names", "of", "first", "for", "with", "is", "to", "has",
     "if", "in", "reports", "as", "gives", "must", "until", "then", "lists", "before", "would", "does", "while", "both",
-    "prints", "without", "cannot", "ends",
+    "prints", "without", "cannot", "ends", "at",
 }  # fmt: skip
 APPLICATIONS = {"rosrv": main.app, "rosrv-fleet": fleet_app, "rosmop": rosmop_app}
 LABELS = re.compile(r"(audit checkpoint|audit removal|order|evidence|fleet receipt|signing key)( .*)?$")
