@@ -1,5 +1,3 @@
-import pytest
-
 from appliance.features.monitor_tools.routes import records_of
 from tests.support.audit import decision, settle
 from tests.unit.audit.conftest import MakeLog, key, make_log, notary, path
