@@ -1,10 +1,14 @@
 """Neither the core nor its tests know a feature."""
 
+import inspect
 import re
+import typing
 from pathlib import Path
 
 import pytest
 
+from appliance.control.core import ControlPart, Core
+from appliance.features.feature import Feature, Tool
 from appliance.features.table import TOOLS
 
 ROOT = Path(__file__).parents[3]
@@ -27,3 +31,26 @@ def test_no_other_test_imports_a_feature(name: str) -> None:
         and imported.search(path.read_text(encoding="utf-8"))
     ]
     assert knowing == []
+
+
+_MEMBERS = {
+    "control_part": "begin",
+    "gate": "GATE",
+    "machine_side": "machine",
+    "pairing": "pairing_in",
+    "replay_input": "recorded_messages",
+    "requests": "REQUESTS",
+    "routes": "routes",
+    "state_files": "STATE_FILES",
+}
+
+
+@pytest.mark.parametrize("tool", TOOLS, ids=lambda tool: str(tool.name))
+def test_the_files_of_a_feature_define_what_the_core_looks_for(tool: Tool) -> None:
+    files = {path.stem for path in (ROOT / "appliance/features" / tool.name).glob("*.py")} & _MEMBERS.keys()
+    assert [file for file in files if tool.member(file, _MEMBERS[file]) is None] == []
+    if "control_part" in files:
+        begin = tool.member("control_part", "begin")
+        assert inspect.iscoroutinefunction(begin)
+        assert typing.get_type_hints(begin) == {"core": Core, "return": ControlPart}
+    assert isinstance(tool, Feature) or files <= {"routes"}, "a tool has verbs and routes only"
