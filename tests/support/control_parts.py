@@ -376,9 +376,14 @@ class ControlParts:
         cast(Any, self.nodes).client = self.clients.client
         self.surround()
         self.addresses, self.parameters = Addresses(), mirror()
-        trail = self.records
-        rights = ParameterRights(lambda: self.current, trail)
-        self.graph = RosGraph(self.registry, self.grants, trail)
+        rights = self._connect_relay()
+        self._connect_master()
+        self._connect_liveness(silent)
+        self._connect_calls(rights)
+
+    def _connect_relay(self) -> ParameterRights:
+        rights = ParameterRights(lambda: self.current, self.records)
+        self.graph = RosGraph(self.registry, self.grants, self.records)
         self.relay = RelayControl(
             self.registry,
             self.grants,
@@ -404,6 +409,9 @@ class ControlParts:
         self.revocation = Revocation(
             self.registry, self.grants, self.graph, lambda: self.current, lambda: self.parameters.tree
         )
+        return rights
+
+    def _connect_master(self) -> None:
         self.rosmaster = RosMaster(1, limits=XmlRpcLimits(), hold=1.0)
         self.rosmaster.calls = cast(Any, self.hidden)
         self.entries = MasterRegistrations(self.rosmaster, self.registry, self.faces.inner_uri)
@@ -425,9 +433,11 @@ class ControlParts:
             self.registry,
             self.subscribers,
             self.parameters,
-            trail,
+            self.records,
             own_parameters=dict,
         )
+
+    def _connect_liveness(self, silent: float) -> None:
         self.shut_out = False  # whether the robot's firewalls may refuse connections
         self.liveness = Liveness(
             self.registry,
@@ -441,6 +451,8 @@ class ControlParts:
             refusals=2,
             shut_out=lambda: self.shut_out,
         )
+
+    def _connect_calls(self, rights: ParameterRights) -> None:
         self._serving = functools.partial(
             serving,
             policy=lambda: self.current,

@@ -105,6 +105,19 @@ def check(row: Row, *, together: bool, shadow: bool = False) -> None:
     assert detail.get("values", {}) == row.values
     named = detail.get("why", {}).get("events", [])
     assert [(one["event"], one.get("node", "")) for one in named] == row.because
+    check_lines(row, found, at, where)
+    if named:
+        times = {one["time"] for one in named}
+        alone = [one for one in row.given if moment(START + one.at * MS) in times]
+        again = told(
+            row, [*alone, Given(row.given[-1].at, "/clock", 0, "/clock")], together=together, shadow=shadow
+        )
+        assert again is not None
+        assert again.text == found.text
+
+
+def check_lines(row: Row, found: MonitorEvent, at: str, where: Mapping[str, Mapping[str, object]]) -> None:
+    """Check the explanation that people read."""
     trail = FakeTrail()
     MonitorRecords(trail, lambda _topic, _data: None, []).reported([found], 0)
     (record,) = trail.records
@@ -129,14 +142,6 @@ def check(row: Row, *, together: bool, shadow: bool = False) -> None:
     assert "because: " not in hidden
     assert "where: " not in hidden
     assert "with: " not in hidden
-    if named:
-        times = {one["time"] for one in named}
-        alone = [one for one in row.given if moment(START + one.at * MS) in times]
-        again = told(
-            row, [*alone, Given(row.given[-1].at, "/clock", 0, "/clock")], together=together, shadow=shadow
-        )
-        assert again is not None
-        assert again.text == found.text
 
 
 INT = "std_msgs/Int32 '{data:%s}'"

@@ -75,26 +75,7 @@ class World:
         self.policy = policy()
         self.put(left=0, right=1)
         self.ports = Ports()
-        carried = RelayTraffic(
-            self.trail,
-            self.registry,
-            2,
-            lambda node, topic: self.cut_off.append((node.name, topic)),
-        )
-        self.grants = Grants(self.registry.mark, carried.used, grants)
-        self.relay = RelayControl(
-            self.registry,
-            self.grants,
-            cast(NodePorts, self.ports),
-            cast(NodeApiClient, NoDelivery()),
-            carried,
-            allocation=self.allocation,
-            policy=lambda: self.policy,
-            monitors=lambda: cast(Any, self),
-            broken=lambda _incarnation: None,
-            own_header=None,
-            own_call=cast(Any, None),
-        )
+        self.relay = self._relay_control(grants)
         self.graph = RosGraph(self.registry, self.grants, self.trail)
         uri = "http://10.0.0.5:4000/"
         self.node = Incarnation(
@@ -111,6 +92,28 @@ class World:
         ):
             self.registry.register(self.node, kind, name, detail)
         self.flush()
+
+    def _relay_control(self, grants: Bounds) -> RelayControl:
+        carried = RelayTraffic(
+            self.trail,
+            self.registry,
+            2,
+            lambda node, topic: self.cut_off.append((node.name, topic)),
+        )
+        self.grants = Grants(self.registry.mark, carried.used, grants)
+        return RelayControl(
+            self.registry,
+            self.grants,
+            cast(NodePorts, self.ports),
+            cast(NodeApiClient, NoDelivery()),
+            carried,
+            allocation=self.allocation,
+            policy=lambda: self.policy,
+            monitors=lambda: cast(Any, self),
+            broken=lambda _incarnation: None,
+            own_header=None,
+            own_call=cast(Any, None),
+        )
 
     def statement(self, _relay: int) -> messages.SpecificationsStated:
         return stated(1, [], {}, {}, restarted=False)
