@@ -142,17 +142,18 @@ class AdoptOperation:
                 await self.passed("parameters")
             await self._register(graph, places, MasterGraph())
             await self.passed("register")
+        if not reads and warm:
+            places = self._known_places()
+        cuts = await self._cuts(graph, places)
         if not warm:
             await self.machine("phase", phase=Phase.TAKING)
         await self.machine("forward")
         await self.passed("forward")
-        if not reads and warm:
-            places = await self._known_places()
         while True:
             self.graph.tell(places.found)
             await self._until_told()
             await self.passed("tell")
-            cut += await self._cut(graph, places)
+            cut += sum(msgspec.convert(await self.machine("cut", **cuts), dict[str, int]).values())
             await self.passed("cut")
             readings += 1
             if not reads:
@@ -161,6 +162,7 @@ class AdoptOperation:
             same = again.registered == graph.registered
             if not same:
                 await self._register(again, places, graph)
+                cuts = await self._cuts(again, places)
             graph = again
             await self.passed("read again")
             if same:
@@ -185,7 +187,7 @@ class AdoptOperation:
         self._missing = places.missing
         return graph, places
 
-    async def _known_places(self) -> Places:
+    def _known_places(self) -> Places:
         """Return the nodes that RVMaster has from before a restart."""
         return Places({
             node.name: NodePlace(node.api_text, node.api, node.host)
@@ -218,7 +220,8 @@ class AdoptOperation:
         while self.waiting() and clock.now() < until:
             await asyncio.sleep(_PAUSE_SECONDS)
 
-    async def _cut(self, graph: MasterGraph, places: Places) -> int:
+    async def _cuts(self, graph: MasterGraph, places: Places) -> dict[str, object]:
+        """Return the ports to cut, found before subscribers get their lists: rospy hears twice until the cut."""
         nodes = {name: place for name, place in places.found.items() if self._registered(name, place)}
         facts = await self.facts(place.uri for place in nodes.values())
         served = await self._served_ports(graph, nodes)
@@ -231,8 +234,7 @@ class AdoptOperation:
                 ports |= (offered & set(facts.sockets.get(place.uri.port, []))) - apis
             elif place.host.version == 4:
                 remote |= {(str(place.host), port) for port in offered - {place.uri.port}}
-        ended = await self.machine("cut", ports=sorted(ports), remote=sorted(remote))
-        return sum(msgspec.convert(ended, dict[str, int]).values())
+        return {"ports": sorted(ports), "remote": sorted(remote)}
 
     def _registered(self, name: str, place: NodePlace) -> bool:
         node = self.graph.node_at(name, place)
