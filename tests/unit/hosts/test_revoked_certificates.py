@@ -1,7 +1,6 @@
 import contextlib
 import itertools
 import sqlite3
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -9,14 +8,13 @@ import pytest
 from cryptography import x509
 from cryptography.hazmat.primitives.serialization import Encoding
 
+from appliance.base import clock
 from appliance.base.clock import using
 from appliance.hosts.revoked_certificates import RevokedCertificates
 from appliance.ipsec.certificate_authority import CertificateAuthority
 from appliance.store.state_file import StateStore
 from tests.support.engines import InlineDatabase
 from tests.support.virtual_clock import VirtualClock
-
-pytestmark = pytest.mark.nightly
 
 DAY = 86_400.0
 LONGEST = 65_535  # bytes of a value of vici
@@ -45,7 +43,7 @@ def bytes_of_list(revoked: RevokedCertificates, enrolled: set[str], directory: P
 def test_a_certificate_is_on_the_list_until_it_has_expired(store: StateStore) -> None:
     """It stays a day longer, because clocks differ."""
     revoked = RevokedCertificates(store.hosts)
-    now = time.time()
+    now = clock.wall()
     for serial, expires in (("a1", now + DAY), ("a2", now - DAY / 2), ("a3", now - 2 * DAY)):
         revoked.add("a", serial, expires)
     assert {row.serial for row in revoked.listed({"a"})} == {"a1", "a2"}
@@ -54,7 +52,7 @@ def test_a_certificate_is_on_the_list_until_it_has_expired(store: StateStore) ->
 
 
 def test_a_clock_that_was_ahead_unrevokes_no_certificate(tmp_path: Path) -> None:
-    now = time.time()
+    now = clock.wall()
     store = StateStore(tmp_path, failed=pytest.fail, kind=InlineDatabase)
     RevokedCertificates(store.hosts).add("a", "a1", now + DAY)
     with using(VirtualClock(wall=now + 366 * DAY)):
@@ -69,7 +67,7 @@ def test_a_clock_that_was_ahead_unrevokes_no_certificate(tmp_path: Path) -> None
 
 
 def test_revoked_certificates_are_kept_over_restarts(tmp_path: Path) -> None:
-    now = time.time()
+    now = clock.wall()
     first = StateStore(tmp_path, failed=pytest.fail, kind=InlineDatabase)
     revoked = RevokedCertificates(first.hosts)
     revoked.add("a", "a1", now + DAY)
@@ -91,7 +89,7 @@ def test_revoked_certificates_are_kept_over_restarts(tmp_path: Path) -> None:
 
 def test_a_list_of_thousands_is_not_too_long_for_charon(store: StateStore, tmp_path: Path) -> None:
     revoked = RevokedCertificates(store.hosts)
-    expires = time.time() + 90 * DAY
+    expires = clock.wall() + 90 * DAY
     for serial in serials(2_000):
         revoked.add("enrolled", serial, expires)
     assert len(revoked.listed({"enrolled"})) == 2_000
@@ -105,7 +103,7 @@ def test_a_list_of_thousands_is_not_too_long_for_charon(store: StateStore, tmp_p
 
 def test_a_full_list_says_when_it_has_space_again(store: StateStore, tmp_path: Path) -> None:
     revoked = RevokedCertificates(store.hosts)
-    expires = time.time() + 90 * DAY
+    expires = clock.wall() + 90 * DAY
     count = 0
     while not (until := revoked.wait_for_room({"a"})):
         for serial in serials(2):
@@ -126,6 +124,6 @@ def test_longer_serial_numbers_fit(store: StateStore, tmp_path: Path) -> None:
     """Older certificates have serial numbers of 160 bits."""
     revoked = RevokedCertificates(store.hosts)
     for number in range(3_000):
-        revoked.add("", f"{(1 << 158) + number:x}", time.time() + DAY)
+        revoked.add("", f"{(1 << 158) + number:x}", clock.wall() + DAY)
     assert bytes_of_list(revoked, set(), tmp_path / "ca") <= LONGEST
     assert revoked.missing(set()) > 1_000
