@@ -4,7 +4,7 @@ from collections.abc import Iterable
 
 PANELS: dict[str, tuple[str, ...]] = {
     "Begin": ("demo", "survey", "up", "adopt", "release", "status", "selftest", "version"),
-    "Drive and stop": ("guard", "drive", "approve", "door"),
+    "Drive and stop": ("guard", "drive", "approve", "approval", "door"),
     "Decide who may do what": ("policy", "host", "protect", "sign"),
     "Watch the robot": ("topic", "node", "monitor", "record"),
     "Review": ("audit", "who-drove", "report", "evidence", "alarm", "limits"),

@@ -107,11 +107,13 @@ class _Deferred(TyperCommand):
     help = property(lambda self: self._verb.help, lambda _self, _given: None)  # click sets it
 
     def __init__(self, verb: Verb, name: str) -> None:
-        super().__init__(name, hidden=verb.hidden)
+        super().__init__(name, hidden=verb.hidden or bool(verb.now))
         self._verb = verb
 
     def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> Any:
         command = loaded(self._verb, str(self.name))
+        if self._verb.now and not extra.get("resilient_parsing"):
+            typer.echo(f"rosrv {_path_of(parent)}{info_name} is now rosrv {self._verb.now}", err=True)
         try:
             return command.make_context(info_name, renamed(command, args), parent, **extra)
         except typer.BadParameter as error:
@@ -120,6 +122,11 @@ class _Deferred(TyperCommand):
             if isinstance(error.__cause__, ValidationError):  # typer chains it
                 error.message = refusal(error.__cause__.errors()[0])
             raise
+
+
+def _path_of(parent: Any) -> str:
+    """Return the names of the groups around a verb, without the program's."""
+    return "" if parent is None or parent.parent is None else f"{_path_of(parent.parent)}{parent.info_name} "
 
 
 def loaded(verb: Verb, name: str) -> Any:

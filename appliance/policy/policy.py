@@ -304,7 +304,8 @@ class Policy:
         holder = self.holder(group)
         now = "" if self.holders is None else f"; now {holder or 'no host'} holds it"
         if request.category is Category.CALL and not self.may_command(request.resource, request.host):
-            told = f"{may_not} while it does not hold {group.name}: rosrv drive take {group.name} --host {request.host}"
+            order = f"rosrv drive assign {group.name} --host {request.host}"
+            told = f"{may_not} while it does not hold {group.name}: {order}"
             return Decision(False, group.rule, told + now, told=told)
         reason = f"{decision.reason}, while it holds {group.name}{now}"
         return replace(decision, reason=reason if len(reason) <= _LONGEST_REASON else decision.reason)

@@ -152,18 +152,20 @@ class ApprovalOrders:
         )
 
     async def approve(self, request: requests.ApproveCall, who: str) -> requests.Approval:
-        """Approve a held call, or give a lease a new time."""
+        """Approve a held call, or give an approval a new time."""
         entry = self._entry(request.number)
         seconds = request.seconds
         if seconds is None and entry.lease and entry.call.category is Category.CALL:
             raise SenselessError(
-                f"approval {entry.number} is a lease: give its new time with --for, or --refuse it"
+                f"approval {entry.number} is for some time: give its new time with --for, or run:"
+                f" rosrv approval refuse {entry.number}"
             )
         if seconds is None and entry.call.category is not Category.CALL:
             seconds = LEASE_SECONDS  # a publisher registers once, so only a lease bounds its messages
         if seconds is not None and not requests.SHORTEST_LEASE <= seconds <= requests.LONGEST_LEASE:
             raise SenselessError(
-                f"{seconds:g} s is not a lease: give {requests.SHORTEST_LEASE:g}s to {requests.LONGEST_LEASE:g}s"
+                f"an approval cannot last {seconds:g} s: give {requests.SHORTEST_LEASE:g}s to"
+                f" {requests.LONGEST_LEASE:g}s"
             )
         if not self._asks(entry):
             raise SenselessError(

@@ -1,4 +1,4 @@
-"""The command `rosrv approve`."""
+"""The commands `rosrv approve` and `rosrv approval refuse`."""
 
 from typing import Annotated, Any
 
@@ -26,7 +26,7 @@ from roswire.standard import standard_definitions
 def approve(
     appliance: Appliance,
     number: Annotated[
-        int | None, typer.Argument(metavar="[NUMBER]", help="The number in the refusal", show_default=False)
+        int | None, typer.Argument(metavar="[NUMBER]", help="The number in the denial", show_default=False)
     ] = None,
     *,
     last: Annotated[
@@ -35,7 +35,9 @@ def approve(
             "--for", metavar="TIME", help="Approve all calls of this name by this host for 1s to 1h"
         ),
     ] = None,
-    refuse: Annotated[bool, typer.Option("--refuse", help="Refuse the call, or end the approval")] = False,
+    refused: Annotated[
+        bool, typer.Option("--refuse", help="Former name of: rosrv approval refuse NUMBER", hidden=True)
+    ] = False,
     watch: Annotated[
         bool, typer.Option("--watch", help="Show calls as they come, with a bell, until interrupted")
     ] = False,
@@ -47,19 +49,33 @@ def approve(
     Example: rosrv approve 48213 --for 30s
     """
     if watch:
-        if number is not None or last is not None or refuse:
+        if number is not None or last is not None or refused:
             raise usage_error("--watch takes no call: approve in another terminal", "rosrv approve")
         approval_watch.watch(appliance, lambda one: _line(appliance, one))
         return
     if number is None:
-        if last is not None or refuse:
+        if last is not None or refused:
             raise usage_error("name the call: rosrv approve NUMBER", "rosrv approve")
         _list(appliance)
         return
-    if refuse and last is not None:
+    if refused:
+        typer.echo(f"rosrv approve --refuse is now rosrv approval refuse {number}", err=True)
+    if refused and last is not None:
         raise usage_error("give --for or --refuse, not both", "rosrv approve")
     seconds = None if last is None else span_given("--for", last, "30s, 5m or 1h", "rosrv approve")
-    _say(appliance, appliance.answer_or_exit(RefuseCall(number) if refuse else ApproveCall(number, seconds)))
+    _say(appliance, appliance.answer_or_exit(RefuseCall(number) if refused else ApproveCall(number, seconds)))
+
+
+@speaks
+def refuse(
+    appliance: Appliance,
+    number: Annotated[int, typer.Argument(help="The number in the denial", show_default=False)],
+) -> None:
+    """Refuse a call that waits for an approval, or end an approval early.
+
+    Example: rosrv approval refuse 48213
+    """
+    _say(appliance, appliance.answer_or_exit(RefuseCall(number)))
 
 
 def _list(appliance: Appliance) -> None:
@@ -81,7 +97,8 @@ def _line(appliance: Appliance, one: Approval) -> tuple[str, str]:
     who = f" by {one.who}" if one.who else ""
     host = appliance.host_in_words(one.host)
     what = f"{one.number}: {host} {one.category} {one.resource}{_arguments(one)}"
-    return f"{what}: {one.state}{who}, {one.left_seconds:g} s left", "yellow" if one.state == "waits" else ""
+    state = "approved" if one.state == "lease" else one.state
+    return f"{what}: {state}{who}, {one.left_seconds:g} s left", "yellow" if one.state == "waits" else ""
 
 
 def _arguments(one: Approval) -> str:

@@ -63,4 +63,4 @@ def _say(appliance: Appliance, one: Approval, line: Callable[[Approval], tuple[s
         sys.stdout.write(_BELL)
     say(*line(one))
     if waits:
-        say(f"    rosrv approve {one.number} --for 30s    rosrv approve {one.number} --refuse")
+        say(f"    rosrv approve {one.number} --for 30s    rosrv approval refuse {one.number}")

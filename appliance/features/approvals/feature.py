@@ -1,6 +1,6 @@
 """Define the feature approvals."""
 
-from appliance.cli.verb_table import Verb
+from appliance.cli.verb_table import Group, Verb
 from appliance.configuration.sections import Sections
 from appliance.features.approvals.quotas import ROWS
 from appliance.features.approvals.settings import ApprovalHook
@@ -49,6 +49,13 @@ FEATURE = Feature(
         ConsolePart("situation", "panel.js", "Waits", order=3),
         ConsolePart("robot", "panel.js", "Approvals", order=3),
     ),
-    verbs={"approve": Verb(f"{_PLACE}approval_verbs:approve", after="drive")},
+    verbs={
+        "approve": Verb(f"{_PLACE}approval_verbs:approve", after="drive"),
+        "approval": Group(
+            "Refuse a call that waits for an approval, or end an approval.",
+            {"refuse": Verb(f"{_PLACE}approval_verbs:refuse")},
+            after="approve",
+        ),
+    },
     quotas=ROWS,
 )  # fmt: skip

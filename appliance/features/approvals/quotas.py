@@ -9,7 +9,7 @@ APPROVALS = QuotaRow(
     at_limit="the call is refused without a number: operators decide about the host's other calls first",
     between="a host has at most 8 of them, whatever it calls",
     counting="hosts that the policy names as one network count as one; unknown: only `*` names the host; repetitions of"
-    " a call are one; each ends after two minutes, or with its lease",
+    " a call are one; each ends after two minutes, or with its approval",
     alarm="`approval-unanswered`, `rosrv limits`",
     margin=HonestUse(
         "one person or agent with three calls that wait",

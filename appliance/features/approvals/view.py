@@ -49,7 +49,7 @@ def _line(state: ApprovalCounts) -> tuple[str, str]:
     calls = "call waits" if state.waiting == 1 else "calls wait"
     return (
         "approvals",
-        f"{state.waiting} {calls}, {state.leases} {'lease' if state.leases == 1 else 'leases'}",
+        f"{state.waiting} {calls}, {state.leases} {'approval' if state.leases == 1 else 'approvals'} for some time",
     )
 
 

@@ -239,8 +239,8 @@ class DriveOrders:
             )
         elif claim is Claim.ASK:
             reason = (
-                f"{host} may only ask for {group.name}: `rosrv drive ask {group.name} --host {host}`; an operator gives"
-                " it"
+                f"{host} may only ask for {group.name}: an operator assigns it with `rosrv drive free {group.name} --to"
+                f" {host}`"
             )
         else:
             reason = f"{host} has no claim to {group.name}: no line of [Authority] names it ({group.rule})"

@@ -1,4 +1,4 @@
-"""The commands `rosrv drive status|take|give|ask`."""
+"""The commands `rosrv drive status|assign|free|ask`."""
 
 from typing import Annotated
 
@@ -17,7 +17,7 @@ from appliance.features.authority.requests import (
 from rosmop.tool.terminal import say
 
 _GroupName = Annotated[
-    str, typer.Argument(metavar="GROUP", help="A group of [Authority]", show_default=False)
+    str, typer.Argument(metavar="GROUP", help="A command group of [Authority]", show_default=False)
 ]
 _Host = Annotated[
     str,
@@ -53,26 +53,26 @@ def status(
 
 
 @speaks
-def take(appliance: Appliance, group: _GroupName, *, host: _Host) -> None:
-    """Give a group to a host that may take it, or that may override its holder.
+def assign(appliance: Appliance, group: _GroupName, *, host: _Host) -> None:
+    """Assign a group to a host that may take it, or that may override its holder.
 
-    Example: rosrv drive take base --host host:ocu-1
+    Example: rosrv drive assign base --host host:ocu-1
     """
     _show(appliance, appliance.answer_or_exit(DriveTake(group, host)))
 
 
 @speaks
-def give(
+def free(
     appliance: Appliance,
     group: _GroupName,
     *,
     to: Annotated[
-        str, typer.Option("--to", metavar="HOST", help="Give it to this host, even if it may only ask")
+        str, typer.Option("--to", metavar="HOST", help="Assign it to this host, even if it may only ask")
     ] = "",
 ) -> None:
-    """End the authority of a group's holder. The first host that waits and may take the group gets it.
+    """Take a group from its holder. The first host that waits and may take the group gets it.
 
-    Example: rosrv drive give base
+    Example: rosrv drive free base
     """
     _show(appliance, appliance.answer_or_exit(DriveGive(group, to)))
 
@@ -88,6 +88,10 @@ def ask(appliance: Appliance, group: _GroupName, *, host: _Host) -> None:
 
 def _show(appliance: Appliance, one: GroupState) -> None:
     shown = appliance.host_in_words
-    held = f"held by {shown(one.holder)}, {one.left_seconds:g} s left of its lease" if one.holder else "free"
+    held = (
+        f"held by {shown(one.holder)}, {one.left_seconds:g} s left without a message"
+        if one.holder
+        else "free"
+    )
     waiting = f"; waiting: {', '.join(map(shown, one.waiting))}" if one.waiting else ""
     say(f"{one.group}: {held}{waiting}")

@@ -19,9 +19,11 @@ FEATURE = Feature(
             "Say which host may drive: one at a time holds each group of [Authority].",
             {
                 "status": Verb(f"{_PLACE}drive_verbs:status"),
-                "take": Verb(f"{_PLACE}drive_verbs:take"),
-                "give": Verb(f"{_PLACE}drive_verbs:give"),
+                "assign": Verb(f"{_PLACE}drive_verbs:assign"),
+                "free": Verb(f"{_PLACE}drive_verbs:free"),
                 "ask": Verb(f"{_PLACE}drive_verbs:ask"),
+                "take": Verb(f"{_PLACE}drive_verbs:assign", now="drive assign"),
+                "give": Verb(f"{_PLACE}drive_verbs:free", now="drive free"),
             },
             after="guard",
         )

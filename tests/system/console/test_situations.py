@@ -161,7 +161,7 @@ def test_a_waiting_call_is_decided_by_one_click_on_any_page(
         expect(bar(page)).to_contain_text("approved by first")
         [row] = approvals(appliance, "lease")
         assert (row["host"], row["resource"]) == (AGENT, "/goal")
-        appliance.rosrv("approve", str(row["number"]), "--refuse")
+        appliance.rosrv("approval", "refuse", str(row["number"]))
         appliance.recorded("--event", "approval ended", resource="/goal")
         page.mouse.move(5, 5)
         expect(bar(page)).to_have_count(0)
@@ -176,7 +176,7 @@ def test_a_waiting_call_is_decided_by_one_click_on_any_page(
     see(windows, lambda page: fact(page, "Waits"), "1 call waits for you")
     see(windows, lambda page: fact(page, "Denied"), re.compile("tablet.*publish /guarded"))
     [row] = approvals(appliance, "waits")
-    appliance.rosrv("approve", str(row["number"]), "--refuse")
+    appliance.rosrv("approval", "refuse", str(row["number"]))
 
 
 def test_the_bar_does_not_move_under_the_pointer(appliance: Appliance, windows: list[Reader]) -> None:
@@ -191,14 +191,14 @@ def test_the_bar_does_not_move_under_the_pointer(appliance: Appliance, windows: 
     advertise(appliance, AGENT, "/third")
     expect(bar(page).locator(".waiting-call")).to_have_count(2)
     assert [number, top] in page.evaluate(_PLACES), "a newer call comes above it"
-    appliance.rosrv("approve", number, "--refuse")
+    appliance.rosrv("approval", "refuse", number)
     expect(bar(page)).to_contain_text("refused by")
     page.wait_for_timeout(4000)
     assert [number, top] in page.evaluate(_PLACES), "an ended call stays while the pointer is there"
     page.mouse.move(600, 100)
     expect(bar(page).locator(".waiting-call")).to_have_count(1)
     [row] = approvals(appliance, "waits")
-    appliance.rosrv("approve", str(row["number"]), "--refuse")
+    appliance.rosrv("approval", "refuse", str(row["number"]))
 
 
 SLOTS = """async () => {

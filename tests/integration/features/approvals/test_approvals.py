@@ -85,12 +85,12 @@ def test_a_call_is_held_approved_used_once_and_held_again(
         assert call(True)["result"] is True
         again = number_in(call(True)["values"]["message"])
         assert again != held
-        appliance.rosrv("approve", again, "--refuse")
+        appliance.rosrv("approval", "refuse", again)
         assert "an operator refused approval" in call(True)["values"]["message"]
         other = number_in(call(False)["values"]["message"])
         appliance.rosrv("approve", other, "--for", "30s")
         assert call(True)["result"] is True and call(False)["result"] is True
-        appliance.rosrv("approve", other, "--refuse")
+        appliance.rosrv("approval", "refuse", other)
         assert "refused approval" in call(True)["values"]["message"]
         number_in(call(False)["values"]["message"])
         appliance.kill("control")

@@ -9,7 +9,7 @@ from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.target import Appliance
 from appliance.features.approvals import approval_verbs, approval_watch
 from appliance.features.approvals.approval_watch import changes
-from appliance.features.approvals.requests import Approval, Approvals
+from appliance.features.approvals.requests import Approval, Approvals, RefuseCall
 
 REST = ("10.0.0.7", "/agent", "call", "/log", "roscpp/SetLoggerLevel", "4bf5")
 
@@ -89,3 +89,18 @@ def test_the_watch_goes_on_while_the_appliance_restarts(
     assert "rosrv approve 7 --for 30s" in out
     assert out.splitlines()[-1] == "7: has ended"
     assert err.count("trying again") == 1
+
+
+def test_a_call_is_refused_by_both_names_of_the_verb(capsys: pytest.CaptureFixture[str]) -> None:
+    refused = Approval(7, "refused", *REST, "", 0, 60.0, "ann")  # type: ignore[arg-type]  # of a tuple
+    asked: list[Any] = []
+
+    def answer_or_exit(request: Any) -> Approval:
+        asked.append(request)
+        return refused
+
+    fake = cast(Appliance, SimpleNamespace(as_json=False, host_in_words=str, answer_or_exit=answer_or_exit))
+    cast(Any, approval_verbs.refuse).function(fake, 7)
+    cast(Any, approval_verbs.approve).function(fake, 7, refused=True)
+    assert asked == [RefuseCall(7), RefuseCall(7)]
+    assert "rosrv approve --refuse is now rosrv approval refuse 7" in capsys.readouterr().err

@@ -9,7 +9,7 @@ import pytest
 import appliance.features.doors
 
 FOLDER = Path(appliance.features.doors.__file__).parent
-PAGE = Path("docs/doors.md")
+PAGE = Path("docs/reference/rosbridge.md")
 _IS_BOUND = re.compile(r"MOST|LONGEST|LEAST|_SECONDS\b|_SECONDS$")
 
 SHOWN = {

@@ -192,7 +192,7 @@ def test_each_row_of_the_table_has_its_test_and_no_order_contradicts_another() -
 
 
 def test_the_page_has_the_table() -> None:
-    page = (Path(__file__).parents[4] / "docs" / "guards.md").read_text()
+    page = (Path(__file__).parents[4] / "docs" / "reference" / "guards.md").read_text()
     for first, then, otherwise in PRECEDENCES:
         names = [", ".join(f"`{name}`" for name in part) for part in (first, then)]
         assert f"| {names[0]} | {names[1]} | {otherwise} |" in page

@@ -160,8 +160,8 @@ def test_a_guard_that_cannot_be_made_is_refused(  # noqa: PLR0917  a row
 
 def test_the_page_names_an_existing_test_for_each_row() -> None:
     """Also the case in brackets exists; the rows without a test are counted, so that no further one is added."""
-    page = (ROOT / "docs" / "guards.md").read_text(encoding="utf-8")
-    section = page.partition("## When the base is stopped")[2].partition("### How fast")[0]
+    page = (ROOT / "docs" / "reference" / "guards.md").read_text(encoding="utf-8")
+    section = page.partition("## When the base is stopped")[2].partition("### Records of a stop")[0]
     rows = [row for row in section.splitlines() if row.startswith("| ") and not row.endswith(" test |")]
     cells = [row.split("|")[-2].strip().strip("`") for row in rows]
     named = [re.fullmatch(r"(test_\w+)(?:\[(.*)\])?", cell) for cell in cells if cell]
