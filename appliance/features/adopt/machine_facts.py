@@ -6,6 +6,9 @@ import msgspec
 
 from appliance.features.adopt.adopt_record import AdoptRecord
 
+FIRST_PORT = 1024
+"""The first port that is cut: smaller ones belong to the machine, whatever a node says."""
+
 
 class RobotMaster(msgspec.Struct, frozen=True):
     """The program that listens on the port of the robot's own master. `group` is set if its unit has nothing else."""

@@ -20,7 +20,7 @@ import structlog
 
 from appliance.base import clock
 from appliance.features.adopt.adopt_record import AdoptRecord, Phase, load_record, save_record
-from appliance.features.adopt.machine_facts import MachineFacts, RobotMaster
+from appliance.features.adopt.machine_facts import FIRST_PORT, MachineFacts, RobotMaster
 from appliance.network import interfaces
 from appliance.network.cut import RemotePort, end_connections, refuse_no_port, refuse_ports
 from appliance.network.isolation import Isolation
@@ -143,8 +143,8 @@ class AdoptWork:
             for address, port in msgspec.convert(terms.get("remote", []), list[tuple[str, int]])[:_MOST_PORTS]
         }
         master, appliance = _master_port(side), side.ends[4].appliance
-        if ports & {master, 22}:
-            raise ValueError("a port of the machine itself is not a node's")
+        if any(port < FIRST_PORT or port == master for port in {*ports, *(one.port for one in remote)}):
+            raise ValueError("a port of the machine itself is not a port of a node")
 
         def of_master(one: TcpSocket) -> bool:
             return one.port == master and one.peer_address != appliance

@@ -29,7 +29,7 @@ from appliance.base.counted import counted
 from appliance.features.adopt.adopt_answers import GiveBackReport, TakeOverReport
 from appliance.features.adopt.adopt_record import Phase
 from appliance.features.adopt.graph_side import AdoptedGraph, service_text
-from appliance.features.adopt.machine_facts import MachineFacts
+from appliance.features.adopt.machine_facts import FIRST_PORT, MachineFacts
 from appliance.features.adopt.places import (
     NodeCaller,
     NodePlace,
@@ -225,7 +225,7 @@ class AdoptOperation:
         nodes = {name: place for name, place in places.found.items() if self._registered(name, place)}
         facts = await self.facts(place.uri for place in nodes.values())
         served = await self._served_ports(graph, nodes)
-        apis = {place.uri.port for place in nodes.values()}
+        apis, master = {place.uri.port for place in nodes.values()}, self.reader(facts).uri
         ports: set[int] = set()
         remote: set[tuple[str, int]] = set()
         for name, offered in served.items():
@@ -234,7 +234,10 @@ class AdoptOperation:
                 ports |= (offered & set(facts.sockets.get(place.uri.port, []))) - apis
             elif place.host.version == 4:
                 remote |= {(str(place.host), port) for port in offered - {place.uri.port}}
-        return {"ports": sorted(ports), "remote": sorted(remote)}
+        return {
+            "ports": sorted(port for port in ports if port >= FIRST_PORT and port != master.port),
+            "remote": sorted(row for row in remote if row[1] >= FIRST_PORT and row[1] != master.port),
+        }
 
     def _registered(self, name: str, place: NodePlace) -> bool:
         node = self.graph.node_at(name, place)

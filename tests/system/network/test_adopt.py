@@ -236,3 +236,24 @@ def test_a_kill_of_everything_in_the_middle_ends_as_ordered(robot: Robot, applia
     assert robot.graph() == graph
     robot.hears()
     assert robot.lives() == lives
+
+
+@pytest.mark.nightly
+def test_an_adoption_waits_until_the_robot_stands(robot: Robot, appliance: Appliance) -> None:
+    def publish(topic: str, kind: str, value: str) -> Process:
+        command = ["/usr/bin/rostopic", "pub", "--rate", "10", topic, kind, value]
+        return robot.ros.start(command, label=f"{topic} {value}")
+
+    ordered = ("adopt", "--when-standing", "--within", "8")
+    assert "no topic commands a base" in rosrv(robot, appliance, *ordered, check=False)
+    robot.ros.start(["/usr/bin/rostopic", "echo", "/cmd_vel"], label="base")
+    moving = publish("/cmd_vel", "geometry_msgs/Twist", "{linear: {x: 0.5}}")
+    eventually(lambda: "/cmd_vel" in str(robot.graph()), robot.ros.story)
+    assert "/cmd_vel says that it moves" in rosrv(robot, appliance, *ordered, check=False)
+    moving.stop()
+    publish("/cmd_vel", "geometry_msgs/Twist", "{linear: {x: 0.0}}")
+    publish("/odom", "nav_msgs/Odometry", "{twist: {twist: {linear: {x: 0.0}}}}")
+    eventually(lambda: "/odom" in str(robot.graph()), robot.ros.story)
+    said = rosrv(robot, appliance, "adopt", "--when-standing", "--within", "30")
+    assert "the robot stands: zero for 3 s on /cmd_vel and 1 odometry topic" in said
+    assert "noted" in said

@@ -62,6 +62,7 @@ class ScriptedReader:
         self.shutdowns: list[str] = []
         self.before: Callable[[], None] = lambda: None
         self.alive = True
+        self.uri = NodeUri("http", LINK, 11311, "/")
 
     def _require(self) -> None:
         self.before()
@@ -125,6 +126,7 @@ class RobotWorld:
         self.began: list[str] = []  # the order of registrations at RVMaster
         self.limit = ""
         self.left = False
+        self.remote: list[tuple[str, int]] = []
         self.begin()
 
     def begin(self) -> None:
@@ -195,6 +197,7 @@ class RobotWorld:
                 self.forwarded = True
             case "cut":
                 self.cuts.append(set(terms["ports"]))
+                self.remote = terms["remote"]
                 return {"master": 1, "nodes": len(terms["ports"])}
             case "stand in":
                 if self.holder is None:

@@ -324,6 +324,21 @@ def test_only_ports_of_the_nodes_own_processes_are_cut() -> None:
     assert run(story).cuts[0] == {5001, 5002, 5003}
 
 
+def test_no_port_of_the_machine_itself_is_cut_whatever_a_node_says() -> None:
+    async def story(world: RobotWorld) -> None:
+        world.resolved["nuc"] = ["192.168.50.2"]
+        world.add("/far", 4010, uri="http://nuc:4010/", publishes=("/scan",), services=("/a", "/b", "/c"))
+        world.master.services |= {
+            "/a": "rosrpc://nuc:22",
+            "/b": "rosrpc://nuc:11311",
+            "/c": "rosrpc://nuc:5001",
+        }
+        await world.until_settled()
+        assert world.remote == [("192.168.50.2", 5001), ("192.168.50.2", 5010)]
+
+    run(story, nodes=False)
+
+
 def test_a_robot_without_a_master_gets_one_with_its_whole_graph() -> None:
     async def story(world: RobotWorld) -> None:
         await world.until_settled()
