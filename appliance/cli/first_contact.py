@@ -16,7 +16,7 @@ NODES = ContactQuestion(
     (
         "on this machine",
         "on another machine: this one is beside the robot",
-        "nowhere yet: I want to see rosrv at work",
+        "nowhere yet: I want to see it at work",
     ),
 )
 DRIVER = ContactQuestion(

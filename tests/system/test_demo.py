@@ -123,8 +123,9 @@ def test_demo_without_root() -> None:
 @pytest.mark.nightly
 def test_demo_of_an_adoption(temporary: Path) -> None:
     environment = os.environ | {"TMPDIR": str(temporary)}
+    command = [ROSRV, "demo", "--adopt", "--json"]
     done = subprocess.run(
-        [ROSRV, "demo", "--adopt", "--json"],
+        command,
         env=environment, capture_output=True, text=True, timeout=LIMIT, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr

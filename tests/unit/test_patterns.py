@@ -33,6 +33,7 @@ LIMITED = {
     "appliance.audit.log.record_format:_BOUND": "a record's reason; each word is scanned once, as another follows",
     "appliance.api.console.console:_ADDRESS": "the console's files, at the start",
     "appliance.api.console.console:_GZIP": "a header of 16 KiB; each `gzip` is followed by its own scan",
+    "appliance.base.timestamps:_IN_UTC": "a record's reason, or a sentence of the appliance",
     "appliance.base.varying_numbers:_NUMBER": "a record's reason; time is linear, see the comment there",
     "appliance.configuration.inventory:_COMMON": "the licence files of the installation",
     "appliance.configuration.inventory:_LICENCE": "the licence files of the installation",

@@ -110,7 +110,7 @@ def see(windows: list[Reader], place: Callable[[Page], Locator], text: str | re.
 
 def test_a_quiet_robot_says_so(windows: list[Reader]) -> None:
     for name, text in QUIET.items():
-        see(windows, lambda page, name=name: fact(page, name), text)  # type: ignore[misc]
+        see(windows, lambda page, name=name: fact(page, name), text)  # type: ignore[misc]  # a lambda in a loop
     see(windows, lambda page: page.get_by_role("region", name="Open alarms"), "No open alarms")
     for reader in windows:
         expect(bar(reader.page)).to_have_count(0)

@@ -181,7 +181,7 @@ class SeparationWorld(DrivenWorld):
             "silent": self.silent, "width": round(self.radius + r.uniform(0.06, 0.2), 2),
             "wheelbase": self.base.wheelbase,
         }, {"by": SCAN})  # fmt: skip
-        self._scanner(r.uniform(25, self.silent * 850), r.uniform(0, reaction * 1000 - lag))
+        self.scanner(r.uniform(25, self.silent * 850), r.uniform(0, reaction * 1000 - lag))
         self.driven(
             tuple((person.x, person.y) for person in self.persons) + tuple((w[0], w[1]) for w in self.walls),
             turns=self.sector == WHOLE, forward=self.sector == HALF,
@@ -228,12 +228,12 @@ class SeparationWorld(DrivenWorld):
         self.honest = (0.3, 1.8) if corridor else (0.5, 3.0)
         self.span = 8000 if corridor else 9000
         self.guarded({"sector": self.sector, "person": self.speed, "silent": self.silent}, {"by": SCAN})
-        self._scanner(100, 20)
+        self.scanner(100, 20)
         self.every(
             lambda: 100, lambda: void(self.drive((self.honest[0], 0.0, 0.0, 0.0, 0.0, 0.0))), first=300
         )
 
-    def _scanner(self, period: float, delay: float) -> None:
+    def scanner(self, period: float, delay: float) -> None:
         r = self.random
         count = r.choice((120, 240, 360))
         self.far = r.choice((3.0, 8.0, 30.0)) if not self.live else 12.0
@@ -252,13 +252,13 @@ class SeparationWorld(DrivenWorld):
             )
             found[found > self.far] = np.inf
             found[found < self.near] = self.near
-            data, valid = self._scan(found)
+            data, valid = self.scan(found)
             arrived = max(arrived, self.now + r.uniform(delay * 0.3, delay))
-            self.after(arrived, lambda: self._arrive(data, valid))
+            self.after(arrived, lambda: self.arrive(data, valid))
 
         self.every(lambda: period * r.uniform(0.7, 1.0), look, first=r.uniform(0, 200))
 
-    def _arrive(self, data: bytes, valid: "bool | None") -> None:
+    def arrive(self, data: bytes, valid: "bool | None") -> None:
         self.say("by", data, 5, whole=self.fault != "cut")
         self.measured(valid=valid)
 
@@ -272,7 +272,7 @@ class SeparationWorld(DrivenWorld):
         self.trace("the scanner works again")
         self.fault = ""
 
-    def _scan(self, found: "np.ndarray") -> "tuple[bytes, bool | None]":
+    def scan(self, found: "np.ndarray") -> "tuple[bytes, bool | None]":
         """Return a scan with the present fault, and whether it is valid; None: parts of it are."""
         start, step = float(self.angles[0]), float(self.angles[1] - self.angles[0])
         low, high, valid = self.near, self.far, not self.fault
@@ -465,11 +465,11 @@ class FenceWorld(DrivenWorld):
                 None if self.fault.endswith("heading") else not self.fault
             )  # far from the edge it needs none
             arrived = max(arrived, self.now + r.uniform(delay * 0.3, delay))
-            self.after(arrived, lambda: self._arrive(data, valid))
+            self.after(arrived, lambda: self.arrive(data, valid))
 
         self.every(lambda: period * r.uniform(0.7, 1.0), look, first=r.uniform(0, 200))
 
-    def _arrive(self, data: bytes, valid: "bool | None") -> None:
+    def arrive(self, data: bytes, valid: "bool | None") -> None:
         self.say("by", data, 5, whole=self.fault != "cut")
         self.measured(valid=valid)
 

@@ -56,7 +56,7 @@ class ZoneWorld(SeparationWorld):
             "muteFor": MUTED if mutes else 0.0, "polygon": self._square(),
         }  # fmt: skip
         self.guarded(values, {"by": SCAN})
-        self._scanner(r.uniform(25, self.silent * 850), delay)
+        self.scanner(r.uniform(25, self.silent * 850), delay)
         if self.live:
             self.every(
                 lambda: 100, lambda: void(self.drive(straight(self.honest[0] * (self.now > 1200)))), first=50
@@ -92,8 +92,8 @@ class ZoneWorld(SeparationWorld):
                 )
             )
 
-    def _scanner(self, period: float, delay: float) -> None:
-        super()._scanner(period, delay)
+    def scanner(self, period: float, delay: float) -> None:
+        super().scanner(period, delay)
         self.far, self.angles = max(self.far, 1.5 * self.half), np.linspace(-math.pi, math.pi, 360)
 
     def _mute(self) -> None:
@@ -107,22 +107,22 @@ class ZoneWorld(SeparationWorld):
     def muted(self) -> bool:
         return self.muted_from <= self.now <= self.muted_until
 
-    def _scan(self, found: "np.ndarray") -> "tuple[bytes, bool | None]":
+    def scan(self, found: "np.ndarray") -> "tuple[bytes, bool | None]":
         near = self.half - 0.01
         x, y = found * np.cos(self.angles), found * np.sin(self.angles)
         inside = np.isfinite(found) & (np.abs(x) < near) & (np.abs(y) < near)
         self.scan_occupied = int(inside.sum()) >= self.points
-        occupied, (data, valid) = self.scan_occupied, super()._scan(found)
+        occupied, (data, valid) = self.scan_occupied, super().scan(found)
         return data + bytes([occupied]), valid
 
-    def _arrive(self, data: bytes, valid: "bool | None") -> None:
+    def arrive(self, data: bytes, valid: "bool | None") -> None:
         occupied = bool(data[-1]) and bool(valid)
         self.occupied = occupied
         if occupied:
             self.occupied_at = self.now
         if occupied and not self.muted:
             self.ready.clear()
-        super()._arrive(data[:-1], valid)
+        super().arrive(data[:-1], valid)
         if (
             occupied
             and not self.switched_off

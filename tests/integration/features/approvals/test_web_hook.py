@@ -50,7 +50,7 @@ def receiver(made: Certificates) -> Iterator[Any]:
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.load_cert_chain(made.certificate, made.key)
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), _RECEIVER) as server:
-        server.got = []  # type: ignore[attr-defined]
+        server.got = []  # type: ignore[attr-defined]  # the handler finds it here
         server.socket = context.wrap_socket(server.socket, server_side=True)
         thread = threading.Thread(target=server.serve_forever)
         thread.start()

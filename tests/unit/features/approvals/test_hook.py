@@ -82,7 +82,7 @@ def _full(_message: object) -> bool:
 
 def _entry() -> ApprovalEntry:
     call = HeldCall(address_of("10.0.0.7"), Category.PUBLISH, "/goal")
-    return ApprovalEntry(7, call, None, "/agent", "", b"", 0, clock.now())  # type: ignore[arg-type]
+    return ApprovalEntry(7, call, None, "/agent", "", b"", 0, clock.now())  # type: ignore[arg-type]  # the hook reads no rule
 
 
 def test_an_unsent_call_is_counted_until_one_is_sent_or_ten_minutes_have_passed() -> None:
@@ -91,7 +91,7 @@ def test_an_unsent_call_is_counted_until_one_is_sent_or_ten_minutes_have_passed(
         hook.notify(_entry(), 120.0)
         assert hook.unsent() == (1, "its process is not running")
         sent: list[object] = []
-        hook.link = cast(Any, SimpleNamespace(send=lambda one: not sent.append(one)))  # type: ignore[func-returns-value]
+        hook.link = cast(Any, SimpleNamespace(send=lambda one: not sent.append(one)))  # type: ignore[func-returns-value]  # true for `send`
         hook.notify(_entry(), 120.0)
         assert sent == [CALL]
         heard = hook.heard

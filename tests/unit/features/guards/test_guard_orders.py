@@ -1,7 +1,6 @@
 from collections import Counter
 from types import SimpleNamespace
 from typing import Any
-from unittest.mock import Mock
 
 import msgspec
 import pytest
@@ -21,6 +20,7 @@ from appliance.features.guards.upgrades import Upgrade
 from appliance.features.guards.view import ActingGuard, GuardsState
 from appliance.specifications.episodes import Stops
 from appliance.specifications.specification_files import SpecificationsRefusedError
+from tests.support.core import FakeTrail
 from tests.support.virtual_clock import let_time_pass
 from tests.unit.features.guards.test_placement import Connections
 
@@ -71,7 +71,7 @@ def manager() -> Manager:
 
 @pytest.fixture
 def orders(manager: Manager) -> GuardOrders:
-    return GuardOrders(manager, lambda: Graph([], [], []), Connections(), Mock())  # type: ignore[arg-type]  # as much as guards need
+    return GuardOrders(manager, lambda: Graph([], [], []), Connections(), FakeTrail())  # type: ignore[arg-type]  # as much as guards need
 
 
 async def row(orders: GuardOrders) -> Any:
@@ -283,7 +283,7 @@ async def test_suggestions_name_the_guards_that_are_loaded(manager: Manager) -> 
     given = [SimpleNamespace(name=name, kind="topic", value=topic) for name, topic in
              (("command", "/cmd_vel"), ("by", "/odom"))]  # fmt: skip
     manager.givens = SimpleNamespace(states=lambda _checked, _name: given)
-    orders = GuardOrders(manager, lambda: Graph([], topics, []), Connections(), Mock())  # type: ignore[arg-type]  # as much as guards need
+    orders = GuardOrders(manager, lambda: Graph([], topics, []), Connections(), FakeTrail())  # type: ignore[arg-type]  # as much as guards need
     found = await orders.suggestions(guard_requests.GuardSuggestionsWanted())
     assert [one.name for one in found.loaded] == ["fence"]
     assert [one.preset for one in found.suggestions] == ["deadman", "speed"]
@@ -319,7 +319,7 @@ async def test_a_guard_shows_its_version_and_is_upgraded_once(
 async def test_a_new_guard_and_the_list_say_that_the_base_is_on_another_machine(manager: Manager) -> None:
     nodes = [Node("/base", "10.0.0.5", "live", [], ["/c"], [])]
     graph = Graph(nodes, [Topic("/c", TYPES["command"], True, [], ["/base"], [])], [])
-    orders = GuardOrders(manager, lambda: graph, Connections(), Mock())  # type: ignore[arg-type]  # as much as guards need
+    orders = GuardOrders(manager, lambda: graph, Connections(), FakeTrail())  # type: ignore[arg-type]  # as much as guards need
     warning = "/c: the base is on 10.0.0.5: a cut between here and there is not guarded"
     loaded = Replacement(2, "2.0", 1, [], [], [], [], ["another"], [], [], None)
     manager.load = lambda *_given, **_options: _answered(loaded)  # type: ignore[method-assign]  # with warnings
