@@ -173,6 +173,9 @@ class _Control:
             name = {"robot": settings.name} if settings.name else {}
             more = {**name, "version": __version__, "configuration": settings.fingerprints()}
             base.trail.happened("appliance started", f"nodes may connect at {uri}", more=more)
+        else:
+            text = "control started again after an unexpected end: no host holds a group of [Authority]"
+            base.trail.happened("process started", text, resource="control")
         detail = {
             "master": uri.rstrip("/"),
             "revision": base.policies.revision,

@@ -25,13 +25,14 @@ from appliance.rpc.graph_inventory import (
     SurveyedService,
     SurveyedTopic,
 )
-from appliance.rpc.master_reader import READ_LIMITS, printable, value_of
 from appliance.rpc.xmlrpc_client import CallFailedError, XmlRpcClient
 from roswire.errors import InvalidUriError
 from roswire.uris import NodeUri, parse_node_uri
-from roswire.xmlrpc import Value
+from roswire.xmlrpc import Value, XmlRpcLimits
 
 _CALLER = "/rosrv_survey"
+_LIMITS = XmlRpcLimits(body=16 << 20)
+_LONGEST = 256  # characters of a name or text
 
 
 class SurveyLimits(NamedTuple):
@@ -71,7 +72,7 @@ class _Survey:
 
     async def read(self) -> GraphInventory:
         master = XmlRpcClient(
-            self._master, timeout=self._limits.call, pool=self._limits.at_once, limits=READ_LIMITS
+            self._master, timeout=self._limits.call, pool=self._limits.at_once, limits=_LIMITS
         )
         try:
             state = await self._asked(master, "getSystemState")
@@ -126,7 +127,11 @@ class _Survey:
 
     async def _asked(self, client: XmlRpcClient, method: str, *parameters: Value) -> Value:
         """Return the value of an answer. Raises `CallFailedError`."""
-        return value_of(method, await self._answer(client, method, *parameters))
+        answer = await self._answer(client, method, *parameters)
+        if not (isinstance(answer, list) and len(answer) == 3 and answer[0] == 1):
+            said = _text(answer[1]) if isinstance(answer, list) and len(answer) > 1 else "not a ROS answer"
+            raise CallFailedError(f"{method} was answered with: {said}")
+        return answer[2]
 
     async def _answer(self, client: XmlRpcClient, method: str, *parameters: Value) -> Value:
         if clock.now() - self._began > self._limits.whole:
@@ -157,7 +162,7 @@ class _Survey:
                 uri = _text(await self._asked(master, "lookupNode", name))
                 place = parse_node_uri(uri)
                 host = await self._address(place.host)
-                client = XmlRpcClient(place, timeout=self._limits.call, limits=READ_LIMITS)
+                client = XmlRpcClient(place, timeout=self._limits.call, limits=_LIMITS)
                 pid = await self._asked(client, "getPid")
                 bus = _rows(await self._asked(client, "getBusInfo"), 5)[: self._limits.rows]
                 before, began = _sent(await self._counts(client)), clock.now()
@@ -225,7 +230,7 @@ def _text(value: object) -> str:
     """Return a text of a node, without control characters, or its type in brackets."""
     if not isinstance(value, str):
         return f"<{type(value).__name__}>"
-    return printable(value)
+    return "".join(char if char.isprintable() else "?" for char in value[:_LONGEST])
 
 
 def _connection(row: list[Value]) -> NodeConnection:

@@ -1,7 +1,8 @@
 """Keep the compiler's answers over restarts, so that a start compiles no unchanged specification again.
 
-1. A key is the digest of the question and of everything else that decides the answer: the compiler's source, its
-   libraries, and the processor, whose machine code the answer contains. Anything unknown: nothing is kept.
+1. A key is the digest of the question and of everything else that decides the answer: the source of the compiler and of
+   all that it imports, its libraries, and the processor, whose machine code the answer contains. Anything unknown:
+   nothing is kept.
 2. Only control writes to the folder, and it sends the relays their code in any case. A file begins with the digest
    of its content; a damaged one is deleted, and its specifications are compiled.
 3. Files that cannot be written are left out. The folder has a bounded number of files and bytes, and never takes the
@@ -27,8 +28,8 @@ from appliance.channel import messages
 _MOST_FILES = 8  # a start has a question for the contents, and one for the parts of several relays
 _MOST_BYTES = 64 << 20
 _FREE_BYTES = 256 << 20  # left to the audit log and the state
-_SOURCES = ("../../rosmop", ".")  # from this folder
-_LIBRARIES = ("wasmtime", "msgspec")
+SOURCES = ("rosmop", "roswire", "appliance")
+LIBRARIES = ("wasmtime", "msgspec", "lark", "rosbags")
 _PROCESSOR = ("flags", "Features", "model name", "CPU part", "isa")  # of /proc/cpuinfo
 
 M = TypeVar("M", bound=messages.Message)
@@ -109,11 +110,11 @@ class CompiledStore:
 def toolchain(processor: Path = Path("/proc/cpuinfo")) -> str:
     """Return the digest of compiler, libraries and processor; an empty text if one of them is unknown."""
     digest = hashlib.sha256(repr((sys.version_info, platform.machine())).encode())
-    here = Path(__file__).parent
+    here = Path(__file__).parents[2]
     try:
-        for file in sorted(path for folder in _SOURCES for path in (here / folder).resolve().rglob("*.py")):
+        for file in sorted(path for folder in SOURCES for path in (here / folder).rglob("*.py")):
             digest.update(file.name.encode() + hashlib.sha256(file.read_bytes()).digest())
-        for name in _LIBRARIES:
+        for name in LIBRARIES:
             digest.update(f"{name} {version(name)}".encode())
         digest.update("\n".join(_described(processor.read_text(errors="replace").splitlines())).encode())
     except (OSError, PackageNotFoundError):

@@ -143,7 +143,7 @@ EVENTS: dict[str, str] = {
     "sign-on refused": "A sign-on at the provider gave no session; `host` is the browser's address, `reason` says why.",
     "switchover ordered": "An operator ordered the active appliance to hand over to the standby; `detail` has who.",
     "switchover failed": "An ordered switchover did not happen; `reason` says why, `detail` has who ordered it.",
-    "process started": "A process of the appliance started.",
+    "process started": "A process of the appliance, in `resource`, started again after an unexpected end.",
     "process died": "A process of the appliance ended unexpectedly.",
     "process failing": "A process of the appliance ends soon after every start; `reason` says why, `detail.output` has"
     " the last lines that it printed. It is restarted at growing intervals of up to a minute.",

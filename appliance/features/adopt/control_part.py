@@ -175,8 +175,7 @@ class AdoptPart:
     async def adopt(self, _request: AdoptOrder) -> TakeOverReport:
         async with self._one:
             try:
-                await self._machine("want", wanted=True)
-                report = await self._operation.take()
+                report = await self._operation.adopt()
             except AdoptError as error:
                 raise UnavailableError(str(error)) from None
             self._taken(report)
@@ -186,9 +185,9 @@ class AdoptPart:
     async def release(self, _request: ReleaseOrder) -> GiveBackReport:
         async with self._one:
             try:
-                await self._machine("want", wanted=False)
-                facts = await self._operation.facts()
-                return GiveBackReport() if facts.record.phase is Phase.FREE else await self._give()
+                report = await self._operation.release()
+                self._given()
+                return report
             except AdoptError as error:
                 raise UnavailableError(
                     f"{error}. The release is tried again while the appliance runs"

@@ -78,7 +78,7 @@ async def _release(state: Path, store: StateStore) -> GiveBackReport:
     operation = AdoptOperation(
         machine, lambda _facts: MasterReader(NodeUri("http", _HERE, MASTER_PORT, "/")), graph,
         _StoredParameters(store.load_parameters()), waiting=lambda: 0, silence=lambda: None, speak=lambda: None,
-        call=_call,
+        call=_call, forwards=False,
     )  # fmt: skip
     report = await operation.give()
     with store.database.together():

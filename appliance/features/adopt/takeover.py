@@ -15,6 +15,8 @@ Giving back: silence, a master, registrations, forward no more, registrations on
 4. Nothing of RVMaster reaches a node after the silence: the other master's list is the last one that a node gets.
 5. A node that was registered with another URI is unregistered first, because `rosmaster` sends a shutdown request to
    the earlier URI of a name.
+6. From the end of the forwarding on, nodes start at their own master. A name that came there since is neither ended nor
+   registered again, unless RVMaster's node of that name still answers.
 """
 
 import asyncio
@@ -25,6 +27,7 @@ from typing import Protocol
 import msgspec
 
 from appliance.base import clock
+from appliance.base.actors import OPERATOR
 from appliance.base.counted import counted
 from appliance.features.adopt.adopt_answers import GiveBackReport, TakeOverReport
 from appliance.features.adopt.adopt_record import Phase
@@ -93,7 +96,10 @@ async def _nothing(_step: str) -> None: ...
 
 @dataclass
 class AdoptOperation:
-    """The sequences. `waiting()` counts the calls that wait for nodes; `own` are the appliance's nodes."""
+    """The sequences. `waiting()` counts the calls that wait for nodes.
+
+    `forwards` is false if the nodes reach their own master already, because the appliance is dead.
+    """
 
     machine: MachineOrders
     reader: Callable[[MachineFacts], MasterReader]
@@ -103,8 +109,10 @@ class AdoptOperation:
     silence: Callable[[], None]
     speak: Callable[[], None]
     call: NodeCaller = call_node
+    forwards: bool = True
     passed: Callable[[str], Awaitable[None]] = _nothing
     _missing: dict[str, str] = field(default_factory=dict, init=False)
+    _who: str = field(default="", init=False)
 
     async def facts(self, nodes: Iterable[NodeUri] = ()) -> MachineFacts:
         uris = list(nodes)
@@ -125,6 +133,42 @@ class AdoptOperation:
         return None
 
     # --- taking over ---
+
+    async def adopt(self) -> TakeOverReport:
+        """Take the graph over by an order, and at each start from now on.
+
+        Raises `AdoptError`. The order then has no later effect: the graph stays with the robot's master, or goes back.
+        """
+        wanted = (await self.facts()).record.wanted
+        await self.machine("want", wanted=True)
+        self._who = OPERATOR
+        try:
+            return await self.take()
+        except AdoptError as error:
+            if not wanted:
+                await self._withdraw_order(error)
+            raise
+        finally:
+            self._who = ""
+
+    async def release(self) -> GiveBackReport:
+        """Give the graph back by an order, for good. Raises `AdoptError`; `settle` then tries again."""
+        await self.machine("want", wanted=False)
+        if (await self.facts()).record.phase is Phase.FREE:
+            return GiveBackReport()
+        self._who = OPERATOR
+        try:
+            return await self.give()
+        finally:
+            self._who = ""
+
+    async def _withdraw_order(self, error: AdoptError) -> None:
+        try:
+            await self.machine("want", wanted=False)
+            if (await self.facts()).record.phase is not Phase.FREE:
+                await self.give()
+        except AdoptError as second:
+            raise AdoptError(f"{error}; the graph is not given back yet: {second}") from None
 
     async def take(self) -> TakeOverReport:
         """Take the graph over. Raises `AdoptError` if the present master is not the recorded one, or cannot be read."""
@@ -300,7 +344,7 @@ class AdoptOperation:
             f"{counted(report.nodes, 'node')}, {counted(report.registrations, 'registration')},"
             f" {len(report.denied)} denied; {counted(report.cut, 'connection')} cut",
             nodes=report.nodes, registrations=report.registrations, cut=report.cut,
-            denied=len(report.denied), missing=len(report.missing),
+            denied=len(report.denied), missing=len(report.missing), who=self._who or None,
         )  # fmt: skip
 
     # --- giving back ---
@@ -325,8 +369,10 @@ class AdoptOperation:
             if facts.foreign_master and not started:
                 raise AdoptError(f"the graph is not given to another master: {facts.foreign_master}")
             reader = self.reader(facts)
-            given, ended = await self._give_registrations(reader)
-            parameters = await self._give_parameters(reader)
+            withdrawn = facts.record.phase is Phase.GIVING  # by a give that a kill ended
+            known = None if self.forwards and not withdrawn else MasterGraph()
+            given, ended, known = await self._give_registrations(reader, known)
+            parameters = 0 if withdrawn else await self._give_parameters(reader)
             await self.passed("give")
         except (AdoptError, MasterReadError) as error:
             self.speak()
@@ -337,7 +383,7 @@ class AdoptOperation:
         ]
         await self.machine("withdraw")
         await self.passed("withdraw")
-        more = await self._give_registrations(reader)  # of calls that were under way
+        more = await self._give_registrations(reader, known)  # of calls that were under way
         await self.passed("give again")
         failed = await self._last_word(reader, nodes)
         await self.passed("tell")
@@ -362,16 +408,30 @@ class AdoptOperation:
             f"{counted(report.nodes, 'node')} use {report.master or 'their own master'} again",
             nodes=report.nodes,
             given=report.given,
+            who=self._who or None,
         )
         self.speak()
         await self.passed("released")
         return report
 
-    async def _give_registrations(self, reader: MasterReader) -> tuple[int, int]:
-        """Register what the robot's master lacks, and unregister what is gone; return both numbers."""
+    async def _give_registrations(
+        self, reader: MasterReader, known: MasterGraph | None
+    ) -> tuple[int, int, MasterGraph]:
+        """Register what the robot's master lacks, and unregister what is gone.
+
+        Return both numbers, and the graph after it. `known` is the graph since which nodes may have come directly to
+        the robot's master; None: none can.
+        """
         there, held = await reader.read(), dict(self.graph.held())
-        gone = [entry for entry in there.in_order() if self._is_gone(entry, there, held)]
-        new = [entry for entry, node in held.items() if _is_new(entry, node, there)]
+        newer = set[str]() if known is None else await self._newer(there, held, known)
+        gone = [
+            entry
+            for entry in there.in_order()
+            if entry[2] not in newer
+            and self._is_gone(entry, there, held)
+            and (known is None or entry in known.entries or self._moved(entry[2], there, held))
+        ]
+        new = [entry for entry, node in held.items() if entry[2] not in newer and _is_new(entry, node, there)]
         new.sort(key=lambda entry: (ORDER.index(entry[0]), entry))
         calls: list[MasterCall] = []
         for kind, resource, name in gone:
@@ -385,7 +445,42 @@ class AdoptOperation:
             )
             calls.append((_REGISTER[kind], name, (resource, detail, node.api_text)))
         await reader.ask_all(calls)
-        return len(new), len(gone)
+        left = {name: uri for name, uri in there.nodes.items() if name not in newer}
+        after = MasterGraph(
+            frozenset(entry for entry in there.entries if entry[2] in left).difference(gone).union(new),
+            nodes=left | {entry[2]: held[entry].api_text for entry in new},
+        )
+        return len(new), len(gone), after
+
+    async def _newer(
+        self, there: MasterGraph, held: Mapping[Entry, Incarnation], known: MasterGraph
+    ) -> set[str]:
+        """Return the names that came to the robot's master since, and whose node at RVMaster does not answer."""
+        nodes = {entry[2]: node for entry, node in held.items()}
+
+        async def is_newer(name: str) -> bool:
+            if name not in nodes:
+                return True
+            try:
+                await self.call(nodes[name].call_uri, "getPid")
+            except CallFailedError:
+                return True
+            return False
+
+        names = [
+            name
+            for name, uri in there.nodes.items()
+            if known.nodes.get(name) != uri and (name not in nodes or nodes[name].api_text != uri)
+        ]
+        found = await asyncio.gather(*map(is_newer, names))
+        return {name for name, newer in zip(names, found, strict=True) if newer}
+
+    @staticmethod
+    def _moved(name: str, there: MasterGraph, held: Mapping[Entry, Incarnation]) -> bool:
+        """Return whether RVMaster's node of this name has another URI."""
+        return any(
+            entry[2] == name and node.api_text != there.nodes.get(name) for entry, node in held.items()
+        )
 
     def _is_gone(self, entry: Entry, there: MasterGraph, held: Mapping[Entry, Incarnation]) -> bool:
         name = entry[2]
@@ -404,7 +499,7 @@ class AdoptOperation:
         calls += [
             ("deleteParam", MASTER_NAME, (f"/{name}",))
             for name in there
-            if name not in {*mine, *_OWN_PARAMETERS}
+            if self.forwards and name not in {*mine, *_OWN_PARAMETERS}
         ]
         await reader.ask_all(calls)
         return len(calls)

@@ -26,9 +26,10 @@ SUBJECTS: Mapping[str, tuple[str, ...]] = {
     ),
     "alarms": ("alarm acknowledged", "alarm silenced", "alarm sounds again"),
     "software": (
-        "appliance started", "appliance stopped", "bundle in force", "bundle refused", "rest certificate replaced",
-        "switchover ordered", "took over", "handed over",
+        "appliance started", "appliance stopped", "process started", "bundle in force", "bundle refused",
+        "rest certificate replaced", "switchover ordered", "took over", "handed over",
     ),
+    "adoption of the robot's graph": ("graph adopted", "graph released"),
     "records": ("recording removed", "evidence exported", "log set aside"),
 }  # fmt: skip
 """The events of each subject."""
@@ -42,7 +43,8 @@ GAPS = (
 NO_INTERVENTION = frozenset(
     {
         # what hosts and nodes did, and what the rules and monitors made of it
-        "decision", "registered", "unregistered", "revoked", "node lost", "node returned", "replaced", "takeover",
+        "decision", "registered", "adopted", "guard bypassed", "unregistered", "revoked", "node lost", "node returned",
+        "replaced", "takeover",
         "approval used", "approval wanted", "authority asked", "authority refused", "motion not stopped",
         "motion stopped", "topics held", "monitor verdict", "message dropped", "message changed", "monitor fault",
         "monitor log", "monitor called", "monitor published", "shadow observed", "stop begun", "stop ended",
@@ -55,7 +57,7 @@ NO_INTERVENTION = frozenset(
         "topic looked into", "recording fetched", "recording read", "recording ordered", "recording closed",
         "recording missed", "ports checked",
         # the appliance itself
-        "topics moved", "monitors restarted", "door failed", "process started", "process failing", "probe failed",
+        "topics moved", "monitors restarted", "door failed", "adoption failed", "process failing", "probe failed",
         "probe passed", "reconciled", "checkpoint", "fleet not joined", "forwarding failed", "forwarding resumed",
         "forwarding gap", "disk has room", "clock synchronised", "protection forgotten", "certificate ends soon",
         "certificate ended",

@@ -28,14 +28,23 @@ def entries_of(log: Log, events: Iterable[str]) -> Iterator[LogEntry]:
 
 
 def with_origin(log: Log, row: Intervention) -> Intervention:
-    """Return the row with the address of its REST call: the first change of its author that was answered after it."""
+    """Return the row with the address of its REST call, if the log leaves no doubt."""
     if row.who in _LOCAL:
         return row
     calls = log.search(Filter(event="rest call"), str(row.sequence), _ORIGIN_RECORDS, newest_first=False)
-    for entry in calls.entries:
-        record = entry.record
-        if record.time - row.time > _ORIGIN_SECONDS * 1_000_000_000:
-            break
-        if record.detail.get("who") == row.who and record.detail.get("method") not in _READS:
-            return msgspec.structs.replace(row, origin=record.host or "")
-    return row
+    return msgspec.structs.replace(row, origin=origin_of(row, calls.entries))
+
+
+def origin_of(row: Intervention, calls: Iterable[LogEntry]) -> str:
+    """Return the address of the call that made a change: it was answered after the change.
+
+    If its author's changes in that time came from several addresses, it may be any of them, and none is returned.
+    """
+    hosts = {
+        entry.record.host or ""
+        for entry in calls
+        if 0 <= entry.record.time - row.time <= _ORIGIN_SECONDS * 1_000_000_000
+        and entry.record.detail.get("who") == row.who
+        and entry.record.detail.get("method") not in _READS
+    }
+    return hosts.pop() if len(hosts) == 1 else ""

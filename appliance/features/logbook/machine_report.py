@@ -128,7 +128,7 @@ def _span(start: _Open, end: Intervention | None) -> LastingState:
 
 
 def driver_spans(rows: Iterable[Intervention], period: Period) -> list[LastingState]:
-    """Return who drove each group of [Authority]; the appliance's end ends it."""
+    """Return who drove each group of [Authority]; the appliance's end ends it, and that of its control process."""
     opened: dict[str, Intervention] = {}
     found: list[tuple[int, LastingState]] = []
 
@@ -138,7 +138,7 @@ def driver_spans(rows: Iterable[Intervention], period: Period) -> list[LastingSt
             found.append((start.time, _span(_Open(start.after, start), end)))
 
     for row in rows:
-        if row.event in ("appliance stopped", "appliance started"):
+        if row.event in ENDS_OF_DRIVING:
             for group in list(opened):
                 close(group, row)
         elif row.event == "authority handed over":
@@ -150,6 +150,9 @@ def driver_spans(rows: Iterable[Intervention], period: Period) -> list[LastingSt
             found.append((start.time, _span(_Open(start.after, start), None)))
     return [span for _, span in sorted(found, key=lambda pair: pair[0])]
 
+
+ENDS_OF_DRIVING = ("appliance stopped", "appliance started", "process started")
+"""Control begins without a holder of any group."""
 
 NO_HOST = "nobody"
 """The holder of a free group in its record."""
@@ -186,4 +189,7 @@ def pauses(rows: Sequence[Intervention], period: Period) -> list[Gap]:
                 reason = f"no record of its end before the start at {row.time_utc}: a crash or a power cut"
             found.append(Gap(time_utc=before.time_utc, event="appliance not running", reason=reason))
         before = row
+    if before is not None and before.event == "appliance stopped" and period.meets(before.time, None):
+        reason = "shut down in order, and not started again since, as far as the log says"
+        found.append(Gap(time_utc=before.time_utc, event="appliance not running", reason=reason))
     return found

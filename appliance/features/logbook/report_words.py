@@ -92,7 +92,11 @@ def _facts(report: MachineReport) -> Iterator[tuple[str, str]]:
 
 def _spans(report: MachineReport) -> Iterable[tuple[str, Sequence[LastingState], str]]:
     return (
-        ("Guards and monitors that were off", report.switched_off, "none in this period"),
+        (
+            "Guards and monitors that an order switched off",
+            report.switched_off,
+            "none in this period; one that was loaded and never enabled is not listed here",
+        ),
         ("Hosts that were blocked", report.blocks, "none in this period"),
         ("Drivers", report.drivers, "no record that a host held a group of [Authority] in this period"),
         ("Software that ran", report.software, "no start in the log"),

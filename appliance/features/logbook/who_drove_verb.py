@@ -13,10 +13,10 @@ from appliance.cli.connection.target import Appliance, speaks_with
 from appliance.cli.output import say_json, usage_error
 from appliance.features.logbook.interventions import Interventions
 from appliance.features.logbook.log_source import entries_of
-from appliance.features.logbook.machine_report import Period, driver_spans
+from appliance.features.logbook.machine_report import ENDS_OF_DRIVING, Period, driver_spans
 from rosmop.tool.terminal import say
 
-_EVENTS = ("authority handed over", "appliance started", "appliance stopped")
+_EVENTS = ("authority handed over", *ENDS_OF_DRIVING)
 
 
 @speaks_with("One JSON object for each time that a host held a group")

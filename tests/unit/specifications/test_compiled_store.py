@@ -1,4 +1,6 @@
+import ast
 import os
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -6,7 +8,7 @@ import pytest
 
 from appliance.channel.messages import Contents, ContentsFound, ContentsWanted, PartsMade, PartsWanted
 from appliance.specifications import compiled_store
-from appliance.specifications.compiled_store import CompiledStore, toolchain
+from appliance.specifications.compiled_store import LIBRARIES, SOURCES, CompiledStore, toolchain
 
 QUESTION = ContentsWanted(0, {"a.rv": "text", "b.rv": "more"}, {}, at_start=True)
 ANSWER = ContentsFound(7, Contents({"a": "a.rv"}, topics={"/t": frozenset({"a"})}, compiled=b"code"))
@@ -47,6 +49,38 @@ def test_the_digest_of_the_toolchain_depends_on_the_processor(tmp_path: Path) ->
     one, same, other = map(toolchain, files)
     assert one == same != other
     assert toolchain(tmp_path / "unreadable") == ""
+
+
+def test_the_digest_of_the_toolchain_covers_all_that_the_compiler_imports() -> None:
+    root = Path(compiled_store.__file__).parents[2]
+    folders = {path.parent.name for path in root.glob("*/__init__.py")}
+    used, found = set[str](), set[str]()
+    waiting = ["appliance.compiler.process"]
+    while waiting:
+        name = waiting.pop()
+        file = next(
+            (
+                one
+                for one in (
+                    root / f"{name.replace('.', '/')}.py",
+                    root / name.replace(".", "/") / "__init__.py",
+                )
+                if one.is_file()
+            ),
+            None,
+        )
+        if name in found or file is None:
+            continue
+        found.add(name)
+        for node in ast.walk(ast.parse(file.read_bytes())):
+            names = [one.name for one in node.names] if isinstance(node, ast.Import | ast.ImportFrom) else []
+            if isinstance(node, ast.ImportFrom) and node.module:
+                names = [node.module, *(f"{node.module}.{one}" for one in names)]
+            used |= {one.partition(".")[0] for one in names}
+            waiting += [one for one in names if one.partition(".")[0] in folders]
+    assert used & folders == {*SOURCES}
+    without_effect = {"rich", "cryptography"}  # the terminal, and signatures
+    assert used - folders - set(sys.stdlib_module_names) - without_effect <= {*LIBRARIES}
 
 
 def test_nothing_is_kept_with_an_unknown_toolchain(folder: Path) -> None:

@@ -122,6 +122,8 @@ class RobotWorld:
         self.cuts: list[set[int]] = []
         self.steps: list[str] = []
         self.killed_after = ""
+        self.after: dict[str, Callable[[], None]] = {}
+        """The acts of the robot after a step, once."""
         self.told_while_silent: list[str] = []
         self.began: list[str] = []  # the order of registrations at RVMaster
         self.limit = ""
@@ -191,6 +193,8 @@ class RobotWorld:
         match work:
             case "look":
                 return dict(msgspec.to_builtins(self._facts(terms["ports"])))
+            case "want":
+                self.record = msgspec.structs.replace(self.record, wanted=bool(terms["wanted"]))
             case "phase":
                 self.record = msgspec.structs.replace(self.record, phase=Phase(terms["phase"]))
             case "forward":
@@ -236,6 +240,7 @@ class RobotWorld:
         await self.parts.settle()
         self._hear()
         self.steps.append(step)
+        self.after.pop(step, lambda: None)()
         if step == self.killed_after:
             self.killed_after = ""
             raise KilledError

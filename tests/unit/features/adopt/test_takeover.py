@@ -187,12 +187,57 @@ def test_a_registration_that_ends_during_the_reading_is_forgotten() -> None:
     require_taken(run(story))
 
 
+def test_an_order_is_recorded_as_the_operators_and_a_start_as_the_appliances() -> None:
+    async def story(world: RobotWorld) -> None:
+        await world.until_settled()
+        await world.operation.release()
+        await world.operation.adopt()
+        seen = [
+            (record.event, record.detail.get("who"))
+            for record in world.parts.records.records
+            if record.event in {"graph adopted", "graph released"}
+        ]
+        assert seen == [
+            ("graph adopted", None),
+            ("graph released", "operator"),
+            ("graph adopted", "operator"),
+        ]
+
+    run(story)
+
+
+def _keep_changing(world: RobotWorld) -> None:
+    numbers = iter(range(100))
+    world.master.before = lambda: world.master.entries.add(("publication", f"/{next(numbers)}", "/base"))
+
+
 def test_a_graph_that_never_rests_is_an_error_after_five_readings() -> None:
     async def story(world: RobotWorld) -> None:
-        numbers = iter(range(100))
-        world.master.before = lambda: world.master.entries.add(("publication", f"/{next(numbers)}", "/base"))
+        _keep_changing(world)
         with pytest.raises(AdoptError, match="still changes after 5"):
             await world.operation.take()
+
+    run(story)
+
+
+@pytest.mark.parametrize("fault", ["master", "restless"])
+@pytest.mark.parametrize("wanted", [False, True])
+def test_an_order_that_fails_has_no_later_effect(fault: str, wanted: bool) -> None:
+    async def story(world: RobotWorld) -> None:
+        world.record = msgspec.structs.replace(world.record, wanted=wanted)
+        if fault == "master":
+            world.master.alive = False
+        else:
+            _keep_changing(world)
+        with pytest.raises(AdoptError):
+            await world.operation.adopt()
+        assert world.record.wanted is wanted
+        if not wanted:
+            world.master.alive = True
+            assert await world.operation.settle(await world.operation.facts(), settled=False) is None
+            assert (world.record.phase, world.forwarded) == (Phase.FREE, False)
+            assert world.graph.nodes() == []
+            assert world.master.entries >= world.truth()
 
     run(story)
 
@@ -362,19 +407,76 @@ def test_a_master_that_a_release_has_started_is_known_at_the_next_start() -> Non
     run(story)
 
 
+async def _restart_under_the_rules(world: RobotWorld) -> None:
+    node = world.robot["/teleop"]
+    node.uri, node.port = "http://base:4022/", 4022
+    for topic in node.publishes:
+        await world.parts.ask("registerPublisher", node.name, topic, "std_msgs/String", node.uri, host=LINK)
+    for topic in node.subscribes:
+        await world.parts.ask("registerSubscriber", node.name, topic, "std_msgs/String", node.uri, host=LINK)
+
+
 def test_a_node_that_was_restarted_under_the_rules_is_given_back_with_its_new_uri() -> None:
     async def story(world: RobotWorld) -> None:
         await world.until_settled()
-        node = world.robot["/teleop"]
-        node.uri, node.port = "http://base:4022/", 4022
-        for topic in node.publishes:
-            await world.parts.ask(
-                "registerPublisher", node.name, topic, "std_msgs/String", node.uri, host=LINK
-            )
-        for topic in node.subscribes:
-            await world.parts.ask(
-                "registerSubscriber", node.name, topic, "std_msgs/String", node.uri, host=LINK
-            )
+        await _restart_under_the_rules(world)
+        world.record = msgspec.structs.replace(world.record, wanted=False)
+        await world.until_settled()
+
+    require_given(run(story))
+
+
+def _start_nodes_at_their_own_master(world: RobotWorld) -> None:
+    """Start a new node, and one of the robot's again, while the appliance no longer stands between."""
+    world.add("/late", 4009, publishes=("/late", "/cmd_vel"), subscribes=("/odom",))
+    node = world.robot["/teleop"]
+    node.uri, node.port = "http://base:4022/", 4022
+    world.register(node)
+    world.master.tree["late"] = 1
+    for one in world.robot.values():  # as rosmaster does
+        for topic in one.subscribes:
+            one.lists[topic] = [other.uri for other in world.robot.values() if topic in other.publishes]
+
+
+def _require_nodes_of_their_own_master(world: RobotWorld) -> None:
+    require_given(world)
+    assert world.master.nodes["/teleop"] == "http://base:4022/"
+    assert world.master.nodes["/late"] == "http://base:4009/"
+    assert world.master.tree["late"] == 1
+
+
+@pytest.mark.parametrize("killed", ["", "withdraw", "give again", "tell", "given"])
+def test_a_node_that_starts_at_the_own_master_after_the_forwarding_stays(killed: str) -> None:
+    async def story(world: RobotWorld) -> None:
+        await world.until_settled()
+        world.record = msgspec.structs.replace(world.record, wanted=False)
+        world.killed_after = killed
+        world.after[killed or "withdraw"] = lambda: _start_nodes_at_their_own_master(world)
+        await world.until_settled()
+        _require_nodes_of_their_own_master(world)
+
+    run(story)
+
+
+def test_a_node_that_starts_while_a_dead_appliance_is_released_stays() -> None:
+    async def story(world: RobotWorld) -> None:
+        await world.until_settled()
+        world.begin()
+        world.operation.forwards = False
+        world.record = msgspec.structs.replace(world.record, wanted=False)
+        world.after["stand in"] = lambda: _start_nodes_at_their_own_master(world)
+        await world.until_settled()
+        _require_nodes_of_their_own_master(world)
+
+    run(story)
+
+
+def test_a_dead_appliance_gives_back_a_node_that_was_restarted_under_the_rules() -> None:
+    async def story(world: RobotWorld) -> None:
+        await world.until_settled()
+        await _restart_under_the_rules(world)
+        world.begin()
+        world.operation.forwards = False
         world.record = msgspec.structs.replace(world.record, wanted=False)
         await world.until_settled()
 

@@ -12,8 +12,10 @@ from appliance.features.logbook.interventions import (
     SUBJECTS,
     Interventions,
 )
+from appliance.features.logbook.log_source import origin_of
 from appliance.features.logbook.machine_report import (
     BLOCKED,
+    ENDS_OF_DRIVING,
     OFF,
     RUNS,
     LastingState,
@@ -37,6 +39,7 @@ def entry(hour: float, event: str, resource: str = "", reason: str = "", **detai
         time=round(hour * HOUR),
         event=event,
         resource=resource or None,
+        host=resource or None,
         reason=reason,
         detail=detail,
     )
@@ -135,8 +138,9 @@ def test_the_driver_at_a_time(at: float, host: str | None) -> None:
 def test_the_end_of_the_appliance_ends_who_drove() -> None:
     entries = (_HANDED[0], entry(1.5, "appliance stopped"), entry(4, "appliance started", version="1"))
     assert drove(*entries, at=1.2) and not drove(*entries, at=2)
-    crashed = (_HANDED[0], entry(4, "appliance started", version="1"))
-    assert not drove(*crashed, at=5)
+    for event in ENDS_OF_DRIVING:
+        ended = (_HANDED[0], entry(4, event, "control"))
+        assert drove(*ended, at=3) and not drove(*ended, at=5)
 
 
 def test_a_crash_and_an_ordered_end_are_different_gaps() -> None:
@@ -149,6 +153,31 @@ def test_a_crash_and_an_ordered_end_are_different_gaps() -> None:
     ordered, crash = pauses(rows, ALWAYS)
     assert "shut down in order" in ordered.reason and "(3600 s)" in ordered.reason
     assert "a crash or a power cut" in crash.reason
+
+
+def test_an_appliance_that_was_not_started_again_is_a_gap() -> None:
+    rows = read(entry(1, "appliance started"), entry(2, "appliance stopped")).rows
+    (gap,) = pauses(rows, ALWAYS)
+    assert "not started again" in gap.reason
+    assert not pauses(rows, Period(0, HOUR))
+
+
+@pytest.mark.parametrize(
+    ("calls", "origin"),
+    [
+        ([("ann", "10.0.0.1")], "10.0.0.1"),
+        ([("bob", "10.0.0.2"), ("ann", "10.0.0.1"), ("ann", "10.0.0.1")], "10.0.0.1"),
+        ([("ann", "10.0.0.1"), ("ann", "10.0.0.2")], ""),
+        ([("bob", "10.0.0.2")], ""),
+    ],
+)
+def test_an_origin_is_named_only_without_doubt(calls: list[tuple[str, str]], origin: str) -> None:
+    (row,) = read(entry(1, "monitor set", "speed", who="ann")).rows
+    made = [
+        entry(1 + number / 10_000, "rest call", host, who=who, method="POST")
+        for number, (who, host) in enumerate(calls)
+    ]
+    assert origin_of(row, made) == origin
 
 
 EVIL = "<script>alert(1)</script>\x1b[31m"
