@@ -38,6 +38,10 @@ class PolicyContext:
     approved: frozenset[Approval] | None = None
     own: Collection[Address] = ()
 
+    def compiled(self, text: str, file: str) -> Policy:
+        """Compile a text for these addresses. Raises `PolicyError`."""
+        return compile_policy(text, file=file, hosts=self.hosts, robot=self.robot, own=self.own)
+
     @classmethod
     def of(cls, fields: Mapping[str, Any]) -> Self:
         return cls(
@@ -82,7 +86,7 @@ class PolicyJudgement(NamedTuple):
 
 def judge(text: str, file: str, known: PolicyContext, signature: str = "") -> PolicyJudgement:
     """Check a text. Raises `PolicyError` with all its errors, or else those of the signature and the test cases."""
-    policy = compile_policy(text, file=file, hosts=known.hosts, robot=known.robot, own=known.own)
+    policy = known.compiled(text, file)
     try:
         signed_by = signer(known.site_keys, text, signature)
     except UnsignedError as error:

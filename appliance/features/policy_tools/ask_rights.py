@@ -4,7 +4,6 @@ An answer is a line of the policy, or a test case: what a person denied is a `de
 again. Both files are written after each answer.
 """
 
-import ipaddress
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
@@ -29,7 +28,6 @@ from appliance.policy.cases import run_cases
 from appliance.policy.judgement import PolicyContext, judge
 from appliance.policy.model import Address, Category, Request
 from appliance.policy.policy import Policy
-from appliance.policy.policy_compiler import compile_policy
 from appliance.policy.policy_findings import PolicyError
 from appliance.policy.rights import Right, decide_right
 from appliance.policy.sections import PARAMETERS
@@ -75,7 +73,7 @@ class AskedPolicy:
             results = run_cases(self._compiled(), self.cases_text, f"{self.file}.tests.yaml")
             denied = (result.request for result in results if result.expected == "deny")
             self._denied |= {(request.category, request.resource, request.host) for request in denied}
-        members = [str(ipaddress.ip_network(place).network_address) for place in self.known.robot]
+        members = [str(place.network_address) for place in self._compiled().robot]
         if members:
             self.given.setdefault("robot", members)
 
@@ -85,7 +83,7 @@ class AskedPolicy:
         return yaml.safe_dump({**given, "cases": self.cases}, sort_keys=False)
 
     def _compiled(self) -> Policy:
-        return compile_policy(self.text, file=self.file, hosts=self.known.hosts, robot=self.known.robot)
+        return self.known.compiled(self.text, self.file)
 
     def missing(self, counts: Counter[tuple[RightKind, str]]) -> Iterator[tuple[RightKind, str, int]]:
         """Yield the kinds that the rules deny and no test case denies, with a node and the number of requests.
@@ -118,7 +116,7 @@ class AskedPolicy:
                 text = enforced(self.text).text
             except EnforceError:  # it is enforced already
                 text = self.text
-            policy = compile_policy(text, file=self.file, hosts=self.known.hosts, robot=self.known.robot)
+            policy = self.known.compiled(text, self.file)
             self._policy = self.text, policy
         return self._policy[1]
 
@@ -133,7 +131,7 @@ class AskedPolicy:
     def deny(self, kind: RightKind, node: str) -> None:
         """Add a test case that no later change may allow it."""
         host = str(kind.host)
-        if any(kind.host in ipaddress.ip_network(place) for place in self.known.robot):
+        if any(kind.host in place for place in self._compiled().robot):
             host = ROBOT
         case = {"host": host, "node": node or "/visitor", "deny": [kind.action]}
         self.cases.append(case)

@@ -31,7 +31,6 @@ from appliance.policy.host_names import HostNames, in_words
 from appliance.policy.judgement import PolicyContext
 from appliance.policy.model import Request
 from appliance.policy.policy import Policy
-from appliance.policy.policy_compiler import compile_policy
 from appliance.policy.policy_findings import PolicyError
 from rosmop.tool.terminal import refused, say
 
@@ -144,9 +143,7 @@ def _known(
 
 def _compiled(source: _Source, known: PolicyContext) -> Policy:
     try:
-        return compile_policy(
-            source.text, file=source.name, hosts=known.hosts, robot=known.robot, own=known.own
-        )
+        return known.compiled(source.text, source.name)
     except PolicyError as error:
         raise refused(error.findings) from error
 

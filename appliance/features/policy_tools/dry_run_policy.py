@@ -18,16 +18,13 @@ from appliance.features.policy_tools.diff import diff
 from appliance.features.policy_tools.policy_models import Change, Ended, Report
 from appliance.policy.judgement import PolicyContext, judge
 from appliance.policy.live_rights import LiveRight, endings
-from appliance.policy.policy_compiler import compile_policy
 from appliance.policy.policy_findings import PolicyError
 
 
 def judge_change(order: PolicyLoad, current: PolicyKnown, registrations: Iterable[Registration]) -> Report:
     """Return the effects of a change. Raises `ProblemError` with every finding if the text is rejected."""
     known = PolicyContext.of(msgspec.structs.asdict(current))
-    before = compile_policy(
-        current.text, file=current.file, hosts=known.hosts, robot=known.robot, own=known.own
-    )
+    before = known.compiled(current.text, current.file)
     try:
         policy = judge(order.text, "policy", known, order.signature).accepted()
     except PolicyError as error:

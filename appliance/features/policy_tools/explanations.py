@@ -84,7 +84,9 @@ def judge_text(text: str | None, current: PolicyKnown, *, cases: bool) -> Policy
     text, file = (current.text, current.file) if text is None else (text, "policy")
     known = PolicyContext.of(msgspec.structs.asdict(current))
     try:
-        known = replace(known, site_keys=()) if cases else PolicyContext(known.hosts, known.robot)
+        known = (
+            replace(known, site_keys=()) if cases else PolicyContext(known.hosts, known.robot, own=known.own)
+        )
         return judge(text, file, known)
     except PolicyError as error:
         raise refused_text(error) from error

@@ -12,12 +12,12 @@ from dataclasses import dataclass, replace
 from typing import Self
 
 from appliance.features.policy_tools.stock_tools import StockTool, key_of, stock_tool
+from appliance.policy.groups import ROBOT
 from appliance.policy.ini_reader import Entry, SectionText, Word, read
 from appliance.policy.judgement import PolicyContext, judge
 from appliance.policy.keys import levels
 from appliance.policy.model import Address, Category, Request, Rule, word_of
 from appliance.policy.policy import Policy
-from appliance.policy.policy_compiler import compile_policy
 from appliance.policy.policy_findings import Findings, PolicyError
 from appliance.policy.policy_settings import TAKEOVERS
 from appliance.policy.rights import Right, decide_right, rights_of, rights_of_call
@@ -68,8 +68,8 @@ class Grant:
 
 def grant(text: str, file: str, known: PolicyContext, asked: DecidedRequest) -> Grant:
     """Grant a request. Raises `UngrantableError`, and `PolicyError` if the text is not a valid policy."""
-    word = _word(text, known, asked.request.host)
-    policy = compile_policy(text, file=file, hosts=known.hosts, robot=known.robot, own=known.own)
+    policy = known.compiled(text, file)
+    word = _word(text, known, policy, asked.request.host)
     block = replace(policy, blocks=known.blocks).blocked(asked.request.host)
     if block is not None:
         raise UngrantableError(f"no line of a policy grants it: {block.reason}")
@@ -84,7 +84,7 @@ def grant(text: str, file: str, known: PolicyContext, asked: DecidedRequest) -> 
         text, line = _changed(policy, text, missing, word, "" if added else asked.wide)
         added.append(line)
         try:
-            policy = compile_policy(text, file=file, hosts=known.hosts, robot=known.robot, own=known.own)
+            policy = known.compiled(text, file)
         except PolicyError:  # the line is invalid: the call is unknown, or no key can name the resource
             raise UngrantableError(f"no line of a policy grants it: {reason}") from None
     if asked.takeover and policy.takeover != TAKEOVERS[-1]:
@@ -100,7 +100,8 @@ def _granted(policy: Policy, right: Right) -> bool:
     return decision.allowed and not decision.would_deny
 
 
-def _word(text: str, known: PolicyContext, host: Address) -> str:
+def _word(text: str, known: PolicyContext, policy: Policy, host: Address) -> str:
+    """Return the word for a host. A rule with an address of the robot's machine would take it out of `robot`."""
     enrolled = next((name for name, address in known.hosts.items() if address == host), None)
     if enrolled is not None:
         return word_of(enrolled)
@@ -108,10 +109,7 @@ def _word(text: str, known: PolicyContext, host: Address) -> str:
     for entry in groups.entries if groups is not None else ():
         if [word.text for word in entry.values] == [str(host)]:
             return entry.key.text
-    alone = [
-        place for place in known.robot if str(place).removesuffix("/32").removesuffix("/128") == str(host)
-    ]
-    return "robot" if alone else str(host)
+    return ROBOT if any(place.num_addresses == 1 and host in place for place in policy.robot) else str(host)
 
 
 def _sections(text: str) -> list[SectionText]:

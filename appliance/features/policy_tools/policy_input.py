@@ -101,7 +101,7 @@ def context_of(body: PolicyInForce) -> PolicyContext:
 
 def running_robot(appliance: Appliance) -> list[Network]:
     body = appliance.ask(PolicyWanted()).given() if appliance.place is None else _over_rest(appliance)
-    return [canonical_network(ipaddress.ip_network(place)) for place in body.robot]
+    return [canonical_network(ipaddress.ip_network(place)) for place in (*body.robot, *body.own)]
 
 
 def _over_rest(appliance: Appliance) -> PolicyInForce:

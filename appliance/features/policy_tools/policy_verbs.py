@@ -35,7 +35,6 @@ from appliance.policy.judgement import PolicyContext, PolicyJudgement, judge
 from appliance.policy.live_rights import Ending
 from appliance.policy.model import Category, Decision, Request
 from appliance.policy.policy import Policy
-from appliance.policy.policy_compiler import compile_policy
 from appliance.policy.policy_findings import FindingSeverity, PolicyError, PolicyFinding
 from appliance.policy.rights import needs_node, rights_of
 from rosmop.tool.terminal import refused, say
@@ -137,7 +136,7 @@ def compiled(
 
 def compiled_with(text: str, name: str, known: PolicyContext) -> Policy:
     try:
-        policy = compile_policy(text, file=name, hosts=known.hosts, robot=known.robot, own=known.own)
+        policy = known.compiled(text, name)
     except PolicyError as error:  # the appliance has another version
         raise refused(error.findings) from error
     return replace(policy, blocks=known.blocks, holders=known.holders, approved=known.approved)

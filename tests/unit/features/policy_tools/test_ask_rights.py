@@ -1,5 +1,6 @@
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 from ipaddress import ip_address
 
 import pytest
@@ -74,6 +75,14 @@ def may(policy: AskedPolicy, kind: RightKind, name: str = "") -> bool:
 def test_only_what_the_rules_deny_is_asked_also_in_audit_only_mode() -> None:
     assert answered(asked(), SCAN, MOVE) == ["/base/cmd_vel"]
     assert answered(asked(TEXT.replace("audit-only = all\n", "")), SCAN, MOVE) == ["/base/cmd_vel"]
+
+
+def test_an_address_of_the_machine_has_the_rights_of_the_robot() -> None:
+    own = AskedPolicy(TEXT, "p.ini", replace(KNOWN, own=[PAD]))
+    assert list(own.missing(counts(MOVE, SCAN))) == []
+    own.deny(MOVE, "/pad")
+    assert own.cases == [{"host": "robot", "node": "/pad", "deny": ["publish /base/cmd_vel"]}]
+    assert own.given == {"robot": [str(ROBOT), str(PAD)]}
 
 
 def test_an_allowed_right_is_that_hosts_alone() -> None:

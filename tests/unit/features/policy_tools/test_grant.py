@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from appliance.features import policy_tools
 from appliance.features.policy_tools.grant import DecidedRequest, UngrantableError, asked, grant
 from appliance.features.policy_tools.stock_tools import stock_tool
 from appliance.policy.judgement import PolicyContext
@@ -86,6 +87,24 @@ def test_a_host_is_named_by_its_group_or_certificate() -> None:
     assert changed(grouped, "subscribe", "/z") == ["/z = ocu"]
     assert changed(BASE, "subscribe", "/z", "10.0.0.77") == ["/z = host:laptop"]
     assert changed(BASE, "subscribe", "/z", "10.84.0.2") == ["/z = robot"]
+
+
+def test_an_address_of_the_machine_is_granted_as_the_robot_unless_the_policy_names_it() -> None:
+    """A rule with the address would take it out of the group, with all its other rights."""
+    own = replace(KNOWN, own=[HOST])
+    wanted = DecidedRequest(request(Category.SUBSCRIBE, "/z"), [Right(request(Category.SUBSCRIBE, "/z"))])
+    text = "[Nodes]\ndefault = robot\n[Subscribers]\n/a = robot\n"
+    found = grant(text, "p.ini", own, wanted)
+    assert found.added == ("/z = robot",)
+    assert own.compiled(found.text, "p.ini").decide(request(Category.SUBSCRIBE, "/a")).allowed
+    named = grant(text + "/b = 10.0.0.9\n", "p.ini", own, wanted)
+    assert "/z = 10.0.0.9" in named.added
+
+
+def test_no_tool_compiles_a_policy_with_a_part_of_what_is_known_beside_it() -> None:
+    """`PolicyContext.compiled` takes all: hosts, the robot, and the other addresses of its machine."""
+    tools = Path(policy_tools.__file__).parent
+    assert [file.name for file in tools.glob("*.py") if "hosts=known.hosts" in file.read_text("utf-8")] == []
 
 
 def test_a_call_about_a_parameter_needs_the_parameter_too() -> None:
