@@ -1,12 +1,14 @@
 """Print the sizes of the program's parts, and of each module of the kernel: `python -m distribution.sizes`.
 
+The last two lines count the words of the guides (`docs/*.md`) and of all pages.
+
 With `--release`, which `make release` uses, the exit status is 1 if a part exceeds its limit by more than 5 %. Between
 releases nothing depends on these numbers: `distribution/interfaces.py` counts what a change should not add to.
 """
 
 import sys
 import tokenize
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
 from distribution.checkout import ROOT
@@ -65,6 +67,12 @@ def sizes() -> Mapping[str, int]:
     }
 
 
+def words() -> Mapping[str, int]:
+    """Return the words of the guides, which a user reads, and of all pages."""
+    docs = ROOT / "docs"
+    return {"guides": _words_in(docs.glob("*.md")), "pages": _words_in(docs.rglob("*.md"))}
+
+
 def too_large(measured: Mapping[str, int]) -> list[str]:
     """Return a line for each part that exceeds its limit by more than 5 %."""
     return [
@@ -78,6 +86,10 @@ def _lines_in(folder: str) -> int:
     return sum(path.read_bytes().count(b"\n") for path in (ROOT / folder).rglob("*.py"))
 
 
+def _words_in(files: Iterable[Path]) -> int:
+    return sum(len(path.read_text(encoding="utf-8").split()) for path in files)
+
+
 def _report(measured: Mapping[str, int]) -> Iterator[str]:
     for part, size in measured.items():
         yield f"{part:<10}{size:>9,}  of {LIMITS[part]:,}"
@@ -85,6 +97,8 @@ def _report(measured: Mapping[str, int]) -> Iterator[str]:
         if part != OUTSIDE:
             yield f"\n{part}"
             yield from (f"{lines_of_code(ROOT / 'appliance' / module):>6}  {module}" for module in modules)
+    yield "\nwords"
+    yield from (f"{part:<10}{number:>9,}" for part, number in words().items())
 
 
 def main(arguments: list[str]) -> int:

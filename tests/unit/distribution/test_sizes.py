@@ -1,6 +1,6 @@
 from pathlib import Path
 
-from distribution.sizes import LIMITS, lines_of_code, too_large
+from distribution.sizes import LIMITS, lines_of_code, too_large, words
 
 
 def test_a_limit_has_five_percent_of_play() -> None:
@@ -14,3 +14,9 @@ def test_lines_of_code_leave_out_blanks_comments_and_docstrings(tmp_path: Path) 
     module = tmp_path / "module.py"
     module.write_text('"""A docstring\nof two lines."""\n\n# a comment\nx = (\n    1,\n)\n')
     assert lines_of_code(module) == 3
+
+
+def test_a_page_that_moves_to_the_reference_is_cut_from_the_guides_only() -> None:
+    moved = Path("docs/guards.md")
+    assert 0 < len(moved.read_text().split()) < words()["guides"] < words()["pages"]
+    assert words()["pages"] == sum(len(page.read_text().split()) for page in Path("docs").rglob("*.md"))
