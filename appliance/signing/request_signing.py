@@ -21,10 +21,12 @@ from typing import NamedTuple
 from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
 
+from appliance.signing.bearer_secrets import SecretForm, hash_of
+
 HEADER = "ROSRV-Proof"  # "CHALLENGE SIGNATURE"
 _VERSION = "rosrv order 1"
 _READING, _SIGNING = b"rosrv reading key 1", b"rosrv signing key 1"
-_READING_FORM = re.compile(r"rosrv-read_([0-9a-f]{12})_([A-Za-z0-9_-]{43})")
+_READING_FORM = SecretForm("rosrv-read_")
 _PROOF_FORM = re.compile(r"([!-~]{1,200}) ([A-Za-z0-9_-]{86})")
 
 
@@ -41,7 +43,7 @@ class TokenKeys(NamedTuple):
 
 def keys_of(token: str) -> TokenKeys:
     """Derive the stored keys from a token, `rosrv_ID_SECRET`."""
-    return TokenKeys(reading_hash(reading_key(token)), _signing_key(token).public_key().public_bytes_raw())
+    return TokenKeys(hash_of(reading_key(token)), _signing_key(token).public_key().public_bytes_raw())
 
 
 def reading_key(token: str) -> str:
@@ -51,13 +53,8 @@ def reading_key(token: str) -> str:
 
 
 def reading_id(shown: str) -> str | None:
-    found = _READING_FORM.fullmatch(shown)
-    return None if found is None else found[1]
-
-
-def reading_hash(key: str) -> bytes:
-    """Hash a reading key; it has 256 random bits, so a fast hash is enough."""
-    return hashlib.sha256(key.encode("ascii")).digest()
+    found = _READING_FORM.parse(shown)
+    return None if found is None else found[0]
 
 
 def statement(

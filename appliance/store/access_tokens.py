@@ -11,9 +11,10 @@ import secrets
 from typing import NamedTuple
 
 from appliance.base.actors import DISK, OPERATOR
+from appliance.signing.bearer_secrets import SecretForm
 from appliance.signing.request_signing import TokenKeys, keys_of
 
-_FORM = re.compile(r"rosrv_([0-9a-f]{12})_([A-Za-z0-9_-]{43})")
+_FORM = SecretForm("rosrv_")
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._@-]{0,62}")
 # `who` has these values in revisions and records that no token made.
 _RESERVED = frozenset({DISK, OPERATOR})
@@ -46,17 +47,14 @@ def make_token(name: str, role: str, *, now: float, seconds: float) -> tuple[Tok
             f"{name[:80]!r} is not a valid token name: letters, digits and . _ @ -, beginning with a letter or digit, "
             f"at most 63, and not {' or '.join(sorted(_RESERVED))}"
         )
-    token_id, salt = secrets.token_hex(6), secrets.token_bytes(16)
-    secret = secrets.token_urlsafe(32)
-    text = f"rosrv_{token_id}_{secret}"
+    (token_id, secret, text), salt = _FORM.make(), secrets.token_bytes(16)
     kept = hash_secret(secret, salt)
     return TokenRow(token_id, name, role, salt, kept, now, now + seconds, None, keys_of(text)), text
 
 
 def parse_token(text: str) -> tuple[str, str] | None:
     """Return the id and the secret, or None for another text."""
-    found = _FORM.fullmatch(text)
-    return None if found is None else (found[1], found[2])
+    return _FORM.parse(text)
 
 
 def hash_secret(secret: str, salt: bytes) -> bytes:

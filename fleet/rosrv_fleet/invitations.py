@@ -1,7 +1,6 @@
 """Keep the invitations with which robots enrol themselves.
 
-1. Only the output of `add` contains the token. Its hash is the file name; as the secret has 256 random bits, a fast
-   hash is enough.
+1. Only the output of `add` contains the token. Its hash is the file name.
 2. A token is valid for one request. Its hash is stored before the robot is enrolled, so the robot may repeat the
    request, even after a crash, and any other request with this token is rejected.
 3. Every other change of a robot's certificate withdraws its invitations, so a repeated request cannot undo it.
@@ -9,7 +8,6 @@
 
 import hashlib
 import re
-import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,6 +16,7 @@ import msgspec
 
 from appliance.base import clock
 from appliance.base.atomic_files import write_whole
+from appliance.signing.bearer_secrets import hash_of, new_secret
 from rosrv_fleet.acts import recorded
 from rosrv_fleet.enrolment import EnrolmentError
 from rosrv_fleet.robots import changing
@@ -57,7 +56,7 @@ class Invitations:
     def add(self, name: str, group: str, seconds: float, appliance: str = "") -> tuple[PendingRobot, str]:
         """Make an invitation, which replaces earlier ones of the same appliance, and return it with its token."""
         pending = PendingRobot(name=name, group=group, expires=clock.wall() + seconds, appliance=appliance)
-        token = f"rosrv-join_{secrets.token_urlsafe(32)}"
+        token = f"rosrv-join_{new_secret()}"
         with changing(self._folder), recorded(self._folder.parent, "robot invite", name, group):
             self._remove(name, appliance)
             self._keep(token, pending)
@@ -107,7 +106,7 @@ class Invitations:
         write_whole(self._file(token), msgspec.json.encode(pending), 0o600)
 
     def _file(self, token: str) -> Path:
-        return self._folder / f"{hashlib.sha256(token.encode()).hexdigest()}.json"
+        return self._folder / f"{hash_of(token).hex()}.json"
 
 
 def _read(file: Path) -> PendingRobot | None:

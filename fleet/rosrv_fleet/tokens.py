@@ -1,7 +1,6 @@
-"""Keep the tokens of operators as SHA-256. A fast hash is enough, because a token has 256 random bits."""
+"""Keep the hashes of operators' tokens."""
 
 import enum
-import hashlib
 import re
 import secrets
 from pathlib import Path
@@ -10,6 +9,7 @@ import msgspec
 
 from appliance.base import clock
 from appliance.base.atomic_files import write_whole
+from appliance.signing.bearer_secrets import hash_of, new_secret
 from rosrv_fleet.acts import recorded
 from rosrv_fleet.robots import changing
 from rosrv_fleet.stored_files import read_stored
@@ -55,7 +55,7 @@ class OperatorTokens:
             return []
 
     def holder(self, token: str) -> OperatorToken | None:
-        digest = hashlib.sha256(token.encode("utf-8", "replace")).hexdigest()
+        digest = hash_of(token).hex()
         return next((one for one in self.all() if secrets.compare_digest(one.hash, digest)), None)
 
     def add(self, name: str, role: FleetRole) -> str:
@@ -63,9 +63,8 @@ class OperatorTokens:
             raise TokenError(
                 f"{name!a}: use 1 to 63 of a-z, 0-9, '.', '_' and '-'; begin with a letter or digit"
             )
-        text = secrets.token_urlsafe(32)
-        digest = hashlib.sha256(text.encode()).hexdigest()
-        made = OperatorToken(name=name, role=role, hash=digest, added=clock.wall_ns())
+        text = new_secret()
+        made = OperatorToken(name=name, role=role, hash=hash_of(text).hex(), added=clock.wall_ns())
         with changing(self._file.parent):
             tokens = self.all()
             if any(one.name == name for one in tokens):

@@ -234,6 +234,8 @@ LISTENERS = {
 """The entrances of each file that listens or binds."""
 
 SECRETS = {
+    "appliance/signing/bearer_secrets.py": "REST with a token, REST without a token, door's ticket, collector",
+    "appliance/signing/request_signing.py": "REST with a token",
     "appliance/control/operators/token_orders.py": "REST with a token",
     "appliance/store/access_tokens.py": "REST with a token",
     "appliance/features/doors/door_orders.py": "door's ticket",

@@ -21,7 +21,8 @@ ROOT = Path(__file__).parents[2]
 _LISTENS = re.compile(
     r"\blisten\(|start_server\(|create_server\(|start_unix_server\(|create_datagram_endpoint\(|\.bind\("
 )
-_SECRET = re.compile(r"secrets\.(token|randbelow)|make_token\(|new_ticket\(")
+_SECRET = re.compile(r"secrets\.(token|randbelow)|make_token\(|new_ticket\(|new_secret\(|SecretForm\(")
+_COMPARED = re.compile(r"compare_digest\(")
 _ROUTES = re.compile(r"APIRouter\(|Routes\(\)|Route\(")
 _NO_WAY_IN = frozenset(
     {"links.start", "links.kill", "policy.provide", "policy.on_change", "policy.on_first", "limits.provide"}
@@ -63,6 +64,17 @@ def test_every_file_that_listens_is_the_row_of_an_entrance() -> None:
 
 def test_every_secret_is_the_row_of_an_entrance() -> None:
     assert files(_SECRET, "appliance", "fleet/rosrv_fleet") == entrances.SECRETS.keys()
+
+
+def test_shown_secrets_are_compared_in_one_module() -> None:
+    """All other comparisons have their reason here."""
+    assert files(_COMPARED, "appliance", "fleet/rosrv_fleet") == {
+        "appliance/signing/bearer_secrets.py",
+        "appliance/store/access_tokens.py",  # a salted, slow hash, for tokens without keys
+        "appliance/control/rest/rest_proof.py",  # the code of a challenge, which is not stored
+        "appliance/features/standby/witness.py",  # the code of a datagram
+        "fleet/rosrv_fleet/tokens.py",  # the hash in hexadecimal, in a file
+    }
 
 
 def test_every_path_without_a_token_is_the_row_of_an_entrance() -> None:

@@ -24,7 +24,8 @@ from appliance.channel.answers.token_answers import TokenRole
 from appliance.channel.messages.api import ClientRequest, TokenKept
 from appliance.configuration.sections import is_loopback
 from appliance.quotas.pool import QuotaClass
-from appliance.signing.request_signing import reading_hash, reading_id
+from appliance.signing.bearer_secrets import is_hash_of
+from appliance.signing.request_signing import reading_id
 from appliance.store.access_tokens import is_secret, parse_token
 
 USE_SECONDS = 60.0
@@ -121,7 +122,7 @@ class TokenAuthenticator:
         parsed = parse_token(text)
         kept = self._tokens.get(parsed[0] if parsed is not None else reading_id(text) or "")
         if kept is not None and (
-            hmac.compare_digest(reading_hash(text), kept.reading)
+            is_hash_of(text, kept.reading)
             if parsed is None
             else await self._matches(text, parsed[1], kept, host)
         ):

@@ -25,13 +25,13 @@ from appliance.channel.answers.token_answers import Challenge, TokenRole, may
 from appliance.channel.messages.api import ClientRequest, RequestMade
 from appliance.channel.operations import CHANGES, RestRequest
 from appliance.channel.rest_meaning import NoOrderError, filled_in, meant
+from appliance.signing.bearer_secrets import is_hash_of
 from appliance.signing.request_signing import (
     HEADER,
     BadProofError,
     is_signed,
     keys_of,
     parse_proof,
-    reading_hash,
     reading_id,
     statement,
 )
@@ -132,7 +132,7 @@ class RequestAuthenticator:
         row = self._tokens.usable_row(token_id) if token_id is not None else None
         if row is not None:
             if parsed is None:
-                good = row.keys is not None and reading_hash(shown) == row.keys.reading
+                good = row.keys is not None and is_hash_of(shown, row.keys.reading)
             else:
                 good = await self._is_token(shown, parsed[1], row)
             if good and self._tokens.usable_row(row.id) is not None:  # the token may have ended since

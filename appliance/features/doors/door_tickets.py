@@ -1,23 +1,16 @@
-"""Tickets that open a door. A viewer carries nothing but a URL, so the ticket is part of the URL.
+"""Tickets that open a door. A viewer carries nothing but a URL, so the ticket is part of the URL."""
 
-A ticket is `ID.SECRET`: 48 bits that name it in records, and 256 random bits, which cannot be guessed, so a fast hash
-is stored.
-"""
-
-import hashlib
-import hmac
-import re
-import secrets
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 
 from appliance.base import clock
 from appliance.base.actors import OPERATOR
 from appliance.control.errors import SenselessError
+from appliance.signing.bearer_secrets import SecretForm, hash_of
 from appliance.store.door_tables import TicketRow
 from appliance.store.ends import EndKind, EndTable
 from appliance.store.state_file import StateStore
 
-_FORM = re.compile(r"([0-9a-f]{12})\.([A-Za-z0-9_-]{43})", re.ASCII)
+TICKET_FORM = SecretForm("", ".")
 _MOST = 1000
 TICKETS = EndKind("door ticket", dated=True)
 LONGEST_SECONDS = 30 * 86_400.0
@@ -55,7 +48,7 @@ class DoorTickets:
         return row, text
 
     def find(self, door: str, text: str) -> TicketRow | None:
-        row = shown(text, self._rows)
+        row = TICKET_FORM.find(text, self._rows)
         return None if row is None or row.door != door or self._ends.passed(TICKETS, row.id) else row
 
     def ended(self, ticket: str) -> bool:
@@ -72,8 +65,8 @@ class DoorTickets:
 
 
 def new_ticket(door: str, seconds: float, who: str) -> tuple[TicketRow, str]:
-    number, secret, now = secrets.token_hex(6), secrets.token_urlsafe(32), clock.wall()
-    return TicketRow(number, door, _hash(secret), now, now + seconds, who), f"{number}.{secret}"
+    (ticket, secret, text), now = TICKET_FORM.make(), clock.wall()
+    return TicketRow(ticket, door, hash_of(secret), now, now + seconds, who), text
 
 
 def left_by_its_maker(row: TicketRow, bearers: Collection[str]) -> str:
@@ -84,17 +77,3 @@ def left_by_its_maker(row: TicketRow, bearers: Collection[str]) -> str:
     if row.who in bearers or row.who == OPERATOR:
         return ""
     return f"{row.who} has no token or session any longer; rosrv door remove {row.door} ends this ticket"
-
-
-def shown(text: str, rows: Mapping[str, TicketRow]) -> TicketRow | None:
-    parts = _FORM.fullmatch(text)
-    row = rows.get(parts[1]) if parts is not None else None
-    return (
-        row
-        if parts is not None and row is not None and hmac.compare_digest(row.hash, _hash(parts[2]))
-        else None
-    )
-
-
-def _hash(secret: str) -> bytes:
-    return hashlib.sha256(secret.encode("ascii")).digest()

@@ -7,7 +7,7 @@ had. A person has at most `_MOST_OF_PERSON` visits; beyond them, a new visit end
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from appliance.features.doors.door_tickets import new_ticket, shown
+from appliance.features.doors.door_tickets import TICKET_FORM, new_ticket
 from appliance.store.door_tables import TicketRow
 from appliance.store.ends import EndKind, EndTable
 
@@ -44,7 +44,7 @@ class DoorVisits:
         return row, text
 
     def find(self, door: str, text: str) -> TicketRow | None:
-        row = shown(text, {one.row.id: one.row for one in self._visits.values()})
+        row = TICKET_FORM.find(text, {one.row.id: one.row for one in self._visits.values()})
         return None if row is None or row.door != door or not self._may_open(self._visits[row.id]) else row
 
     def opened(self, ticket: str) -> None:

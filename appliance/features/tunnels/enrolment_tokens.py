@@ -1,19 +1,15 @@
 """Keep the one-time tokens with which hosts enrol themselves. A host with an unused token is *awaited*.
 
-1. Only the hash of a token's secret is stored. The secret has 256 random bits, so a fast hash is enough.
+1. Only the hash of a token's secret is stored.
 2. A token is valid once, for one name, until it expires or a newer token for the name replaces it.
 """
 
-import hashlib
-import hmac
-import re
-import secrets
-
 from appliance.base import clock
+from appliance.signing.bearer_secrets import SecretForm, hash_of
 from appliance.store.ends import EndKind, EndTable
 from appliance.store.host_tables import EnrolmentTokenRow, HostTables
 
-_FORM = re.compile(r"rosrv-enrol_([0-9a-f]{12})_([A-Za-z0-9_-]{43})")
+_FORM = SecretForm("rosrv-enrol_")
 LONGEST_SECONDS = 7 * 86_400.0
 MOST = 1000
 ENROLMENT = EndKind("enrolment", dated=True)
@@ -46,19 +42,16 @@ class EnrolmentTokens:
     def add(
         self, name: str, *, seconds: float, address: str, days: float, kit: dict[str, str], who: str
     ) -> tuple[EnrolmentTokenRow, str]:
-        token_id, now = secrets.token_hex(6), clock.wall()
-        secret = secrets.token_urlsafe(32)
-        row = EnrolmentTokenRow(name, token_id, _hash(secret), now, now + seconds, address, days, kit, who)
+        (token_id, secret, text), now = _FORM.make(), clock.wall()
+        row = EnrolmentTokenRow(name, token_id, hash_of(secret), now, now + seconds, address, days, kit, who)
         self._rows[name] = row
         self._ends.set(ENROLMENT, name, seconds)
         self._tables.save_awaited(row)
-        return row, f"rosrv-enrol_{token_id}_{secret}"
+        return row, text
 
     def take(self, text: str) -> EnrolmentTokenRow:
-        found = _FORM.fullmatch(text)
-        rows = {row.id: row for row in self.rows().values()}
-        row = rows.get(found[1]) if found is not None else None
-        if found is None or row is None or not hmac.compare_digest(_hash(found[2]), row.hash):
+        row = _FORM.find(text, {row.id: row for row in self.rows().values()})
+        if row is None:
             raise BadEnrolmentTokenError(
                 "the token is wrong, already used, or expired: ask for another one (rosrv host add NAME --token)"
             )
@@ -80,7 +73,3 @@ class EnrolmentTokens:
         for name in ended:
             self.forget(name)
         self._ends.forget(ENROLMENT, *ended)
-
-
-def _hash(secret: str) -> bytes:
-    return hashlib.sha256(secret.encode("ascii")).digest()

@@ -270,6 +270,21 @@ def test_a_kill_between_the_record_and_the_change(data: Path, tmp_path: Path) ->
     assert [json.loads(line)["result"] for line in lines[2:]] == ["asked", "done"]
 
 
+def test_the_stored_hashes_of_secrets_never_change(tmp_path: Path) -> None:
+    """The hashes were made with `sha256sum`."""
+    operators = tmp_path / "tokens.json"
+    digest = "0f007385b6f9d4b7eeb2748605afe1a984a0a3bfa3f014d09e2a784ce9e5cd1a"
+    operators.write_text(f'[{{"name": "ann", "role": "viewer", "hash": "{digest}", "added": 0}}]', "ascii")
+    holder = OperatorTokens(operators).holder("A" * 43)
+    assert holder is not None and holder.name == "ann"
+    assert OperatorTokens(operators).holder("A" * 42 + "B") is None
+    (tmp_path / "invitations").mkdir()
+    file = "6e3a37f4f7e1630b0f42cf9ed119e810259763d3d80332c098eed71eda31a0f3.json"
+    (tmp_path / "invitations" / file).write_text('{"name": "arm7", "group": "", "expires": 9e12}', "ascii")
+    with Invitations(tmp_path / "invitations").using(f"rosrv-join_{'A' * 43}", b"request") as robot:
+        assert robot.name == "arm7"
+
+
 @pytest.mark.nightly
 def test_two_changes_of_tokens_do_not_undo_each_other(tmp_path: Path) -> None:
     tokens = OperatorTokens(tmp_path / "tokens.json")

@@ -5,13 +5,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from appliance.signing.bearer_secrets import hash_of
 from appliance.signing.request_signing import (
     BadProofError,
     is_signed,
     keys_of,
     parse_proof,
     proof_of,
-    reading_hash,
     reading_id,
     reading_key,
     statement,
@@ -45,7 +45,7 @@ def test_the_vectors() -> None:
     assert reading_key(TOKEN) == READING
     assert reading_id(READING) == "5c0f3d2b9a11"
     assert keys_of(TOKEN).verifying.hex() == VERIFYING
-    assert keys_of(TOKEN).reading == reading_hash(READING)
+    assert keys_of(TOKEN).reading == hash_of(READING)
     assert stated() == STATED
     assert proof_of(TOKEN, "60.000.abc.def", STATED) == PROOF
     challenge, signature = parse_proof(PROOF)
