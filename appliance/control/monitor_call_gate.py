@@ -12,9 +12,9 @@ from appliance.channel.messages import MonitorCallAnswered, MonitorCallWanted
 from appliance.master.endpoints.relay_control import RelayControl
 from appliance.master.graph.graph import RosGraph
 from appliance.master.graph.registry import Kind, Registry
+from appliance.policy.model import plain_address
 from appliance.policy.policy import Policy
 from appliance.policy.rights import decide, request_of, rights_of_call
-from appliance.rpc.front import plain_address
 from appliance.telemetry.audit_trail import NOT_RECORDED, Asker, AuditTrail
 
 _CALL = "lookupService"

@@ -57,6 +57,14 @@ def address_of(text: str) -> Address:
     return _IPv6(text) if ":" in text else _IPv4(text)
 
 
+def plain_address(text: str) -> Address:
+    """Return the address without its zone, as IPv4 if it is mapped into IPv6. Raises `ValueError`."""
+    address = address_of(text.partition("%")[0])
+    if isinstance(address, ipaddress.IPv6Address) and address.ipv4_mapped is not None:
+        return address_of(str(address.ipv4_mapped))
+    return address
+
+
 class Category(enum.StrEnum):
     """The kind of access. Each category has its own section, except READ and WRITE, which share one."""
 

@@ -20,8 +20,7 @@ from typing import TYPE_CHECKING
 
 import structlog
 
-from appliance.policy.model import Address, address_of
-from appliance.rpc.front import plain_address
+from appliance.policy.model import Address, address_of, plain_address
 from appliance.rpc.processor_time import ProcessorTime
 
 if TYPE_CHECKING:  # the API's process accepts connections too, and does not load the policy's modules

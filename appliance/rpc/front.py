@@ -7,7 +7,6 @@
 
 import asyncio
 import contextlib
-import ipaddress
 import socket
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -16,7 +15,6 @@ from typing import Any
 import httptools
 
 from appliance.base import clock
-from appliance.policy.model import Address, address_of
 from appliance.rpc.connection_table import ConnectionTable, Stage
 
 # The bytes around each header field; they count for the size of a head.
@@ -176,10 +174,3 @@ class Front(asyncio.BaseProtocol, ABC):
         else:
             with contextlib.suppress(OSError):  # later reads and writes report the end
                 self._socket.shutdown(socket.SHUT_RDWR)
-
-
-def plain_address(text: str) -> Address:
-    address = address_of(text.partition("%")[0])
-    if isinstance(address, ipaddress.IPv6Address) and address.ipv4_mapped is not None:
-        return address_of(str(address.ipv4_mapped))
-    return address

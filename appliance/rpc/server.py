@@ -20,11 +20,11 @@ from typing import NamedTuple, cast
 import structlog
 
 from appliance.base import clock
-from appliance.policy.model import Address
+from appliance.policy.model import Address, plain_address
 from appliance.rpc.acceptor import BACKLOG, Acceptor, Program, SourceQueues
 from appliance.rpc.connection_table import ConnectionTable, Stage
 from appliance.rpc.fair_queue import Turns
-from appliance.rpc.front import Front, HttpLimits, plain_address
+from appliance.rpc.front import Front, HttpLimits
 from appliance.rpc.processor_time import HostTask, ProcessorTime
 from roswire.xmlrpc import build_fault
 

@@ -24,8 +24,7 @@ from appliance.features.blocks.requests import (
 from appliance.hosts.host_table import HostRefusedError
 from appliance.policy.host_names import HostNames, UnknownHostNameError
 from appliance.policy.live_rights import LiveRight
-from appliance.policy.model import Address, address_of
-from appliance.rpc.front import plain_address
+from appliance.policy.model import Address, address_of, plain_address
 from appliance.store.ends import EndTable
 from appliance.store.host_tables import HostBlockRow
 from appliance.store.state_file import StateStore

@@ -15,11 +15,10 @@ import structlog
 from appliance.base.counted import counted
 from appliance.master.graph.registry import Incarnation
 from appliance.policy.host_sets import Network
-from appliance.policy.model import Address
+from appliance.policy.model import Address, plain_address
 from appliance.policy.policy import Policy
 from appliance.quotas.pool import Pool, QuotaClass
 from appliance.quotas.table import NODE_PORTS
-from appliance.rpc.front import plain_address
 from appliance.rpc.server import Peer, listen
 
 _TIMES_THE_REST = 3

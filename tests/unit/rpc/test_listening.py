@@ -3,7 +3,7 @@ import socket
 
 import pytest
 
-from appliance.rpc.front import plain_address
+from appliance.policy.model import plain_address
 from appliance.rpc.server import listen
 from tests.support.http_server import WAIT
 
