@@ -37,6 +37,7 @@ def test_only_the_whole_text_finds_its_row(prefix: str, separator: str) -> None:
         f"{prefix}{'0' * 12}{separator}{secret}", f"{prefix}{number.upper()}é{separator}{secret}",
     ]  # fmt: skip
     assert [one for one in wrong if form.find(one, rows)] == []
+    assert [one for one in (text[:-1], text + "A", f"{text}\n") if form.parse(one)] == []
 
 
 def test_a_text_of_one_form_is_none_of_another() -> None:
