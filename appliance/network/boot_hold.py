@@ -127,7 +127,10 @@ class BootHold:
         raise FirewallError(f"other machines are not held off: {'; '.join(reasons)}")
 
     def lift(self) -> bool:
-        """End the hold; return whether it lasted longer than the robot's own programs were held."""
+        """End the hold; return whether it lasted longer than the robot's own programs were held.
+
+        Raises `FirewallError` if its rules are still in force.
+        """
         try:
             held = self._held()
         except FirewallError:
@@ -135,11 +138,15 @@ class BootHold:
         own = None if held is None else held.own_seconds
         lapsed = own is not None and self._since.exists() and self._seconds_so_far() > own
         self._since.unlink(missing_ok=True)
+        reasons = []
         for backend in self._backends:
             try:
                 backend.remove()
-            except FirewallError:
-                continue  # it is not there, so it holds nothing
+            except FirewallError as error:
+                if _holds(backend):
+                    reasons.append(f"{backend.name}: {error}")
+        if reasons:
+            raise FirewallError(f"other machines are still held off: {'; '.join(reasons)}")
         return lapsed
 
     def arm(self, held: HeldPorts | None) -> None:
@@ -170,6 +177,13 @@ class BootHold:
             with contextlib.suppress(OSError):
                 self._since.write_text(str(now), encoding="ascii")
             return 0.0
+
+
+def _holds(backend: Backend) -> bool:
+    """Return whether the rules of a back end that works are in force."""
+    with contextlib.suppress(FirewallError):
+        return bool(backend.counters())
+    return False
 
 
 def _starts_again() -> bool:

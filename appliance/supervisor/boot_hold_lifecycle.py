@@ -36,16 +36,24 @@ class HoldAround:
                 )
 
     def served(self) -> str:
-        """Lift and arm the hold; return an alarm if the robot's own programs started without the appliance."""
+        """Lift and arm the hold.
+
+        Return an alarm if it is not lifted, or if the robot's own programs started without the appliance.
+        """
         if not self._hold.is_present:
             return ""
-        lapsed = self._hold.lift()
+        lapsed, trouble = False, ""
+        try:
+            lapsed = self._hold.lift()
+        except (NetworkError, OSError) as error:
+            trouble = f"{error}: run `systemctl stop rosrv-hold`, which tries again"
+            log.error("the boot hold is not lifted", error=str(error))
         try:
             self._hold.arm(self._ports)
         except OSError as error:
             log.error("the hold of the next boot keeps its last settings", error=str(error))
-        if not lapsed or self._ports is None or self._ports.own_seconds is None:
-            return ""
+        if trouble or not lapsed or self._ports is None or self._ports.own_seconds is None:
+            return trouble
         return (
             f"the appliance served more than {self._ports.own_seconds} s after the hold began, so the robot's own "
             "programs may have started without it: restart them"

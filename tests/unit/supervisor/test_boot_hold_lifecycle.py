@@ -1,9 +1,12 @@
 from collections.abc import Callable
+from contextlib import nullcontext
+from pathlib import Path
 from typing import Literal
 
 import pytest
 
 from appliance.configuration.settings import FirewallSection, Settings
+from appliance.network import boot_hold
 from appliance.network.boot_hold import BootHold, HeldPorts
 from appliance.network.firewall.backend import FirewallError
 from appliance.network.namespaces import Namespace
@@ -25,6 +28,8 @@ class RecordedHold(BootHold):
 
     def lift(self) -> bool:
         self.calls.append("lift")
+        if self._broken:
+            raise FirewallError("other machines are still held off")
         return self._lapsed
 
     def arm(self, held: HeldPorts | None) -> None:
@@ -83,3 +88,35 @@ def test_a_lapsed_hold_is_an_alarm_only_if_the_robot_waited() -> None:
 
 def test_a_hold_that_fails_does_not_end_the_appliance() -> None:
     around(RecordedHold(broken=True)).put()
+
+
+def test_a_hold_that_cannot_be_lifted_is_an_alarm_and_the_appliance_serves() -> None:
+    hold = RecordedHold(broken=True)
+    assert "still held off: run `systemctl stop rosrv-hold`" in around(hold).served()
+    assert hold.calls == ["lift", (11311, "veth-rosrv", None)]
+
+
+class _StuckBackend:
+    """A back end that cannot remove its rules, which are in force, or which it does not have."""
+
+    name = "stuck"
+
+    def __init__(self, *, has_rules: bool) -> None:
+        self._rules = (1,) if has_rules else ()
+
+    def remove(self) -> None:
+        raise FirewallError("it is busy")
+
+    def counters(self) -> tuple[int, ...]:
+        return self._rules
+
+
+@pytest.mark.parametrize("has_rules", [True, False])
+def test_only_rules_that_are_in_force_keep_a_hold_from_being_lifted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, has_rules: bool
+) -> None:
+    monkeypatch.setattr(boot_hold, "NftBackend", lambda *_: _StuckBackend(has_rules=has_rules))
+    monkeypatch.setattr(boot_hold, "IptablesBackend", lambda *_: _StuckBackend(has_rules=False))
+    hold = BootHold(Namespace.own(), unit_runs=tmp_path, state=tmp_path)
+    with pytest.raises(FirewallError, match="stuck: it is busy") if has_rules else nullcontext():
+        hold.lift()
