@@ -5,6 +5,7 @@ becomes a finding, so an outdated good finding never hides a failure.
 """
 
 import asyncio
+import math
 import threading
 from collections.abc import Callable
 from functools import partial
@@ -12,6 +13,7 @@ from typing import TypeVar
 
 import structlog
 
+from appliance.base import clock
 from appliance.channel import messages
 from appliance.channel.answers.status import FirewallState
 from appliance.network.namespaces import NetworkError
@@ -21,6 +23,8 @@ from appliance.supervisor.isolation_lifecycle import NoIsolation
 from appliance.supervisor.machine_work import MachineWork, Terms
 
 PROBE_SECONDS = 60.0
+FORMER_SECONDS = 10.0
+"""For so long, another machine cannot use a former address of this one: control may still count it as the robot's."""
 _ROUTES_AT_ONCE = 4
 
 T = TypeVar("T")
@@ -46,6 +50,7 @@ class IsolationWatchdog:
         self._probe: messages.Message | None = None
         self._machine = isolation.trusted_machine
         self._taking_machine = False
+        self._told_machine_at = -math.inf
         self._report = messages.FirewallReported(isolation=isolation.kind, report=FirewallState())
 
     def news(self) -> list[messages.Message]:
@@ -58,7 +63,10 @@ class IsolationWatchdog:
         return not self._taking_machine and self.isolation.machine_addresses() != self._machine
 
     async def take_machine(self) -> None:
-        """Tell control the new addresses of the machine, while the firewall drops foreign packets with them."""
+        """Tell control the new addresses of the machine, while the firewall drops foreign packets with them.
+
+        It drops those with former addresses too, until a later `look`.
+        """
         self._taking_machine = True
         try:
             async with self._one_at_a_time:
@@ -66,7 +74,7 @@ class IsolationWatchdog:
                 await in_thread(lambda: self.isolation.trust_machine((*self._machine, *found)))
                 self._machine = found
                 self._tell(self.machine())
-                await in_thread(lambda: self.isolation.trust_machine(found))
+                self._told_machine_at = clock.now()
         except Exception as error:  # noqa: BLE001  see the invariant
             log.error("new addresses of the machine are not the robot's yet", error=_words(error))
             await asyncio.sleep(self._every)
@@ -76,8 +84,17 @@ class IsolationWatchdog:
     async def look(self) -> str | None:
         async with self._one_at_a_time:
             reason = await self._find_fault()
+            await self._forget_former_machine()
         self._found(reason)
         return reason
+
+    async def _forget_former_machine(self) -> None:
+        if clock.now() - self._told_machine_at < FORMER_SECONDS:
+            return
+        try:
+            await in_thread(lambda: self.isolation.trust_machine(self._machine))
+        except Exception as error:  # noqa: BLE001  see the invariant
+            log.error("former addresses of the machine stay closed to others", error=_words(error))
 
     def _found(self, reason: str | None) -> None:
         if reason is not None:

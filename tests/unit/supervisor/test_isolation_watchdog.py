@@ -5,9 +5,17 @@ import threading
 import pytest
 
 from appliance.channel.answers.status import FirewallState
-from appliance.channel.messages import EndpointFound, FirewallReported, Message, ProbeFailed, ProbePassed
+from appliance.channel.messages import (
+    EndpointFound,
+    FirewallReported,
+    MachineAddresses,
+    Message,
+    ProbeFailed,
+    ProbePassed,
+)
 from appliance.network.esp import Esp
 from appliance.network.namespaces import NetworkError
+from appliance.supervisor import isolation_watchdog
 from appliance.supervisor.isolation_lifecycle import NoIsolation
 from appliance.supervisor.isolation_watchdog import IsolationWatchdog
 
@@ -182,3 +190,27 @@ async def test_a_crowd_of_new_hosts_costs_a_few_threads(
     release.set()
     assert (await asyncio.gather(*asked)) == [f"way to {number}" for number in range(200)]
     assert most[0] <= 8
+
+
+@pytest.mark.nightly
+async def test_a_former_address_of_the_machine_stays_closed_until_control_has_forgotten_it(
+    surroundings: Surroundings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    trusted: list[tuple[str, ...]] = []
+    monkeypatch.setattr(surroundings, "trust_machine", trusted.append)
+    told: list[Message] = []
+    watchdog = IsolationWatchdog(surroundings, told.append)
+    for addresses in (("10.0.0.1",), ("10.0.0.2",)):
+        monkeypatch.setattr(surroundings, "machine_addresses", lambda found=addresses: found)
+        assert watchdog.machine_has_changed()
+        await watchdog.take_machine()
+        assert not watchdog.machine_has_changed()
+    assert [message for message in told if isinstance(message, MachineAddresses)] == [
+        MachineAddresses(["10.0.0.1"]), MachineAddresses(["10.0.0.2"]),
+    ]  # fmt: skip
+    surroundings.found = [None, None]
+    await watchdog.look()
+    assert trusted == [("10.0.0.1",), ("10.0.0.1", "10.0.0.2")]
+    monkeypatch.setattr(isolation_watchdog, "FORMER_SECONDS", 0.0)
+    await watchdog.look()
+    assert trusted[-1] == ("10.0.0.2",)
