@@ -11,8 +11,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Self
 
+from appliance.features.policy_tools.learn import ROBOT
 from appliance.features.policy_tools.stock_tools import StockTool, key_of, stock_tool
-from appliance.policy.groups import ROBOT
 from appliance.policy.ini_reader import Entry, SectionText, Word, read
 from appliance.policy.judgement import PolicyContext, judge
 from appliance.policy.keys import levels
