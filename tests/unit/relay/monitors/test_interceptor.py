@@ -1,15 +1,17 @@
 import gc
 import struct
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from appliance.channel.messages import (
+    ConnectionClosed,
     FlowLimit,
     GrantInstalled,
+    MessagesLimited,
     MonitorGiven,
     MonitorResumed,
     MonitorsCounted,
@@ -18,6 +20,7 @@ from appliance.channel.messages import (
     NodePlaced,
     OwnPublished,
     PublicationPlaced,
+    PublicationRefused,
     PublicationWithdrawn,
     SpecificationsRefused,
     SpecificationsTaken,
@@ -602,6 +605,16 @@ def latching_client(world: Monitored, topic: str) -> tuple[Peer, Peer]:
     return publisher, server
 
 
+def connected_again(world: Monitored, topic: str, header: Mapping[str, str], *frames: bytes) -> Peer:
+    """Let the publisher of `topic` connect again, and send these frames at once."""
+    world.hears(UpstreamWanted, key="k", topic=topic)
+    world.state(UpstreamFound("k", topic, LOOPBACK, world.publisher.getsockname()[1]))
+    publisher = world.accept(world.publisher)
+    world.gets_header(publisher)
+    publisher.send(encode_header({**TYPED, "topic": topic, **header}) + b"".join(frames))
+    return publisher
+
+
 def shadowed(world: Monitored, text: str) -> None:
     world.state(stated(2, [("0.rv", text)], {}, {}, False, shadows=("guard",)))
     world.until(lambda: world.taken(SpecificationsTaken, 2))
@@ -646,16 +659,91 @@ def test_a_latched_command_is_new_only_on_the_first_connection(
     world.until(lambda: string("before") in data_of(base))
     base.data.clear()
     publisher.sock.close()
-    world.hears(UpstreamWanted, key="k", topic=topic)
-    world.state(UpstreamFound("k", topic, LOOPBACK, world.publisher.getsockname()[1]))
-    again = world.accept(world.publisher)
-    world.gets_header(again)
-    again.send(encode_header(TYPED | {"topic": topic, "latching": "1"}) + string(replayed) + string("new"))
+    connected_again(world, topic, {"latching": "1"}, string(replayed), string("new"))
     world.until(lambda: data_of(base).endswith(string("new")))
     passes = replayed == "stop" and topic == "/chatter"
     assert base.data == (string("stop") if passes else b"") + string("new")
     if not passes:
         assert "send it again" in world.event("drop").text
+
+
+@pytest.mark.parametrize("off", ["disabled", "removed", "in shadow mode"])
+def test_a_guard_that_was_removed_still_has_its_stop_in_force(world: Monitored, off: str) -> None:
+    """Until the next command a base that connects gets it, and then the last command, as in plain ROS.
+
+    A publisher that connects to the same relay again does not repeat what it had latched.
+    """
+    text = BEGINNING.strip().replace("int seen", SAFE)
+    world.load(text)
+    publisher, base = latching_client(world, "/chatter")
+    publisher.send(string("before"))
+    world.until(lambda: string("before") in data_of(base))
+    world.state(StopWanted(1, "/chatter", begin=True))
+    world.until(lambda: data_of(base).endswith(string("stop")))
+    OFF[off](world, text)
+    for sent in ("stop", "back"):
+        late = world.connect(encode_header(WANTED))
+        world.gets_header(late)
+        world.gets(late, string(sent))
+        publisher.send(string("back"))
+        world.gets(late, string("back"))
+    publisher.sock.close()
+    connected_again(world, "/chatter", {"latching": "1"}, string("back"), string("new"))
+    world.gets(late, string("new"))
+    assert "send it again" in world.event("drop").text
+
+
+def test_without_a_guard_a_latched_command_is_sent_again(world: Monitored) -> None:
+    """As in plain ROS: so it does after a restart of the relay, if the guard was removed."""
+    publisher, base = latching_client(world, "/chatter")
+    publisher.send(string("before"))
+    world.gets(base, string("before"))
+    publisher.sock.close()
+    connected_again(world, "/chatter", {"latching": "1"}, string("before"))
+    world.gets(base, string("before"))
+
+
+@pytest.mark.parametrize("off", ["disabled", "removed", "in shadow mode"])
+def test_a_publisher_that_returns_with_another_type_is_refused_while_a_guard_is_in_force(
+    world: Monitored, off: str
+) -> None:
+    other = {"type": "std_msgs/Int32", "md5sum": "da5909fbe378aeaf85e547e830cc1bb7"}
+    text = BEGINNING.strip().replace("int seen", SAFE)
+    world.load(text)
+    publisher, base = world.typed()
+    publisher.send(string("before"))
+    world.until(lambda: data_of(base).endswith(string("before")))
+    publisher.sock.close()
+    connected_again(world, "/chatter", other, string("other"))
+    assert "std_msgs/Int32" in world.hears(PublicationRefused, key="k", resource="/chatter").reason
+    assert string("other") not in data_of(base)
+    OFF[off](world, text)
+    connected_again(world, "/chatter", other)
+    cut = world.hears(ConnectionClosed)  # the base has to read the new header
+    assert cut.reason == "the publisher returned with a different type"
+
+
+def test_a_policys_limit_keeps_back_motions_and_no_stop(world: Monitored) -> None:
+    """The base connects to its commander and to the appliance."""
+    world.load(GUARD.strip().replace("int seen", SAFE.replace("1s", "10ms")))
+    limit = FlowLimit(messages=0.001)
+    port = world.listen()
+    world.state(NodePlaced("own", "/rosrv", LOOPBACK, monitors=True), port)
+    world.state(PublicationPlaced("own", "/chatter", "std_msgs/String"))
+    for key in ("k", "own"):
+        world.state(GrantInstalled(key, "/chatter", LOOPBACK, "/listener", limit))
+    publisher, driven = world.typed()
+    world.port = port
+    stopped = world.connect(encode_header(WANTED))
+    world.gets_header(stopped)
+    publisher.send(string("a") * 3)
+    world.until(
+        lambda: [row.messages for one in world.told if isinstance(one, MessagesLimited) for row in one.rows]
+    )
+    assert data_of(driven) == string("a")
+    world.state(StopWanted(1, "/chatter", begin=True))
+    world.until(lambda: len(data_of(stopped)) >= 3 * len(string("stop")))
+    assert stopped.data.startswith(string("stop") * 3)
 
 
 def test_a_server_that_connects_again_does_not_get_a_cancelled_goal(world: Monitored) -> None:
