@@ -1,8 +1,9 @@
 """The command `rosrv policy enforce`."""
 
 from collections import Counter
+from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import msgspec
 import typer
@@ -17,10 +18,11 @@ from appliance.cli.output import say_json, write_told
 from appliance.features.policy_tools.audit_only import EnforcedText, EnforceError, enforced
 from appliance.features.policy_tools.learn import Observation, needed_rights
 from appliance.features.policy_tools.live_verbs import say_loaded
-from appliance.features.policy_tools.policy_input import body_in_force, context_of, usage_error
+from appliance.features.policy_tools.policy_input import body_in_force, context_of, live_now, usage_error
 from appliance.features.policy_tools.policy_verbs import compiled_with
 from appliance.features.policy_tools.recorded_requests import RecordedPeriod, recorded_period
 from appliance.policy.actions import BadWordError
+from appliance.policy.live_rights import Ending, LiveRight, endings
 from appliance.policy.model import Request
 from appliance.policy.policy import Policy
 from appliance.policy.rights import Right, decide_right
@@ -39,6 +41,17 @@ class WouldDeny(msgspec.Struct, frozen=True):
     resource: str
     count: int
     reason: str
+
+
+class _Comparison(NamedTuple):
+    """The recorded requests that the enforced policy denies, the rights of running nodes that it ends, and the numbers
+    that were compared.
+    """
+
+    denied: list[WouldDeny]
+    ended: list[Ending]
+    requests: int
+    rights: int
 
 
 @speaks
@@ -60,7 +73,8 @@ def enforce(
 ) -> None:
     """Enforce sections of the policy in force that are `audit-only`, after a comparison with the recorded requests.
 
-    With --dry-run, exit status 1 if a recorded request would have been denied. The policy file is not changed: a
+    The rights of nodes that run now are also compared: they may be older. With --dry-run, exit status 1 if a recorded
+    request would have been denied, or such a right would end. The policy file is not changed: a
     reload brings its text back. A denial because another host holds a node name is not compared.
 
     Example: rosrv policy enforce Publishers --confirm-within 5m
@@ -73,28 +87,32 @@ def enforce(
         raise refused([f"rosrv policy: {error}"]) from None
     policy = compiled_with(change.text, body.file, context_of(body))
     period = recorded_period(appliance, since)
-    rows = _would_deny(policy, period)
-    _show(appliance, rows, period, change)
+    live = live_now(appliance)
+    found = _compared(policy, period, live)
+    _show(appliance, found, period, change)
     if write is not None:
         try:
             write_told(write, change.text.encode())
         except OSError as error:
             raise usage_error(f"cannot write {write}: {error.strerror}") from None
     if dry_run:
-        raise typer.Exit(1 if rows else 0)
+        raise typer.Exit(1 if found.denied or found.ended else 0)
     _load(appliance, body, change, within, written=write)
 
 
-def _would_deny(policy: Policy, period: RecordedPeriod) -> list[WouldDeny]:
+def _compared(policy: Policy, period: RecordedPeriod, live: list[LiveRight]) -> _Comparison:
     counts: Counter[tuple[Request, str]] = Counter()
+    number = 0
     for recorded in period.requests():
+        number += recorded.count
         reason = denial(policy, recorded.observation)
         if reason:
             counts[recorded.observation.request, reason] += recorded.count
-    return [
+    denied = [
         WouldDeny(**request.fields(), count=count, reason=reason)
         for (request, reason), count in counts.most_common()
     ]
+    return _Comparison(denied, endings(policy, live), number, len(live))
 
 
 def denial(policy: Policy, observation: Observation) -> str:
@@ -112,12 +130,14 @@ def denial(policy: Policy, observation: Observation) -> str:
     return ""
 
 
-def _show(appliance: Appliance, rows: list[WouldDeny], period: RecordedPeriod, change: EnforcedText) -> None:
+def _show(appliance: Appliance, found: _Comparison, period: RecordedPeriod, change: EnforcedText) -> None:
+    rows, ended = found.denied, found.ended
     start = local_text(period.start, digits=0)
     if appliance.as_json:
         say_json({
             "sections": list(change.sections), "since": start, "removed": period.removed,
             "unnamed": period.unnamed, "would_deny": [msgspec.to_builtins(row) for row in rows],
+            "would_end": [asdict(row) for row in ended], "requests": found.requests, "rights": found.rights,
         })  # fmt: skip
         return
     number = sum(row.count for row in rows)
@@ -126,6 +146,14 @@ def _show(appliance: Appliance, rows: list[WouldDeny], period: RecordedPeriod, c
         say(printable(f"  {row.count}x {row.caller_id or 'a client'}: {row.reason}"), "yellow")
     if len(rows) > _MOST_SHOWN:
         say(f"  and {counted(len(rows) - _MOST_SHOWN, 'more request')}: --json lists all", "yellow")
+    if ended:
+        say(f"would end {counted(len(ended), 'right')} of nodes that run now", "yellow")
+    for end in ended[:_MOST_SHOWN]:
+        say(printable(f"  {end.caller_id or 'a client'}: {end.reason}"), "yellow")
+    if len(ended) > _MOST_SHOWN:
+        say(f"  and {len(ended) - _MOST_SHOWN} more: --json lists all", "yellow")
+    compared = f"{counted(found.requests, 'recorded request')}, {counted(found.rights, 'right')} of nodes that run now"
+    say(f"compared: {compared}", "" if found.requests else "yellow")
     if period.removed:
         say("earlier records of that time are removed from the log", "yellow")
     for host, count in sorted(period.unnamed.items()):

@@ -147,8 +147,9 @@ def request_of(host: str, caller_id: str, category: str, resource: str) -> Reque
 
 
 def live_now(appliance: Appliance) -> list[LiveRight]:
-    answer = appliance.ask(RegistrationsWanted())
-    return [LiveRight.of(asdict(row)) for row in answer.given().registrations] if answer.ok else []
+    """Return the rights of running nodes. Exits if the appliance refuses; raises `NotRunningError`."""
+    found = appliance.body_or_exit(appliance.ask(RegistrationsWanted())).registrations
+    return [LiveRight.of(asdict(row)) for row in found]
 
 
 def requests_of_audit_log(appliance: Appliance) -> Iterator[Request]:
