@@ -43,6 +43,7 @@ from appliance.features.adopt.places import (
     parsed,
 )
 from appliance.master.graph.registry import Incarnation
+from appliance.policy.model import Address
 from appliance.rpc.master_reader import (
     ORDER,
     PUBLICATION,
@@ -60,7 +61,9 @@ from roswire.uris import NodeUri
 from roswire.xmlrpc import Value
 
 MASTER_NAME = "/master"
+LAST_WORD_SECONDS = 5.0  # an ordered end of the appliance waits 10 s for the whole
 _READINGS = 5
+_AT_ONCE_OF_HOST = 16
 _LISTS_SECONDS = 2.0
 _PAUSE_SECONDS = 0.02
 _AT_ONCE = 50  # registrations without a pause for other callers
@@ -507,28 +510,40 @@ class AdoptOperation:
     async def _last_word(
         self, reader: MasterReader, nodes: list[tuple[Incarnation, set[Entry]]]
     ) -> list[str]:
-        """Send each subscriber the list of the robot's own master; return the nodes that did not take it."""
+        """Send each subscriber the list of the robot's own master; return the nodes that did not take it.
+
+        A host that does not answer delays only its own nodes, and the whole only for `LAST_WORD_SECONDS`.
+        """
         graph = await reader.read()
         publishers: dict[str, list[str]] = {}
         for kind, topic, name in sorted(graph.entries):
             if kind == PUBLICATION and name in graph.nodes:
                 publishers.setdefault(topic, []).append(graph.nodes[name])
         failed: set[str] = set()
-        turns = asyncio.Semaphore(16)
+        turns: dict[Address, asyncio.Semaphore] = {}
 
         async def tell(node: Incarnation, topic: str) -> None:
-            async with turns:
+            async with turns.setdefault(node.host, asyncio.Semaphore(_AT_ONCE_OF_HOST)):
+                if node.name in failed:
+                    return
                 try:
                     uris: list[Value] = [*publishers.get(topic, [])]
                     await self.call(node.call_uri, "publisherUpdate", topic, uris)
                 except CallFailedError:
                     failed.add(node.name)
 
-        await asyncio.gather(*(
-            tell(node, topic) for node, entries in nodes for kind, topic, _name in sorted(entries)
+        calls = {
+            asyncio.create_task(tell(node, topic)): node.name
+            for node, entries in nodes
+            for kind, topic, _name in sorted(entries)
             if kind == SUBSCRIPTION
-        ))  # fmt: skip
-        return sorted(failed)
+        }
+        late: set[asyncio.Task[None]] = set()
+        if calls:
+            _done, late = await asyncio.wait(calls, timeout=LAST_WORD_SECONDS)
+        for call in late:
+            call.cancel()
+        return sorted(failed.union(calls[call] for call in late))
 
 
 def _is_new(entry: Entry, node: Incarnation, there: MasterGraph) -> bool:

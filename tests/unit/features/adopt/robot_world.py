@@ -4,6 +4,7 @@ A `KilledError` ends an operation after a step, as a kill of control does: the r
 it; all that the operation knew is lost.
 """
 
+import asyncio
 import ipaddress
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -126,7 +127,7 @@ class RobotWorld:
         """The acts of the robot after a step, once."""
         self.told_while_silent: list[str] = []
         self.began: list[str] = []  # the order of registrations at RVMaster
-        self.limit = ""
+        self.limit = self.silent_host = ""
         self.left = False
         self.remote: list[tuple[str, int]] = []
         self.begin()
@@ -227,6 +228,8 @@ class RobotWorld:
         )  # fmt: skip
 
     async def _call(self, uri: NodeUri, method: str, /, *params: Value) -> Value:
+        if uri.host == self.silent_host:
+            await asyncio.Event().wait()
         node = next((one for one in self.robot.values() if one.alive and one.port == uri.port), None)
         if node is None or ipaddress.ip_address(uri.host).is_loopback:
             raise CallFailedError(f"{uri.host}:{uri.port} refuses")

@@ -5,6 +5,7 @@ from typing import Any
 import msgspec
 import pytest
 
+from appliance.features.adopt import takeover
 from appliance.features.adopt.adopt_record import Phase
 from appliance.features.adopt.machine_facts import RobotMaster
 from appliance.features.adopt.takeover import AdoptError
@@ -424,6 +425,25 @@ def test_a_node_that_was_restarted_under_the_rules_is_given_back_with_its_new_ur
         await world.until_settled()
 
     require_given(run(story))
+
+
+def test_a_host_that_does_not_answer_delays_no_node_of_another_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(takeover, "LAST_WORD_SECONDS", 0.0)
+
+    async def story(world: RobotWorld) -> None:
+        world.resolved["laptop"] = ["192.168.50.9"]
+        for number in range(40):
+            world.add(
+                f"/a{number}", 5000 + number, f"http://laptop:{5000 + number}/", subscribes=("/odom", "/late")
+            )
+        await world.until_settled()
+        world.silent_host = "192.168.50.9"
+        report = await world.operation.release()
+        assert sorted(report.failed) == sorted(f"/a{number}" for number in range(40))
+        assert world.robot["/teleop"].lists["/odom"] == ["http://base:4001/"]
+        assert world.record.phase is Phase.FREE
+
+    run(story)
 
 
 def _start_nodes_at_their_own_master(world: RobotWorld) -> None:
