@@ -381,6 +381,22 @@ def test_a_velocity_is_scaled_by_the_distance_in_its_direction(direction: float,
 STILL_LEGS = twist()
 
 
+@pytest.mark.parametrize("away", [0.4, -0.7, math.pi / 4, 2.0, -2.5, 3 * math.pi / 4])
+def test_a_base_retreats_from_a_near_wall_in_any_direction(away: float) -> None:
+    """From the second scan on: the guard measures the way in the direction of the last command."""
+    guard, back = Guarded("separation"), twist(0.2 * math.cos(away), 0.2 * math.sin(away))
+    at = seen(guard, wall(0.3, away + math.pi))
+    guard.drive(back, at)
+    at = seen(guard, wall(0.3, away + math.pi), at + 100, 1)
+    assert legs_of(back) == guard.drive(back, at)
+    aside = [0.04 * math.cos(away + 0.04), 0.04 * math.sin(away + 0.04)]
+    assert guard.drive(twist(*aside), at) == (*aside, 0, 0, 0, 0)
+    forth = guard.drive(twist(-0.2 * math.cos(away), -0.2 * math.sin(away)), at)
+    assert forth[:3] == (0, 0, 0)
+    at = seen(guard, wall(0.3, away), at + 100, 1)
+    assert guard.drive(back, at)[:3] == (0, 0, 0)
+
+
 def test_a_corridor_of_one_and_a_half_metres_can_be_driven() -> None:
     guard = Guarded("separation")
     corridor = [min(a, b) for a, b in zip(wall(0.75, math.pi / 2), wall(0.75, -math.pi / 2), strict=True)]
