@@ -83,6 +83,8 @@ LOOKING = [
     ("guard", "list"), ("guard", "suggest"), ("guard", "new", "nothing", "/cmd_vel"),
     ("door", "list"), ("door", "ticket", "nobody"), ("door", "remove", "nobody"), ("drive", "status"),
     ("drive", "take", "base", "--host", "robot"), ("drive", "give", "base"),
+    ("drive", "assign", "base", "--host", "robot"), ("drive", "free", "base"), ("approval", "refuse", "48213"),
+    ("policy", "unused", "--json"), ("policy", "enforce", "Publishers", "--dry-run"), ("who-drove", "--at", "0s"),
     ("drive", "ask", "base", "--host", "robot"), ("approve",),
     ("approve", "48213"), ("sso", "list"), ("sso", "end", "nobody"),
     ("guard", "set", "nobody", "vMax=1"), ("guard", "enforce", "nobody"), ("guard", "upgrade", "nobody"),

@@ -4,11 +4,13 @@ from tests.support.command import commands
 
 COMPARISON = Path(__file__).parents[2] / "integration" / "cli" / "test_both_ways.py"
 # These verbs are tested over REST elsewhere, with their preconditions (a recording, a host's key, a pair); `limits` has
-# numbers that change, and `audit acknowledge` is refused over REST. The last three have options with these names that
-# do not select the appliance.
+# numbers that change, a report has the time, and `audit acknowledge`, `adopt` and `release` are refused over REST. The
+# last three have options with these names that do not
+# select the appliance.
 ELSEWHERE = {
     "monitor replay", "record messages", "record fetch", "host add", "host kit", "policy check", "monitor diff",
-    "standby status", "standby promote", "limits", "door add", "audit acknowledge", "up", "selftest", "protect",
+    "standby status", "standby promote", "limits", "door add", "audit acknowledge", "adopt", "release",
+    "report interventions", "up", "selftest", "protect",
 }  # fmt: skip
 
 

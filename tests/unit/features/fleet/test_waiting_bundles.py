@@ -93,7 +93,7 @@ class _Robot:
             """All is on the disk."""
 
         parts: Any = {
-            "policies": self.policies, "monitors": self.monitors, "hosts": self.hosts,
+            "policies": self.policies, "monitors": self.monitors, "hosts": lambda: self.hosts,
             "store": SimpleNamespace(settings=dict, save_setting=lambda *_given: None, settled=settled),
             "trail": self.trail,
             "health": lambda _deprived: _HEALTHY,

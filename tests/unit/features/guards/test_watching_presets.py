@@ -354,6 +354,8 @@ def test_two_sources_agree_for_a_number_of_messages() -> None:
             guard.tell(given, speed(*v), at)
             if given == "other":
                 others, other_at = tuple(v), at
+                if any(map(math.isnan, v)):
+                    row, good = -3, False
                 continue
             mine_at = at
             apart = [
