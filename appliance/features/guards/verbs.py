@@ -86,7 +86,7 @@ def _list_loaded(appliance: Appliance, body: GuardList) -> None:
             say_json({"guard": row.name, "preset": row.preset, "state": row.state, "shadow": shadow,
                       "enabled": not shadow and not on, "held": held, "topics": [*row.topics.values()],
                       "stops": row.stops, "confirm_by": row.confirm_by, "version": row.version,
-                      "origin": row.origin, "below": row.below})  # fmt: skip
+                      "origin": row.origin, "below": row.below, "digest": row.digest})  # fmt: skip
         else:
             say(f"guard {row.name}: {_origin(row)} on {', '.join(row.topics.values())}, {_state(row)}")
             for value in row.below:

@@ -61,6 +61,7 @@ class Robot:
                 rows = [
                     GuardRow(name, "fence", "", "stopping", {"command": "/cmd_vel"}, {}, [], {}, 3, version=1,
                              origin=origin, below=["silent=0 is below the standard"] * (name == "old"),
+                             digest=f"digest of {name}",
                              last_stop=LastStop(5, until, 2, "at the edge", "10.0.0.7", "/teleop", "18e9")
                              if until != 0 else None)
                     for name, origin, until in (
@@ -290,6 +291,15 @@ def test_lists_and_proposals_are_printed(tmp_path: Path, capsys: pytest.CaptureF
     assert lines[0] == {"loaded": "mine", "preset": "deadman", "topics": {"command": "/cmd_vel"}}
     assert (lines[1]["command"], lines[1]["others"]) == ("rosrv guard new fence", {"by": ["/wheels"]})
     assert lines[2]["left_out"].startswith("/estop_enabled")
+
+
+def test_each_guard_of_the_list_has_its_digest_in_json(capsys: pytest.CaptureFixture[str]) -> None:
+    robot = Robot(None)
+    robot.as_json = True
+    run(verbs.list_guards, robot)
+    lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    digests = {line["guard"]: line["digest"] for line in lines if "guard" in line}
+    assert digests == {name: f"digest of {name}" for name in ("fence", "old", "mine")}
 
 
 def test_all_guards_of_an_older_version_are_upgraded_and_written(
