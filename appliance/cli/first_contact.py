@@ -43,7 +43,7 @@ _AFTER = {
     ),
     2: (
         "rosrv policy who-may publish /cmd_vel",
-        "lists the hosts that may drive; hosts behind `ask` need a person's approval",
+        "lists the hosts that may drive; hosts after `ask` need a person's approval",
     ),
 }
 
