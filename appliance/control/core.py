@@ -185,11 +185,17 @@ class GraphFacts:
 
 
 class RelayOrders:
-    """Orders to the relays, which carry the messages."""
+    """Orders to the relays, which carry the messages. `changed` registers what the own node publishes."""
 
-    def __init__(self, relay: RelayControl, holder: CallHolder) -> None:
+    def __init__(self, relay: RelayControl, holder: CallHolder, changed: Callable[[], None]) -> None:
         self._relay = relay
         self._holder = holder
+        self._changed = changed
+        self._published: set[str] = set()
+        self.ranks = relay.ranks
+        """The drivers of topics with a rank."""
+        self.publish = relay.publish
+        """Publishes a message on a topic of `publish_only`."""
         self.look = relay.taps.look
         self.stop = relay.taps.stop
         """Lets the monitors of a topic send their safe messages, and returns their names."""
@@ -208,6 +214,17 @@ class RelayOrders:
         request to a service.
         """
         self._holder.held.provide(HeldCalls(call, request))
+
+    def publish_only(self, headers: Iterable[messages.OwnHeaderStated]) -> None:
+        """Let the appliance's own node publish these topics, and no others of earlier calls."""
+        before, self._published = self._published, set()
+        for header in headers:
+            self._relay.begin_own_topic(header)
+            self._published.add(header.topic)
+        for topic in before - self._published:
+            self._relay.end_own_topic(topic)
+        if before != self._published:
+            self._changed()
 
     def ready(self) -> bool:
         return self._relay.presence == "connected"

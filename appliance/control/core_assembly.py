@@ -42,7 +42,7 @@ def make_core(base: Foundation, parts: Parts, bearers: Bearers, alarms: Alarms) 
         specifications=parts.monitors,
         hosts=base.hosts,
         graph=_graph_facts(base, parts),
-        relay=RelayOrders(parts.endpoints.relay, base.calls),
+        relay=RelayOrders(parts.endpoints.relay, base.calls, parts.publisher.wake),
         rest=RestServices(),
         own_services=OwnServices(base.own_services),
         bearers=bearers,

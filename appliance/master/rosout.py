@@ -14,7 +14,6 @@ from roswire.definitions import Definitions
 from roswire.log_message import DEBUG, ERROR, FATAL, INFO, TYPE, WARN, log_message
 
 TOPIC = "/rosout"
-PUBLICATIONS = {TOPIC: TYPE}
 _A_SECOND = 50
 _LEVELS = {"DEBUG": DEBUG, "INFO": INFO, "WARN": WARN, "ERROR": ERROR, "FATAL": FATAL}
 _ALARMING = frozenset({"violation", "fail", "timeout"})  # categories of verdicts with level WARN

@@ -224,7 +224,7 @@ class Policy:
         group = self._commanded.get(name)
         if group is None:
             return True
-        if self.holders is None:
+        if self.holders is None or group.ranks:
             return group.claim(self.atoms_of(host)) is not None
         return self.holder(group) == canonical_address(host)
 
@@ -293,14 +293,17 @@ class Policy:
         """Deny a host without a claim to the group, and calls of a host that does not hold it.
 
         A publication of a host with a claim stays registered, because a ROS 1 node never registers again; the relay
-        carries its messages only while the host holds the group.
+        carries its messages only while the host holds the group, or while its node moves and no higher rank does.
         """
         if not decision.allowed and decision.asks is None:
             return decision
         may_not = self._what(request, "may not")
         if group.claim(self.atoms_of(request.host)) is None:
-            reason = f"{may_not}: no line of {place_of(group.rule)} lets it take, override or ask"
+            lets = "names it in the rank" if group.ranks else "lets it take, override or ask"
+            reason = f"{may_not}: no line of {place_of(group.rule)} {lets}"
             return Decision(False, group.rule, reason)
+        if group.ranks:
+            return self._ranked(request, decision, group)
         holder = self.holder(group)
         now = "" if self.holders is None else f"; now {holder or 'no host'} holds it"
         if request.category is Category.CALL and not self.may_command(request.resource, request.host):
@@ -308,6 +311,15 @@ class Policy:
             told = f"{may_not} while it does not hold {group.name}: {order}"
             return Decision(False, group.rule, told + now, told=told)
         reason = f"{decision.reason}, while it holds {group.name}{now}"
+        return replace(decision, reason=reason if len(reason) <= _LONGEST_REASON else decision.reason)
+
+    def _ranked(self, request: Request, decision: Decision, group: AuthorityGroup) -> Decision:
+        """Deny calls: only messages have a rank."""
+        if request.category is Category.CALL:
+            told = f"{self._what(request, 'may not')}: {group.name} has a rank, which services cannot have"
+            return Decision(False, group.rule, told)
+        line = " > ".join(group.in_words(rank) for rank in range(len(group.ranks)))
+        reason = f"{decision.reason}, while it moves and no higher rank of {group.name} does: {line}"
         return replace(decision, reason=reason if len(reason) <= _LONGEST_REASON else decision.reason)
 
     def _decide_named_only(self, request: Request, table: RuleTable, found: CompiledRule | None) -> Decision:

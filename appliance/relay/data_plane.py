@@ -25,8 +25,8 @@ from appliance.relay.context import RelayContext
 from appliance.relay.grant_table import GrantTable, PeerGrant
 from appliance.relay.loop import EventLoop
 from appliance.relay.monitors.interceptor import Interceptor
-from appliance.relay.monitors.observation_points import ObservationPoint
 from appliance.relay.monitors.topic_pipeline import TopicPipeline
+from appliance.relay.ranked_topics import RankedTopics
 from appliance.relay.relay_limits import RelayLimits
 from appliance.relay.report import Reporter
 from appliance.relay.topic_taps import TopicTaps
@@ -52,7 +52,7 @@ class DataPlane:
             changed=self._monitors_changed,
             holder=lambda host: host if self._table.is_registered(host) else "",
             payer=self._table.payer,
-            publishers=self._publishers,
+            publishers=lambda topic: [relayed.point for relayed in self._publications(topic)],
         )
         self._context = RelayContext.of(loop, limits, self._reporter, self.interceptor, self._table)
         self.memory = self._context.memory
@@ -64,6 +64,7 @@ class DataPlane:
             make_room=self._make_connection_room,
         )
         self.topics: dict[tuple[str, str], RelayedTopic] = {}
+        self._ranks = RankedTopics(loop, self._reporter.send, self._publications)
         self._servers = ActionServers()
         self._own: dict[str, OwnTopicPublisher] = {}
         self._own_headers: dict[str, dict[str, str]] = {}
@@ -112,8 +113,8 @@ class DataPlane:
             self.interceptor.state(message)
         elif isinstance(message, messages.MonitorSwitched | messages.MonitorGiven | messages.StopWanted):
             self.interceptor.order(message)
-        elif isinstance(message, messages.MonitorResumed):
-            self._ask_for_latched(self.interceptor.resume(message.name))
+        elif isinstance(message, messages.MonitorResumed | messages.RankFreed):
+            self._release(message)
         elif isinstance(message, messages.LookWanted | messages.LookEnded):
             self._topic_taps.order(message, self.topics.values())
         elif isinstance(message, messages.OwnHeaderStated | messages.OwnPublished):
@@ -148,6 +149,7 @@ class DataPlane:
         elif isinstance(message, messages.PublicationPlaced):
             self._place_topic(message.key, message.topic)
             self._limit_topic(message)
+            self._ranks.place(message, self.topics[message.key, message.topic])
             self.topics[message.key, message.topic].upstream.silence(silent=message.silent)
         elif isinstance(message, messages.GrantInstalled):
             self._limit_subscriber(message)
@@ -158,6 +160,7 @@ class DataPlane:
         for message in self._table.end(epoch):
             self._withdrawn(message)
         self._reporter.repeat_connections()
+        self._ranks.repeat()
         for topic in self.topics.values():
             topic.upstream.ask_again()
             topic.latch.repeat()
@@ -257,13 +260,12 @@ class DataPlane:
     def _may_pass_again(self, relayed: RelayedTopic, body: memoryview) -> bool:
         if self.interceptor.is_stop(relayed.topic, bytes(body)):
             return True
-        point = ObservationPoint(relayed.key, relayed.topic, relayed.host, relayed.name)
-        self.interceptor.refuse_replay(point, body)
+        self.interceptor.refuse_replay(relayed.point, body)
         return False
 
-    def _publishers(self, topic: str) -> list[ObservationPoint]:
+    def _publications(self, topic: str) -> list[RelayedTopic]:
         return [
-            ObservationPoint(relayed.key, topic, relayed.host, relayed.name)
+            relayed
             for relayed in self.topics.values()
             if relayed.topic == topic and isinstance(relayed.upstream, PublisherConnection)
         ]
@@ -272,8 +274,7 @@ class DataPlane:
         interceptor, topic = self.interceptor, relayed.topic
         wanted, guarded = interceptor.wants(topic), interceptor.is_guarded(topic)
         if interceptor.intercepts(topic):
-            point = ObservationPoint(relayed.key, topic, relayed.host, relayed.name)
-            pipeline = TopicPipeline(interceptor, point)
+            pipeline = TopicPipeline(interceptor, relayed.point)
             relayed.monitor(pipeline.through, wanted=wanted, call=pipeline.module_call, guarded=guarded)
         else:
             relayed.monitor(None, wanted=wanted)
@@ -302,6 +303,12 @@ class DataPlane:
             if concerned and relayed.lacks_latched:
                 relayed.upstream.request_latched()
 
+    def _release(self, message: messages.MonitorResumed | messages.RankFreed) -> None:
+        if isinstance(message, messages.RankFreed):
+            self._ranks.free(message.topic)
+        else:
+            self._ask_for_latched(self.interceptor.resume(message.name))
+
     def _own_topic(self, message: messages.OwnHeaderStated | messages.OwnPublished) -> None:
         if isinstance(message, messages.OwnPublished):
             self._publish(message.topic, message.data)
@@ -310,7 +317,7 @@ class DataPlane:
             "type": message.type,
             "md5sum": message.md5sum,
             "message_definition": message.definition,
-            "latching": "0",
+            "latching": "1" if message.latching else "0",
         }
 
     def _header_of(self, topic: str) -> dict[str, str] | None:
@@ -338,6 +345,7 @@ class DataPlane:
         if self._own.get(topic) is relayed.upstream:
             del self._own[topic]
         relayed.upstream.close()  # its remaining subscribers get nothing more
+        self._ranks.withdraw(key, topic)
         self.interceptor.invalidate_prepared()  # its pipeline's counts are collected once more, and then freed
         self._cut_members(relayed, reason)
 

@@ -394,7 +394,7 @@ class ControlParts:
             policy=lambda: self.current,
             monitors=lambda: cast(Any, NoSpecifications()),
             broken=lambda _node: None,
-            own_header=None,
+            own_topics={},
             own_call=cast(Any, None),
         )
         self.subscribers = Subscribers(

@@ -85,7 +85,7 @@ def idle_core(state: Path) -> Core:
             connections=idle(NodeConnections),
             registrar=_idle_registrar(),
         ),
-        relay=RelayOrders(relay, CallHolder()),
+        relay=RelayOrders(relay, CallHolder(), lambda: None),
         rest=RestServices(),
         own_services=OwnServices(OwnServiceTable()),
         bearers=Bearers(list, lambda: None, Provided()),

@@ -25,7 +25,15 @@ _SECRET = re.compile(r"secrets\.(token|randbelow)|make_token\(|new_ticket\(|new_
 _COMPARED = re.compile(r"compare_digest\(")
 _ROUTES = re.compile(r"APIRouter\(|Routes\(\)|Route\(")
 _NO_WAY_IN = frozenset(
-    {"links.start", "links.kill", "policy.provide", "policy.on_change", "policy.on_first", "limits.provide"}
+    {
+        "links.start",
+        "links.kill",
+        "policy.provide",
+        "policy.on_change",
+        "policy.on_first",
+        "limits.provide",
+        "relay.publish_only",
+    }
 )
 
 

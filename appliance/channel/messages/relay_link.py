@@ -59,13 +59,30 @@ class FlowLimit(msgspec.Struct, frozen=True, array_like=True):
 
 UNLIMITED = FlowLimit()
 
+RankStanding = Literal["unknown", "free", "moving", "lost"]
+"""Whether the driver of a topic with a rank moves. `lost`: it fell silent after a motion. `unknown`: after a start."""
+
+
+class RankPlace(msgspec.Struct, frozen=True, array_like=True):
+    """The rank of a publication (0 is the highest), the time from a zero to a free topic in seconds, and the last known
+    driver of the topic: its key, its rank and its standing.
+
+    A relay uses the driver only if it carries no other ranked publication of the topic yet, so its own state is as old.
+    """
+
+    rank: int
+    free: float
+    driver: str = ""
+    driver_rank: int = 0
+    standing: RankStanding = "unknown"
+
 
 class PublicationPlaced(Message):
     """A publication; its type is as registered, or `*` if unknown. Sending it again changes the limits.
 
     `limit` applies to all publications of the topic on this host. `together` applies to all publications of the topic;
     hosts, by `counted_as`, share it equally. `silent`: the relay drops all messages of the node, because its host does
-    not hold the topic's group (`[Authority]`).
+    not hold the topic's group (`[Authority]`). `rank`: the relay drops the messages while a higher rank moves.
     """
 
     key: str
@@ -76,6 +93,7 @@ class PublicationPlaced(Message):
     counted_as: str = ""
     named: bool = True
     silent: bool = False
+    rank: RankPlace | None = None
 
 
 class PublicationWithdrawn(Message):
@@ -214,6 +232,21 @@ class UpstreamLost(Message):
     topic: str
     reason: str
     violation: Violation = ""
+
+
+class RankFreed(Message):
+    """An operator hands the topic back, so that all ranks may move."""
+
+    topic: str
+
+
+class RankReported(Message):
+    """The driver of a topic with a rank, or its standing, has changed. `key` is empty if there was none."""
+
+    topic: str
+    key: str
+    rank: int
+    standing: RankStanding
 
 
 class LatchRefused(Message):
@@ -438,6 +471,7 @@ class OwnHeaderStated(Message):
     type: str
     md5sum: str
     definition: str
+    latching: bool = False
 
 
 class OwnPublished(Message):
@@ -624,4 +658,5 @@ RelayLink = (
     | SpecificationsRefused | PublicationRefused | MonitorsReported | MonitorsCounted | LookWanted | LookEnded
     | MessageSeen | OrdersAsked | OrdersCarriedOut | OwnServiceCalled | OwnServiceAnswered
     | MonitorCallWanted | MonitorCallAnswered | RequestHeld | HeldRequestDecided | StopWanted | StopBegun
+    | RankFreed | RankReported
 )  # fmt: skip

@@ -90,7 +90,7 @@ def assemble(base: Foundation) -> Parts:
         name=settings.publish_as,
         inner_port=base.port(INNER),
         wanted=lambda: (
-            (rosout.PUBLICATIONS if settings.monitors_on_rosout else {})
+            {topic: header.type for topic, header in ends.relay.own_topics.items()}
             | core.monitors().checked.publications
         ),
         services=settings.own_services,

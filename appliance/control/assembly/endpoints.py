@@ -144,7 +144,7 @@ def _make_relay(
         policy=core.policy,
         monitors=core.monitors,
         broken=core.watchlist.look_at,
-        own_header=_header_of_rosout() if settings.monitors_on_rosout else None,
+        own_topics={rosout.TOPIC: _header_of_rosout()} if settings.monitors_on_rosout else {},
         own_call=lambda asked: (
             gate().answer(asked)
             if isinstance(asked, messages.MonitorCallWanted)

@@ -5,6 +5,7 @@ from appliance.control.motion_stop import MotionStop
 from appliance.control.operators.request_method import RequestMethod
 from appliance.features.authority import requests
 from appliance.features.authority.drive_orders import DriveOrders
+from appliance.features.authority.ranked_groups import RankedGroups
 from appliance.features.authority.settings import GIVE, TAKE
 
 
@@ -12,11 +13,20 @@ async def begin(core: Core) -> ControlPart:
     """Begin without a holder of any group, and stop motions that earlier holders commanded."""
     policy = core.policy
     stop = MotionStop(core.relay.stop, core.trail, policy.current)
+    ranked = RankedGroups(
+        policy.current,
+        core.trail,
+        core.relay,
+        stop,
+        node=core.settings.publish_as,
+        find=lambda key: ((name := core.graph.name_of(key)), core.graph.host_of(name)),
+    )
     orders = DriveOrders(
         policy.current,
         core.trail,
         core.graph.signs,
         stop,
+        ranked,
         decide_again=policy.decide_again,
         carried_out=core.relay.carried_out,
         relays_ready=core.relay.ready,
@@ -28,6 +38,7 @@ async def begin(core: Core) -> ControlPart:
     )
     policy.provide(holders=orders.holders)
     policy.on_change(orders.policy_changed)
+    policy.on_first(ranked.policy_changed)
     core.own_services.provide(TAKE, orders.take_called)
     core.own_services.provide(GIVE, orders.give_called)
     return ControlPart(
@@ -39,6 +50,7 @@ async def begin(core: Core) -> ControlPart:
         ),
         {
             "the leases of command authority": orders.watch,
+            "the stop of drivers that were lost": ranked.stop_lost,
             "the stop of what was commanded before groups ended": at_start,
         },
     )

@@ -15,6 +15,7 @@ from appliance.control.errors import SenselessError, UnavailableError, UnknownTh
 from appliance.control.motion_stop import MotionStop
 from appliance.features.authority import requests
 from appliance.features.authority.group_holders import GroupHolders, Holding
+from appliance.features.authority.ranked_groups import RankedGroups
 from appliance.master.endpoints.host_signs import HostSigns
 from appliance.policy.actions import BadWordError, find_host
 from appliance.policy.authority import AuthorityGroup, Claim
@@ -37,6 +38,7 @@ class DriveOrders:
         trail: AuditTrail,
         signs: HostSigns,
         stop: MotionStop,
+        ranked: RankedGroups,
         *,
         decide_again: Callable[[], int],
         # Waits until the relays of these topics (None: all relays) have applied the policy.
@@ -47,6 +49,7 @@ class DriveOrders:
         self._trail = trail
         self._signs = signs
         self._stop = stop
+        self._ranked = ranked
         self._decide_again = decide_again
         self._carried_out = carried_out
         self._relays_ready = relays_ready
@@ -57,7 +60,8 @@ class DriveOrders:
         return self._groups.hosts()
 
     def policy_changed(self) -> None:
-        self._groups.lose_claims(self._policy().authority)
+        self._groups.lose_claims(self._held_groups())
+        self._ranked.policy_changed()
 
     # --- operators ---
 
@@ -66,13 +70,17 @@ class DriveOrders:
         return requests.GroupStates([self._state(groups[name]) for name in sorted(groups)])
 
     async def take(self, request: requests.DriveTake, who: str) -> requests.GroupState:
-        group, host = self._group(request.group), self._host(request.host)
+        group, host = self._held_group(request.group), self._host(request.host)
         async with self._turn(group):
             await self._taken(group, host, who)
         return self._state(group)
 
     async def give(self, request: requests.DriveGive, who: str) -> requests.GroupState:
         group = self._group(request.group)
+        if group.ranks and not request.to:
+            await self._ranked.free(group, who)
+            return self._state(group)
+        group = self._held_group(request.group)
         to = self._host(request.to) if request.to else None
         if to is not None and self._claim(group, to) is None:
             raise SenselessError(
@@ -86,7 +94,7 @@ class DriveOrders:
 
     async def ask(self, request: requests.DriveAsk, who: str) -> requests.GroupState:
         """Let a host wait for a group, or give it the group at once if it is free and the host may take it."""
-        group, host = self._group(request.group), self._host(request.host)
+        group, host = self._held_group(request.group), self._host(request.host)
         async with self._turn(group):
             await self._asked(group, host, who)
         return self._state(group)
@@ -95,7 +103,7 @@ class DriveOrders:
 
     async def take_called(self, call: OwnServiceCalled) -> OwnServiceAnswered:
         host, done, refused = address_of(call.host), [], []
-        for group in self._policy().authority.values():
+        for group in self._held_groups().values():
             claim = self._claim(group, host)
             if claim is None:
                 continue
@@ -116,7 +124,7 @@ class DriveOrders:
 
     async def give_called(self, call: OwnServiceCalled) -> OwnServiceAnswered:
         host, done = address_of(call.host), []
-        for group in self._policy().authority.values():
+        for group in self._held_groups().values():
             async with self._turn(group):
                 holding = self._groups.holder(group.name)
                 if holding is not None and holding.host == host:
@@ -135,7 +143,7 @@ class DriveOrders:
 
     async def check(self) -> None:
         """End each authority whose lease has expired, all of them before the first wait for a relay."""
-        groups = self._policy().authority
+        groups = self._held_groups()
         if gone := self._groups.forget_others(frozenset(groups)):
             self._decide_again()
         for name, holding in gone.items():
@@ -259,6 +267,19 @@ class DriveOrders:
             return None
         return current.claim(policy.atoms_of(host))
 
+    def _held_groups(self) -> dict[str, AuthorityGroup]:
+        """Return the groups without a rank."""
+        return {name: group for name, group in self._policy().authority.items() if not group.ranks}
+
+    def _held_group(self, name: str) -> AuthorityGroup:
+        group = self._group(name)
+        if group.ranks:
+            raise SenselessError(
+                f"{name} has a rank, so no order gives it to a host: the highest node that moves drives. After a loss,"
+                f" `rosrv drive free {name}` hands it back"
+            )
+        return group
+
     def _group(self, name: str) -> AuthorityGroup:
         group = self._policy().authority.get(name)
         if group is None:
@@ -273,6 +294,8 @@ class DriveOrders:
             raise SenselessError(str(error)) from None
 
     def _state(self, group: AuthorityGroup) -> requests.GroupState:
+        if group.ranks:
+            return self._ranked_state(group)
         now, holding = clock.now(), self._groups.holder(group.name)
         moved = 0.0 if holding is None else self._signs.moved(holding.host, group.names)
         left = self._groups.seconds_left(group, now, moved)
@@ -284,4 +307,20 @@ class DriveOrders:
             group.lease,
             None if left is None else round(max(0.0, left), 1),
             [str(host) for host in self._groups.waiting(group, now)],
+        )
+
+    def _ranked_state(self, group: AuthorityGroup) -> requests.GroupState:
+        driver = self._ranked.driver(group)
+        return requests.GroupState(
+            group.name,
+            sorted(group.names),
+            driver.holder,
+            round(clock.now() - driver.since, 1) if driver.holder else None,
+            0.0,
+            None,
+            [],
+            [group.in_words(rank) for rank in range(len(group.ranks))],
+            driver.node if driver.holder else "",
+            driver.standing,
+            driver.why(group),
         )

@@ -72,6 +72,8 @@ def free(
 ) -> None:
     """Take a group from its holder. The first host that waits and may take the group gets it.
 
+    A group with a rank is handed back after its driver was lost: all its ranks may move again.
+
     Example: rosrv drive free base
     """
     _show(appliance, appliance.answer_or_exit(DriveGive(group, to)))
@@ -88,6 +90,10 @@ def ask(appliance: Appliance, group: _GroupName, *, host: _Host) -> None:
 
 def _show(appliance: Appliance, one: GroupState) -> None:
     shown = appliance.host_in_words
+    if one.ranks:
+        say(f"{one.group}: {one.standing}: {one.why}")
+        say(f"  rank: {' > '.join(one.ranks)}")
+        return
     held = (
         f"held by {shown(one.holder)}, {one.left_seconds:g} s left without a message"
         if one.holder

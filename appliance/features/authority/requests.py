@@ -33,9 +33,20 @@ class GroupState(msgspec.Struct, frozen=True):
     names: Annotated[list[str], doc("its topics and services")]
     holder: Annotated[str, doc("address of the host that holds it, or empty if none does")]
     held_seconds: Annotated[float | None, doc("how long the holder has had it, or null if no host holds it")]
-    lease: Annotated[float, doc("seconds of silence after which a holder loses the group")]
+    lease: Annotated[
+        float, doc("seconds of silence after which a holder loses the group, or 0 if the group has a rank")
+    ]
     left_seconds: Annotated[float | None, doc("until silence ends the authority")]
     waiting: Annotated[list[str], doc("addresses of the hosts that asked for it, the first one first")]
+    ranks: Annotated[
+        list[str], doc("the hosts and nodes of each rank, the highest first; empty without a rank")
+    ] = []
+    driver: Annotated[str, doc("name of the node that moves it, or that fell silent after a motion")] = ""
+    standing: Annotated[
+        str,
+        doc("of a group with a rank: `moving`, `free`, `lost` after a motion, or `unknown` after a start"),
+    ] = ""
+    why: Annotated[str, doc("why this node drives, or whom lower ranks wait for")] = ""
 
 
 class GroupStates(msgspec.Struct, frozen=True):
@@ -63,7 +74,10 @@ class DriveTake(WaitingRequest[GroupState], frozen=True, tag="drive take"):
     "operator", "POST", "/v1/drive/{group}/give", name="drive_give", body=GroupGift, problems=_NO_GROUP
 )  # fmt: skip
 class DriveGive(WaitingRequest[GroupState], frozen=True, tag="drive give"):
-    """End the authority of a group's holder: the group is given to a host, or to the first waiting host."""
+    """End the authority of a group's holder: the group is given to a host, or to the first waiting host.
+
+    A group with a rank is handed back, so that all its ranks may move again.
+    """
 
     group: GroupName
     to: str = ""

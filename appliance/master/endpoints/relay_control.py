@@ -19,6 +19,7 @@ from appliance.channel.channel import Channel
 from appliance.channel.link import Link
 from appliance.master.endpoints.delivery import NodeApiClient
 from appliance.master.endpoints.node_ports import NodePorts
+from appliance.master.endpoints.rank_states import RankStates
 from appliance.master.endpoints.topic_taps_control import TapRequests
 from appliance.master.endpoints.traffic import RelayTraffic
 from appliance.master.graph.graph import Grants
@@ -83,7 +84,7 @@ class RelayControl:
     """Control's end of the links to the relays.
 
     `own_call` answers calls of the appliance's own service, and decides monitors' calls and requests that need an
-    approval.
+    approval. `own_topics` are the headers of what the appliance's own node publishes, except for monitors.
     """
 
     registry: Registry
@@ -95,14 +96,16 @@ class RelayControl:
     policy: Callable[[], Policy]
     monitors: Callable[[], SpecificationManager]
     broken: Callable[[Incarnation], None]
-    own_header: messages.OwnHeaderStated | None
+    own_topics: dict[str, messages.OwnHeaderStated]
     own_call: Callable[[OwnCall], Awaitable[OwnAnswer]]
     relay_all: bool = True
     stand_ins: bool = True
     _posts: tuple[RelayOutbox, ...] = field(init=False)
     _asking: set[asyncio.Task[None]] = field(default_factory=set)
     _moving: set[Resource] = field(default_factory=set)
+    _latched: dict[str, messages.OwnPublished] = field(default_factory=dict)
     taps: TapRequests = field(init=False)
+    ranks: RankStates = field(init=False)
 
     def __post_init__(self) -> None:
         self._posts = tuple(
@@ -110,6 +113,7 @@ class RelayControl:
             for index in range(self.allocation.relays)
         )
         self.taps = TapRequests(lambda topic: self._post(TOPIC, topic).send)
+        self.ranks = RankStates(lambda order: self._post(TOPIC, order.topic).send(order))
 
     @property
     def presence(self) -> str:
@@ -153,8 +157,8 @@ class RelayControl:
         post.attach(channel)
         # Send the specifications before the topics, so that no message bypasses the monitors.
         post.send(self.monitors().statement(index))
-        if self.own_header is not None:
-            post.send(self.own_header)
+        for header in self.own_topics.values():
+            post.send(header)
         post.epoch += 1
         post.send(messages.StateBegan(post.epoch))
         self._state_all(post, self.registry.live())
@@ -168,7 +172,21 @@ class RelayControl:
         return self._posts[relay].send(message)
 
     def publish(self, message: messages.OwnPublished) -> None:
+        """Publish a message; on a latching topic, the relay gets the last one again whenever the topic is placed."""
+        header = self.own_topics.get(message.topic)
+        if header is not None and header.latching:
+            self._latched[message.topic] = message
         self._post(TOPIC, message.topic).send(message)
+
+    def begin_own_topic(self, header: messages.OwnHeaderStated) -> None:
+        """Let the own node publish a topic once it is registered."""
+        self.own_topics[header.topic] = header
+        for post in self._posts:
+            post.send(header)
+
+    def end_own_topic(self, topic: str) -> None:
+        self.own_topics.pop(topic, None)
+        self._latched.pop(topic, None)
 
     async def carried_out(self, topics: Iterable[str] | None = None) -> None:
         """Wait until the relays, or those that carry these topics, have carried out their orders.
@@ -273,6 +291,8 @@ class RelayControl:
                 self._place_node(post, node)
             post.send(wanted, soon=soon)
             post.stated[node.key][fact] = wanted
+            if node.of_monitors and isinstance(fact, RegistrationKey) and fact.resource in self._latched:
+                post.send(self._latched[fact.resource], soon=True)
         elif before is not None:
             post.send(messages.withdrawal(before), soon=soon)
             del post.stated[node.key][fact]
@@ -295,6 +315,13 @@ class RelayControl:
             return messages.ServicePlaced(node.key, resource, str(node.host), int(registration.detail))
         policy = self.policy()
         together = policy.limit(LimitScope.TOPIC, resource)
+        group, rank = policy.commanded(resource), None
+        if group is not None and group.ranks and not node.own:
+            place = group.rank(policy.atoms_of(node.host), node.name)
+            rank = None if place is None else self.ranks.place(resource, place, group.free)
+            may_command = rank is not None
+        else:
+            may_command = node.own or policy.may_command(resource, node.host)
         return messages.PublicationPlaced(
             node.key,
             resource,
@@ -303,7 +330,8 @@ class RelayControl:
             _flow(together),
             policy.counted_as(node.host) if together is not NO_LIMIT else "",
             _names(policy, node.host),
-            not (node.own or policy.may_command(resource, node.host)),
+            not may_command,
+            rank,
         )
 
     def _granted(self, post: RelayOutbox, node: Incarnation, row: PermissionRow) -> messages.RelayFact | None:
@@ -333,6 +361,8 @@ class RelayControl:
             case messages.MessagesLimited():
                 for row in message.rows:
                     self.carried.limited(row, self.policy().limit_rule(row.topic) if row.topic else None)
+            case messages.RankReported():
+                self.ranks.reported(message)
             case messages.OrdersCarriedOut():
                 post.carried_out()
             case messages.MessageSeen() | messages.StopBegun():

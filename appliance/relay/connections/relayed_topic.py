@@ -16,6 +16,9 @@ subscriber makes the relay reconnect to the publisher; the other subscribers the
 command (a message of a topic that had a guard, or a goal) is never requested again: it would begin a motion long after
 it was refused.
 
+Messages of a topic with a rank pass while their publisher is heard (`give_rank`). A message that was taken before a
+hand-over, and waits for monitors, does not pass after it; nor does a latched one.
+
 While *all* subscribers are behind, the relay stops reading the publisher for at most `queue_grace`, so a subscriber
 that the scheduler paused for some milliseconds loses nothing.
 """
@@ -29,8 +32,10 @@ from appliance.relay.connections.headers import to_subscriber
 from appliance.relay.connections.latched_message import LatchedMessage
 from appliance.relay.connections.message_sink import MessageSink, MessageStream
 from appliance.relay.connections.named_subscribers import seen_names
+from appliance.relay.connections.ranked_publication import RankedPublication
 from appliance.relay.connections.served_subscribers import ServedSubscribers, TopicSubscriber
 from appliance.relay.connections.startup_replay import APPEARED, LatchReplay, StartupReplay
+from appliance.relay.monitors.observation_points import ObservationPoint
 from appliance.relay.transport.frames import Batch
 from appliance.relay.transport.memory import HostMemory
 from appliance.relay.transport.pump import SUBSCRIBERS, ModuleCall, Traffic, Version
@@ -159,6 +164,12 @@ class RelayedTopic:
         self._reported = True
         self._superseded = False  # whether a guard's stop is the last message
         self._is_command = topic.endswith("/goal")  # no monitor can declare what stops an action
+        self._rank: RankedPublication | None = None
+
+    @property
+    def point(self) -> ObservationPoint:
+        """Where monitors observe its messages."""
+        return ObservationPoint(self.key, self.topic, self.host, self.name)
 
     @property
     def members(self) -> tuple[TopicSubscriber, ...]:
@@ -208,7 +219,7 @@ class RelayedTopic:
         """
         if self.latch.is_latching or self._taps or self.flow.limits or len(self._served) > SUBSCRIBERS:
             return None
-        if self._served.mask is not None or self._superseded:
+        if self._served.mask is not None or self._superseded or self._rank is not None:
             return None
         if self._stream is not None or self._startup_replay.keeps or self._served.undelivered:
             return None
@@ -230,6 +241,8 @@ class RelayedTopic:
 
     @property
     def _is_wanted(self) -> bool:
+        if self._rank is not None:  # its motions count even without a subscriber
+            return True
         return bool(self._waiting or self._served or self._monitoring.wanted or self._taps)
 
     def _spare_unwanted(self) -> None:
@@ -258,6 +271,29 @@ class RelayedTopic:
             self.upstream.connect()
         self._spare_unwanted()
 
+    def give_rank(self, rank: RankedPublication | None) -> None:
+        """Pass only messages that the `rank` passes, from the next batch on. Such a topic carries commands."""
+        if rank is None and self._rank is None:
+            return
+        self._rank = rank
+        self.differs()
+        if rank is None:
+            self._spare_unwanted()
+            return
+        self._is_command = True
+        if self._header is not None and self._state is TopicState.OPEN:
+            rank.opened(self._header, self._clock())
+        self.hush()
+        self.upstream.connect()
+
+    def hush(self) -> None:
+        """Repeat no message to later subscribers, and read on: another publisher of the topic drives."""
+        self._startup_replay.forget()
+        if not self._superseded:
+            self.latch.forget()
+        self.differs()
+        self.relieve()
+
     def withhold(self, mask: Callable[[str], bool] | None) -> None:
         """Withhold messages from each host for which `mask` is true at their delivery.
 
@@ -271,12 +307,16 @@ class RelayedTopic:
         before, self._header = self._header, header
         self.latch.is_latching = header.get("latching", "0") == "1"
         self._state = TopicState.OPEN
+        if self._rank is not None:
+            self._latch_replay = LatchReplay(-1.0)  # a latched message may be older than a hand-back
+            self._rank.opened(header, self._clock())
         self._latch_replay.opened(self._clock(), is_latching=self.latch.is_latching)
         self.differs()
         self._end_stream()
         if self._sink is not None:
             self._stream = self._sink.open(self.topic, self.host, header)
-        alone = self._monitoring.wanted and not (self.latch.is_latching or self._waiting or self._served)
+        watched = self._monitoring.wanted or self._rank is not None
+        alone = watched and not (self.latch.is_latching or self._waiting or self._served)
         self._startup_replay.opened(self._clock(), alone=alone)
         if before is not None and _identity(before) != _identity(header):
             self._forget_stop()
@@ -294,6 +334,8 @@ class RelayedTopic:
         return self.latch.is_lacking and not self._is_command
 
     def upstream_closed(self) -> None:
+        if self._rank is not None:
+            self._rank.closed(self._clock())
         self._end_stream()
         self.hand_out(divided=False)
         if not self._superseded:
@@ -317,8 +359,20 @@ class RelayedTopic:
         passing = batch
         if self._latch_replay.awaited:
             passing = self._without_replay(batch)
-        if self.flow.limits and passing.messages:
-            passing = self.flow.passing(passing, self._clock(), latching=self.latch.is_latching)
+        if self._rank is not None:
+            passing = self._rank.passing(passing, self._clock())
+        if passing is not batch:
+            if self._stream is not None:
+                dropped = batch.head(batch.messages - passing.messages)
+                self._stream.write(dropped.view, dropped.messages, dropped.first)
+            if not passing.messages:
+                return None
+            batch = passing
+        if self.flow.limits:
+            latching = (
+                self.latch.is_latching and self._rank is None
+            )  # a delayed message could be older than a hand-back
+            passing = self.flow.passing(passing, self._clock(), latching=latching)
         return self._take(batch, passing, since)
 
     def _without_replay(self, batch: Batch) -> Batch:
@@ -342,6 +396,8 @@ class RelayedTopic:
 
     def go_on(self, rest: Batch, since: float) -> Batch | None:
         self._reported = False
+        if self._rank is not None and not self._rank.hears(self._clock()):
+            return self._take(rest, Batch(rest.view[:0], 0, None), since)
         return self._take(rest, rest, since)
 
     def _take(self, batch: Batch, passing: Batch, since: float) -> Batch | None:
@@ -438,7 +494,7 @@ class RelayedTopic:
     def tidy(self) -> None:
         now = self._clock()
         waiting = self.flow.later(now)
-        if waiting is not None:
+        if waiting is not None and self._rank is None:
             self._admit(waiting, now, divided=False)
         self._startup_replay.expire(now)
         if self.latch.batch is not None:

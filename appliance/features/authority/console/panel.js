@@ -31,13 +31,18 @@ export function Drives() {
   const { value, error, rows } = useGroups();
   const silent = rows.some((/** @type {any} */ one) => isSilent(one));
   const waits = rows.some((/** @type {any} */ one) => one.waiting.length);
-  return html`<${Fact} name="Drives" to="/console/robot" tone=${silent || waits ? "warn" : ""}>${error && !value ? "not known" : !value ? "…" : !rows.length ? html`<span class="muted">every host that may: no [Authority]</span>` : rows.map((/** @type {any} */ one) => html`<div key=${one.group}>
-    ${one.holder ? html`<${Host} value=${one.holder} /> <span class="muted">drives</span> <${Given} value=${one.group} most=${40} /> <span class="muted nowrap">for ${lasting(one.held_seconds)}</span>${isSilent(one) && html` <${Badge} word=${`silent: ${one.left_seconds.toFixed(1)} s left`} tone="warn" />`}` : html`<span class="muted">no host drives</span> <${Given} value=${one.group} most=${40} />`}
+  return html`<${Fact} name="Drives" to="/console/robot" tone=${silent || waits || rows.some(isStuck) ? "warn" : ""}>${error && !value ? "not known" : !value ? "…" : !rows.length ? html`<span class="muted">every host that may: no [Authority]</span>` : rows.map((/** @type {any} */ one) => html`<div key=${one.group}>
+    ${one.ranks.length ? html`<${Given} value=${one.group} most=${40} /> <${Badge} word=${one.standing} tone=${isStuck(one) ? "warn" : ""} /> <span class="muted"><${Given} value=${one.why} most=${200} /></span>` : one.holder ? html`<${Host} value=${one.holder} /> <span class="muted">drives</span> <${Given} value=${one.group} most=${40} /> <span class="muted nowrap">for ${lasting(one.held_seconds)}</span>${isSilent(one) && html` <${Badge} word=${`silent: ${one.left_seconds.toFixed(1)} s left`} tone="warn" />`}` : html`<span class="muted">no host drives</span> <${Given} value=${one.group} most=${40} />`}
     ${one.waiting.length > 0 && html` <${Badge} word="waits" tone="warn" /> <${Host} value=${one.waiting[0]} />${one.waiting.length > 1 && ` and ${one.waiting.length - 1} more`}`}</div>`)}</${Fact}>`;
 }
 
 function isSilent(/** @type {any} */ group) {
   return group.left_seconds !== null && group.left_seconds < group.lease / 2;
+}
+
+/** Whether lower ranks wait for a person. */
+function isStuck(/** @type {any} */ group) {
+  return group.standing === "lost" || group.standing === "unknown";
 }
 
 export function Drive() {
@@ -54,9 +59,9 @@ function Group(/** @type {{group: any, again: () => void}} */ { group, again }) 
   const button = (/** @type {keyof typeof SAID} */ verb, /** @type {any} */ more = {}) => html`<${Button} small role="operator" ...${more} onClick=${() => setOpen(verb)}>${SAID[verb]}…</${Button}>`;
   return html`<tr data-group=${group.group}>
     <td class="first"><strong><${Given} value=${group.group} most=${64} /></strong><div class="muted small">${group.names.map((/** @type {string} */ name) => html`<div key=${name}><${Given} value=${name} mono most=${80} /></div>`)}</div></td>
-    <td data-label="Holder"><div>${group.holder ? html`<${Host} value=${group.holder} /><div class="muted small">for ${lasting(group.held_seconds)}; ends after ${lasting(group.lease)} of silence${isSilent(group) && html` <${Badge} word=${`silent: ${group.left_seconds.toFixed(1)} s left`} tone="warn" />`}</div>` : html`<${Badge} word="no host" />`}</div></td>
+    <td data-label="Holder"><div>${group.ranks.length ? html`<${Badge} word=${group.standing} tone=${isStuck(group) ? "warn" : ""} /> <${Given} value=${group.why} most=${200} /><div class="muted small"><${Given} value=${group.ranks.join(" > ")} mono most=${200} /></div>` : group.holder ? html`<${Host} value=${group.holder} /><div class="muted small">for ${lasting(group.held_seconds)}; ends after ${lasting(group.lease)} of silence${isSilent(group) && html` <${Badge} word=${`silent: ${group.left_seconds.toFixed(1)} s left`} tone="warn" />`}</div>` : html`<${Badge} word="no host" />`}</div></td>
     <td data-label="Waits"><div>${group.waiting.length ? group.waiting.map((/** @type {string} */ host) => html`<div key=${host}><${Host} value=${host} /></div>`) : html`<span class="muted">–</span>`}</div></td>
-    <td><div class="row row-end">${button("take", { tone: group.holder ? "" : "primary" })}${button("give", { disabled: !group.holder, why: "No host holds it" })}${button("ask")}</div>
+    <td><div class="row row-end">${group.ranks.length ? button("give", { disabled: !isStuck(group), why: "Nobody waits for a person" }) : html`${button("take", { tone: group.holder ? "" : "primary" })}${button("give", { disabled: !group.holder, why: "No host holds it" })}${button("ask")}`}</div>
       ${open && html`<${HandOver} verb=${open} group=${group} again=${again} close=${() => setOpen("")} />`}</td></tr>`;
 }
 
@@ -68,7 +73,7 @@ function HandOver(/** @type {{verb: keyof typeof SAID, group: any, again: () => 
   const go = async () => {
     try {
       const { body } = await ask("POST", `/v1/drive/${encodeURIComponent(group.group)}/${verb}`, { json: give ? { to: host } : { host }, match: "*" });
-      done(body.holder ? `${body.holder} holds ${body.group}` : `No host holds ${body.group}`, body.waiting.length ? `${body.waiting.length} waiting` : "");
+      done(body.ranks.length ? `${body.group} is ${body.standing}` : body.holder ? `${body.holder} holds ${body.group}` : `No host holds ${body.group}`, body.waiting.length ? `${body.waiting.length} waiting` : "");
       close();
     } catch (failure) {
       failed(failure);
@@ -77,7 +82,7 @@ function HandOver(/** @type {{verb: keyof typeof SAID, group: any, again: () => 
   };
   const text = {
     take: "The host drives from now on, if the policy lets it take the group or override its holder. Messages of all other hosts on these topics are dropped.",
-    give: "The holder's authority ends. The group goes to this host, or without one to the first that waits.",
+    give: group.ranks.length ? "The group is handed back: the next node that moves drives. Leave the host empty." : "The holder's authority ends. The group goes to this host, or without one to the first that waits.",
     ask: "The host waits for the group. It gets the group once that is free, if the policy lets it take the group.",
   }[verb];
   const submit = (/** @type {Event} */ event) => {

@@ -6,9 +6,10 @@ from typing import Any, cast
 import pytest
 
 from appliance.base import clock
-from appliance.channel.messages import OwnServiceCalled
+from appliance.channel.messages import OwnServiceCalled, RankReported
 from appliance.control.errors import SenselessError, UnavailableError, UnknownThingError
 from appliance.features.authority.drive_orders import CHECK_SECONDS, DriveOrders
+from appliance.features.authority.ranked_groups import RankedDriver
 from appliance.features.authority.requests import (
     DriveAsk,
     DriveGive,
@@ -17,6 +18,7 @@ from appliance.features.authority.requests import (
     GroupState,
 )
 from appliance.master.endpoints.host_signs import HostSigns
+from appliance.policy.authority import AuthorityGroup
 from appliance.policy.model import Address, address_of
 from appliance.policy.policy import Policy
 from appliance.policy.policy_compiler import compile_policy
@@ -36,6 +38,25 @@ lease base = {LEASE:g}s
 """
 
 
+class RankedGiver:
+    """Stands in for the groups with a rank, which have their own tests."""
+
+    def __init__(self) -> None:
+        self.given: list[str] = []
+
+    def policy_changed(self) -> None: ...
+
+    def driver(self, _group: AuthorityGroup) -> RankedDriver:
+        return RankedDriver(RankReported("", "", 0, "unknown"))
+
+    async def free(self, group: AuthorityGroup, who: str) -> None:
+        self.given.append(f"{group.name} by {who}")
+
+
+def as_any(double: Any) -> Any:
+    return double
+
+
 class Site:
     def __init__(self, chance: random.Random, time: VirtualClock) -> None:
         self.time = time
@@ -48,11 +69,13 @@ class Site:
         self.ordered: list[list[Address | None]] = [[], []]
         self.ready = True
         self.hanging: set[str] = set()  # topics of a relay that does not answer
+        self.ranked = RankedGiver()
         self.orders = DriveOrders(
             lambda: self.policy,
             self.trail,
             HostSigns(self.live.__contains__, lambda host, _names: self.moved.get(host, 0.0)),
             cast(Any, self),
+            as_any(self.ranked),
             decide_again=self.decide_again,
             carried_out=self.carried_out,
             relays_ready=lambda: self.ready,

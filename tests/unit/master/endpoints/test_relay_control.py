@@ -111,7 +111,7 @@ class World:
             policy=lambda: self.policy,
             monitors=lambda: cast(Any, self),
             broken=lambda _incarnation: None,
-            own_header=None,
+            own_topics={},
             own_call=cast(Any, None),
         )
 

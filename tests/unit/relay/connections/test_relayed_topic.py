@@ -101,6 +101,7 @@ class Story:
         fresh: bool = True,
         sink: MessageSink | None = None,
         servers: Callable[[str], Collection[str]] = lambda _topic: (),
+        replayed: Callable[[RelayedTopic, memoryview], bool] = lambda _topic, _body: True,
     ) -> None:
         self.now = 100.0
         self.share = share(memory)
@@ -120,6 +121,7 @@ class Story:
             refused=self.refused.append,
             sink=sink,
             servers=servers,
+            replayed=replayed,
         )
         self.upstream = RecordedUpstream()
         self.topic.upstream = self.upstream

@@ -1,0 +1,42 @@
+"""One publisher of a topic with a rank, as its relayed topic uses it."""
+
+import struct
+from collections.abc import Callable, Mapping
+
+from appliance.relay.ranked_topic import RankedTopic
+from appliance.relay.transport.frames import Batch
+from appliance.relay.velocity_zero import moves_of
+
+_LENGTH = struct.Struct("<I")
+
+
+class RankedPublication:
+    """The publisher `key` of a ranked topic. Its type is known once it is `opened`."""
+
+    def __init__(self, topic: RankedTopic, key: str) -> None:
+        self._topic = topic
+        self._key = key
+        self._moves: Callable[[memoryview], bool] = moves_of({})
+
+    def opened(self, header: Mapping[str, str], now: float) -> None:
+        self._moves = moves_of(header)
+        self._topic.opened(self._key, now)
+
+    def closed(self, now: float) -> None:
+        self._topic.lose(self._key, now)
+
+    def hears(self, now: float) -> bool:
+        return self._topic.hears(self._key, now)
+
+    def passing(self, batch: Batch, now: float) -> Batch:
+        """Return the messages that pass. They are the last ones of a batch: a publisher that is heard stays so."""
+        view, start, dropped = batch.view, 0, 0
+        for _ in range(batch.messages):
+            end = start + _LENGTH.size + _LENGTH.unpack_from(view, start)[0]
+            moves = self._moves(view[start + _LENGTH.size : end])
+            dropped += not self._topic.passes(self._key, moves=moves, now=now)
+            start = end
+        if not dropped:
+            return batch
+        left = batch.messages - dropped
+        return batch.tail(left) if left else Batch(view[:0], 0, None)
