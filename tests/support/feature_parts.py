@@ -36,6 +36,7 @@ from appliance.hosts.stored_authority import StoredAuthority
 from appliance.hosts.tunnel_state import Tunnels
 from appliance.master.calls.parameter_calls import ParameterCalls
 from appliance.master.endpoints.host_signs import HostSigns
+from appliance.master.endpoints.rank_states import RankStates
 from appliance.master.endpoints.relay_control import RelayControl
 from appliance.master.endpoints.topic_taps_control import TapRequests
 from appliance.master.graph.graph import RosGraph
@@ -57,6 +58,7 @@ def idle_core(state: Path) -> Core:
     policies, trail, relay = idle(Policies), idle(AuditTrail), idle(RelayControl)
     policies.in_force = RevisionRow(0, "", "", 0.0, "", "")
     trail.audit, relay.taps = idle(AuditLog), idle(TapRequests)
+    relay.ranks = RankStates(lambda _order: False)
     return Core(
         settings=settings,
         role=ActiveRole(),

@@ -1,0 +1,7 @@
+from appliance.features.guards.message_types import VELOCITIES
+from appliance.relay.velocity_zero import LAYOUTS
+
+
+def test_a_rank_knows_the_zeros_of_all_types_of_velocities() -> None:
+    """A type that only the guards know would never let go."""
+    assert LAYOUTS.keys() == VELOCITIES.keys()
