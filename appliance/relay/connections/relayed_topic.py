@@ -308,9 +308,10 @@ class RelayedTopic:
         self.latch.is_latching = header.get("latching", "0") == "1"
         self._state = TopicState.OPEN
         if self._rank is not None:
-            self._latch_replay = LatchReplay(-1.0)  # a latched message may be older than a hand-back
             self._rank.opened(header, self._clock())
-        self._latch_replay.opened(self._clock(), is_latching=self.latch.is_latching)
+        # With a rank, a latched message may be older than a hand-back.
+        may_be_new = self._rank is None
+        self._latch_replay.opened(self._clock(), is_latching=self.latch.is_latching, may_be_new=may_be_new)
         self.differs()
         self._end_stream()
         if self._sink is not None:

@@ -88,8 +88,9 @@ class LatchReplay:
         self._new_until = new_until
         self._until = 0.0
 
-    def opened(self, now: float, *, is_latching: bool) -> None:
-        self._until = now + REPLAY_SECONDS if is_latching and now > self._new_until else 0.0
+    def opened(self, now: float, *, is_latching: bool, may_be_new: bool) -> None:
+        is_new = may_be_new and now <= self._new_until
+        self._until = now + REPLAY_SECONDS if is_latching and not is_new else 0.0
         self._new_until = -1.0  # only the first connection of a new publisher has a new message first
 
     @property
