@@ -355,7 +355,9 @@ class Schedule:
             relay.expire(now)
 
 
-@pytest.mark.parametrize("number", [60, pytest.param(100_000, marks=pytest.mark.nightly)])
+@pytest.mark.parametrize(
+    "number", [60, pytest.param(100_000, marks=[pytest.mark.nightly, pytest.mark.timeout(3600)])]
+)
 def test_schedules(number: int) -> None:
     """Never two are heard, rank 0 passes at once, nothing older than a hand-back, nothing after a loss."""
     passed = handed_over = 0

@@ -231,6 +231,7 @@ class StandstillWorld(MeasuredWorld):
         """When the base last got a stop."""
         self.moving_from = NEVER
         """Since when each measurement says that the base moves."""
+        self.read = True
         self.happens()
 
     def received(self, at: int, legs: Legs) -> None:
@@ -242,7 +243,10 @@ class StandstillWorld(MeasuredWorld):
             self.stopped_at = at if self.stopped_at == NEVER else self.stopped_at
 
     def noted(self) -> None:
-        moves = not self.stands
+        read, self.read = self.read, self.measure[0] != NEVER
+        if self.read and not read and self.stopped_at != NEVER:
+            self.stopped_at = self.now  # after unreadable bytes the guard begins anew
+        moves = not self.stands and self.read
         self.moving_from = (self.now if self.moving_from == NEVER else self.moving_from) if moves else NEVER
 
     def _escaped(self, slack: int) -> bool:
