@@ -245,7 +245,7 @@ class StandstillWorld(MeasuredWorld):
     def noted(self) -> None:
         read, self.read = self.read, self.measure[0] != NEVER
         if self.read and not read and self.stopped_at != NEVER:
-            self.stopped_at = self.now  # after unreadable bytes the guard begins anew
+            self.stopped_at = self.now  # after unreadable bytes the guard begins again
         moves = not self.stands and self.read
         self.moving_from = (self.now if self.moving_from == NEVER else self.moving_from) if moves else NEVER
 
