@@ -3,6 +3,7 @@
 Text from the network is printed without control characters and never as markup.
 """
 
+import os
 import shutil
 import sys
 from collections.abc import Callable, Iterable, Mapping
@@ -51,6 +52,16 @@ def write_told(path: Path, data: bytes | mmap) -> None:
         write_where_told(path, data)
     except NotLastingError as error:
         typer.echo(f"rosrv: {printable(str(path))}: {error.strerror}", err=True)
+
+
+def write_new(file: Path, text: str, *, verb: str) -> None:
+    """Write a file that must not exist; otherwise exit with a usage error."""
+    try:
+        descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644)
+    except OSError as error:
+        raise usage_error(f"cannot write {file}: {error.strerror}", verb=verb) from error
+    with os.fdopen(descriptor, "w", encoding="utf-8") as made:
+        made.write(text)
 
 
 def say_json(fields: msgspec.Struct | Mapping[str, Any] | tuple[Any, ...]) -> None:

@@ -1,6 +1,5 @@
 """The command `rosrv report interventions`."""
 
-import os
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -20,7 +19,7 @@ from appliance.cli.audit.verified import last_verification
 from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.audit_file import FileLog
 from appliance.cli.connection.target import Appliance, speaks_with
-from appliance.cli.output import say_json, usage_error
+from appliance.cli.output import say_json, usage_error, write_new
 from appliance.features.logbook import live_facts
 from appliance.features.logbook.interventions import GAPS, SUBJECT_OF, Interventions
 from appliance.features.logbook.log_source import Log, entries_of, with_origin
@@ -81,7 +80,8 @@ def report_interventions(
         end = now if until is None else parse_timestamp(until, now)
         found = _report(appliance, begin, end)
     if output is not None:
-        _write(output, page(found, appliance.host_in_words))
+        write_new(output, page(found, appliance.host_in_words), verb=_VERB)
+        sys.stderr.write(f"rosrv: written to {output}\n")
     if appliance.as_json:
         say_json(found)
     elif output is None:
@@ -161,13 +161,3 @@ def _end_of(file: Path) -> int:
         raise usage_error(
             f"{file}: not a report of `rosrv report interventions --json`: {error}", verb=_VERB
         ) from error
-
-
-def _write(file: Path, text: str) -> None:
-    try:
-        descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644)
-    except OSError as error:
-        raise usage_error(f"cannot write {file}: {error.strerror}", verb=_VERB) from error
-    with os.fdopen(descriptor, "w", encoding="utf-8") as made:
-        made.write(text)
-    sys.stderr.write(f"rosrv: written to {file}\n")

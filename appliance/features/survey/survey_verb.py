@@ -1,7 +1,6 @@
 """The command `rosrv survey`."""
 
 import asyncio
-import os
 from pathlib import Path
 from typing import Annotated
 
@@ -9,7 +8,7 @@ import msgspec
 import typer
 
 from appliance.base.input_files import names_of_hosts
-from appliance.cli.output import Json, say_json, usage_error
+from appliance.cli.output import Json, say_json, usage_error, write_new
 from appliance.features.survey.draft import DraftError, PolicyDraft, draft
 from appliance.features.survey.page import page, report
 from appliance.policy.policy_findings import PolicyError
@@ -17,6 +16,8 @@ from appliance.rpc.graph_inventory import GraphInventory, problems
 from appliance.rpc.graph_reader import SurveyError, SurveyLimits
 from appliance.rpc.graph_reader import survey as read_graph
 from rosmop.tool.terminal import say
+
+_VERB = "rosrv survey"
 
 
 def survey(
@@ -46,7 +47,7 @@ def survey(
     tests = None if policy is None else policy.with_name(f"{policy.name}.tests.yaml")
     for file in filter(None, (html, policy, tests)):
         if file.exists():
-            raise usage_error(f"{file} exists already: give the name of a new file", verb="rosrv survey")
+            raise usage_error(f"{file} exists already: give the name of a new file", verb=_VERB)
     try:
         inventory = asyncio.run(read_graph(master, SurveyLimits(whole=seconds)))
     except SurveyError as error:
@@ -54,10 +55,10 @@ def survey(
         raise typer.Exit(1) from None
     drafted = _drafted(inventory, required=policy is not None) if html or policy else None
     if html is not None:
-        _write(html, page(inventory, drafted))
+        write_new(html, page(inventory, drafted), verb=_VERB)
     if policy is not None and tests is not None and drafted is not None:
-        _write(policy, drafted.text)
-        _write(tests, drafted.tests)
+        write_new(policy, drafted.text, verb=_VERB)
+        write_new(tests, drafted.tests, verb=_VERB)
     if as_json:
         say_json({**msgspec.to_builtins(inventory), "problems": list(problems(inventory))})
         return
@@ -77,12 +78,3 @@ def _drafted(inventory: GraphInventory, *, required: bool) -> PolicyDraft | None
         if required:
             raise typer.Exit(1) from None
         return None
-
-
-def _write(file: Path, text: str) -> None:
-    try:
-        descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644)
-    except OSError as error:
-        raise usage_error(f"cannot write {file}: {error.strerror}", verb="rosrv survey") from error
-    with os.fdopen(descriptor, "w", encoding="utf-8") as output:
-        output.write(text)
