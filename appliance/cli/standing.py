@@ -81,7 +81,7 @@ class StandingJudge:
 
 
 async def wait_until_standing(master: str, longest: float, source: str = "127.0.0.1") -> str:
-    """Return what was seen when the robot at this master stands. Raises `NotStandingError` after `longest` seconds.
+    """Wait until the robot at this master stands; return the signs of it. Raises `NotStandingError` after `longest` s.
 
     `source` is an address of this machine that the robot's nodes reach.
     """

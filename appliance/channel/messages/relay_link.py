@@ -241,7 +241,7 @@ class RankFreed(Message):
 
 
 class RankReported(Message):
-    """The driver of a topic with a rank, or its standing, has changed. `key` is empty if there was none."""
+    """A ranked topic has another driver, or its driver has another standing. `key` is empty without a driver."""
 
     topic: str
     key: str

@@ -38,7 +38,7 @@ _UNLIMITED = "double low = -INFINITY, high = INFINITY;"
 
 
 def _listed(*paths: str, low: str = "", high: str = "", may_lack: str = "") -> TypeRow:
-    """Make `values` of the fields at `paths`: none, unless each is finite but the one that a sensor `may_lack`.
+    """Make `values` of the fields at `paths`, or none if one is not finite; the field `may_lack` may be.
 
     `low` and `high` are the fields of their range, if the type has them.
     """

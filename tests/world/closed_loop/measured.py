@@ -226,7 +226,7 @@ class StandstillWorld(MeasuredWorld):
         self.settle = round(self.random.uniform(0.7, 1.5), 2)
         self.guarded({"settle": self.settle, "silent": self.silent}, {"by": ODOMETRY})
         self.stopped_at = 0
-        """Since when the base is commanded to stand; `NEVER`: it is commanded to move."""
+        """The time of the command to stand; `NEVER` while the base is commanded to move."""
         self.stop_at = 0
         """When the base last got a stop."""
         self.moving_from = NEVER

@@ -447,7 +447,7 @@ def test_a_host_that_does_not_answer_delays_no_node_of_another_one(monkeypatch: 
 
 
 def _start_nodes_at_their_own_master(world: RobotWorld) -> None:
-    """Start a new node, and one of the robot's again, while the appliance no longer stands between."""
+    """Start a new node, and restart one of the robot's, at the robot's own master."""
     world.add("/late", 4009, publishes=("/late", "/cmd_vel"), subscribes=("/odom",))
     node = world.robot["/teleop"]
     node.uri, node.port = "http://base:4022/", 4022
