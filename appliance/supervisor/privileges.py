@@ -90,6 +90,15 @@ def add_niceness(by: int) -> bool:
     return permitted
 
 
+def set_niceness(pid: int, nice: int) -> None:
+    """Set the niceness of all threads of a process, and of its session's autogroup. Raises `OSError`."""
+    for thread in os.listdir(f"/proc/{pid}/task"):  # noqa: PTH208  pathlib is not loaded in this early stage
+        with contextlib.suppress(ProcessLookupError):
+            os.setpriority(os.PRIO_PROCESS, int(thread), nice)
+    with contextlib.suppress(OSError), open(f"/proc/{pid}/autogroup", "w", encoding="ascii") as file:  # noqa: PTH123  as above
+        file.write(str(min(0, nice)))
+
+
 def shorten_slice(nanoseconds: int) -> None:
     """Let this process run soon after it wakes; its share stays the same. Linux before 6.12 ignores the request."""
     call = _SCHED_SETATTR.get(os.uname().machine)

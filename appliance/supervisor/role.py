@@ -73,8 +73,9 @@ class Role:
 
     The group of the user `readable_by` may read files of `part`; a role that reads them has this user as `group`.
     `secret` is a file that the role's user may not read: the last argument of `entry` is its descriptor or None.
-    `inputs` are files of the operator, which the supervisor opens. `ended_early` is the `oom_score_adj`, and
-    `slice_ns` is the length of its turns if it may not have its niceness (0: the kernel's). `receiver` is the only
+    `inputs` are files of the operator, which the supervisor opens. `ended_early` is the `oom_score_adj`. With
+    `nice_if_busy`, a running process has `nice` only while tasks wait for a processor. `slice_ns` is the length of its
+    turns if it may not have its niceness (0: the kernel's). `receiver` is the only
     other machine that the user can reach. `memory` names a function (`module:function`) that gets the sections and the
     number of relays, and makes the memory that they share, or returns None.
     """
@@ -105,6 +106,7 @@ class Role:
     inputs: Callable[[Facts], tuple[Path, ...]] = lambda _facts: ()
     ended_early: int = 0
     nice: int = 0
+    nice_if_busy: bool = False
     slice_ns: int = 0
     sandbox: Callable[[Facts], SandboxPlan] = lambda _facts: SandboxPlan(allowlist=True)
     paired: bool = False

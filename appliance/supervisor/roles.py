@@ -20,7 +20,9 @@ _ROSMASTER_LOGGING = Path(__file__).with_name("rosmaster_logging.conf")
 ROSOUT = Path("/usr/lib/rosout/rosout")
 SYSTEM_PYTHON = Path("/usr/bin/python3")
 _SHORTEST_SLICE = 100_000  # nanoseconds, the kernel's minimum
-_RELAY_NICE = -10  # ten times the share of a busy program, so that no stop waits behind it
+_RELAY_NICE = (
+    -10
+)  # ten times the share of a busy program, so that no stop waits behind it; only while one is busy
 _CONTROL_NICE = -5  # three times the share, because all nodes of a starting robot wait for it
 ROS_PROGRAMS = {ROSMASTER: "python3-rosmaster", ROSOUT: "rosout"}
 
@@ -68,7 +70,7 @@ ROLES = (
     ),
     _ours(
         "relay", "rosrv-relay", "relay", "appliance.supervisor.relay_entry:main",
-        ended_early=300, indexed=True, files=65_536, nice=_RELAY_NICE, slice_ns=_SHORTEST_SLICE,
+        ended_early=300, indexed=True, files=65_536, nice=_RELAY_NICE, nice_if_busy=True, slice_ns=_SHORTEST_SLICE,
         sandbox=lambda _facts: SandboxPlan(allowlist=True, families=NETWORK, connects=None),
     ),
     _ours(

@@ -38,6 +38,7 @@ from appliance.supervisor.isolation_watchdog import IsolationWatchdog
 from appliance.supervisor.lapse_answers import answer_for_control
 from appliance.supervisor.machine_work import MachineWork, NoMachineWork, Terms
 from appliance.supervisor.monitor_memory import MonitorMemory
+from appliance.supervisor.priority import PrioritizedProcess, keep_priorities
 from appliance.supervisor.process_handle import (
     ANSWER_SECONDS,
     FIRST_ANSWER_SECONDS,
@@ -171,6 +172,7 @@ class Supervisor:
         try:
             await self._start()
             self._spawn(self._watchdog.run())
+            self._spawn(keep_priorities(self._prioritized))
             await self.stopping.wait()
             await self._announce_end()
         finally:
@@ -614,6 +616,14 @@ class Supervisor:
             if read != self._clock:
                 self._clock = read
                 self._tell_control(read)
+
+    def _prioritized(self) -> list[PrioritizedProcess]:
+        usual = os.getpriority(os.PRIO_PROCESS, 0) + self._facts.raised
+        return [
+            PrioritizedProcess(slot.process.pid, usual + slot.role.nice, usual)
+            for slot in self.slots
+            if slot.role.nice_if_busy and slot.process is not None and slot.process.ready
+        ]
 
     def _look_at(self, slot: ProcessSlot, process: ProcessHandle, slept: float) -> None:
         if slept > 1.0:

@@ -3,14 +3,19 @@ import os
 import shutil
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+from appliance.supervisor.priority import ProcessorPressure, may_raise_priority, waited_seconds
 from appliance.supervisor.users import account_of
+from benchmarks.published_stop import busy_programs
 from tests.support.appliance import Appliance
+from tests.support.processes import LIMIT
 from tests.support.requirements import need_root
+from tests.support.waiting import eventually
 
 LOG = {"control/audit.db", "control/audit.db-wal", "control/audit.db-shm"}
 NO_SECRET = {"run/config.json", "control/audit.pub"}
@@ -73,16 +78,48 @@ def test_the_order_of_oom_kills(appliance: Appliance) -> None:
     assert scores["rosmaster"] == scores["signer"] == own
 
 
-def test_the_weights_of_processes(appliance: Appliance) -> None:
-    pids = {role: int(row["pid"]) for role, row in appliance.processes().items()}
-    nice = {role: os.getpriority(os.PRIO_PROCESS, pid) for role, pid in pids.items()}
-    own = os.getpriority(os.PRIO_PROCESS, 0)
-    assert nice["relay"] == own - 10 and nice["api"] == own + 5
-    assert nice["control"] == own - 5 and nice["rosmaster"] == own
+def niceness_of_threads(pid: int) -> set[int]:
+    threads = [int(path.name) for path in Path(f"/proc/{pid}/task").iterdir()]
+    return {os.getpriority(os.PRIO_PROCESS, thread) for thread in threads}
+
+
+def autogroups_follow(pids: dict[str, int]) -> None:
     for role in ("relay", "control", "api"):
         group = Path(f"/proc/{pids[role]}/autogroup")
         if group.exists() and (text := group.read_text()):
-            assert text.endswith(f" nice {min(0, nice[role])}\n")
+            assert text.endswith(f" nice {min(0, os.getpriority(os.PRIO_PROCESS, pids[role]))}\n")
+
+
+def test_the_weights_of_processes(appliance: Appliance) -> None:
+    pids = {role: int(row["pid"]) for role, row in appliance.processes().items()}
+    own = os.getpriority(os.PRIO_PROCESS, 0)
+    with busy_programs(2 * (os.cpu_count() or 1)):
+        eventually(lambda: niceness_of_threads(pids["relay"]) == {own - 10}, "the relay has its priority")
+        autogroups_follow(pids)
+    nice = {role: os.getpriority(os.PRIO_PROCESS, pid) for role, pid in pids.items()}
+    assert nice["control"] == own - 5 and nice["rosmaster"] == own and nice["api"] == own + 5
+
+
+@pytest.mark.skipif(
+    waited_seconds() is None, reason="this kernel does not count the time in which tasks wait"
+)
+def test_a_relay_gives_its_priority_up_while_no_task_waits(appliance: Appliance) -> None:
+    pids = {role: int(row["pid"]) for role, row in appliance.processes().items()}
+    own = os.getpriority(os.PRIO_PROCESS, 0)
+    pressure = ProcessorPressure()
+    began = time.monotonic()
+    quiet_samples = 0
+
+    def is_given_up_or_needed() -> bool:
+        nonlocal quiet_samples
+        busy = pressure.is_busy(waited_seconds(), time.monotonic())
+        quiet_samples = 0 if busy else quiet_samples + 1
+        assert quiet_samples < 40, "the machine has been quiet for seconds"
+        other_programs_wait = time.monotonic() - began > LIMIT
+        return niceness_of_threads(pids["relay"]) == {own} or other_programs_wait
+
+    eventually(is_given_up_or_needed, "the relay has given its priority up")
+    autogroups_follow(pids)
 
 
 def test_a_relay_has_short_turns_only_without_its_priority(appliance: Appliance) -> None:
@@ -95,8 +132,7 @@ def test_a_relay_has_short_turns_only_without_its_priority(appliance: Appliance)
         slices[role] = ctypes.c_uint64.from_buffer(attributes, 24).value
     if slices["control"] == 0:
         pytest.skip("this kernel has no slices")
-    [relay] = appliance.pids("relay")
-    has_priority = os.getpriority(os.PRIO_PROCESS, relay) < os.getpriority(os.PRIO_PROCESS, 0)
+    has_priority = may_raise_priority()
     assert slices["relay"] == (slices["control"] if has_priority else 100_000)
 
 
