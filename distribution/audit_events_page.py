@@ -99,15 +99,57 @@ def uses() -> Iterator[EventUse]:
                 yield from _use(node, f"{path.relative_to(root)}:{node.lineno}")
 
 
-def _use(node: ast.Call, place: str) -> Iterator[EventUse]:
-    called = node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
+def written() -> frozenset[str]:
+    """Return the events that the code records: by a literal name, or by a name from a table of the same module.
+
+    A name that is only compared, or only printed, records nothing.
+    """
+    return frozenset(
+        name
+        for path in Path(appliance.__file__).parent.rglob("*.py")
+        for name in written_by(path.read_text(encoding="utf-8"))
+    )
+
+
+def written_by(text: str) -> Iterator[str]:
+    """Yield the events that a module records."""
+    nodes = [*ast.walk(ast.parse(text))]
+    events = [event for node in nodes if isinstance(node, ast.Call) and (event := _event(node)) is not None]
+    yield from (name for event in events for name in _texts(event))
+    if any(not [*_texts(event)] for event in events):
+        no_record = {
+            id(part)
+            for node in nodes
+            if isinstance(node, ast.Compare) or (isinstance(node, ast.Call) and _prints(node))
+            for part in ast.walk(node)
+        }
+        yield from (name for node in nodes if id(node) not in no_record for name in _texts(node))
+
+
+def _prints(node: ast.Call) -> bool:
+    owner = node.func.value if isinstance(node.func, ast.Attribute) else None
+    return isinstance(owner, ast.Name) and owner.id in ("log", "_log")
+
+
+def _called(node: ast.Call) -> str:
+    return node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
+
+
+def _event(node: ast.Call) -> ast.expr | None:
+    """Return the expression for the event of a call that records one."""
+    called = _called(node)
     named = {one.arg: one.value for one in node.keywords if one.arg is not None}
     if called in ("AuditRecord", "WriteRecord") and "event" in named:
-        event = named["event"]
-    elif called in ("happened", "_own", "_make", "AuditRecord", "WriteRecord", "_record") and node.args:
-        event = node.args[0]
-    else:
+        return named["event"]
+    records = called in ("happened", "_own", "_make", "AuditRecord", "WriteRecord", "_record") and node.args
+    return node.args[0] if records else None
+
+
+def _use(node: ast.Call, place: str) -> Iterator[EventUse]:
+    called, event = _called(node), _event(node)
+    if event is None:
         return
+    named = {one.arg: one.value for one in node.keywords if one.arg is not None}
     fields = tuple(name for name in named if name not in _FIELDS) if called == "happened" else ()
     for name in _texts(event):
         denies = "decision" in named and any("deny" in _texts(one) for one in ast.walk(named["decision"]))

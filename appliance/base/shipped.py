@@ -18,3 +18,11 @@ def before_program() -> float:
     """Return the seconds that the system clock is behind the program's files; 0 for less than a day."""
     before = Path(__file__).stat().st_mtime - clock.wall()
     return before if before > _DAY else 0.0
+
+
+def earliest_now() -> float:
+    """Return the system time, or the date of the program's files if the clock is behind them: it is not set yet.
+
+    A certificate that is made until the time service answers would otherwise have ended long ago once it does.
+    """
+    return clock.wall() + before_program()

@@ -52,7 +52,8 @@ def make_queries(base: Foundation, parts: Parts, features: FeatureParts) -> Quer
     settings, trail, ends = base.settings, base.trail, parts.endpoints
     rest, sessions = Current[RestLink](), Provided[Sessions]()
     tokens = TokenOrders(base.store, trail, base.ends, lambda: rest().state_tokens(), sessions=sessions)
-    clock = ClockCheck(trail, lambda: base.audit.ids.ahead)
+    clock = ClockCheck(trail, lambda: base.audit.ids.ahead, stepped=base.hosts.tunnels.state_anew)
+    base.ends.when_cut_short(clock.cut_short)
     switched_off = SwitchedOffWatch(
         parts.monitors, base.policies, base.store, trail, settings.forgotten_after
     )

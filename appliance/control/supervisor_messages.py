@@ -48,6 +48,8 @@ class SupervisorMessages:
             case messages.ProcessesChanged(processes):
                 self._note_failing(processes)
                 self._parts.reconciler.wake()
+            case messages.ProcessDied():
+                self._record_death(message)
             case messages.PolicyReloadRequested():
                 self._spawn(self._reload())
             case messages.EndAnnounced():
@@ -91,6 +93,18 @@ class SupervisorMessages:
                 output=process.output,
             )
         self._failing = frozenset(failing)
+
+    def _record_death(self, death: messages.ProcessDied) -> None:
+        self._base.trail.happened(
+            "process died",
+            f"{death.role}: {death.reason}",
+            resource=death.role,
+            index=death.index,
+            pid=death.pid,
+            end=death.end,
+            lived=round(death.lived, 3),
+            restarts=death.restarts,
+        )
 
     def _link(self, role: str, index: int, sock: socket.socket) -> None:
         match role:

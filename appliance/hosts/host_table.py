@@ -12,6 +12,7 @@ import itertools
 import re
 
 from appliance.base import clock
+from appliance.base.shipped import earliest_now
 from appliance.channel.messages import APPLIANCE_NAME, CertificateMade
 from appliance.hosts.hosts_file import DeclaredHosts
 from appliance.hosts.revoked_certificates import RevokedCertificates
@@ -171,7 +172,7 @@ class HostTable:
     # --- changes ---
 
     def keep(self, name: str, address: str, made: CertificateMade) -> HostRow:
-        before, now = self.rows.get(name), clock.wall()
+        before, now = self.rows.get(name), earliest_now()
         if before is not None and before.revoked is None:
             self._revoke_certificates(before)
         enrolled = before.enrolled if before is not None and before.revoked is None else now
@@ -183,7 +184,7 @@ class HostTable:
     def keep_next(self, name: str, made: CertificateMade) -> None:
         row = self.certificates.get(name)
         before = row.certificate if row is not None else ""
-        since = row.made if row is not None else clock.wall()
+        since = row.made if row is not None else earliest_now()
         if row is not None and row.next is not None:
             self.revoked.add(name, row.next.serial, row.next.expires)
         following = NextCertificate(made.serial, made.expires, made.certificate.decode())
@@ -197,7 +198,7 @@ class HostTable:
         following = certificate.next
         self.revoked.add(name, row.serial, row.expires)
         taken = self._set(row._replace(serial=following.serial, expires=following.expires))
-        self._set_certificate(CertificateRow(name, clock.wall(), following.certificate))
+        self._set_certificate(CertificateRow(name, earliest_now(), following.certificate))
         self.changed()
         return taken
 

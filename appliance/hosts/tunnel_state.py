@@ -9,6 +9,7 @@
 
 import asyncio
 import contextlib
+import math
 from collections.abc import Callable, Container
 
 import structlog
@@ -85,6 +86,8 @@ class Tunnels:
         self._opening = asyncio.Lock()
         self._link = Link(self._received, self._lost)
         self._certificate: bytes | None = None
+        self._needed: messages.CertificateNeeded | None = None
+        self._own_end = math.inf  # of charon's certificate, in seconds since the epoch
         self._dirty = asyncio.Event()
         # The number of the last statement. Reports may still have numbers of an earlier process; a start from the clock
         # avoids the same numbers.
@@ -155,7 +158,8 @@ class Tunnels:
     # --- the process that runs charon ---
 
     def attach(self, link: Channel, needed: messages.CertificateNeeded | None = None) -> None:
-        self._certificate = self.charon = None
+        self._certificate = self.charon = self._needed = None
+        self._own_end = math.inf
         self._link.attach(link)
         if needed is not None:
             self._spawn(needed)
@@ -175,6 +179,7 @@ class Tunnels:
                     await self._dirty.wait()
             each_hour()
             self._dirty.clear()
+            self._renew_own()
             try:
                 await self._state()
                 self._failures = 0
@@ -185,8 +190,18 @@ class Tunnels:
     def _until_it_changes(self) -> float:
         """Return the seconds until the next update: charon does not close a tunnel whose certificate ends."""
         now = clock.wall()
-        ends = [row.expires - now for row in self._table.admitted() if row.expires > now]
+        dates = [self._own_end, *(row.expires for row in self._table.admitted())]
+        ends = [date - now for date in dates if date > now]
         return min([_RESTATE_SECONDS, *(end + _JUST_AFTER_SECONDS for end in ends)])
+
+    def _renew_own(self) -> None:
+        """Ask for another certificate of charon if its present one has ended.
+
+        charon asks each month, in time, unless the clock was set forward: then no host could connect until then.
+        """
+        if self._needed is not None and self._own_end <= clock.wall():
+            self._own_end = math.inf
+            self._spawn(self._needed)
 
     async def until_taken(self) -> bool:
         wanted = self._changes
@@ -255,6 +270,7 @@ class Tunnels:
                 self._wake.set()
 
     def _spawn(self, needed: messages.CertificateNeeded) -> None:
+        self._needed = needed
         task = asyncio.get_running_loop().create_task(self._certify(needed))
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
@@ -285,6 +301,7 @@ class Tunnels:
             return kept
         made = await self._authority.issue(needed.request, messages.APPLIANCE_NAME, CERTIFICATE_DAYS)
         self._appliances.certified(needed.key, made)
+        self._own_end = made.expires
         return made.certificate
 
     def _lost(self, _reason: str) -> None:

@@ -3,7 +3,8 @@
 1. The key never leaves the process. A key without its certificate, a certificate of another key, or a key that others
    may read is an error; nothing is replaced.
 2. Only the public key of a request is used: this module sets the names, times and usages of a certificate.
-3. A certificate is never valid for longer than the authority's own.
+3. A certificate is never valid for longer than the authority's own. Its time counts from the date of the program's
+   files if the clock is behind them.
 4. charon ignores a revocation list with a lower number, so its number always grows, even if the clock is set back.
 """
 
@@ -24,6 +25,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from appliance.base import clock
 from appliance.base.atomic_files import write_whole
+from appliance.base.shipped import earliest_now
 from appliance.ipsec.authority_key import Kind, load_key, make_key, write_key
 from appliance.ipsec.key_files import SignerKeyError
 from appliance.ipsec.proof_of_possession import RequestRefusedError, require_proof
@@ -95,7 +97,7 @@ class CertificateAuthority:
         now = clock.utc_now()
         if proof or former:
             require_proof(request, proof, former, name=name, authority=self._certificate, now=now)
-        end = min(now + datetime.timedelta(days=days), self._certificate.not_valid_after_utc)
+        end = min(_end_after(days), self._certificate.not_valid_after_utc)
         certificate = (
             x509.CertificateBuilder()
             .subject_name(_subject(name))
@@ -128,7 +130,7 @@ class CertificateAuthority:
             x509.CertificateRevocationListBuilder()
             .issuer_name(self._certificate.subject)
             .last_update(now - _CLOCKS_DIFFER)
-            .next_update(now + datetime.timedelta(days=REVOCATIONS_DAYS))
+            .next_update(_end_after(REVOCATIONS_DAYS))
             .add_extension(x509.CRLNumber(self._next_list()), critical=False)
             .add_extension(self._identifier(), critical=False)
         )
@@ -185,7 +187,7 @@ def _create(key_path: Path, certificate_path: Path, kind: Kind, passphrase: byte
         .public_key(key.public_key())
         .serial_number(serial)
         .not_valid_before(now - _CLOCKS_DIFFER)
-        .not_valid_after(now + datetime.timedelta(days=AUTHORITY_DAYS))
+        .not_valid_after(_end_after(AUTHORITY_DAYS))
         .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
         .add_extension(_usage(authority=True), critical=True)
         .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
@@ -194,6 +196,10 @@ def _create(key_path: Path, certificate_path: Path, kind: Kind, passphrase: byte
     # Write the certificate first: after a crash in between, the error for a certificate without its key has a remedy.
     write_whole(certificate_path, certificate.public_bytes(Encoding.PEM), 0o644)
     write_key(key_path, key, passphrase)
+
+
+def _end_after(days: float) -> datetime.datetime:
+    return datetime.datetime.fromtimestamp(earliest_now(), datetime.UTC) + datetime.timedelta(days=days)
 
 
 def _load_certificate(path: Path) -> x509.Certificate:

@@ -10,6 +10,7 @@ from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption,
 from cryptography.x509.oid import NameOID
 
 from appliance.base import clock
+from appliance.base.shipped import earliest_now
 
 _EARLIER = datetime.timedelta(days=1)  # the peer's clock may be behind
 
@@ -24,6 +25,7 @@ def make_own_certificate(name: str, days: int, address: str | None = None) -> tu
     public = private.public_key()
     subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
     now = clock.utc_now()
+    until = datetime.datetime.fromtimestamp(earliest_now(), datetime.UTC) + datetime.timedelta(days=days)
     usage = x509.KeyUsage(True, False, False, False, False, True, False, False, False)
     builder = x509.CertificateBuilder(
         subject,
@@ -31,7 +33,7 @@ def make_own_certificate(name: str, days: int, address: str | None = None) -> tu
         public,
         x509.random_serial_number(),
         now - _EARLIER,
-        now + datetime.timedelta(days=days),
+        until,
     )
     extensions: list[tuple[x509.ExtensionType, bool]] = [
         (x509.BasicConstraints(ca=True, path_length=0), True),

@@ -6,8 +6,11 @@
 3. A right may end too early, and never too late: a long time off, which the age clock counts only later, counts at
    once for it. An end that is `late`, as that of a block, is never too early.
 4. A credential is `dated`: it also ends when the system clock shows its date. Only so time off counts on a machine
-   whose clock is right only some time after its start.
+   whose clock is right only some time after its start. One that is made while the clock is behind the program's own
+   files gets its date once the clock is set, or is dated from those files after a restart.
 5. `passed` is exact. The owner of a kind is called soon after an end, and again until it forgets or sets the end.
+
+6. An end by the system clock, before the time that was counted, is reported (`when_cut_short`).
 
 The names of kinds are stored, so a kind keeps its name.
 """
@@ -25,6 +28,7 @@ import structlog
 
 from appliance.base import clock
 from appliance.base.age_clock import AgeClock
+from appliance.base.shipped import before_program
 from appliance.store.earlier_ends import earlier_ends
 from appliance.store.state_file import EndRow, StateStore
 from appliance.store.writer_thread import StoreError
@@ -36,6 +40,7 @@ _NOTE_SECONDS = 30.0
 _PAIRED_NOTE_SECONDS = 1.0  # at each look, unless many come together
 LOOK_SECONDS = 5.0
 """The longest time between two checks: timers do not count while the machine is suspended, the age clock does."""
+_CUT_SHORT = 60 * _SECOND  # clocks that are not set differ by less
 _SAME_DATE = _SECOND  # a smaller difference of the clocks moves no date that people see
 
 _log = structlog.get_logger()
@@ -68,6 +73,7 @@ class _End(NamedTuple):
     late: bool
     stored: bool
     date: int | None  # by the system clock
+    undated: bool = False  # the system clock was not set yet: `date` is only for a later start
 
 
 class EndTable:
@@ -78,16 +84,25 @@ class EndTable:
     """
 
     def __init__(
-        self, store: StateStore, age: AgeClock, *, appliance: str = "", away_seconds: float | None = None
+        self,
+        store: StateStore,
+        age: AgeClock,
+        *,
+        appliance: str = "",
+        away_seconds: float | None = None,
+        behind: Callable[[], float] = before_program,
     ) -> None:
+        """`behind()` returns the seconds by which the system clock is behind any possible time; 0: it may be right."""
         self._store = store
+        self._behind = behind
+        self._cut_short: Callable[[str, str, float], object] = lambda _kind, _name, _seconds: None
         self._age = age
         self._appliance = appliance
         self._calls: dict[str, Callable[[list[str]], object]] = {}
         self._changed = asyncio.Event()
         self._noted = -math.inf
-        self._offset: int | None = None  # the system clock minus the age clock
         self.read_clock()
+        self._offset = clock.wall_ns() - self._now()  # the system clock minus the age clock
         self._ends: dict[str, dict[str, _End]] = {}
         with store.database.together():
             self._begin(away_seconds)
@@ -96,14 +111,20 @@ class EndTable:
 
     def set(self, kind: EndKind, name: str, seconds: float) -> None:
         now, length = self._now(), int(seconds * _SECOND)
-        date = clock.wall_ns() + length if kind.dated else None
-        self._put(kind.name, name, _End(now + length, now, kind.late, kind.stored, date))
+        behind = int(self._behind() * _SECOND) if kind.dated else 0
+        date = clock.wall_ns() + behind + length if kind.dated else None
+        self._put(kind.name, name, _End(now + length, now, kind.late, kind.stored, date, undated=behind > 0))
 
     def forget(self, kind: EndKind, *names: str) -> None:
         for name in names:
             end = self._ends.get(kind.name, {}).pop(name, None)
-            if end is not None and end.stored:
+            if end is None:
+                continue
+            if end.stored:
                 self._store.forget_end(kind.name, name)
+            left = end.at - self._now()
+            if left > _CUT_SHORT and self._left(end) <= 0:
+                self._cut_short(kind.name, name, left / _SECOND)
 
     # --- reading ends ---
 
@@ -120,10 +141,13 @@ class EndTable:
     def date(self, kind: EndKind, name: str) -> float | None:
         """Return the end in seconds since the epoch by the present system clock, for people."""
         end = self._ends.get(kind.name, {}).get(name)
-        if end is None or self._offset is None:
+        if end is None:
             return None
+        offset = clock.wall_ns() - self._now()
+        if abs(offset - self._offset) > _SAME_DATE:
+            self._offset = offset
         by_age = end.at + self._offset
-        return (by_age if end.date is None else min(end.date, by_age)) / _SECOND
+        return (by_age if end.date is None or end.undated else min(end.date, by_age)) / _SECOND
 
     def names(self, kind: EndKind) -> list[str]:
         return list(self._ends.get(kind.name, {}))
@@ -136,8 +160,15 @@ class EndTable:
     # --- calling the owners ---
 
     def when_due(self, kind: EndKind, call: Callable[[list[str]], object]) -> None:
-        """Call `call(names)` when ends have passed. It must not wait."""
+        """Call `call(names)` when ends have passed, and without names when dates have changed. It must not wait."""
         self._calls[kind.name] = call
+
+    def when_cut_short(self, call: Callable[[str, str, float], object]) -> None:
+        """Call `call(kind, name, seconds)` for each thing that the system clock ended, with its time left otherwise.
+
+        The clock was set forward, or shows that the appliance was off for long.
+        """
+        self._cut_short = call
 
     async def run(self) -> None:
         while True:
@@ -151,14 +182,13 @@ class EndTable:
 
     def read_clock(self) -> None:
         """Read the age clock, which may write a file. Only one thread at a time may call this."""
-        age, wall, boot = self._age(), clock.wall_ns(), clock.since_boot_ns()
+        age, boot = self._age(), clock.since_boot_ns()
         self._age_at_boot = age - boot
-        if self._offset is None or abs(wall - age - self._offset) > _SAME_DATE:
-            self._offset = wall - age
 
     def look(self) -> None:
         """Call the owners of all ends that have passed, and note the clocks from time to time."""
         self._count_time_off()
+        self._date_late()
         for kind, call in self._calls.items():
             due = [name for name, end in self._ends.get(kind, {}).items() if self._left(end) <= 0]
             try:
@@ -180,7 +210,7 @@ class EndTable:
     def _left(self, end: _End) -> int:
         uncounted = 0 if end.late else self._age.uncounted(end.since)
         left = end.at - self._now() - uncounted
-        return left if end.date is None else min(left, end.date - clock.wall_ns())
+        return left if end.date is None or end.undated else min(left, end.date - clock.wall_ns())
 
     def _all(self) -> Iterator[_End]:
         return (end for ends in self._ends.values() for end in ends.values())
@@ -197,6 +227,18 @@ class EndTable:
             for name, end in list(ends.items()):
                 if added := self._age.dated(end.since) - end.since:
                     self._put(kind, name, end._replace(at=end.at + added, since=self._now()))
+
+    def _date_late(self) -> None:
+        """Date the ends that were set before the system clock was, once it is set."""
+        if self._behind():
+            return
+        for kind, ends in self._ends.items():
+            undated = [(name, end) for name, end in ends.items() if end.undated]
+            for name, end in undated:
+                date = clock.wall_ns() + end.at - self._now()
+                self._put(kind, name, end._replace(date=date, undated=False))
+            if undated and kind in self._calls:
+                self._calls[kind]([])
 
     def _begin(self, away_seconds: float | None) -> None:
         settings, now = self._store.settings(), self._now()
@@ -259,7 +301,9 @@ def _inherited(end: _End, last: _Reading, away_seconds: float | None, now: int) 
     if away_seconds is not None:
         away, date = int(away_seconds * _SECOND), end.date
         if date is not None:
-            date += clock.wall_ns() - int(last.wall * _SECOND) - away
+            # The earlier system clock may not have been set when it was dated.
+            by_age = clock.wall_ns() + end.at - last.age - away
+            date = min(date + clock.wall_ns() - int(last.wall * _SECOND) - away, by_age)
         return end._replace(at=end.at + ahead - away, since=now, date=date)
     if end.late:
         return end._replace(at=end.at + ahead, since=now)

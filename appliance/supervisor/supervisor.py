@@ -47,7 +47,7 @@ from appliance.supervisor.process_handle import (
     ProcessHandle,
     link_processes,
 )
-from appliance.supervisor.process_slot import ProcessSlot
+from appliance.supervisor.process_slot import FAILING_AFTER, ProcessSlot
 from appliance.supervisor.role import Facts, Role, SharedMemory
 from appliance.supervisor.service_gate import RoleChanges, ServiceGate
 from appliance.supervisor.shutdown import end_all
@@ -149,6 +149,8 @@ class Supervisor:
         self._process_died = asyncio.Event()
         self._lacking: set[tuple[str, ...]] = set()
         self.failure: str | None = None
+        self._serving: ProcessHandle | None = None  # the control that records what happens
+        self._deaths: dict[tuple[str, int], messages.ProcessDied] = {}  # until control has got them
         self._asking: asyncio.Task[None] | None = None
         self._tasks: set[asyncio.Task[None]] = set()
         self._unanswered = 0
@@ -436,6 +438,8 @@ class Supervisor:
         except msgspec.ValidationError as error:
             self._violated(process, f"reported ready without an address: {error}")
             return
+        self._serving = process
+        self._tell_deaths()
         self._facts = replace(self._facts, rosout_master=said.rosout_master)
         self._leave_answers()
         self._spawn(self.control_ready(process, said))
@@ -594,6 +598,7 @@ class Supervisor:
 
     def _violated(self, process: ProcessHandle, what: str) -> None:
         log.critical("process is killed", role=process.role, pid=process.pid, reason=f"it {what}")
+        process.reason = f"the supervisor killed it, because it {what}"
         process.kill()
 
     # --- watching -----------------------------------------------------------------------------------------
@@ -636,6 +641,7 @@ class Supervisor:
             process.ping()
         if process.is_hanging:
             log.error("process does not answer and is killed", role=process.role, pid=process.pid)
+            process.reason = "the supervisor killed it, because it did not answer"
             process.kill()
 
     def _ask(self, process: ProcessHandle) -> None:
@@ -671,6 +677,7 @@ class Supervisor:
             "process died", role=process.role, pid=process.pid, end=_end_of(code), lived=round(lived, 3)
         )
         slot.reason, slot.output = process.reason or f"it ended with {_end_of(code)}", process.output
+        self._note_death(slot, process, code, lived)
         self._tell_processes()
         if slot.is_failing:
             if not self.is_ready:
@@ -683,6 +690,23 @@ class Supervisor:
                 again_in=slot.delay(),
             )  # fmt: skip
         self._start_later(slot)
+
+    def _note_death(self, slot: ProcessSlot, process: ProcessHandle, code: int, lived: float) -> None:
+        """Tell control, which records it, unless `process failing` is recorded already."""
+        if process is self._serving:
+            self._serving = None
+        if slot.short_runs <= FAILING_AFTER:
+            self._deaths[slot.role.name, slot.index] = messages.ProcessDied(
+                slot.role.name, slot.index, process.pid, _end_of(code), slot.reason, lived, slot.starts - 1
+            )
+            self._tell_deaths()
+
+    def _tell_deaths(self) -> None:
+        if self._serving is None:
+            return
+        for death in self._deaths.values():
+            self._serving.send(death)
+        self._deaths.clear()
 
     def _ended(self, slot: ProcessSlot) -> None:
         log.info("process ended", role=slot.role.name)

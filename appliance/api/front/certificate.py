@@ -20,6 +20,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from appliance.base.atomic_files import write_whole
+from appliance.base.shipped import before_program
 
 CERTIFICATE = "certificate.pem"
 KEY = "key.pem"
@@ -85,7 +86,7 @@ def _make(certificate_path: Path, key_path: Path, names: Iterable[str], now: dat
         .public_key(key.public_key())
         .serial_number(x509.random_serial_number())
         .not_valid_before(now - datetime.timedelta(hours=1))
-        .not_valid_after(now + datetime.timedelta(days=_DAYS))
+        .not_valid_after(now + datetime.timedelta(days=_DAYS, seconds=before_program()))
         .add_extension(
             x509.SubjectAlternativeName([_general_name(name) for name in dict.fromkeys(names)]),
             critical=False,

@@ -144,7 +144,10 @@ EVENTS: dict[str, str] = {
     "switchover ordered": "An operator ordered the active appliance to hand over to the standby; `detail` has who.",
     "switchover failed": "An ordered switchover did not happen; `reason` says why, `detail` has who ordered it.",
     "process started": "A process of the appliance, in `resource`, started again after an unexpected end.",
-    "process died": "A process of the appliance ended unexpectedly.",
+    "process died": "A process of the appliance, in `resource`, ended unexpectedly; `reason` has its own words or why"
+    " it was killed, `detail.end` the signal or exit status. An end while control was away is recorded once control is"
+    " back: the last one of each process. After `process failing`, further ends are not recorded until the process"
+    " has run for ten seconds.",
     "process failing": "A process of the appliance ends soon after every start; `reason` says why, `detail.output` has"
     " the last lines that it printed. It is restarted at growing intervals of up to a minute.",
     "appliance started": "The appliance is in service; `detail` has its version, the robot's `name` of"
@@ -196,6 +199,9 @@ EVENTS: dict[str, str] = {
     "clock set forward": "The machine's clock advanced further than the time that passed; `detail` has by how many"
     " seconds.",
     "clock set back": "The machine's clock is earlier than the last record; `detail` has by how many seconds.",
+    "ended by the clock": "The machine's clock ended a token, a ticket or another right (`detail.kind`, its name in"
+    " `resource`), which otherwise had `detail.seconds` left: the clock was set forward, or it shows that the appliance"
+    " was off for that long.",
     "protection forgotten": "A monitor is disabled or in shadow mode, or a section of the policy audit-only, for"
     " longer than `forgotten_after`; `resource` names it, `reason` says how to enable it again.",
     "adopted": "A registration was taken over from the robot's own master by an operator's order (`rosrv adopt`).",
@@ -228,12 +234,12 @@ SEVERITIES: dict[str, Severity] = {
         ),
         Severity.WARNING: (
             "authority refused", "motion not stopped", "bundle metadata rejected", "bundle refused",
-            "certificate ended", "certificate ends soon", "clock set back", "clock set forward", "enrolment refused",
+            "certificate ended", "certificate ends soon", "clock set back", "clock set forward", "ended by the clock",
+            "enrolment refused",
             "door entry refused", "door failed", "forwarding failed", "host authority replaced",
             "host blocked", "host revoked", "limit exceeded", "malformed", "packets refused",
-            "policy refused", "recording missed", "renewal refused", "rest certificate replaced", "sign-on refused",
-            "specifications refused", "switchover failed",
-            "tunnel refused",
+            "policy refused", "process died", "recording missed", "renewal refused", "rest certificate replaced",
+            "sign-on refused", "specifications refused", "switchover failed", "tunnel refused",
         ),
         Severity.ALARM: (
             "adoption failed", "fleet not joined", "forwarding gap", "guard bypassed", "monitor not built",

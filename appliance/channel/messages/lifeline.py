@@ -106,6 +106,22 @@ class ProcessesChanged(Message):
     processes: list[ProcessInfo]
 
 
+class ProcessDied(Message):
+    """A process ended unexpectedly, by a signal or with an exit status (`end`), after `lived` seconds.
+
+    `reason` has its own words, or why the supervisor killed it. `restarts` counts the starts after the first one.
+    Sent once control serves: of the ends before, the last one of each process.
+    """
+
+    role: str
+    index: int
+    pid: int
+    end: str
+    reason: str
+    lived: float
+    restarts: int
+
+
 class ClockRead(Message):
     """Tells whether a time service synchronises the machine's clock; sent at the start, and on changes."""
 
@@ -287,8 +303,8 @@ class Activated(Message):
 
 Lifeline = (
     Ping | Pong | Stop | Walled | Ready | Failed | LinkOpened | SocketKept | SocketDropped | SocketRestored
-    | SocketsRestored | Announced | ProcessesChanged | ClockRead | MachineAddresses | FirewallReported | ProbeFailed
-    | ProbePassed | PolicyReloadRequested | RouteWanted | EndpointWanted | EndpointFound
+    | SocketsRestored | Announced | ProcessesChanged | ProcessDied | ClockRead | MachineAddresses | FirewallReported
+    | ProbeFailed | ProbePassed | PolicyReloadRequested | RouteWanted | EndpointWanted | EndpointFound
     | TunnelsWanted | TunnelsEnclosed | ProcessWanted | ProcessOverdue
     | OwnNetworkWanted | OwnNetworkOpened
     | MachineWorkWanted | MachineWorkDone | EndAnnounced | EndAgreed

@@ -98,7 +98,7 @@ class ControlLifeline:
     def queue(self, message: Any, descriptors: tuple[int, ...]) -> None:
         """Queue a message in place of an earlier one of its kind, because control may wait for months."""
         key: tuple[object, ...] = (type(message),)
-        if isinstance(message, messages.LinkOpened):
+        if isinstance(message, messages.LinkOpened | messages.ProcessDied):
             key = (*key, message.role, message.index)
         _message, replaced = self._early.pop(key, (None, ()))
         for descriptor in replaced:

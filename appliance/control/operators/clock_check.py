@@ -24,12 +24,15 @@ class ClockCheck:
         trail: AuditTrail,
         behind: Callable[[], float],
         started: Callable[[], float] = lambda: clock.wall() - clock.since_boot(),
+        stepped: Callable[[], object] = lambda: None,
     ) -> None:
+        """`stepped()` is called soon after each step of the clock: timers do not notice that a date has come."""
         self._trail = trail
         self._behind = behind
         self._synchronised: bool | None = None
         self._set_back = False
         self._started = started
+        self._stepped = stepped
         self._seen = started()
 
     def synchronisation_reported(self, synchronised: bool | None) -> None:
@@ -56,6 +59,8 @@ class ClockCheck:
         """Record steps of the clock, but a step back only once, until the clock catches up with the last record."""
         before, self._seen = self._seen, self._started()
         ahead = self._seen - before
+        if abs(ahead) > _STEP_SECONDS:
+            self._stepped()
         if ahead > _STEP_SECONDS:
             self._trail.happened(
                 "clock set forward",
@@ -71,3 +76,14 @@ class ClockCheck:
                 seconds=round(behind, 3),
             )
         self._set_back = behind > 0
+
+    def cut_short(self, kind: str, name: str, seconds: float) -> None:
+        """Record that the clock ended a thing before the time that the appliance counted."""
+        self._trail.happened(
+            "ended by the clock",
+            f"{kind} {name}: the machine's clock shows a time after its end, and the appliance has counted"
+            f" {seconds:.0f} s less: the clock was set, or the appliance was off",
+            resource=name,
+            kind=kind,
+            seconds=round(seconds, 3),
+        )

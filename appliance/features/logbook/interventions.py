@@ -60,6 +60,7 @@ NO_INTERVENTION = frozenset(
         "topics moved", "monitors restarted", "door failed", "adoption failed", "process failing", "probe failed",
         "probe passed", "reconciled", "checkpoint", "fleet not joined", "forwarding failed", "forwarding resumed",
         "forwarding gap", "disk has room", "clock synchronised", "protection forgotten", "certificate ends soon",
+        "ended by the clock",
         "certificate ended",
     }
 )  # fmt: skip

@@ -19,7 +19,7 @@ from appliance.features.standby.membership import Membership
 
 CERTIFICATE = "standby.pem"
 KEY = "standby-key.pem"
-_BEGIN = datetime.datetime(2000, 1, 1, tzinfo=datetime.UTC)  # earlier than any clock that was never set
+_BEGIN = datetime.datetime(1970, 1, 1, tzinfo=datetime.UTC)  # where a clock begins that was never set
 _END = datetime.datetime(9999, 12, 31, 23, 59, 59, tzinfo=datetime.UTC)  # RFC 5280: no expiry
 
 

@@ -55,7 +55,7 @@ class EnrolmentTokens:
             raise BadEnrolmentTokenError(
                 "the token is wrong, already used, or expired: ask for another one (rosrv host add NAME --token)"
             )
-        self.forget(row.name)
+        self._take_out(row.name)  # its end stays, for `give_back`
         return row
 
     def give_back(self, row: EnrolmentTokenRow) -> None:
@@ -65,11 +65,13 @@ class EnrolmentTokens:
             self._tables.save_awaited(row)
 
     def forget(self, name: str) -> None:
-        """Forget a token. Its end stays, for `give_back`."""
+        self._due([name])
+
+    def _take_out(self, name: str) -> None:
         if self._rows.pop(name, None) is not None:
             self._tables.forget_awaited(name)
 
     def _due(self, ended: list[str]) -> None:
         for name in ended:
-            self.forget(name)
+            self._take_out(name)
         self._ends.forget(ENROLMENT, *ended)

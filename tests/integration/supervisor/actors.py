@@ -21,6 +21,7 @@ from appliance.channel.messages import (
     Message,
     Ping,
     Pong,
+    ProcessDied,
     ProcessesChanged,
     Ready,
     RelayLink,
@@ -161,6 +162,8 @@ class _Control(_Actor):
                 self.serve()
             case ProcessesChanged(processes):
                 self.say(processes={one.role: [one.pid, one.restarts] for one in processes})
+            case ProcessDied(role, _index, pid, end):
+                self.say(died=role, died_pid=pid, end=end)
             case _:
                 super().received(message, descriptors)
 

@@ -148,6 +148,7 @@ def test_a_killed_process_is_back_within_a_second(common: Running, role: str) ->
         lambda event: event.get("processes", {}).get(role) == [new, restarts + 1], actor="control"
     )
     assert common.echo() == common.living("control")
+    common.process.wait_for(actor="control", died=role, died_pid=old, end="signal SIGKILL")
 
 
 @pytest.mark.parametrize("role", ["control", "rosmaster"])

@@ -64,6 +64,8 @@ class Site:
         self.home = home
         self.clocks = {"a": VirtualClock(wall=WALL, now=100.0), "b": VirtualClock(wall=WALL, now=9000.0)}
         self.active = "a"
+        self.built = 0.0  # the date of the program's files
+        self.cut_short: list[str] = []
         self.store: StateStore | None = None
 
     def start(self, name: str = "", *, away: float | None = None, paired: bool = False) -> None:
@@ -75,7 +77,14 @@ class Site:
         with clock.using(self.clocks[self.active]):
             age = AgeClock(self.home / self.active / "age")
             appliance = self.active if paired else ""
-            self.ends = EndTable(self.store, age, appliance=appliance, away_seconds=away)
+            self.ends = EndTable(
+                self.store,
+                age,
+                appliance=appliance,
+                away_seconds=away,
+                behind=lambda: max(0.0, self.built - clock.wall()),
+            )
+            self.ends.when_cut_short(lambda kind, _name, _seconds: self.cut_short.append(kind))
             self.things = {owner.kind: owner(self.store, self.ends) for owner in OWNERS}
 
     def off(self, seconds: float, ahead: float = 0.0) -> None:
@@ -144,7 +153,45 @@ async def test_a_clock_that_is_set_while_control_runs_ends_credentials_early_and
         site.clocks["a"].set_wall(WALL + ahead)
         site.run(10.0)
         assert await site.lasting() == {owner.kind.name for owner in OWNERS if not owner.kind.dated}
+    assert sorted(site.cut_short) == sorted(owner.kind.name for owner in OWNERS if owner.kind.dated)
     await site.end_after(lambda kind: 0.0 if kind.dated else 2940.0)
+    assert len(site.cut_short) == sum(owner.kind.dated for owner in OWNERS)
+
+
+BEFORE, BUILT = 1000.0, WALL - 40 * DAY
+"""The system clock of a machine that has not set it yet, and the date of the program's files."""
+
+
+@pytest.mark.parametrize("before", [BEFORE, BUILT - 2 * DAY], ids=["1970", "the date of an image"])
+async def test_a_right_that_began_before_the_clock_was_set_keeps_its_time(site: Site, before: float) -> None:
+    site.built = BUILT
+    site.clocks["a"].set_wall(before)
+    await begun(site)
+    site.clocks["a"].set_wall(WALL)
+    kept = [(kind, name) for kind in site.things for name in site.ends.names(kind)]
+    for seconds in (0.0, 10.0):  # before the table sees the step, and after it
+        with clock.using(site.clocks["a"]):
+            assert not any(site.ends.passed(*one) for one in kept)
+            dates = [site.ends.date(*one) for one in kept]
+        assert dates == pytest.approx([WALL + 3000.0] * len(kept), abs=1.0)
+        site.run(seconds)
+    site.run(0.0)
+    assert len(await site.lasting()) == len(OWNERS)
+    await site.end_after(lambda _kind: 2990.0)
+    assert site.cut_short == []
+
+
+async def test_a_right_that_began_before_a_restart_is_dated_from_the_programs_files(site: Site) -> None:
+    site.built = BUILT
+    site.clocks["a"].set_wall(BEFORE)
+    await begun(site)
+    site.off(5.0)
+    site.clocks["a"].set_wall(BUILT + 1800.0)
+    site.run(10.0)
+    assert len(await site.lasting()) == sum(owner.kind.stored for owner in OWNERS)
+    site.clocks["a"].set_wall(WALL)
+    await site.end_after(lambda kind: (0.0 if kind.dated else 2985.0) if kind.stored else 0.0)
+    assert sorted(site.cut_short) == sorted(owner.kind.name for owner in OWNERS if owner.kind.dated)
 
 
 async def test_time_off_that_a_late_correction_of_the_clock_shows_counts_for_credentials(site: Site) -> None:
@@ -168,6 +215,8 @@ async def test_no_restart_gives_an_end_more_time(site: Site, ahead: float, left:
     await begun(site)
     site.off(5.0, ahead)
     await site.end_after(lambda kind: (late if kind.late else left) if kind.stored else 0.0)
+    told = [owner.kind.name for owner in OWNERS if owner.kind.stored and not owner.kind.late]
+    assert sorted(site.cut_short) == (sorted(told) if ahead == YEAR else [])
 
 
 @pytest.mark.parametrize("ahead", [0.0, HOUR, -HOUR, YEAR, -YEAR])
@@ -180,6 +229,17 @@ async def test_each_stored_end_keeps_its_time_over_takeovers(site: Site, ahead: 
     site.run(600.0)
     site.start("a", away=0.0, paired=True)
     await site.end_after(lambda kind: 2395.0 if kind.stored else 0.0)
+
+
+async def test_a_takeover_from_a_machine_whose_clock_was_not_set_prolongs_no_right(site: Site) -> None:
+    site.built = BUILT
+    site.clocks["a"].set_wall(BEFORE)
+    await begun(site, paired=True)
+    site.start("b", away=0.0, paired=True)
+    for machine in site.clocks.values():
+        machine.set_wall(WALL + 1000.0)  # the other one's clock was right, and is set again
+    site.run(10.0)
+    await site.end_after(lambda kind: (2590.0 if kind.dated else 2990.0) if kind.stored else 0.0)
 
 
 @pytest.mark.parametrize("ahead", [0.0, HOUR, -HOUR, YEAR, -YEAR])

@@ -6,13 +6,23 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
 
+import msgspec
 import pytest
 from structlog.testing import capture_logs
 
-from appliance.channel.messages import CompilerWanted, ProcessOverdue, ProcessWanted, RouteWanted
+from appliance.base import clock
+from appliance.channel.messages import (
+    CompilerWanted,
+    ProcessDied,
+    ProcessOverdue,
+    ProcessWanted,
+    Ready,
+    RouteWanted,
+)
 from appliance.supervisor import supervisor as module
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.process_handle import ProcessHandle
+from appliance.supervisor.process_slot import FAILING_AFTER, ProcessSlot
 from appliance.supervisor.role import Facts, Role
 from appliance.supervisor.supervisor import ControlReady, Supervisor
 
@@ -30,6 +40,7 @@ class StandIn:
     def __init__(self) -> None:
         self.heard_of = 0
         self.told: list[str] = []
+        self.deaths: list[ProcessDied] = []
         self.killed = False
         self.signals: list[signal.Signals] = []
         self.pid = 1
@@ -50,17 +61,23 @@ class StandIn:
 
     def send(self, message: object, _descriptors: tuple[int, ...] = ()) -> None:
         self.told.append(type(message).__name__)
+        if isinstance(message, ProcessDied):
+            self.deaths.append(message)
 
     def note_answer(self) -> None:
         self.heard_of += 1
 
 
+def handle(process: StandIn) -> ProcessHandle:
+    return cast(ProcessHandle, process)
+
+
 def made(
-    tmp_path: Path, role: Role, ready: Callable[[ControlReady], None] = lambda _said: None
+    tmp_path: Path, *roles: Role, ready: Callable[[ControlReady], None] = lambda _said: None
 ) -> Supervisor:
     admin = socket.create_server(("127.0.0.1", 0))
     facts = Facts(state=tmp_path, config=tmp_path / "config.json", rosmaster_port=1)
-    return Supervisor((role,), facts, admin=admin, ready=ready)
+    return Supervisor(roles, facts, admin=admin, ready=ready)
 
 
 async def test_a_master_that_dies_during_a_check_is_checked_again(
@@ -78,11 +95,11 @@ async def test_a_master_that_dies_during_a_check_is_checked_again(
         return True
 
     monkeypatch.setattr(supervisor, "answers", answers)
-    slot.process = cast(ProcessHandle, first)
+    slot.process = handle(first)
     waiting = asyncio.create_task(supervisor.until_answering(slot))
     async with asyncio.timeout(20):
         await asked.wait()
-        slot.process = cast(ProcessHandle, second)
+        slot.process = handle(second)
         await waiting
     assert (first.heard_of, second.heard_of) == (0, 1)
 
@@ -93,8 +110,8 @@ async def test_a_first_token_that_cannot_be_saved_ends_the_start(tmp_path: Path)
     def ready(_said: ControlReady) -> None:
         raise StartError("the first access token cannot be written")
 
-    supervisor, control = made(tmp_path, CONTROL, ready), StandIn()
-    await supervisor.control_ready(cast(ProcessHandle, control), READY)
+    supervisor, control = made(tmp_path, CONTROL, ready=ready), StandIn()
+    await supervisor.control_ready(handle(control), READY)
     assert supervisor.failure == "the first access token cannot be written"
     assert not supervisor.is_ready
     assert "Announced" not in control.told
@@ -121,7 +138,7 @@ def test_a_control_that_asks_for_too_much_at_once_is_replaced(tmp_path: Path) ->
     async def scene() -> tuple[StandIn, int]:
         supervisor, control = made(tmp_path, CONTROL), StandIn()
         for number in range(10_000):
-            supervisor.control_said(cast(ProcessHandle, control), RouteWanted(f"10.0.0.{number}"), ())
+            supervisor.control_said(handle(control), RouteWanted(f"10.0.0.{number}"), ())
             if control.killed:
                 return control, number
         return control, -1
@@ -137,7 +154,7 @@ async def test_a_slow_start_is_waited_for_and_reported(
     monkeypatch.setattr(module, "_START_SECONDS", 0.0)
     monkeypatch.setattr(module, "_LOOK_SECONDS", 0.01)
     supervisor, slow, reasons = made(tmp_path, CONTROL), StandIn(), list[str]()
-    supervisor.slots[0].process = cast(ProcessHandle, slow)
+    supervisor.slots[0].process = handle(slow)
 
     def stop(reason: str) -> None:
         reasons.append(reason)
@@ -163,8 +180,8 @@ def test_control_may_have_only_a_process_on_demand_killed(tmp_path: Path) -> Non
     supervisor = made(tmp_path, ROSMASTER)
     [slot] = supervisor.slots
     master = StandIn()
-    slot.process = cast(ProcessHandle, master)
-    supervisor.control_said(cast(ProcessHandle, StandIn()), ProcessOverdue("rosmaster", 0), ())
+    slot.process = handle(master)
+    supervisor.control_said(handle(StandIn()), ProcessOverdue("rosmaster", 0), ())
     assert not master.killed
     supervisor.kept.close()
 
@@ -181,15 +198,15 @@ async def test_the_slot_of_an_overdue_process_is_free_for_the_next_one(
     monkeypatch.setattr(supervisor, "start", lambda slot: filled.append(slot.index))
     processes = [StandIn(), StandIn()]
     for slot, process in zip(supervisor.slots, processes, strict=True):
-        slot.process = cast(ProcessHandle, process)
-    control = cast(ProcessHandle, StandIn())
+        slot.process = handle(process)
+    control = handle(StandIn())
     if wanted:
         supervisor.control_said(control, ProcessWanted("door", 1), ())
     supervisor.control_said(control, ProcessOverdue("door", 1), ())
     assert [process.killed for process in processes] == [False, True]
-    supervisor.died(cast(ProcessHandle, processes[1]), -9)
+    supervisor.died(handle(processes[1]), -9)
     assert supervisor.slots[1].is_free and filled == [1] * wanted
-    supervisor.died(cast(ProcessHandle, processes[0]), -9)
+    supervisor.died(handle(processes[0]), -9)
     assert supervisor.slots[0].due is not None  # control did not ask for this end
     supervisor.slots[0].due.cancel()
     supervisor.kept.close()
@@ -205,10 +222,10 @@ async def _end_by_themselves(supervisor: Supervisor, monkeypatch: pytest.MonkeyP
     [slot] = supervisor.slots
     filled: list[int] = []
     monkeypatch.setattr(supervisor, "start", lambda slot: filled.append(slot.starts))
-    control = cast(ProcessHandle, StandIn())
+    control = handle(StandIn())
     supervisor.control_said(control, CompilerWanted(), ())
     assert filled == [0]
-    slot.process, slot.starts = cast(ProcessHandle, StandIn()), 1
+    slot.process, slot.starts = handle(StandIn()), 1
     cast(Any, slot.process).started = 0.0
     if wanted:
         supervisor.control_said(control, CompilerWanted(), ())
@@ -216,7 +233,7 @@ async def _end_by_themselves(supervisor: Supervisor, monkeypatch: pytest.MonkeyP
     assert filled == [0] + [0] * wanted
     assert slot.is_free
     assert slot.starts == 0
-    slot.process, slot.starts = cast(ProcessHandle, StandIn()), 1
+    slot.process, slot.starts = handle(StandIn()), 1
     cast(Any, slot.process).started = 0.0
     supervisor.died(slot.process, -9)
     assert slot.due is not None  # each death is followed by a new start
@@ -240,3 +257,47 @@ async def test_the_processes_learn_whether_the_appliance_is_stopped_by_order(
         supervisor.stop("no master" if end == "failure" else None)
     await supervisor.end()
     assert found == [failed]
+
+
+async def test_control_gets_each_unexpected_end_once_while_it_serves(tmp_path: Path) -> None:
+    supervisor = made(tmp_path, ROSMASTER, CONTROL)
+    supervisor.is_ready = True
+    master, control = supervisor.slots
+
+    def begin(slot: ProcessSlot) -> StandIn:
+        process = StandIn()
+        process.role, process.started = slot.role.name, clock.now()
+        slot.process, slot.starts = handle(process), slot.starts + 1
+        return process
+
+    def die(process: StandIn, code: int = -9) -> None:
+        supervisor.died(handle(process), code)
+
+    def serves(process: StandIn) -> None:
+        ready = Ready(msgspec.to_builtins(READY))
+        supervisor.reports.received(handle(process), ready, ())
+
+    first, failed = begin(control), begin(master)
+    die(failed, 1)
+    assert first.deaths == []
+    serves(first)
+    [death] = first.deaths
+    assert (death.role, death.end, death.reason) == (
+        "rosmaster",
+        "exit status 1",
+        "it ended with exit status 1",
+    )
+    supervisor.reports.violated(handle(first), "sent Stop, which it may not send")
+    die(first)
+    second = begin(control)
+    serves(second)
+    [death] = second.deaths
+    assert (death.role, death.end, death.restarts) == ("control", "signal SIGKILL", 0)
+    assert death.reason == "the supervisor killed it, because it sent Stop, which it may not send"
+    for _time in range(2 * FAILING_AFTER):
+        die(begin(master))
+    assert len(second.deaths) == FAILING_AFTER  # with the first one; `process failing` covers the others
+    for slot in supervisor.slots:
+        slot.process = None
+    await supervisor.end()
+    supervisor.kept.close()

@@ -50,6 +50,27 @@ def test_each_step_forward_is_recorded(trail: FakeTrail) -> None:
     assert trail.events == ["clock set forward"] * 2
 
 
+@pytest.mark.parametrize(("step", "stepped"), [(0.5, 0), (3600.0, 1), (-3600.0, 1)])
+def test_each_step_is_passed_on(trail: FakeTrail, step: float, stepped: int) -> None:
+    started, told = [1000.0], list[str]()
+    clock = ClockCheck(trail, lambda: 0.0, lambda: started[0], stepped=lambda: told.append("stepped"))
+    started[0] += step
+    clock.look()
+    clock.look()
+    assert len(told) == stepped
+
+
+def test_a_right_that_the_clock_ended_is_recorded(trail: FakeTrail) -> None:
+    ClockCheck(trail, lambda: 0.0).cut_short("door ticket", "1f", 3600.0)
+    [row] = trail.rows
+    assert (row["event"], row["resource"], row["kind"], row["seconds"]) == (
+        "ended by the clock",
+        "1f",
+        "door ticket",
+        3600.0,
+    )
+
+
 @pytest.mark.parametrize(
     ("days", "said"), [(0.5, None), (2000.0, "wrong: 2000 days before this program was built")]
 )

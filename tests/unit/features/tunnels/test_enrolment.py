@@ -12,6 +12,7 @@ from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
+from appliance.base import clock, shipped
 from appliance.base.clock import using
 from appliance.channel.answers.host_answers import PortsSeen
 from appliance.channel.channel import Channel
@@ -25,6 +26,7 @@ from appliance.channel.messages import (
     TunnelsStated,
     TunnelsWanted,
 )
+from appliance.control.operators.clock_check import ClockCheck
 from appliance.features.tunnels.certification import Certification
 from appliance.features.tunnels.enrolment import HostEnrolment
 from appliance.features.tunnels.host_answers import (
@@ -69,6 +71,7 @@ from appliance.store.writer_thread import StoreError
 from tests.support.audit import RecordingTrail
 from tests.support.ends import ends_of
 from tests.support.engines import InlineDatabase, open_log
+from tests.support.memory_channel import memory_link
 from tests.support.near_authority import NearAuthority
 from tests.support.virtual_clock import VirtualClock
 
@@ -725,6 +728,49 @@ async def test_the_tunnel_of_a_blocked_host_is_closed_until_the_block_ends(bench
     running.cancel()
     for one in (link, charon):
         one.close()
+
+
+async def test_charon_has_a_valid_certificate_and_list_soon_after_a_step_of_the_clock(bench: Bench) -> None:
+    link, charon = memory_link(TunnelLink)
+    stated: asyncio.Queue[TunnelsStated] = asyncio.Queue()
+
+    def heard(message: Message, _descriptors: tuple[int, ...]) -> None:
+        if isinstance(message, TunnelsStated):
+            stated.put_nowait(message)
+
+    charon.attach(asyncio.get_running_loop(), heard, lambda: None)
+    await bench.add("a")
+    with using(machine := VirtualClock()):
+        check = ClockCheck(bench.trail, lambda: 0.0, stepped=bench.tunnels.state_anew)
+        bench.tunnels.attach(link)
+        running = asyncio.create_task(bench.tunnels.run(lambda: None))
+        key = make_key()
+        charon.send(CertificateNeeded(signing_request(key, "rosrv-appliance"), fingerprint(key)))
+        first = await stated.get()
+        for days, same in ((40, True), (60, False)):  # the list of revoked certificates is valid for 30 days
+            machine.set_wall(clock.wall() + days * 86_400.0)
+            check.look()
+            now = clock.utc_now()
+            while (last := await stated.get()).revocations == first.revocations:
+                pass
+            if not same:
+                while last.certificate == first.certificate:
+                    last = await stated.get()
+            listed_until = x509.load_pem_x509_crl(last.revocations).next_update_utc
+            assert listed_until is not None and listed_until > now
+            assert x509.load_pem_x509_certificate(last.certificate).not_valid_after_utc > now
+            assert (last.certificate == first.certificate) is same
+            first = last
+        running.cancel()
+
+
+async def test_a_host_that_enrolled_before_the_clock_was_set_can_renew(bench: Bench) -> None:
+    first, second = make_key(), make_key()
+    with using(machine := VirtualClock(wall=10.0)):
+        await bench.add("a", key=first)
+        machine.set_wall(Path(shipped.__file__).stat().st_mtime + 30 * 86_400.0)
+        made = await bench.renew_itself("a", signing_request(second, "a").decode(), first)
+        assert made.expires == pytest.approx(clock.wall() + 90 * 86_400.0, abs=86_400.0)
 
 
 def test_a_full_disk_during_enrolment_names_the_way_out(

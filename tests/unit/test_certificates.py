@@ -1,0 +1,73 @@
+"""Certificates that are made before the machine's clock is set, as on a computer without a clock of its own."""
+
+import datetime
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from cryptography import x509
+
+from appliance.api.front.certificate import CERTIFICATE, renew, tls_context
+from appliance.base import clock, shipped
+from appliance.features.standby.link_certificates import make_link_certificate
+from appliance.ipsec.certificate_authority import CertificateAuthority
+from appliance.ipsec.requests import make_key, signing_request
+from appliance.signing.own_certificate import make_own_certificate
+from tests.support.sources import ROOT
+from tests.support.virtual_clock import VirtualClock
+
+_MAKES = re.compile(r"(?:Certificate|CertificateRevocationList)Builder\(")
+BUILT = Path(shipped.__file__).stat().st_mtime
+IMAGE = BUILT - 200 * 86_400.0
+
+
+def _of_the_authority(folder: Path) -> list[bytes]:
+    authority = CertificateAuthority(folder)
+    return [authority.certificate, authority.issue(signing_request(make_key(), "a"), "a", 90).certificate]
+
+
+def _of_rest(folder: Path) -> list[bytes]:
+    tls_context(folder, [], clock.utc_now())
+    return [(folder / CERTIFICATE).read_bytes()]
+
+
+MADE: dict[str, Callable[[Path], list[bytes]]] = {
+    "appliance/ipsec/certificate_authority.py": _of_the_authority,
+    "appliance/api/front/certificate.py": _of_rest,
+    "appliance/signing/own_certificate.py": lambda _folder: [make_own_certificate("robot", 90)[1]],
+    "appliance/features/standby/link_certificates.py": lambda _folder: [
+        make_link_certificate().certificate.encode()
+    ],
+}
+
+
+def test_every_maker_of_certificates_has_its_row() -> None:
+    """A new maker of certificates has its row in `MADE`."""
+    makers = {
+        str(path.relative_to(ROOT))
+        for folder in ("appliance", "fleet/rosrv_fleet")
+        for path in (ROOT / folder).rglob("*.py")
+        if _MAKES.search(path.read_text(encoding="utf-8"))
+    }
+    assert makers == MADE.keys()
+
+
+@pytest.mark.parametrize("wall", [10.0, IMAGE], ids=["1970", "the date of an image"])
+@pytest.mark.parametrize("maker", MADE)
+def test_a_certificate_of_the_time_before_is_valid_when_the_clock_is_set(
+    maker: str, wall: float, tmp_path: Path
+) -> None:
+    with clock.using(machine := VirtualClock(wall=wall)):
+        made = [x509.load_pem_x509_certificate(one) for one in MADE[maker](tmp_path)]
+        for at in (wall, BUILT + 60 * 86_400.0):
+            machine.set_wall(at)
+            now = datetime.datetime.fromtimestamp(at, datetime.UTC)
+            assert all(one.not_valid_before_utc <= now < one.not_valid_after_utc for one in made)
+
+
+def test_the_certificate_of_rest_stays_when_the_clock_is_set(tmp_path: Path) -> None:
+    with clock.using(machine := VirtualClock(wall=10.0)):
+        context = tls_context(tmp_path, [], clock.utc_now())
+        machine.set_wall(BUILT + 60 * 86_400.0)
+        assert not renew(context, tmp_path, [], clock.utc_now())
