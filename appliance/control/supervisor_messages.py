@@ -60,6 +60,7 @@ class SupervisorMessages:
                 self._operators.clock.synchronisation_reported(synchronised)
             case messages.MachineAddresses(addresses):
                 _log.info("addresses of the robot's machine", addresses=addresses)
+                self._parts.endpoints.addresses.forget_routes()
                 self._base.policies.hosts_changed()
             case messages.ProbeFailed(reason):
                 self._base.listener_limits.probed(reason)

@@ -1,6 +1,10 @@
-"""Each cache states what becomes of a failure: one that keeps successes only lets its caller repeat the work."""
+"""Each cache states what becomes of a failure: one that keeps successes only lets its caller repeat the work.
+
+So does each dictionary that a function asks first and fills itself, by hand.
+"""
 
 import ast
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -85,3 +89,211 @@ def test_each_form_of_a_cache_is_found(text: str, tmp_path: Path, monkeypatch: p
     monkeypatch.setattr("tests.unit.test_caches.ROOT", tmp_path)
     (tmp_path / "module.py").write_text(text)
     assert [*caches(tmp_path / "module.py")] == ["module.py::one"]
+
+
+OPEN = "an entry is something open of a client, node or host, within its quota, and ends with it"
+LOCKS = "a lock, which lives while it is in use, or one of each robot of the collector"
+TEXT = "as many as the text has of a policy, a definition or a specification, which is bounded and read as a whole"
+ANSWER = "it lives as long as one answer, or one recording"
+ONE_EACH = "one for each token; a wrong one is limited by `Buckets`, or checked one at a time"
+OURS_ONLY = "its keys are ours: files, paths of a service, threads, the two appliances, groups of the policy"
+NO_CACHE = "memory or a line, in which a place is looked at before it is written"
+
+BY_HAND = {
+    "appliance/api/front/access.py::_recognised": ONE_EACH,
+    "appliance/audit/log/folding.py::_coming": OPEN,  # a record that a thread is about to write
+    "appliance/audit/log/folding.py::_due": "if host in self._kinds or len(self._kinds) < 2 *",
+    "appliance/audit/log/folding.py::_kinds": "if host in self._kinds or len(self._kinds) < 2 *",
+    "appliance/control/operators/token_orders.py::_stored": ONE_EACH,
+    "appliance/control/rest/rest_proof.py::_checked": ONE_EACH,
+    "appliance/control/rest/rest_proof.py::_taken": "if len(self._taken) >= _MOST_TAKEN",
+    "appliance/features/approvals/approval_orders.py::_moved": OPEN,
+    "appliance/features/authority/drive_orders.py::_turns": LOCKS,
+    "appliance/features/authority/group_holders.py::_held": OURS_ONLY,
+    "appliance/features/doors/door_node.py::_heard": OPEN,
+    "appliance/features/doors/door_node.py::_locks": LOCKS,
+    "appliance/features/doors/door_node.py::_offers": OPEN,
+    "appliance/features/doors/door_node.py::_publications": OPEN,
+    "appliance/features/doors/door_node.py::_refused": "if len(self._refused) >= self._topics.whole",
+    "appliance/features/doors/door_parameters.py::_clients": OPEN,
+    "appliance/features/doors/door_parameters.py::_reads": "if self._reads[client] >= _MOST_READS",
+    "appliance/features/doors/door_processes.py::_host_numbers": "if len(self._host_numbers) >= _MOST_HOSTS",
+    "appliance/features/doors/foxglove.py::_channels": "if len(self._channels) >= self._limits.channels",
+    "appliance/features/doors/foxglove.py::_parameters": "if len(self._parameters) >= self._limits.parameters",
+    "appliance/features/doors/fragments.py::_frames": "if self._bytes > self._most_bytes",
+    "appliance/features/doors/known_types.py::_failed": "while len(self._failed) > _MOST_FAILURES",
+    "appliance/features/doors/known_types.py::_kept": "while self.bytes > self._most",
+    "appliance/features/doors/message_reader.py::_made": TEXT,
+    "appliance/features/doors/message_writer.py::made": TEXT,
+    "appliance/features/doors/rosbridge.py::_advertised": "_check_room(self._advertised, ",
+    "appliance/features/doors/rosbridge.py::_subscriptions": "_check_room(self._subscriptions, ",
+    "appliance/features/fleet/connection.py::_known": OURS_ONLY,
+    "appliance/features/fleet/lost_rights.py::_lost": TEXT,
+    "appliance/features/logbook/interventions.py::_states": ANSWER,
+    "appliance/features/recorder/recording.py::_numbers": ANSWER,
+    "appliance/features/recorder/recording_plan.py::_begun": "if len(self._begun) > _MOST_HOSTS",
+    "appliance/features/recorder/recording_plan.py::_open": "if own != ROBOT and len(others) >= _MOST_AT_ONCE",
+    "appliance/features/standby/witness.py::_connected": OURS_ONLY,
+    "appliance/features/standby/witness.py::_last": OURS_ONLY,
+    "appliance/features/topics/topic_looks.py::_shown": "if moment - since >= ONE_LOOK",
+    "appliance/features/tunnels/refusals.py::_packets": OURS_ONLY,
+    "appliance/hosts/hosts_file.py::found": TEXT,
+    "appliance/master/endpoints/delivery.py::_lists": OPEN,
+    "appliance/master/endpoints/delivery.py::_queues": OPEN,
+    "appliance/master/endpoints/delivery.py::_used": "if len(self._used) + len(self._unused) >= _MOST_KEPT",
+    "appliance/master/endpoints/node_ports.py::_routes": "if len(self._routes) > _MOST_ROUTES",
+    "appliance/policy/groups.py::_kept": TEXT,
+    "appliance/policy/host_sets.py::_networks": TEXT,
+    "appliance/policy/policy.py::standings": "if len(self.standings) >= _KEPT_HOSTS",
+    "appliance/relay/data_plane.py::topics": OPEN,
+    "appliance/relay/loop.py::_payers": "if len(self._payers) >= _PAYERS",
+    "appliance/relay/monitors/host_mask.py::_known": "if len(self._known) >= _MOST_KNOWN",
+    "appliance/relay/monitors/observation_points.py::_numbers": "if len(self._points) > _SENDERS",
+    "appliance/relay/monitors/observations.py::_told": "self._distinct.get((kind, monitor), 0) >= _DISTINCT",
+    "appliance/relay/monitors/observer.py::_counters": TEXT,
+    "appliance/relay/monitors/state_memory.py::_memory": NO_CACHE,
+    "appliance/relay/monitors/time_budget.py::_own": OPEN,
+    "appliance/relay/transport/frames.py::area": NO_CACHE,
+    "appliance/relay/transport/rate_limit.py::_shares": OPEN,
+    "appliance/rpc/connection_table.py::_stages": OPEN,
+    "appliance/rpc/fair_queue.py::_taken": OPEN,
+    "appliance/rpc/fair_queue.py::_taken_as": OPEN,
+    "appliance/rpc/graph_reader.py::_addresses": ANSWER,
+    "appliance/specifications/episodes.py::_going": TEXT,  # monitors and topics in force
+    "appliance/specifications/episodes.py::_known": "len(self._known) < _MOST else",
+    "fleet/rosrv_fleet/bundles/keys.py::_signers": OURS_ONLY,
+    "fleet/rosrv_fleet/connections.py::_owners": OPEN,
+    "fleet/rosrv_fleet/indexer.py::_killed": OURS_ONLY,
+    "fleet/rosrv_fleet/search.py::_running": OPEN,
+    "fleet/rosrv_fleet/segment_store.py::_locks": LOCKS,
+    "rosmop/logics/buchi.py::_after": TEXT,
+    "rosmop/logics/buchi.py::_chosen": TEXT,
+    "rosmop/logics/buchi.py::_moves": TEXT,
+    "rosmop/logics/buchi.py::_steps": TEXT,
+    "rosmop/logics/ere.py::_derived": TEXT,
+    "rosmop/logics/ere.py::_letters": TEXT,
+    "rosmop/logics/ere.py::_numbers": TEXT,
+    "rosmop/logics/ltl.py::propositions": TEXT,
+    "rosmop/logics/ltl_nodes.py::_known": TEXT,
+    "rosmop/logics/ltl_nodes.py::_numbers": TEXT,
+    "rosmop/logics/parsing.py::_shapes": "if len(self._shapes) >= KEPT_ENTRIES",
+    "rosmop/logics/past_monitors.py::_numbers": TEXT,
+    "rosmop/run/engine.py::_silent": TEXT,
+    "rosmop/run/subformulas.py::_known": ANSWER,
+    "rosmop/run/subformulas.py::_plain": ANSWER,
+    "rosmop/runtime/action_context.py::throttled": TEXT,
+    "rosmop/runtime/values.py::_made": TEXT,
+    "rosmop/runtime/wire.py::buffer": NO_CACHE,
+    "roswire/definitions.py::_depths": TEXT,
+    "roswire/definitions.py::_layouts": TEXT,
+    "roswire/definitions.py::_md5sums": TEXT,
+    "roswire/message_view.py::_sizes": ANSWER,
+    "roswire/node/ros_node.py::_locks": LOCKS,
+    "roswire/node/ros_node.py::parameters": OPEN,
+    "roswire/node/ros_node.py::publishers": OPEN,
+    "roswire/node/ros_node.py::services": OPEN,
+    "roswire/node/ros_node.py::subscribers": OPEN,
+}
+"""The rule of each dictionary, or the text of its module that bounds it: then others make room, or it is refused."""
+RULES_BY_HAND = {OPEN, LOCKS, TEXT, ANSWER, ONE_EACH, OURS_ONLY, NO_CACHE}
+OF_OPERATORS = re.compile(
+    r"appliance/(api/console|cli|configuration)/|rosmop/(batch|certify|check|fast|form|learn|recordings|tool|types)/"
+)
+"""Folders that work for one command of an operator, or compile one text."""
+
+
+_FILLED = re.compile(r"self\.\w+\[[^\n]+\][^\n=]*= |self\.\w+\.setdefault\(")
+
+
+def kept_by_hand(path: Path) -> set[str]:
+    """Return the attributes that a function looks into by a key and also fills by it, to save work later."""
+    text = path.read_text(encoding="utf-8")
+    return {
+        attribute
+        for node in ast.walk(ast.parse(text if _FILLED.search(text) else ""))
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+        for attribute in _looked_up_and_filled(node)
+    }
+
+
+def _looked_up_and_filled(function: ast.AST) -> set[str]:
+    nodes = [*ast.walk(function)]
+    filled = {place for node in nodes for place in _places(node, filled=True)}
+
+    def looked_up(within: ast.AST) -> set[str]:
+        return {
+            place[0] for node in ast.walk(within) for place in _places(node, filled=False) if place in filled
+        }
+
+    names: dict[str, set[str]] = {}
+    for node in nodes:
+        if isinstance(node, ast.Assign | ast.AnnAssign | ast.NamedExpr) and node.value is not None:
+            for target in node.targets if isinstance(node, ast.Assign) else [node.target]:
+                if isinstance(target, ast.Name):
+                    names.setdefault(target.id, set()).update(looked_up(node.value))
+    results = [node.value for node in nodes if isinstance(node, ast.Return) and node.value is not None]
+    tests = [
+        node.test
+        for node in nodes
+        if isinstance(node, ast.If) and isinstance(node.body[-1], ast.Return | ast.Raise | ast.Continue)
+    ]
+    decides = {name.id for test in tests for name in ast.walk(test) if isinstance(name, ast.Name)}
+    decides |= {
+        name.id
+        for value in results
+        for name in (value.elts if isinstance(value, ast.Tuple) else [value])
+        if isinstance(name, ast.Name)
+    }
+    return {one for name in decides for one in names.get(name, ())}.union(
+        *(looked_up(one) for one in [*results, *tests])
+    )
+
+
+def _places(node: ast.AST, *, filled: bool) -> Iterator[tuple[str, str]]:
+    match node:
+        case ast.Subscript(value=ast.Attribute(value=ast.Name(id="self"), attr=name), slice=key, ctx=use):
+            if isinstance(use, ast.Store) is filled:
+                yield name, ast.unparse(key)
+        case ast.Call(
+            func=ast.Attribute(value=ast.Attribute(value=ast.Name(id="self"), attr=name), attr=method),
+            args=[key, *_],
+        ):
+            if method == "setdefault" or (method == "get" and not filled):
+                yield name, ast.unparse(key)
+        case ast.Compare(
+            left=key, ops=[ast.In()], comparators=[ast.Attribute(value=ast.Name(id="self"), attr=name)]
+        ) if not filled:
+            yield name, ast.unparse(key)
+
+
+def test_each_dictionary_that_is_asked_and_filled_has_its_rule() -> None:
+    found = {
+        f"{name}::{attribute}": text
+        for folder in FOLDERS
+        for file in (ROOT / folder).rglob("*.py")
+        if "tests" not in file.parts and not OF_OPERATORS.match(name := str(file.relative_to(ROOT)))
+        for text in [file.read_text(encoding="utf-8")]
+        for attribute in kept_by_hand(file)
+    }
+    assert found.keys() == BY_HAND.keys()
+    lacking = [
+        one for one, rule in BY_HAND.items() if rule not in RULES_BY_HAND and found[one].count(rule) == 0
+    ]
+    assert lacking == [], "the module has not this bound any longer"
+
+
+@pytest.mark.parametrize(
+    ("body", "found"),
+    [
+        ("if key not in self.x: self.x[key] = make(key)\n return self.x[key]", True),
+        ("known = self.x.get(key)\n if known is None: self.x[key] = make()\n return known", True),
+        ("if key in self.x: return True\n self.x[key] = make()", True),
+        ("if (old := self.x.get(key)) is not None: raise old\n self.x[key] = make()", True),
+        ("return self.x.setdefault(key, make())", True),
+        ("self.x[key] = make()", False),
+        ("return self.x[key]", False),
+    ],
+)
+def test_each_form_of_a_dictionary_that_saves_work_is_found(body: str, found: bool, tmp_path: Path) -> None:
+    (tmp_path / "module.py").write_text(f"def one(self, key):\n {body}")
+    assert kept_by_hand(tmp_path / "module.py") == ({"x"} if found else set())

@@ -10,6 +10,7 @@ import hashlib
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import NamedTuple, TypeVar
 from weakref import WeakValueDictionary
 
@@ -186,18 +187,22 @@ class KnownTypes:
         if (known := self._heard.find(key)) is not None:
             return known
         text = header.get("message_definition", "")
-        failure = key, hashlib.sha256(text.encode("utf-8", "surrogateescape")).digest()
+        digest = hashlib.sha256(text.encode("utf-8", "surrogateescape")).digest()
+        known = self._once((key, digest), lambda: self._parsed(key, text))
+        self._heard.keep(known, beyond=False)
+        return known
+
+    def _once(self, failure: tuple[TypeKey, bytes], make: Callable[[], KnownType]) -> KnownType:
+        """Make a type. One that cannot be made is remembered under `failure`."""
         if (earlier := self._failed.get(failure)) is not None:
             raise DefinitionError(earlier.text, earlier.source, earlier.line)
         try:
-            known = self._parsed(key, text)
+            return make()
         except DefinitionError as error:
             self._failed[failure] = error.with_traceback(None)
             while len(self._failed) > _MOST_FAILURES:
                 self._failed.popitem(last=False)
             raise
-        self._heard.keep(known, beyond=False)
-        return known
 
     def _parsed(self, key: TypeKey, text: str) -> KnownType:
         definitions = Definitions.from_full_text(key.name, text)
@@ -218,7 +223,8 @@ class KnownTypes:
         key = TypeKey(name, self._definitions.md5sum(name))
         known = self._defined.find(key)
         if known is None:
-            known = self._made(key, self._definitions, defined=True)
+            made = partial(self._made, key, self._definitions, defined=True)
+            known = self._once((key, b""), made)
             self._defined.keep(known, beyond=True)
         return known
 

@@ -6,12 +6,14 @@ A host may have `_TIMES_THE_REST` times as many ports as are left; a network tha
 
 import asyncio
 import errno
+import math
 import socket as sockets
 from collections import deque
 from collections.abc import Awaitable, Callable, Iterable, Sequence
 
 import structlog
 
+from appliance.base import clock
 from appliance.base.counted import counted
 from appliance.master.graph.registry import Incarnation
 from appliance.policy.host_sets import Network
@@ -187,6 +189,8 @@ class NodePorts:
 
 _log = structlog.get_logger()
 _ANSWER_SECONDS = 3.0
+_AGAIN_SECONDS = 30.0  # without an answer; each call of the host would wait again
+_MOST_ROUTES = 10_000
 
 
 class AdvertisedAddresses:
@@ -211,7 +215,8 @@ class AdvertisedAddresses:
         self._fixed = fixed
         self._tunnels = tunnels
         self._route_to = route_to
-        self._routes: dict[Address, str | None] = {}
+        # By host: the address, and until when it stands; that of an unanswered question only for a while.
+        self._routes: dict[Address, tuple[str | None, float]] = {}
 
     def address_for(self, peer: Peer) -> str:
         for network, address in self._advertised:
@@ -221,17 +226,25 @@ class AdvertisedAddresses:
             inside = self._tunnels is not None and peer.host in self._tunnels
             return peer.local if inside else self._fixed
         # The appliance's own nodes use a separate loopback listener. Proxy endpoints may not listen there.
-        return self._routes.get(peer.host) or self.listen or peer.local
+        route, _until = self._routes.get(peer.host, (None, 0.0))
+        return route or self.listen or peer.local
+
+    def forget_routes(self) -> None:
+        """Ask again about each host: the machine has other addresses."""
+        self._routes.clear()
 
     async def learn(self, peer: Peer) -> None:
-        if self._route_to is None or self._fixed is not None or peer.host in self._routes:
+        if self._route_to is None or self._fixed is not None:
             return
-        if len(self._routes) > 10_000:
+        if self._routes.get(peer.host, (None, -math.inf))[1] > clock.now():
+            return
+        if len(self._routes) > _MOST_ROUTES:
             self._routes.clear()
         try:
             async with asyncio.timeout(_ANSWER_SECONDS):
-                self._routes[peer.host] = await self._route_to(peer.text)
+                self._routes[peer.host] = await self._route_to(peer.text), math.inf
         except TimeoutError:
+            self._routes[peer.host] = None, clock.now() + _AGAIN_SECONDS
             _log.warning(
                 "the supervisor did not report the address at which a host reaches the appliance",
                 host=peer.text,

@@ -10,6 +10,7 @@ from appliance.features.doors.rosbridge_frames import Compression, publish_frame
 from appliance.features.doors.values import MessageCodec, ValueLimits
 from roswire.definitions import Definitions
 from roswire.errors import DefinitionError
+from roswire.message_layout import MessageLayout
 from roswire.standard import standard_definitions
 
 
@@ -21,6 +22,24 @@ def header(name: str, text: str) -> dict[str, str]:
 @pytest.fixture
 def types() -> KnownTypes:
     return KnownTypes(standard_definitions(), ValueLimits())
+
+
+def test_a_type_of_the_operator_that_cannot_be_used_is_tried_once(
+    types: KnownTypes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tried: list[str] = []
+    layout = Definitions.layout
+
+    def counted(self: Definitions, name: str) -> MessageLayout:
+        tried.append(name)
+        return layout(self, name)
+
+    monkeypatch.setattr(Definitions, "layout", counted)
+    types.define(Definitions.from_files({"own/Huge.msg": "int64[1000000000] x"}))
+    for _message in range(100):
+        with pytest.raises(DefinitionError):
+            types.message("own/Huge")
+    assert len(tried) <= 2
 
 
 def test_a_definition_counts_for_its_header_only(types: KnownTypes) -> None:

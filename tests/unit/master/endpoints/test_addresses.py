@@ -1,3 +1,4 @@
+import asyncio
 import ipaddress
 
 import pytest
@@ -24,6 +25,41 @@ def peer(host: str, local: str) -> Peer:
 )
 def test_the_appliance_listens_on_the_address_in_answers(listen: str, local: str, told: str) -> None:
     assert AdvertisedAddresses([], None, listen).address_for(peer("127.0.0.1", local)) == told
+
+
+def test_a_host_learns_the_machines_new_address() -> None:
+    routes = ["192.168.1.7", "192.168.1.9"]
+
+    async def route(_host: str) -> str | None:
+        return routes.pop(0)
+
+    addresses, host = AdvertisedAddresses([], route, "0.0.0.0"), peer("10.0.0.5", "10.0.0.1")
+    for _time in range(2):
+        autojump.run(addresses.learn(host))
+        assert addresses.address_for(host) == "192.168.1.7"
+    addresses.forget_routes()
+    autojump.run(addresses.learn(host))
+    assert addresses.address_for(host) == "192.168.1.9"
+
+
+def test_a_host_without_an_answer_waits_once_in_a_while() -> None:
+    asked: list[str] = []
+
+    async def never(host: str) -> str | None:
+        asked.append(host)
+        await asyncio.Event().wait()
+        return None
+
+    addresses, host = AdvertisedAddresses([], never, "0.0.0.0"), peer("10.0.0.5", "10.0.0.1")
+
+    async def calls() -> None:
+        for _call in range(20):
+            await addresses.learn(host)
+        await asyncio.sleep(60.0)
+        await addresses.learn(host)
+
+    autojump.run(calls())
+    assert len(asked) == 2
 
 
 def test_configured_and_translated_addresses_come_first() -> None:
