@@ -100,6 +100,10 @@ class FeatureSection:
     def services(self) -> tuple[str, ...]:
         return ()
 
+    def recorded(self) -> dict[str, str]:
+        """Return the values that each start records in the audit log, by name: no secrets."""
+        return {}
+
     def on_page(self) -> dict[str, str]:
         """Return what the console's page states, by the names of its attributes."""
         return {}

@@ -483,6 +483,11 @@ class Settings:
         values = dataclasses.asdict(self).items()
         return {name: hashlib.sha256(repr(value).encode()).hexdigest()[:16] for name, value in values}
 
+    def recorded(self) -> dict[str, dict[str, str]]:
+        """Return the values that sections admit to the audit log, by section and name."""
+        found = {kind.place: self.of(kind).recorded() for kind in SECTIONS}
+        return {place: values for place, values in found.items() if values}
+
     @property
     def listen_address(self) -> tuple[str, int]:
         return split_address(self.listen)

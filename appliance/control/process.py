@@ -172,6 +172,7 @@ class _Control:
         if not restarted:
             name = {"robot": settings.name} if settings.name else {}
             more = {**name, "version": __version__, "configuration": settings.fingerprints()}
+            more |= {"settings": settings.recorded(), "off": self._parts.monitors.off}
             base.trail.happened("appliance started", f"nodes may connect at {uri}", more=more)
         else:
             text = "control started again after an unexpected end: no host holds a group of [Authority]"

@@ -16,6 +16,7 @@ import yaml
 from appliance.base.input_files import read_given_text
 from appliance.base.validation_messages import meant, not_yaml
 from appliance.policy.policy_findings import quoted
+from appliance.telemetry.text_changes import changed_lines
 
 IN_BUNDLE = "hosts.yaml of the bundle"
 BUNDLED_HOSTS = "bundled hosts"
@@ -64,6 +65,15 @@ class DeclaredHosts:
             self.error = str(error)
             with contextlib.suppress(DeclaredHostsError):  # an earlier version read it
                 self.hosts = parse_declared(text, str(path))
+
+    @property
+    def in_force(self) -> str:
+        """Return the text in force: of the bundle, or of the file when it was last valid."""
+        return self.bundled or self.text
+
+    def changed_lines(self, earlier: str) -> list[str]:
+        """Return the lines in which the text in force differs from an earlier one."""
+        return changed_lines({"hosts.yaml": earlier}, {"hosts.yaml": self.in_force})
 
     @property
     def there(self) -> bool:

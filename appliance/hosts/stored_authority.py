@@ -6,15 +6,17 @@ from appliance.channel.messages import CertificateMade
 from appliance.hosts.certificate_requests import Authority, AuthorityError
 from appliance.store.host_tables import AuthorityRow, HostTables
 
+Replaced = Callable[[bytes, bytes], object]
+
 
 class StoredAuthority:
-    """The authority in use; `replaced()` is called if it differs from the last one.
+    """The authority in use; `replaced` gets the last certificate and the present one if they differ.
 
     Every method raises `AuthorityError`.
     """
 
     def __init__(
-        self, signer: Authority, kept: HostTables, *, replaced: Callable[[], object] = lambda: None
+        self, signer: Authority, kept: HostTables, *, replaced: Replaced = lambda _earlier, _now: None
     ) -> None:
         self._signer = signer
         self._kept = kept
@@ -33,7 +35,7 @@ class StoredAuthority:
             return kept.certificate.encode()
         self._save(AuthorityRow(own.decode(), "", 0.0))
         if kept is not None:
-            self._replaced()
+            self._replaced(kept.certificate.encode(), own)
         return own
 
     def _keeps(self, kept: AuthorityRow, own: bytes) -> bool:

@@ -6,6 +6,7 @@ A value stays until its monitor is removed, or until a new text no longer declar
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 from appliance.channel.answers.monitor_answers import GivenState
 from appliance.channel.messages import GivenDeclared, GivenValue
@@ -14,6 +15,23 @@ from appliance.specifications.specification_files import CheckedSpecifications, 
 Given = Mapping[str, Mapping[str, GivenValue]]
 
 _TOPIC = "topic"
+_NOT_DECLARED = "not declared"
+
+
+class DroppedValue(NamedTuple):
+    """A given value that a new text does not allow, and the text's own value, which applies instead."""
+
+    monitor: str
+    name: str
+    value: GivenValue
+    now: GivenValue
+
+    @property
+    def text(self) -> str:
+        return (
+            f"{self.monitor}: {self.name}={_shown(self.value)} no longer applies, because the text does not allow it:"
+            f" the default of the text is in force; rosrv monitor set {self.monitor} prints it"
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,11 +56,11 @@ class Givens:
         }
         return {monitor: values for monitor, values in found.items() if values}
 
-    def dropped(self, checked: CheckedSpecifications) -> list[str]:
+    def dropped(self, checked: CheckedSpecifications) -> list[DroppedValue]:
         kept = self.in_force(checked)
+        own = {monitor: {one.name: one.value for one in rows} for monitor, rows in checked.givens.items()}
         return [
-            f"{monitor}: {name}={_shown(value)} no longer applies, because the text does not allow it: the default of"
-            f" the text is in force; rosrv monitor set {monitor} prints it"
+            DroppedValue(monitor, name, value, own.get(monitor, {}).get(name, _NOT_DECLARED))
             for monitor, values in self.said.items()
             for name, value in values.items()
             if monitor in checked.monitors and name not in kept.get(monitor, {})

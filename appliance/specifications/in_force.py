@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple, TypeVar
 
 from appliance.channel.messages import GivenValue
-from appliance.specifications.givens import Given, Givens, parsed, require_topics
+from appliance.specifications.givens import DroppedValue, Given, Givens, parsed, require_topics
 from appliance.specifications.specification_files import (
     CheckedSpecifications,
     Sources,
@@ -78,7 +78,7 @@ class Cleared(NamedTuple):
 
     now: InForce
     drawn_in: list[str]
-    dropped: list[str]
+    dropped: list[DroppedValue]
 
 
 def loaded(now: InForce, wanted: Wanted, checked: CheckedSpecifications, *, signed: bool) -> Coming:

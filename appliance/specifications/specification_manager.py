@@ -62,6 +62,7 @@ from appliance.store.ends import EndKind, EndTable
 from appliance.store.revisions import Revisions, reloaded_by
 from appliance.store.state_file import MonitorRevisionRow, StateStore
 from appliance.telemetry.audit_trail import AuditTrail
+from appliance.telemetry.text_changes import changed_lines
 
 _log = structlog.get_logger()
 _ACTS = "monitor acts"
@@ -81,6 +82,7 @@ _EVENTS: dict[Switch, str] = {
     SHADOW: "monitor in shadow mode",
 }
 _WORDS: dict[Switch, str] = {True: "enabled", False: "disabled", SHADOW: "in shadow mode"}
+_NOT_LOADED = "not loaded"
 
 
 class UnknownMonitorError(Exception):
@@ -546,7 +548,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         told = [(name, messages.MonitorSwitched(name, to is True)) for name in changed]
         await self._bring(new, store, tell=None if shadow else told)
         for name in changed:
-            self._say_switched(name, to, who)
+            self._say_switched(name, to, who, earlier=switches.states[name])
         await self.store.settled()
         await self.rollout.carried_out()
         return changed
@@ -580,7 +582,14 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         fix = f"load a version without the error: rosrv monitor load {file}"
         self._trail.happened("monitor not built", f"{text}; {fix}", category="monitor", resource=file)
 
-    def _say_switched(self, name: str, to: Switch, who: str, why: str = "") -> None:
+    @property
+    def off(self) -> dict[str, str]:
+        """Return the monitors that are disabled or in shadow mode, each with its state in words."""
+        return {name: _WORDS[to] for name, to in self.switches.states.items() if to is not True}
+
+    def _say_switched(
+        self, name: str, to: Switch, who: str, why: str = "", *, earlier: Switch | None
+    ) -> None:
         until = self.returns.until(name) or self.returns.confirm_by(name)
         end = "" if until is None else f" until {_moment(until)}{' unless confirmed' if to is True else ''}"
         self._trail.happened(
@@ -590,6 +599,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             category="monitor",
             resource=name,
             who=who,
+            earlier=_NOT_LOADED if earlier is None else _WORDS[earlier],
             more=None if until is None else {"until": _moment(until)},
         )
 
@@ -744,7 +754,8 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         try:
             checked = await check(wanted.sources)
             new, put, given = in_force.loaded(before, wanted, checked, signed=bool(self.site_keys))
-            warnings = self._judged(new, _in_shadow(new), order.consent) + new.givens.dropped(checked)
+            warnings = self._judged(new, _in_shadow(new), order.consent)
+            warnings += [dropped.text for dropped in new.givens.dropped(checked)]
             kept = replace(order, warnings=warnings)
             moved = await self._bring(
                 new, lambda: self._keep(before, new, kept, self.rollout.began(checked.monitors))
@@ -761,10 +772,12 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             )
             raise SpecificationsRefusedError(findings) from error
         for name, to in put.items():
-            self._say_switched(name, to, order.who, ", as it was loaded")
+            earlier = before.states.get(name)
+            self._say_switched(name, to, order.who, ", as it was loaded", earlier=earlier)
         for name in given:
-            said = before.givens.said.get(name, {})
-            self._say_given(name, {one: said.get(one, "the default") for one in given[name]}, order.who)
+            own = {one.name: one.default for one in new.givens.states(checked, name)}
+            present = own | {one.name: one.value for one in before.givens.states(before.checked, name)}
+            self._say_given(name, {one: present[one] for one in given[name]}, order.who)
         await self.store.settled()
         await self.rollout.all_taken()
         self._published()
@@ -880,8 +893,11 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             who=order.who,
             revision_of_specifications=row.revision,
             sha256=fingerprint_of_all(new.sources.named()),
+            earlier_sha256=fingerprint_of_all(before.named()) if before.files else "",
+            diff=changed_lines(before.named(), new.sources.named()),
             compiled_sha256=fingerprint(checked.compiled),
             monitors=list(checked.monitors),
+            off=self.off,
             added=added,
             changed=changed,
             removed=removed,
@@ -899,19 +915,23 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             self.store.save_monitor_revision(self.in_force)
 
     def _enforce(self, new: InForce) -> None:
-        self.now, drawn_in, dropped = in_force.cleared(new)
+        earlier = self.now.states
+        self.now, drawn_in, values = in_force.cleared(new)
         self.rollout.adopt(self.now)
         for name in drawn_in:
-            self._say_switched(name, SHADOW, self.in_force.who, ": it shares variables with one that is")
+            why = ": it shares variables with one that is"
+            self._say_switched(name, SHADOW, self.in_force.who, why, earlier=earlier.get(name))
         self.returns.keep(self.switches.states)
-        for text in dropped:
+        for dropped in values:
             self._trail.happened(
                 "monitor set",
-                text,
+                dropped.text,
                 severity=Severity.WARNING,
                 category="monitor",
-                resource="",
+                resource=dropped.monitor,
                 who=self.in_force.who,
+                values={dropped.name: dropped.now},
+                before={dropped.name: dropped.value},
             )
         self._store_words(self.now)
 

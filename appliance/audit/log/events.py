@@ -11,8 +11,8 @@ EVENTS: dict[str, str] = {
     "node returned": "A lost node answers again.",
     "replaced": "A node registered again under its name from the same host; the earlier node got a shutdown call.",
     "takeover": "A node registered under a name that another host holds.",
-    "policy loaded": "A policy came into force; `detail` has who loaded it, its source, the hash of its text, and its"
-    " changed lines in `diff` (at most 32,768 characters).",
+    "policy loaded": "A policy came into force; `detail` has who loaded it, its source, the hash of its text and of the"
+    " one before, and its changed lines in `diff` (at most 32,768 characters).",
     "policy confirmed": "A policy that was loaded with commit-confirm was confirmed and stays in force.",
     "policy refused": "A new policy has errors and was rejected as a whole; the previous policy stays in force.",
     "policy file refused": "The appliance started, and the policy's file has errors or fails its tests; the revision"
@@ -45,8 +45,8 @@ EVENTS: dict[str, str] = {
     "alarm sounds again": "An operator ended the silence or the acknowledgement of an alarm.",
     "host awaited": "A one-time token was made; the host that presents it is enrolled under this name.",
     "host awaited no longer": "A one-time token for enrolment was revoked before it was used.",
-    "hosts reloaded": "The file of declared hosts was read again; `detail` has the tunnels that were opened and"
-    " closed.",
+    "hosts reloaded": "The file of declared hosts was read again; `detail` has its changed lines in `diff`, its hash"
+    " before and after, and the tunnels that were opened and closed.",
     "enrolment refused": "An enrolment was rejected; `host` is the real address.",
     "renewal refused": "A host's request for a new certificate was rejected.",
     "ports checked": "A check of a machine's ROS ports from outside was reported; `detail` has the result and who"
@@ -60,15 +60,16 @@ EVENTS: dict[str, str] = {
     " only).",
     "specifications confirmed": "Specifications that were loaded with commit-confirm were confirmed and stay in force.",
     "specifications loaded": "Specifications of monitors came into force; `detail` has who loaded them, the changed"
-    " files, and the hashes of all files and of the compiled modules that relays run.",
+    " files, the changed lines in `diff` (at most 32,768 characters), the hashes of all files before and after and of"
+    " the compiled modules that relays run, and in `off` all monitors that are not in force, with their states.",
     "specifications refused": "Specifications have errors and were rejected as a whole; the previous ones stay in"
     " force.",
     "monitor not built": "The file of a monitor has an error at the start, for example after an upgrade. The appliance"
     " starts without the monitor, which holds its topics unless it is declared `begin`. If the topics of the file are"
     " not known (`resource` is the file), nothing holds them.",
-    "monitor enabled": "A monitor was enabled; `detail` has who enabled it.",
-    "monitor disabled": "A monitor was disabled: its topics' messages pass unchanged; `detail` has who disabled it,"
-    " and `until` if it is enabled again automatically.",
+    "monitor enabled": "A monitor was enabled; `detail` has who enabled it, and its `earlier` state.",
+    "monitor disabled": "A monitor was disabled: its topics' messages pass unchanged; `detail` has who disabled it, its"
+    " `earlier` state, and `until` if it is enabled again automatically.",
     "monitor in shadow mode": "A monitor gets copies of messages and has no effect; `detail` has who ordered it.",
     "shadow observed": "A monitor in shadow mode would have acted: `detail.would` is drop, change, verdict, fault, log"
     " or publish, or `missed` for a message that it did not get.",
@@ -151,7 +152,8 @@ EVENTS: dict[str, str] = {
     "process failing": "A process of the appliance ends soon after every start; `reason` says why, `detail.output` has"
     " the last lines that it printed. It is restarted at growing intervals of up to a minute.",
     "appliance started": "The appliance is in service; `detail` has its version, the robot's `name` of"
-    " `appliance.yaml`, and the start of the SHA-256 of each setting.",
+    " `appliance.yaml`, the start of the SHA-256 of each setting, in `settings` the values of the section `sso`, and in"
+    " `off` all monitors that are not in force, with their states.",
     "appliance stopped": "The appliance was shut down in an orderly way.",
     "took over": "This appliance of a pair became the active one; `detail` has the epoch, both names, the last"
     " checkpoint of the other appliance's log that was replicated (null without one), and the takeover before.",

@@ -76,11 +76,15 @@ def with_network(wanted: Filter) -> Filter:
 
 
 class Condition(NamedTuple):
-    """A part of a WHERE clause, its values, and the index that can answer it."""
+    """A part of a WHERE clause, its values, and the index that can answer it.
+
+    `in_order`: that index lists the records of the condition in the order of the log.
+    """
 
     sql: str
     values: tuple[object, ...]
     answered_by: str | None = None
+    in_order: bool = False
 
 
 def conditions(wanted: Filter) -> list[Condition]:
@@ -160,7 +164,7 @@ def _match(column: str, value: str) -> Condition:
     value = checked_pattern(column, value)
     operator = "GLOB" if any(sign in value for sign in "*?[") else "="
     present = "" if column == "event" else f" AND {column} IS NOT NULL"
-    return Condition(f"({column} {operator} ?{present})", (value,), f"record_{column}")
+    return Condition(f"({column} {operator} ?{present})", (value,), f"record_{column}", operator == "=")
 
 
 def checked_pattern(name: str, value: str) -> str:

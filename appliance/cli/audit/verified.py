@@ -18,12 +18,14 @@ _MODE = 0o640
 
 
 class LastVerification(msgspec.Struct, frozen=True, kw_only=True):
-    """A result with its date; `complete` if nothing was wrong."""
+    """A result with its date; `complete` if nothing was wrong with the log up to the sequence `through`."""
 
     time_utc: str
     complete: bool
     records: int
     text: str
+    log: str = ""
+    through: int = 0
 
 
 def keep_verification(log: Path, result: Verification, seconds: float) -> None:
@@ -33,8 +35,9 @@ def keep_verification(log: Path, result: Verification, seconds: float) -> None:
     ]
     parts += [finding.message for finding in result.findings[:3]]
     kept = LastVerification(
-        time_utc=rfc3339(clock.wall_ns()), complete=result.ok, records=result.records, text="; ".join(parts)
-    )
+        time_utc=rfc3339(clock.wall_ns()), complete=result.ok, records=result.records, text="; ".join(parts),
+        log=result.log, through=result.last,
+    )  # fmt: skip
     with contextlib.suppress(OSError):
         owner = log.parent.stat()
         write_whole(log.parent / _NAME, msgspec.json.encode(kept), _MODE, (owner.st_uid, owner.st_gid))

@@ -2,7 +2,7 @@
 
 import os
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -20,6 +20,7 @@ from appliance.audit.search.search import (
     SearchPage,
     export,
     last_sequence,
+    of_events,
     search,
     show,
 )
@@ -60,6 +61,10 @@ class FileLog:
 
     def export(self, wanted: Filter) -> Iterator[LogEntry]:
         return export(self.path, wanted)
+
+    def of_events(self, events: Collection[str]) -> Iterator[LogEntry]:
+        """Yield the records of some events, oldest first."""
+        return of_events(self.path, events)
 
     def evidence(self, wanted: Filter) -> Iterator[tuple[int, str]]:
         found, robot = evidence(self.path, wanted), self._robot()

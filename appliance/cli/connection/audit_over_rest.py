@@ -2,7 +2,7 @@
 
 import json
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -69,6 +69,10 @@ class RestLog:
             for line in lines:
                 if line:
                     yield entry_of(json.loads(line))
+
+    def of_events(self, events: Collection[str]) -> Iterator[LogEntry]:
+        found = [entry for event in events for entry in self.export(Filter(event=event))]
+        return iter(sorted(found, key=lambda entry: entry.sequence))
 
     def evidence(self, wanted: Filter) -> Iterator[tuple[int, str]]:
         with self._lines("/export", _parameters(wanted), _SILENCE_SECONDS) as lines:

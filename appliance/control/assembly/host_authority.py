@@ -1,5 +1,6 @@
 """Make the table of hosts, the authority of their certificates, and the table of the appliances of their tunnels."""
 
+from functools import partial
 from typing import NamedTuple
 
 from appliance.channel.link import Link
@@ -9,6 +10,7 @@ from appliance.hosts.certificate_requests import Authority
 from appliance.hosts.host_table import HostTable
 from appliance.hosts.hosts_file import BUNDLED_HOSTS, DECLARED_HOSTS, DeclaredHosts
 from appliance.hosts.stored_authority import StoredAuthority
+from appliance.signing.fingerprints import fingerprint
 from appliance.store.state_file import StateStore
 from appliance.telemetry.audit_trail import AuditTrail
 
@@ -29,13 +31,15 @@ def make_host_table(settings: Settings, store: StateStore) -> HostTable:
 def make_host_authority(
     signer: Link, store: StateStore, trail: AuditTrail, table: HostTable
 ) -> HostAuthority:
-    authority = StoredAuthority(Authority(signer), store.hosts, replaced=lambda: _record_replaced(trail))
+    authority = StoredAuthority(Authority(signer), store.hosts, replaced=partial(_record_replaced, trail))
     return HostAuthority(authority, Appliances(store.hosts, table.revoked))
 
 
-def _record_replaced(trail: AuditTrail) -> None:
+def _record_replaced(trail: AuditTrail, earlier: bytes, now: bytes) -> None:
     trail.happened(
         "host authority replaced",
         "the authority of hosts has another key: no certificate of the earlier one is accepted, and each enrolled host"
         " needs a new kit (rosrv host kit NAME)",
+        sha256=fingerprint(now),
+        earlier_sha256=fingerprint(earlier),
     )

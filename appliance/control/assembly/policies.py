@@ -343,6 +343,7 @@ class Policies(Revisions[RevisionRow]):
             who=by or who,
             file=policy.file,
             sha256=fingerprint(policy.text),
+            earlier_sha256=fingerprint(earlier["policy"]) if earlier else "",
             diff=changed_lines(earlier, {"policy": policy.text}),
             signed_by=signer(known.site_keys, policy.text, signature),
             revoked=revoked,

@@ -36,6 +36,10 @@ class HandledAlarms:
             self._keep(kept)
         return msgspec.structs.replace(status, handled_alarms=[self._dated(row) for row in kept.values()])
 
+    def state(self, kind: str) -> str:
+        row = self._rows.get(kind)
+        return "not handled" if row is None else "acknowledged" if row.until is None else "silenced"
+
     def acknowledge(self, kind: str, who: str, note: str) -> None:
         self._keep({**self._rows, kind: HandledAlarm(kind, who, clock.wall(), None, note)})
 

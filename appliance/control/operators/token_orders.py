@@ -192,6 +192,8 @@ class TokenOrders:
             f"token {row.name} ({row.role}) {reason}",
             token=row.name,
             id=row.id,
+            role=row.role,
+            expires=row.expires,
             who=who or None,
         )
         return revoked

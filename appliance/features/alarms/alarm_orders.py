@@ -27,16 +27,18 @@ class AlarmOrders:
 
     async def acknowledge(self, request: AlarmAcknowledge, who: str) -> AlarmList:
         self._must_be_present(request.kind)
-        self._handled.acknowledge(request.kind, who, request.note)
-        self._record("alarm acknowledged", f"{request.kind} is acknowledged", request.kind, who, request.note)
+        kind, earlier = request.kind, self._handled.state(request.kind)
+        self._handled.acknowledge(kind, who, request.note)
+        text = f"{kind} is acknowledged"
+        self._record("alarm acknowledged", text, kind, who, request.note, earlier=earlier)
         return self._list()
 
     async def silence(self, request: AlarmSilence, who: str) -> AlarmList:
-        kind, seconds = request.kind, request.seconds
+        kind, seconds, earlier = request.kind, request.seconds, self._handled.state(request.kind)
         if seconds is None:
             if not self._handled.end(kind):
                 raise UnknownThingError(f"the alarm {kind[:200]} is neither silenced nor acknowledged")
-            self._record("alarm sounds again", f"{kind} is an alarm again", kind, who, "")
+            self._record("alarm sounds again", f"{kind} is an alarm again", kind, who, "", earlier=earlier)
             return self._list()
         if not 1 <= seconds <= LONGEST_SILENCE_SECONDS:
             raise SenselessError(f"silence an alarm for 1 to {LONGEST_SILENCE_SECONDS:.0f} seconds")
@@ -48,6 +50,7 @@ class AlarmOrders:
             kind,
             who,
             request.note,
+            earlier=earlier,
             until=until,
         )
         return self._list()
@@ -62,7 +65,7 @@ class AlarmOrders:
             known = f"there are: {', '.join(present)}" if present else "there is none now"
             raise UnknownThingError(f"there is no alarm {kind[:200]!r}; {known}")
 
-    def _record(self, event: str, text: str, kind: str, who: str, note: str, **more: float) -> None:
+    def _record(self, event: str, text: str, kind: str, who: str, note: str, **more: object) -> None:
         self._trail.happened(
             event,
             f"{text}: {note}" if note else text,

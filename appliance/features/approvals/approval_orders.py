@@ -173,10 +173,12 @@ class ApprovalOrders:
             )
         take_effect()
         credentials = frozenset(number for number, name in self._approvers().items() if name == who)
+        earlier = entry.state.value
         entry = self._table.approve(entry, seconds, who, clock.now(), credentials=credentials)
         self._unanswered.clear()
         what = "once" if seconds is None else f"for {seconds:g} s"
-        self._record("approval given", entry, f"{who} gave approval {entry.number}, {what}", who=who)
+        text = f"{who} gave approval {entry.number}, {what}"
+        self._record("approval given", entry, text, who=who, earlier=earlier, now=f"approved {what}")
         if self._enforce():
             await self._carried_out({entry.call.resource})
         return self._shown(entry)
@@ -190,8 +192,10 @@ class ApprovalOrders:
             self._enforce()
             await self._stop_motion(entry)
             return self._shown(replace(entry, state=ApprovalState.REFUSED, who=who))
+        earlier = entry.state.value
         entry = self._table.refuse(entry, who)
-        self._record("approval refused", entry, f"{who} refused approval {entry.number}", who=who)
+        text = f"{who} refused approval {entry.number}"
+        self._record("approval refused", entry, text, who=who, earlier=earlier, now=entry.state.value)
         return self._shown(entry)
 
     # --- the end of approvals ---
@@ -289,7 +293,8 @@ class ApprovalOrders:
         self._table.end(entry)
         self._moved.pop(entry.number, None)
         self._still.pop(entry.number, None)
-        self._record("approval ended", entry, f"approval {entry.number} ended: {reason}", who=who)
+        text = f"approval {entry.number} ended: {reason}"
+        self._record("approval ended", entry, text, who=who, earlier=entry.state.value, now="ended")
 
     def _enforce(self) -> bool:
         differ = self._policy().approved != self.approved()
@@ -334,7 +339,7 @@ class ApprovalOrders:
             )
         return entry
 
-    def _record(self, event: str, entry: ApprovalEntry, reason: str, *, who: str = "") -> None:
+    def _record(self, event: str, entry: ApprovalEntry, reason: str, *, who: str = "", **more: str) -> None:
         call = entry.call
         self._trail.happened(
             event,
@@ -347,6 +352,7 @@ class ApprovalOrders:
             approval=entry.number,
             sha256=call.digest,
             who=who,
+            more=more,
         )
 
     def _shown(self, entry: ApprovalEntry) -> requests.Approval:

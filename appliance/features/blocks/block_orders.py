@@ -33,6 +33,7 @@ from appliance.telemetry.audit_trail import AuditTrail
 
 MOST = 1000
 _LONGEST_NOTE = 200
+_NOT_BLOCKED = "not blocked"
 _LONGEST_NAME = 300
 _MOST_NAMED = 5
 _FEW = 10  # registrations: two nodes; a robot has more
@@ -112,6 +113,7 @@ class BlockOrders:
             until=shown.until,
             note=row.note,
             replaced=replaced is not None,
+            earlier=_NOT_BLOCKED if earlier is None else _words(earlier),
             forced=request.force,
             ended=ended,
         )
@@ -145,6 +147,7 @@ class BlockOrders:
             whole=True,
             address=earlier.address,
             who=who,
+            earlier=_words(earlier),
             restored=restored,
         )
         await self._store.settled()
@@ -162,6 +165,7 @@ class BlockOrders:
                 host=rows[address].address,
                 whole=True,
                 address=rows[address].address,
+                earlier=_words(rows[address]),
                 note=rows[address].note,
             )
 
@@ -285,3 +289,7 @@ def in_words(held: requests.BlockEnded) -> str:
 
 def _registrations_of(held: requests.BlockEnded) -> int:
     return held.publications + held.subscriptions + held.services + held.parameters
+
+
+def _words(row: HostBlockRow) -> str:
+    return f"blocked by {row.who}"

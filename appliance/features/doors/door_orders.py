@@ -75,6 +75,7 @@ class DoorOrders:
                 whole=True,
                 resource=row.name,
                 who=who,
+                address=row.address,
                 port=row.port,
                 source=row.source,
             )
@@ -98,6 +99,9 @@ class DoorOrders:
                 whole=True,
                 resource=row.name,
                 who=who,
+                address=row.address,
+                port=row.port,
+                source=row.source,
                 revoked=revoked,
             )
             if row.port is not None and (problem := await self._open(self._table.ports())):

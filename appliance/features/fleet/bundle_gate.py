@@ -299,6 +299,7 @@ class BundleGate:
             self._refuse(trial.path, trial.sha256, reason)
             return
         policy, monitors = self._policies.revision, self._monitors.revision
+        earlier, earlier_sha256 = self._record.in_force, self._record.sha256
         await self._keep(
             BundleRecord(
                 trial.path,
@@ -316,6 +317,8 @@ class BundleGate:
             f"{trial.path} is in force, healthy for {self._fleet.bundles.confirm_seconds:g} s{without}",
             bundle=trial.path,
             sha256=trial.sha256,
+            earlier=earlier,
+            earlier_sha256=earlier_sha256,
             revision_of_specifications=monitors,
         )
 
@@ -359,6 +362,7 @@ class BundleGate:
             f"{path} is refused, {stays} stays in force: {reason.splitlines()[0] if reason else ''}",
             bundle=path,
             sha256=sha256,
+            stays=stays,
             findings=reason.splitlines()[:100],
         )
 

@@ -1,9 +1,13 @@
 """Say which events are interventions in the machine's safety settings, and read them from the audit log. No I/O.
 
 Each event of the log belongs to a subject here, or to `NO_INTERVENTION`: a test compares both with the list of events.
+Each intervention has an entry in `CHANGES`, which says where its record has the state before and after it: another test
+compares the entries with the records that the appliance writes.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterator, Mapping
+from string import Formatter
+from typing import Any, NamedTuple
 
 import msgspec
 
@@ -65,8 +69,101 @@ NO_INTERVENTION = frozenset(
     }
 )  # fmt: skip
 
+_Detail = Mapping[str, Any]
 SUBJECT_OF = {event: subject for subject, events in SUBJECTS.items() for event in events}
-_TEXT = "sha256"
+
+READ = (*SUBJECT_OF, *GAPS)
+"""The events of which a report is made."""
+
+
+class StateChange(NamedTuple):
+    """The state before and after an intervention: texts with fields of the record's detail in braces.
+
+    `text_before` and `text_after` name the fields with the SHA-256 of a text; its changed lines are in `diff`.
+    """
+
+    before: str
+    after: str
+    text_before: str = ""
+    text_after: str = ""
+
+
+def _text(before: str = "", after: str = "", *, earlier: str = "earlier_sha256") -> StateChange:
+    return StateChange(before, after, earlier, "sha256")
+
+
+NOTHING_CHANGED = StateChange("", "")
+"""The order changed no setting: it looked, asked, exported, or was refused."""
+
+CHANGES: Mapping[str, StateChange] = {
+    "policy loaded": _text(),
+    "policy confirmed": StateChange("in force until its time limit", "confirmed"),
+    "policy file refused": NOTHING_CHANGED,
+    "specifications loaded": _text(),
+    "specifications confirmed": StateChange("in force until their time limit", "confirmed"),
+    "monitor enabled": StateChange("{earlier}", "enabled"),
+    "monitor disabled": StateChange("{earlier}", "disabled"),
+    "monitor in shadow mode": StateChange("{earlier}", "in shadow mode"),
+    "monitor set": StateChange("{before}", "{values}"),
+    "monitor resumed": StateChange("holds its topics", "released"),
+    "monitor not built": StateChange("loaded", "does nothing"),
+    "driver checked": NOTHING_CHANGED,
+    "authority handed over": StateChange("{earlier}", "{holder}"),
+    "approval given": StateChange("{earlier}", "{now}"),
+    "approval refused": StateChange("{earlier}", "{now}"),
+    "approval ended": StateChange("{earlier}", "{now}"),
+    "host blocked": StateChange("{earlier}", "blocked until {until}"),
+    "host unblocked": StateChange("{earlier}", "not blocked"),
+    "host block ended": StateChange("{earlier}", "not blocked"),
+    "door added": StateChange("no door", "address {address}, port {port}, from {source}"),
+    "door removed": StateChange("address {address}, port {port}, from {source}", "no door"),
+    "door ticket made": StateChange("no ticket", "ticket {ticket} until {expires}"),
+    "token added": StateChange("no token", "{role} until {expires}"),
+    "token revoked": StateChange("{role} until {expires}", "revoked"),
+    "token rotated": StateChange("{earlier} until {earlier_until}", "{id}, {role} until {expires}"),
+    "signed on": StateChange("no session", "{role} until {expires}, groups of doors: {groups}"),
+    "signed off": StateChange("{role}, groups of doors: {groups}", "no session"),
+    "host enrolled": StateChange("not enrolled", "{address}, certificate {serial} until {expires}"),
+    "host renewed": StateChange("certificate {replaced}", "certificate {serial} until {expires}"),
+    "host revoked": StateChange("{address}, certificate {serial}", "revoked"),
+    "host awaited": StateChange("no one-time token", "one-time token {id} for {address} until {expires}"),
+    "host awaited no longer": StateChange("one-time token {id} for {address} until {expires}", "revoked"),
+    "hosts reloaded": _text(),
+    "host authority replaced": _text(),
+    "alarm acknowledged": StateChange("{earlier}", "acknowledged"),
+    "alarm silenced": StateChange("{earlier}", "silenced until {until}"),
+    "alarm sounds again": StateChange("{earlier}", "not handled"),
+    "appliance started": StateChange("", "{version}"),
+    "appliance stopped": StateChange("runs", "stopped"),
+    "process started": StateChange("ended unexpectedly", "runs"),
+    "bundle in force": _text("{earlier}", "{bundle}"),
+    "bundle refused": StateChange("{stays}", "{stays}"),
+    "rest certificate replaced": _text(earlier="earlier"),
+    "switchover ordered": NOTHING_CHANGED,
+    "took over": StateChange("{other} serves, or none", "{appliance} serves"),
+    "handed over": StateChange("{appliance} serves", "{to} may serve"),
+    "graph adopted": StateChange("the robot's own master", "the appliance: {registrations} registrations"),
+    "graph released": StateChange("the appliance", "the robot's own master: {given} registrations"),
+    "recording removed": StateChange("SHA-256 {sha256}", "removed"),
+    "evidence exported": NOTHING_CHANGED,
+    "log set aside": StateChange("log {log} up to checkpoint {number}", "set aside"),
+}
+"""The state before and after each intervention. A start has the version before from the start before it."""
+
+_LASTING = {
+    **dict.fromkeys(("monitor enabled", "monitor disabled", "monitor in shadow mode"), "monitor"),
+    **dict.fromkeys(("host blocked", "host unblocked", "host block ended"), "host"),
+}
+"""The kinds of states that last until the next record: records of earlier versions lack the state before."""
+
+_TIMES = frozenset({"expires", "until", "earlier_until"})
+_NONE = {"until": "an order ends it", "source": "any address"}
+
+
+def fields_of(change: StateChange) -> set[str]:
+    """Return the names of the detail's fields that a record needs for its change."""
+    named = {name for text in change[:2] for _, name, _, _ in Formatter().parse(text) if name}
+    return named | set(filter(None, change[2:]))
 
 
 class Intervention(msgspec.Struct, frozen=True, kw_only=True):
@@ -75,6 +172,7 @@ class Intervention(msgspec.Struct, frozen=True, kw_only=True):
     `who` is a token, a person of single sign-on, `operator` for an order on the machine itself, or the appliance.
     `origin` is the address of the REST call, where one was found. `before` and `after` are values or versions;
     `sha256_before` and `sha256_after` those of a text, and `diff` the changed lines of it, if the log has them.
+    `names` are those that the addresses in these fields had then, by the records of enrolled hosts and doors.
     """
 
     sequence: int
@@ -93,83 +191,132 @@ class Intervention(msgspec.Struct, frozen=True, kw_only=True):
     sha256_before: str
     sha256_after: str
     diff: list[str]
+    names: dict[str, str] = {}
+
+
+class ReadRow(NamedTuple):
+    """An intervention, and what its record says about others.
+
+    `off` are all monitors that are not in force from then on, with their states; None if the record does not list them.
+    `loaded` are all monitors; None if the record does not list them.
+    """
+
+    row: Intervention
+    off: Mapping[str, str] | None
+    loaded: frozenset[str] | None
 
 
 class Interventions:
-    """Makes interventions of records in the order of the log, each with what was before it."""
+    """Makes interventions of records in order, each with what was before it.
 
-    def __init__(self, appliance: str = "") -> None:
-        self._appliance = appliance
-        self._hashes: dict[str, str] = {}
-        self._states: dict[str, str] = {}
-        self._settings: Mapping[str, str] | None = None
-        self.rows: list[Intervention] = []
+    The records are of one appliance, or of both of a pair, which share their state.
+    """
 
-    def add(self, entries: Iterable[LogEntry]) -> None:
-        for entry in entries:
-            self.rows.append(self._row(entry))
+    def __init__(self) -> None:
+        self.hosts: dict[str, str] = {}
+        """The names of addresses after the last record."""
+        self._states: dict[tuple[str, str], str] = {}
+        self._starts: dict[str, _Detail] = {}
 
-    def _row(self, entry: LogEntry) -> Intervention:
+    def read(self, entry: LogEntry, appliance: str = "") -> ReadRow:
+        """Return the intervention of a record, which must be of `SUBJECT_OF`."""
         record, detail = entry.record, entry.record.detail
-        before, after = self._values(record.event, record.resource or "", detail)
-        text = _hash_of(detail)
-        key = record.event
-        earlier = self._hashes.get(key, "") if text else ""
-        if text:
-            self._hashes[key] = text
+        self._name(record.event, record.resource, detail)
         named = (detail.get(name) for name in ("name", "address", "token"))
-        return Intervention(
+        what = str(record.resource or next(filter(None, named), None) or record.host or "")
+        change = CHANGES[record.event]
+        before, after = (_filled(text, detail) for text in change[:2])
+        sha256_before, sha256_after = (_hash(detail.get(name)) for name in change[2:])
+        if change.text_after:
+            sha256_before = self._earlier((record.event, what), sha256_before, sha256_after)
+        elif record.event == "appliance started":
+            before = self._earlier(("version", appliance), before, after)
+        elif record.event in _LASTING:
+            before = self._earlier((_LASTING[record.event], what), before, after)
+        addresses = {what, before, after, record.host or ""} & self.hosts.keys()
+        row = Intervention(
             sequence=entry.sequence, id=record.id, time=record.time, time_utc=rfc3339(record.time),
-            appliance=self._appliance, subject=SUBJECT_OF[record.event], event=record.event,
-            what=str(record.resource or next(filter(None, named), None) or record.host or ""),
+            appliance=appliance, subject=SUBJECT_OF[record.event], event=record.event, what=what,
             who=str(detail.get("who") or ""), origin="", reason=record.reason, before=before, after=after,
-            sha256_before=earlier, sha256_after=text,
-            diff=[*map(str, detail.get("diff") or ()), *self._changed_settings(detail)],
+            sha256_before=sha256_before, sha256_after=sha256_after,
+            diff=[*map(str, detail.get("diff") or ()), *self._changed_settings(detail, appliance)],
+            names={address: self.hosts[address] for address in sorted(addresses)},
         )  # fmt: skip
+        return ReadRow(row, _mapping(detail.get("off")), _names(detail))
 
-    def _values(self, event: str, what: str, detail: Mapping[str, object]) -> tuple[str, str]:
-        match event:
-            case "monitor set":
-                return _pairs(detail.get("before")), _pairs(detail.get("values"))
-            case "monitor enabled" | "monitor disabled" | "monitor in shadow mode":
-                return self._state(f"monitor {what}", event.removeprefix("monitor "))
-            case "authority handed over":
-                return str(detail.get("earlier", "")), str(detail.get("holder", ""))
-            case "host blocked" | "host unblocked" | "host block ended":
-                address = str(detail.get("address", what))
-                return self._state(f"host {address}", "blocked" if event == "host blocked" else "not blocked")
-            case "appliance started":
-                return self._state("version", str(detail.get("version", "")))
-        return "", ""
+    def _earlier(self, key: tuple[str, str], before: str, after: str) -> str:
+        """Return the state before, which records of earlier versions lack, and keep the state after."""
+        earlier = before or self._states.get(key, "")
+        self._states[key] = after
+        return earlier
 
-    def _changed_settings(self, detail: Mapping[str, object]) -> list[str]:
-        now, before = detail.get("configuration"), self._settings
+    def _name(self, event: str, resource: str | None, detail: _Detail) -> None:
+        """Learn the name of an address. A revoked host and a removed door keep theirs: no other gets the address."""
+        name = resource if event.startswith("door ") else detail.get("name")
+        if event in _NAMING and name and detail.get("address"):
+            self.hosts[str(detail["address"])] = str(name)
+
+    def _changed_settings(self, detail: _Detail, appliance: str) -> Iterator[str]:
+        now = detail.get("configuration")
         if not isinstance(now, Mapping):
-            return []
-        self._settings = now
-        names = sorted(now.keys() | before.keys()) if before is not None else []
-        return [
-            f"appliance.yaml: {name} changed"
-            for name in names
-            if before and before.get(name) != now.get(name)
-        ]
-
-    def _state(self, key: str, now: str) -> tuple[str, str]:
-        before = self._states.get(key, "")
-        self._states[key] = now
-        return before, now
-
-
-def _hash_of(detail: Mapping[str, object]) -> str:
-    found = detail.get(_TEXT)
-    if isinstance(found, Mapping):  # one for each file of specifications
-        return " ".join(f"{name}:{value}" for name, value in sorted(found.items()))
-    return str(found or "")
+            return
+        earlier, self._starts[appliance] = self._starts.get(appliance), detail
+        if earlier is None:
+            return
+        before = earlier["configuration"]
+        for name in sorted(now.keys() | before.keys()):
+            if before.get(name) != now.get(name):
+                yield f"appliance.yaml: {name} changed"
+                if "settings" in detail and "settings" in earlier:
+                    yield from _changed_values(
+                        name, *((one["settings"].get(name) or {}) for one in (earlier, detail))
+                    )
 
 
-def _pairs(values: object) -> str:
-    return (
-        ", ".join(f"{name} = {value}" for name, value in sorted(values.items()))
-        if isinstance(values, Mapping)
-        else ""
-    )
+_NAMING = frozenset({"host enrolled", "host awaited", "door added"})
+
+
+def _changed_values(section: str, before: _Detail, after: _Detail) -> Iterator[str]:
+    for name in sorted(before.keys() | after.keys()):
+        if before.get(name) != after.get(name):
+            yield f"-{section}.{name}: {before.get(name, 'the default')}"
+            yield f"+{section}.{name}: {after.get(name, 'the default')}"
+
+
+def _filled(text: str, detail: _Detail) -> str:
+    """Return the text with the fields of a record, or an empty one if the record lacks one of them."""
+    names = [name for _, name, _, _ in Formatter().parse(text) if name]
+    if any(name not in detail for name in names):
+        return ""
+    return text.format_map({name: _words(name, detail[name]) for name in names})
+
+
+def _words(name: str, value: object) -> str:
+    if value is None:
+        return _NONE.get(name, "none")
+    if name in _TIMES and isinstance(value, int | float) and not isinstance(value, bool):
+        return rfc3339(round(value * 1_000_000_000))[:19] + "Z"
+    if isinstance(value, Mapping):
+        return ", ".join(f"{one} = {_plain(found)}" for one, found in sorted(value.items()))
+    if isinstance(value, list | tuple):
+        return ", ".join(map(str, value)) or "none"
+    return str(value) or "none"
+
+
+def _plain(value: object) -> str:
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def _hash(value: object) -> str:
+    if isinstance(value, Mapping):  # one for each file, in records of earlier versions
+        return " ".join(f"{name}:{digest}" for name, digest in sorted(value.items()))
+    return str(value or "")
+
+
+def _mapping(value: object) -> Mapping[str, str] | None:
+    return {str(name): str(state) for name, state in value.items()} if isinstance(value, Mapping) else None
+
+
+def _names(detail: _Detail) -> frozenset[str] | None:
+    found = detail.get("monitors")
+    return frozenset(map(str, found)) if isinstance(found, list) and "cut" not in detail else None

@@ -6,12 +6,16 @@ from typing import Any
 from appliance.base.counted import counted
 from appliance.channel.answers.policy_answers import PolicyInForce
 from appliance.channel.answers.token_answers import Tokens
-from appliance.features.logbook.machine_report import MachineInterface
+from appliance.features.logbook.machine_report import MachineInterface, MachineRight
 from appliance.policy.model import Category
 from appliance.policy.policy import Policy
-from appliance.policy.sections import BY_CATEGORY
 
 _ACTS = (Category.PUBLISH, Category.CALL, Category.WRITE)
+_WORDS = {Category.PUBLISH: "publish", Category.CALL: "call", Category.WRITE: "write"}
+_STOP = "stop the robot remotely"
+_ALSO_STOPS = {
+    Category.PUBLISH: f" ({_STOP}, if it takes commands)", Category.CALL: f" ({_STOP}, if it is a stop)",
+}  # fmt: skip
 
 
 def interfaces(
@@ -65,31 +69,38 @@ def interfaces(
         )  # fmt: skip
 
 
-def rights(policy: Policy, in_force: PolicyInForce, tokens: Tokens) -> Iterator[str]:
-    """Yield a sentence for each way to act on the machine, or to change its safety settings."""
+def rights(policy: Policy, in_force: PolicyInForce, tokens: Tokens) -> Iterator[MachineRight]:
+    """Yield each right to act on the machine, or to change its safety settings."""
     usable = [token for token in tokens.tokens if token.valid and token.revoked is None]
-    for role, may in (
-        ("admin", "change policies, monitors and guards"),
-        (
-            "operator",
-            "load policies and guards that exist already, set guards, switch monitors, block hosts, approve",
-        ),
-    ):
-        names = sorted({token.name for token in usable if token.role == role})
-        yield f"{role} tokens ({may}): {', '.join(names) or 'none'}"
-    keys = in_force.site_keys
-    yield (
-        f"policies and monitors must be signed by one of {counted(len(keys), 'site key')}"
-        if keys
-        else "policies and monitors need no signature of the site: root and admin tokens can change them"
+    admins, operators = (
+        ", ".join(sorted({token.name for token in usable if token.role == role})) or "no token"
+        for role in ("admin", "operator")
     )
-    yield "on the appliance's machine, root and its group can give every order"
+    keys = in_force.site_keys
+    signed = f", signed by one of {counted(len(keys), 'site key')}" if keys else ""
+    yield MachineRight(what="every order", who="root and the appliance's group", by="the appliance's machine")
+    yield MachineRight(
+        what=f"change policies, monitors and guards{signed}", who=admins, by="token, role admin"
+    )
+    yield MachineRight(
+        what="load policies and guards that exist already, set guards' values, switch monitors, approve", who=operators,
+        by="token, role operator",
+    )  # fmt: skip
+    yield MachineRight(
+        what=f"{_STOP}: block a host, whose motions guards then stop", who=f"{admins}; {operators}",
+        by="token, role admin or operator",
+    )  # fmt: skip
+    yield from _ends(policy)
     for category in _ACTS:
         for rule in policy.rules(category):
-            section = BY_CATEGORY[category].name
-            verb = f" {category.value}" if len(BY_CATEGORY[category].categories) > 1 else ""
-            yield f"[{section}]{verb} {rule.key.text if rule.key is not None else 'default'}: {rule.shown}"
-    for name in ("shutdown",):
-        for rule in policy.rules(Category.COMMAND):
-            if rule.key is None or rule.key.text == name:
-                yield f"end a node (shutdown): {rule.shown}, by {rule.place}"
+            name = rule.key.text if rule.key is not None else "all others"
+            yield MachineRight(
+                what=f"{_WORDS[category]} {name}{_ALSO_STOPS.get(category, '')}", who=rule.shown,
+                by=rule.place,
+            )  # fmt: skip
+
+
+def _ends(policy: Policy) -> Iterator[MachineRight]:
+    for rule in policy.rules(Category.COMMAND):
+        if rule.key is None or rule.key.text == "shutdown":
+            yield MachineRight(what=f"{_STOP}: end a node", who=rule.shown, by=rule.place)

@@ -1,15 +1,18 @@
-"""Read interventions, gaps and their origins from the audit log of an appliance."""
+"""Read interventions, gaps and their origins from the audit logs of an appliance, or of a pair."""
 
-import heapq
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Annotated
 
 import msgspec
+import typer
 
 from appliance.audit.log.record_format import LogEntry
 from appliance.audit.search.query import Filter
 from appliance.base.actors import DISK, OPERATOR, UNCONFIRMED
 from appliance.cli.connection.audit_file import FileLog
 from appliance.cli.connection.audit_over_rest import RestLog
+from appliance.cli.output import usage_error
 from appliance.features.logbook.interventions import Intervention
 
 _ORIGIN_SECONDS = 60
@@ -18,13 +21,40 @@ _LOCAL = {"", OPERATOR, DISK, UNCONFIRMED}
 _READS = ("GET", "HEAD")
 
 Log = FileLog | RestLog
+Other = Annotated[
+    Path | None,
+    typer.Option(
+        "--other",
+        metavar="DIR",
+        help="State directory, or a copy, of the other appliance of a pair: of both logs",
+    ),
+]
 
 
-def entries_of(log: Log, events: Iterable[str]) -> Iterator[LogEntry]:
-    """Yield the records of some events in the order of the log. Raises `LogUnreadableError` and `FilterError`."""
-    return heapq.merge(
-        *(log.export(Filter(event=event)) for event in events), key=lambda entry: entry.sequence
-    )
+def logs_of(own: Log, other: Path | None, verb: str) -> dict[str, Log]:
+    """Return the log, or both logs of a pair by the names of their appliances. Exits with 2 for a wrong `--other`."""
+    if other is None:
+        return {"": own}
+    if isinstance(own, RestLog):
+        raise usage_error(
+            "--other needs the logs' files: give --state, on any machine with copies of both", verb=verb
+        )
+    if not other.is_dir():
+        raise usage_error(
+            f"{other}: no such directory; give the other appliance's state directory", verb=verb
+        )
+    partner = FileLog(other)
+    if own.present() == partner.present():
+        raise usage_error(f"{other}: the same log as that of --state; give the other appliance's", verb=verb)
+    found: dict[str, Log] = {_name_in(own) or "this appliance": own}
+    found[_name_in(partner) or "the other appliance"] = partner
+    return found
+
+
+def _name_in(log: FileLog) -> str:
+    """Return the name of the appliance that wrote a log, or an empty string if it never took over."""
+    taken = next(iter(log.of_events(("took over", "handed over"))), None)
+    return "" if taken is None else str(taken.record.detail.get("appliance", ""))
 
 
 def with_origin(log: Log, row: Intervention) -> Intervention:

@@ -1,5 +1,6 @@
 """The command `rosrv report interventions`."""
 
+import ipaddress
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -21,26 +22,25 @@ from appliance.cli.connection.audit_file import FileLog
 from appliance.cli.connection.target import Appliance, speaks_with
 from appliance.cli.output import say_json, usage_error, write_new
 from appliance.features.logbook import live_facts
-from appliance.features.logbook.interventions import GAPS, SUBJECT_OF, Interventions
-from appliance.features.logbook.log_source import Log, entries_of, with_origin
+from appliance.features.logbook.interventions import READ
+from appliance.features.logbook.log_source import Log, Other, logs_of, with_origin
 from appliance.features.logbook.machine_report import (
-    BLOCKED,
-    OFF,
-    RUNS,
     MachineInterface,
     MachineReport,
+    MachineRight,
     Period,
+    ReportedLog,
     VerificationResult,
-    driver_spans,
-    gaps_of,
-    pauses,
-    spans,
+    merged,
+    read_records,
 )
 from appliance.features.logbook.report_words import page, report_lines
-from appliance.policy.policy_compiler import compile_policy
+from appliance.policy.judgement import PolicyContext
+from appliance.policy.model import address_of
 from appliance.policy.policy_findings import PolicyError
 from rosmop.tool.terminal import say
 
+_VERIFY, _VERIFY_BOTH = "rosrv audit verify", "rosrv audit verify --other DIR"
 _VERB = "rosrv report"
 
 
@@ -54,6 +54,7 @@ def report_interventions(
         Path | None,
         typer.Option(metavar="FILE", help="From the end of an earlier report on (its --json output)"),
     ] = None,
+    other: Other = None,
     output: Annotated[
         Path | None,
         typer.Option(
@@ -66,7 +67,7 @@ def report_interventions(
     The report has all changes of the policy, guards, monitors, driving rights, approvals, blocks, doors, tokens, hosts,
     alarms and software, what was off or blocked and for how long, who drove, the interfaces of now, and the gaps of the
     log. It contains no secret and no value of a parameter. It does not verify the log: `rosrv audit verify` does, and
-    the report names its last result on this machine. Each appliance of a pair reports its own log.
+    the report names its last result on this machine. With --other, it is about both appliances of a pair.
 
     Example: rosrv report interventions --since 2026-03-01 --until 2026-04-01 --output march.html
     """
@@ -78,7 +79,7 @@ def report_interventions(
             _end_of(after) if after is not None else None if since is None else parse_timestamp(since, now)
         )
         end = now if until is None else parse_timestamp(until, now)
-        found = _report(appliance, begin, end)
+        found = _report(appliance, begin, end, other)
     if output is not None:
         write_new(output, page(found, appliance.host_in_words), verb=_VERB)
         sys.stderr.write(f"rosrv: written to {output}\n")
@@ -89,34 +90,30 @@ def report_interventions(
             say(line)
 
 
-def _report(appliance: Appliance, since: int | None, end: int) -> MachineReport:
-    log = appliance.audit()
-    first = next(iter(log.export(Filter())), None)
-    begins = end if first is None else first.record.time
-    period = Period(begins if since is None else since, end)
-    read = Interventions()
-    read.add(entries_of(log, SUBJECT_OF))
-    rows = [with_origin(log, row) for row in read.rows if period.has(row.time)]
-    starts = [row for row in read.rows if row.event in ("appliance started", "appliance stopped")]
-    gaps = sorted(
-        [*gaps_of(entries_of(log, GAPS), period), *pauses(starts, period)], key=lambda gap: gap.time_utc
+def _report(appliance: Appliance, since: int | None, end: int, other: Path | None) -> MachineReport:
+    logs = logs_of(appliance.audit(), other, _VERB)
+    sources = [_reported(name, log) for name, log in logs.items()]
+    begins = min((one.begins_utc for one in sources if one.begins_utc), default="")
+    if since is None:
+        since = parse_timestamp(begins, end) if begins else end
+    period = Period(since, end)
+    read = read_records(
+        merged({name: log.of_events(READ) for name, log in logs.items()}),
+        period,
+        lambda row: with_origin(logs[row.appliance], row),
     )
     facts = _Live.of(appliance)
     return MachineReport(
-        robot=facts.robot, logs=_names(log), since_utc=rfc3339(period.since), until_utc=rfc3339(end),
-        made_utc=rfc3339(clock.wall_ns()), version=__version__,
-        log_begins_utc="" if first is None else rfc3339(begins), interventions=rows,
-        switched_off=spans(read.rows, OFF, period), blocks=spans(read.rows, BLOCKED, period),
-        software=spans(read.rows, RUNS, period, one=True), drivers=driver_spans(read.rows, period),
-        interfaces=facts.interfaces, rights=facts.rights, live_reason=facts.reason, gaps=gaps,
-        verification=_verification(log),
+        robot=facts.robot, logs=sources, since_utc=rfc3339(period.since), until_utc=rfc3339(end),
+        made_utc=rfc3339(clock.wall_ns()), version=__version__, verify=_VERIFY if other is None else _VERIFY_BOTH,
+        interfaces=facts.interfaces, rights=facts.rights, live_reason=facts.reason, **msgspec.structs.asdict(read),
     )  # fmt: skip
 
 
 class _Live(msgspec.Struct):
     robot: str = ""
     interfaces: list[MachineInterface] = []
-    rights: list[str] = []
+    rights: list[MachineRight] = []
     reason: str = ""
 
     @classmethod
@@ -131,8 +128,13 @@ class _Live(msgspec.Struct):
             if not answer.ok:
                 return cls(reason=f"not known: {answer.error}")
         state, text, made = msgspec.to_builtins(status.given()), policy.given(), tokens.given()
+        known = PolicyContext(
+            {name: address_of(address) for name, address in text.hosts.items()},
+            [ipaddress.ip_network(place) for place in text.robot],
+            own=[ipaddress.ip_address(address) for address in text.own],
+        )
         try:
-            compiled = compile_policy(text.text, file=text.file)
+            compiled = known.compiled(text.text, text.file)
         except PolicyError as error:
             return cls(
                 reason=f"not known: this program's version does not read the policy in force: {error.findings[0]}"
@@ -144,12 +146,18 @@ class _Live(msgspec.Struct):
         )
 
 
-def _names(log: Log) -> list[str]:
-    return [log.present()] if isinstance(log, FileLog) else []
+def _reported(name: str, log: Log) -> ReportedLog:
+    first = log.search(Filter(), None, 1, newest_first=False).entries
+    at_hand = log if isinstance(log, FileLog) else None
+    return ReportedLog(
+        name=name, id=at_hand.present() if at_hand is not None else "",
+        begins_utc=rfc3339(first[0].record.time) if first else "",
+        last=log.last(), verification=_verification(at_hand) if at_hand is not None else None,
+    )  # fmt: skip
 
 
-def _verification(log: Log) -> VerificationResult | None:
-    stored = last_verification(log.path) if isinstance(log, FileLog) else None
+def _verification(log: FileLog) -> VerificationResult | None:
+    stored = last_verification(log.path)
     return None if stored is None else msgspec.convert(msgspec.to_builtins(stored), VerificationResult)
 
 

@@ -1,54 +1,159 @@
 """Put a report into words: lines for a terminal, and one page for paper. No I/O."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import NamedTuple
 
 from appliance.base.counted import counted
 from appliance.features.logbook.interventions import SUBJECTS, Intervention
-from appliance.features.logbook.machine_report import LastingState, MachineReport
+from appliance.features.logbook.machine_report import Gap, LastingState, MachineReport, ReportedLog
 from appliance.formats.html_page import Cells, head, lines, section, text
 
 _TITLE = "Interventions in the safety settings of a machine"
-_NO_VERIFICATION = "no result of `rosrv audit verify` is stored here: run it, on the machine, as root"
 _TAMPERING = (
     "Each record has the hash of the one before it, and checkpoints of this chain are signed. A changed, removed or"
-    " inserted record is found by `rosrv audit verify`; a log that root replaced as a whole, or cut at its end, by"
+    " inserted record is found by `{verify}`; a log that root replaced as a whole, or cut at its end, by"
     " comparison with checkpoints that were kept on another machine (`--checkpoints`), by the signer's memory, or by"
-    " the collector. This report is not signed: make it again from the log."
+    " the collector. The last result is stored beside the log and is not signed, and neither is this report: verify the"
+    " log, and make the report again from it."
 )
 _SPAN = ("what", "state", "from (UTC)", "to (UTC)", "by", "ended by", "reason")
-_ROW = ("time (UTC)", "record", "event", "what", "who", "from", "before", "after", "reason")
+_ROW = ("time (UTC)", "event", "what", "before", "after", "who", "reason", "record")
+InWords = Callable[[str], str]
 
 
-def page(report: MachineReport, in_words: Callable[[str], str] = str) -> str:
-    """Return a self-contained HTML page without scripts. `in_words` names hosts."""
-    parts = [head(_TITLE), f"<h1>{_TITLE}</h1>\n"]
-    parts += section("About this report", (), _facts(report))
-    for subject in SUBJECTS:
-        rows = [row for row in report.interventions if row.subject == subject]
+class _Section(NamedTuple):
+    title: str
+    columns: Sequence[str]
+    rows: Sequence[Cells]
+    empty: str
+    below: str = ""
+
+
+class ReportPage:
+    """A self-contained HTML page without scripts. `in_words` names hosts by the policy of now."""
+
+    def __init__(self, report: MachineReport, in_words: InWords = str) -> None:
+        self._report = report
+        self._in_words = in_words
+        self._named = any(log.name for log in report.logs)  # a column for the appliances or robots
+
+    def text(self) -> str:
+        sections = list(self._sections())
+        numbers = {one.title: number for number, one in enumerate(sections, start=1)}
+        parts = [head(_TITLE), f"<h1>{_TITLE}</h1>\n"]
+        parts += section("About this report", (), _facts(self._report, _time))
         parts += section(
-            subject[0].upper() + subject[1:], _ROW, [_cells(row, in_words) for row in rows], "No record."
+            "Answers",
+            ("question", "answer", "in"),
+            [(*row, f"{numbers[title]}") for *row, title in self._answers()],
         )
-        for row in rows:
-            if row.diff:
-                parts.append(f"<p>{text(row.time_utc)}: changed lines of record {text(row.id)}:</p>\n")
-                parts.append(f"<pre>{lines(chr(10).join(row.diff))}</pre>\n")
-    for title, spans, empty in _spans(report):
-        parts += section(title, _SPAN, [_span(span, in_words) for span in spans], empty)
-    parts += section(
-        "Interfaces now, and what protects each", ("interface", "where", "commands", "protection"),
-        [(row.name, row.where, row.commands, row.protection) for row in report.interfaces], report.live_reason,
-    )  # fmt: skip
-    parts += section("Rights on the machine now", (), [(row,) for row in report.rights], report.live_reason)
-    parts += section(
-        "Completeness of the log", ("time (UTC)", "event", "reason"),
-        [(row.time_utc, row.event, row.reason) for row in report.gaps],
-        "The log has no record of a gap in this period.",
-    )  # fmt: skip
-    parts += section("Verification", (), [(_verification(report),), (_TAMPERING,)])
-    return "".join(parts)
+        for one in sections:
+            parts += section(f"{numbers[one.title]}. {one.title}", one.columns, one.rows, one.empty)
+            parts.append(one.below)
+        return "".join(parts)
+
+    def _sections(self) -> Iterator[_Section]:
+        report = self._report
+        for subject in SUBJECTS:
+            rows = [row for row in report.interventions if row.subject == subject]
+            below = "".join(map(self._diff, rows))
+            cells = [self._row(row) for row in rows]
+            yield _Section(_title(subject), self._columns(_ROW), cells, "No record.", below)
+        for title, spans, empty in _spans(report):
+            yield _Section(title, self._columns(_SPAN), [self._span(span) for span in spans], empty)
+        ways = [(row.name, row.where, row.commands, row.protection) for row in report.interfaces]
+        yield _Section(
+            _INTERFACES, ("interface", "where", "commands", "protection"), ways, report.live_reason
+        )
+        rights = [(row.what, row.who, row.by) for row in report.rights]
+        yield _Section(_RIGHTS, ("right", "who", "by"), rights, report.live_reason)
+        gaps = [
+            (*self._name(row.appliance), _time(row.time_utc), row.event, row.reason) for row in report.gaps
+        ]
+        yield _Section(_GAPS, self._columns(("time (UTC)", "event", "reason")), gaps, _NO_GAP)
+        verified = [(*self._name(log.name), _verification(log, report.verify)) for log in report.logs]
+        below = f"<p>{text(_TAMPERING.format(verify=report.verify))}</p>\n"
+        yield _Section(_VERIFICATION, (), verified, "no log", below)
+
+    def _answers(self) -> Iterator[tuple[str, str, str]]:
+        """Yield questions, short answers, and the title of the section with the whole answer."""
+        report = self._report
+        rows = report.interventions
+        values = [row for row in rows if row.event == "monitor set"]
+        loads = [row for row in rows if row.event == "policy loaded"]
+        live = report.live_reason
+        yield "Who may stop the robot remotely?", live or _who(report, "stop the robot"), _RIGHTS
+        yield (
+            "Who can change policies, monitors and guards?",
+            live or _who(report, "change policies"),
+            _RIGHTS,
+        )
+        yield (
+            "Which interfaces take commands, and what protects each?",
+            live or ", ".join(row.name for row in report.interfaces if row.commands),
+            _INTERFACES,
+        )
+        yield "Who changed a guard's value, from what to what?", _last(values), _title("guards and monitors")
+        yield "Who changed the policy?", _last(loads), _title("policy")
+        yield "Was a guard off, when, by whose order?", _states(report.switched_off), _OFF
+        yield "Who drove, and when?", _states(report.drivers), _DRIVERS
+        yield "Which hosts were blocked?", _states(report.blocks), _BLOCKED
+        yield (
+            "Who approved calls of agents?",
+            _last([row for row in rows if row.event == "approval given"]),
+            _title("approvals"),
+        )
+        yield "Which software ran?", ", ".join(dict.fromkeys(one.state for one in report.software)), _SOFTWARE
+        yield "Does the log have gaps, and why?", _gap_words(report.gaps), _GAPS
+        yield (
+            "Was the log changed, and how would one know?",
+            "; ".join(_verdict(log) for log in report.logs),
+            _VERIFICATION,
+        )
+
+    # --- rows ---
+
+    def _columns(self, columns: Sequence[str]) -> Sequence[str]:
+        return ("machine", *columns) if self._named else columns
+
+    def _name(self, name: str) -> Cells:
+        return (name,) if self._named else ()
+
+    def _row(self, row: Intervention) -> Cells:
+        before, after = (_value(row, which, self._in_words) for which in ("before", "after"))
+        return (
+            *self._name(row.appliance), _time(row.time_utc), row.event, _host(row.what, row.names, self._in_words),
+            before, after, _author(row, self._in_words), row.reason, f"{row.sequence}",
+        )  # fmt: skip
+
+    def _diff(self, row: Intervention) -> str:
+        if not row.diff:
+            return ""
+        name = f"{row.appliance}, " if row.appliance else ""
+        title = f"Changed lines of record {name}{row.sequence} ({row.event}, {_time(row.time_utc)}):"
+        return f"<p>{text(title)}</p>\n<pre>{lines(chr(10).join(row.diff))}</pre>\n"
+
+    def _span(self, span: LastingState) -> Cells:
+        return (
+            *self._name(span.appliance), _host(span.what, span.names, self._in_words),
+            _host(span.state, span.names, self._in_words), _time(span.since_utc),
+            _time(span.until_utc) if span.until_utc else "lasts", span.by, span.ended_by, span.reason,
+        )  # fmt: skip
 
 
-def report_lines(report: MachineReport, in_words: Callable[[str], str] = str) -> Iterator[str]:
+_OFF, _BLOCKED, _DRIVERS, _SOFTWARE = (
+    "Guards and monitors that were off", "Hosts that were blocked", "Drivers", "Software that ran",
+)  # fmt: skip
+_INTERFACES, _RIGHTS = "Interfaces now, and what protects each", "Rights on the machine now"
+_GAPS, _VERIFICATION = "Completeness of the log", "Verification"
+_NO_GAP = "The log has no record of a gap in this period."
+
+
+def page(report: MachineReport, in_words: InWords = str) -> str:
+    return ReportPage(report, in_words).text()
+
+
+def report_lines(report: MachineReport, in_words: InWords = str) -> Iterator[str]:
     """Yield the lines for a terminal, in the order of the page."""
     yield from (f"{name}: {value}" for name, value in _facts(report))
     for subject in SUBJECTS:
@@ -56,88 +161,148 @@ def report_lines(report: MachineReport, in_words: Callable[[str], str] = str) ->
         if rows:
             yield f"{subject}:"
         for row in rows:
-            who = " ".join(filter(None, (row.who, row.origin and f"from {in_words(row.origin)}")))
-            change = f" ({row.before or 'unknown'} -> {row.after})" if row.after else ""
-            what = f" {in_words(row.what)}" if row.what else ""
-            yield f"  {row.time_utc}  {row.event}{what}{change} by {who or 'the appliance'}: {row.reason}"
+            what = f" {_host(row.what, row.names, in_words)}" if row.what else ""
+            name = f"{row.appliance}  " if row.appliance else ""
+            yield f"  {row.time_utc}  {name}{row.event}{what}{_change(row, in_words)}: {row.reason}"
             yield from (f"      {line}" for line in row.diff)
     for title, spans, empty in _spans(report):
         yield f"{title}:" if spans else f"{title}: {empty}"
         for span in spans:
             until = span.until_utc or "now"
             by = f" by {span.by}" if span.by else ""
-            yield f"  {span.since_utc} to {until}  {in_words(span.what)}: {in_words(span.state)}{by}"
+            what, state = (_host(one, span.names, in_words) for one in (span.what, span.state))
+            yield f"  {span.since_utc} to {until}  {what}: {state}{by}"
     if report.live_reason:
         yield f"interfaces and rights: {report.live_reason}"
     yield from (
         f"interface {row.name} at {row.where}: {row.commands}; {row.protection}" for row in report.interfaces
     )
-    yield from report.rights
-    yield from (f"gap {row.time_utc}  {row.event}: {row.reason}" for row in report.gaps)
-    yield _verification(report)
+    yield from (f"right: {row.what}: {row.who} ({row.by})" for row in report.rights)
+    for gap in report.gaps:
+        name = f"{gap.appliance}  " if gap.appliance else ""
+        yield f"gap {gap.time_utc}  {name}{gap.event}: {gap.reason}"
+    for log in report.logs:
+        yield (
+            f"{log.name}: {_verification(log, report.verify)}"
+            if log.name
+            else _verification(log, report.verify)
+        )
 
 
-def _facts(report: MachineReport) -> Iterator[tuple[str, str]]:
+def host_words(address: str, names: Mapping[str, str], in_words: InWords) -> str:
+    """Return a host by the name that the records give it, or by its address and its name in the policy of now."""
+    if address in names:
+        return f"{names[address]} ({address})"
+    label = in_words(address).removesuffix(f" ({address})")
+    return address if label == address else f"{address} (now {label})"
+
+
+_host = host_words
+
+
+def _facts(report: MachineReport, time: Callable[[str], str] = str) -> Iterator[tuple[str, str]]:
     yield "machine", report.robot or "(no name in appliance.yaml)"
-    yield "period", f"{report.since_utc} to {report.until_utc}"
-    yield "made", f"{report.made_utc}, by ROSRV {report.version}"
-    yield (
-        "audit log",
-        f"{', '.join(report.logs)}; its first record is of {report.log_begins_utc or 'no time: it is empty'}",
-    )
-    if report.log_begins_utc > report.since_utc:
-        yield "not covered", f"{report.since_utc} to {report.log_begins_utc}: the log begins later"
+    yield "period (UTC)", f"{time(report.since_utc)} to {time(report.until_utc)}"
+    yield "made (UTC)", f"{time(report.made_utc)}, by ROSRV {report.version}"
+    for log in report.logs:
+        name = f"audit log of {log.name}" if log.name else "audit log"
+        begins = time(log.begins_utc) if log.begins_utc else "no time: it is empty"
+        yield (
+            name,
+            f"{log.id or '(read over REST)'}, up to record {log.last}; its first record is of {begins}",
+        )
+        if log.begins_utc > report.since_utc:
+            yield "not covered", f"{time(report.since_utc)} to {begins}: the {name} begins later"
+    if len(report.logs) > 1:
+        yield "order", "by the time of each record, which is that of its own machine's clock"
     yield "interventions", str(len(report.interventions))
 
 
 def _spans(report: MachineReport) -> Iterable[tuple[str, Sequence[LastingState], str]]:
     return (
-        (
-            "Guards and monitors that an order switched off",
-            report.switched_off,
-            "none in this period; one that was loaded and never enabled is not listed here",
-        ),
-        ("Hosts that were blocked", report.blocks, "none in this period"),
-        ("Drivers", report.drivers, "no record that a host held a group of [Authority] in this period"),
-        ("Software that ran", report.software, "no start in the log"),
+        (_OFF, report.switched_off, "none in this period"),
+        (_BLOCKED, report.blocks, "none in this period"),
+        (_DRIVERS, report.drivers, "no record that a host held a group of [Authority] in this period"),
+        (_SOFTWARE, report.software, "no start in the log"),
     )
 
 
-def _cells(row: Intervention, in_words: Callable[[str], str]) -> Cells:
-    before = row.before or (row.sha256_before and f"SHA-256 {row.sha256_before}")
-    after = row.after or (row.sha256_after and f"SHA-256 {row.sha256_after}")
-    origin = in_words(row.origin) if row.origin else ""
-    return (
-        row.time_utc,
-        row.id,
-        row.event,
-        in_words(row.what),
-        row.who or "the appliance",
-        origin,
-        before,
-        after,
-        row.reason,
+def _title(subject: str) -> str:
+    return subject[0].upper() + subject[1:]
+
+
+def _time(utc: str) -> str:
+    """Return a time (UTC) to the second for paper; a terminal and JSON have nanoseconds."""
+    return f"{utc[:10]} {utc[11:19]}" if utc[10:11] == "T" else utc
+
+
+def _value(row: Intervention, which: str, in_words: InWords) -> str:
+    words, digest = (row.before, row.sha256_before) if which == "before" else (row.after, row.sha256_after)
+    parts = (_host(words, row.names, in_words) if words else "", digest and f"SHA-256 {digest}")
+    return ", ".join(filter(None, parts))
+
+
+def _author(row: Intervention, in_words: InWords) -> str:
+    origin = f"from {_host(row.origin, row.names, in_words)}" if row.origin else ""
+    return " ".join(filter(None, (row.who or "the appliance", origin)))
+
+
+def _change(row: Intervention, in_words: InWords) -> str:
+    author = f" by {_author(row, in_words)}"
+    if not row.after:
+        return author
+    before, after = (_host(words, row.names, in_words) for words in (row.before or "unknown", row.after))
+    return f" ({before} -> {after}){author}"
+
+
+def _who(report: MachineReport, what: str) -> str:
+    return "; ".join(f"{row.who} ({row.by})" for row in report.rights if what in row.what) or "no one"
+
+
+def _last(rows: Sequence[Intervention]) -> str:
+    if not rows:
+        return "no record in this period"
+    row = rows[-1]
+    change = f": {row.what} {row.before} → {row.after}" if row.before and row.after else f": {row.reason}"
+    times = f"{counted(len(rows), 'record')}, the last at" if len(rows) > 1 else "at"
+    return f"{times} {_time(row.time_utc)} by {row.who or 'the appliance'}{change}"
+
+
+def _states(spans: Sequence[LastingState]) -> str:
+    if not spans:
+        return "none in this period"
+    names = ", ".join(dict.fromkeys(span.what for span in spans))
+    last = sum(not span.until_utc for span in spans)
+    return f"{counted(len(spans), 'time')} ({names}); {last} of them last"
+
+
+def _gap_words(gaps: Sequence[Gap]) -> str:
+    if not gaps:
+        return "no record of a gap in this period"
+    return ", ".join(
+        f"{event}: {sum(gap.event == event for gap in gaps)}" for event in sorted({gap.event for gap in gaps})
     )
 
 
-def _span(span: LastingState, in_words: Callable[[str], str]) -> Cells:
-    until = span.until_utc or "lasts"
-    return (
-        in_words(span.what),
-        in_words(span.state),
-        span.since_utc,
-        until,
-        span.by,
-        span.ended_by,
-        span.reason,
-    )
+def _verdict(log: ReportedLog) -> str:
+    name, found = f"{log.name}: " if log.name else "", log.verification
+    if found is None:
+        return f"{name}not verified, as far as this machine knows"
+    verdict = "complete and unchanged" if found.complete else "NOT complete or changed"
+    return f"{name}{verdict}, at {_time(found.time_utc)}, up to record {found.through}"
 
 
-def _verification(report: MachineReport) -> str:
-    result = report.verification
+def _verification(log: ReportedLog, verify: str) -> str:
+    result = log.verification
     if result is None:
-        return f"last verification: {_NO_VERIFICATION}"
+        return f"last verification: none is stored here: run `{verify}`"
     verdict = "complete and unchanged" if result.complete else "NOT complete or changed"
-    return (
+    text = (
         f"last verification: {result.time_utc}, {counted(result.records, 'record')}: {verdict}: {result.text}"
     )
+    if result.log and log.id and result.log != log.id:
+        return f"{text}. It is of another log ({result.log}), and says nothing of this one: run `{verify}`"
+    if result.through and log.last > result.through:
+        later = counted(log.last - result.through, "later record is", "later records are")
+        return f"{text}. {later} not verified: run `{verify}`"
+    return text

@@ -11,12 +11,13 @@ from appliance.base.timestamps import parse_timestamp
 from appliance.cli.audit.audit_errors import Errors
 from appliance.cli.connection.target import Appliance, speaks_with
 from appliance.cli.output import say_json, usage_error
-from appliance.features.logbook.interventions import Interventions
-from appliance.features.logbook.log_source import entries_of
-from appliance.features.logbook.machine_report import ENDS_OF_DRIVING, Period, driver_spans
+from appliance.features.logbook.log_source import Other, logs_of
+from appliance.features.logbook.machine_report import ENDS_OF_DRIVING, Period, merged, read_records
+from appliance.features.logbook.report_words import host_words
 from rosmop.tool.terminal import say
 
-_EVENTS = ("authority handed over", *ENDS_OF_DRIVING)
+_VERB = "rosrv who-drove"
+_EVENTS = ("authority handed over", "host enrolled", "host awaited", "door added", *ENDS_OF_DRIVING)
 
 
 @speaks_with("One JSON object for each time that a host held a group")
@@ -30,6 +31,7 @@ def who_drove(
         tuple[str, str] | None,
         typer.Option("--between", metavar="TIME TIME", help="From the first to the second time"),
     ] = None,
+    other: Other = None,
 ) -> None:
     """List the hosts that held a group of [Authority] at a time, since when, and by whose order.
 
@@ -41,26 +43,26 @@ def who_drove(
     with Errors():
         now = clock.wall_ns()
         if (at is None) == (between is None):
-            raise usage_error("give --at TIME or --between TIME TIME", verb="rosrv who-drove")
+            raise usage_error("give --at TIME or --between TIME TIME", verb=_VERB)
         first, last = between or (at or "", at or "")
         begin, end = parse_timestamp(first, now), parse_timestamp(last, now)
         if begin > end:
-            raise usage_error(f"--between: {first} is after {last}", verb="rosrv who-drove")
-        read = Interventions()
-        read.add(entries_of(appliance.audit(), _EVENTS))
+            raise usage_error(f"--between: {first} is after {last}", verb=_VERB)
+        logs = logs_of(appliance.audit(), other, _VERB)
+        read = read_records(
+            merged({name: log.of_events(_EVENTS) for name, log in logs.items()}), Period(begin, end + 1)
+        )
         # A span that ends at that very moment does not include it.
-        rows = [
-            row for row in driver_spans(read.rows, Period(begin, end + 1)) if row.until_utc != rfc3339(begin)
-        ]
+        rows = [row for row in read.drivers if row.until_utc != rfc3339(begin)]
     for row in rows:
         if appliance.as_json:
             say_json(msgspec.to_builtins(row))
             continue
         until = f"until {row.until_utc} ({row.ended_by})" if row.until_utc else "and holds it now"
         order = f" by {row.by}" if row.by else ""
-        say(
-            f"{row.what}: {appliance.host_in_words(row.state)} since {row.since_utc}{order}, {until}: {row.reason}"
-        )
+        place = f" at {row.appliance}" if row.appliance else ""
+        host = host_words(row.state, row.names, appliance.host_in_words)
+        say(f"{row.what}: {host} since {row.since_utc}{place}{order}, {until}: {row.reason}")
     if not rows and not appliance.as_json:
         say("the log has no record that a host held a group then", "yellow")
     raise typer.Exit(0 if rows else 1)

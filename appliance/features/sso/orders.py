@@ -99,6 +99,8 @@ class SsoOrders:
             who=who,
             name=session.name,
             subject=session.subject,
+            role=session.role,
+            groups=list(session.groups),
             id=session.id,
         )
 

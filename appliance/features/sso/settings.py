@@ -1,5 +1,6 @@
 """The section `sso` of `appliance.yaml`."""
 
+import dataclasses
 import re
 import unicodedata
 from collections.abc import Iterable, Iterator
@@ -191,6 +192,12 @@ class Sso(FeatureSection):
             )
         if "openid" not in self.scopes:
             raise ValueError("scopes must contain openid: without it, the provider gives no ID token")
+
+    def recorded(self) -> dict[str, str]:
+        """Return all values if single sign-on is on: they decide who has which role. The secret is not among them."""
+        if self.issuer is None:
+            return {}
+        return {name: str(value) for name, value in dataclasses.asdict(self).items()}
 
     @property
     def destination(self) -> tuple[str, int]:

@@ -32,6 +32,7 @@ from appliance.hosts.hosts_file import BUNDLED_HOSTS, DECLARED_HOSTS, DeclaredHo
 from appliance.hosts.tunnel_hosts import TunnelHosts
 from appliance.policy.host_names import HostInWords
 from appliance.policy.model import Address
+from appliance.signing.fingerprints import fingerprint
 from appliance.store.host_tables import EnrolmentTokenRow
 
 
@@ -234,6 +235,7 @@ class HostEnrolment(TunnelHosts):
 
     async def _declare(self, read: Callable[[], None], who: str) -> answers.Reloaded:
         before = {row.name for row in self._table.admitted()}
+        earlier = self._table.declared.in_force
         try:
             read()
         except DeclaredHostsError as error:
@@ -254,12 +256,16 @@ class HostEnrolment(TunnelHosts):
         if self._tunnels.addresses != meant:  # `start` opened the first tunnel and blocked clear text
             taken += self._certification.changed()
         divergence = [f"{row.name}: {row.divergence}" for row in self._view.rows() if row.divergence]
+        now = self._table.declared.in_force
         self._trail.happened(
             "hosts reloaded",
             f"{self._table.declared.source}: {counted(len(self._table.declared.hosts), 'host is', 'hosts are')}"
             " declared",
             opened=sorted(after - before),
             closed=sorted(before - after),
+            sha256=fingerprint(now),
+            earlier_sha256=fingerprint(earlier),
+            diff=self._table.declared.changed_lines(earlier),
             taken_back=taken,
             divergence=divergence,
             who=who,
@@ -292,7 +298,9 @@ class HostEnrolment(TunnelHosts):
             "host awaited no longer",
             f"the one-time token {awaited.id} of {awaited.name} was revoked",
             name=awaited.name,
+            address=awaited.address,
             id=awaited.id,
+            expires=awaited.expires,
             who=who,
         )
         await self._store.settled()

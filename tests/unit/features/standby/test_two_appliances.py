@@ -84,7 +84,9 @@ async def test_a_single_appliance_uses_its_own_key(tmp_path: Path, store: StateS
 async def test_another_authority_is_reported_once(tmp_path: Path, store: StateStore) -> None:
     told: list[str] = []
     for name in ("a", "a", "b", "b"):
-        alone = StoredAuthority(near(tmp_path, name), store.hosts, replaced=lambda: told.append("new"))
+        alone = StoredAuthority(
+            near(tmp_path, name), store.hosts, replaced=lambda *_certificates: told.append("new")
+        )
         await alone.certificate()
         await alone.certificate()
     assert told == ["new"]

@@ -1,0 +1,254 @@
+"""An auditor has one HTML page and no program of ours: each question is answered by it, for a history that is known."""
+
+import ipaddress
+from html.parser import HTMLParser
+from typing import Any
+
+import pytest
+
+from appliance.audit.log.record import AuditRecord
+from appliance.audit.log.record_format import LogEntry
+from appliance.base.timestamps import parse_timestamp
+from appliance.channel.answers.policy_answers import PolicyInForce
+from appliance.channel.answers.token_answers import Token, Tokens
+from appliance.features.logbook import live_facts
+from appliance.features.logbook.machine_report import (
+    MachineReport,
+    Period,
+    ReportedLog,
+    VerificationResult,
+    merged,
+    read_records,
+)
+from appliance.features.logbook.report_words import page
+from appliance.policy.policy_compiler import compile_policy
+
+POLICY = """[Groups]
+joystick = 10.0.0.5
+[Nodes]
+default = robot joystick
+[Publishers]
+/cmd_vel = joystick
+default = robot
+[Subscribers]
+default = *
+[Services]
+default = robot
+[Clients]
+/brake = joystick
+[Parameters]
+write default = robot
+[Commands]
+shutdown = robot
+default = robot joystick
+"""
+STATUS: dict[str, Any] = {
+    "master": "http://10.0.0.2:11311", "policy": {"audit_only": []}, "blocks": {"hosts": 1},
+    "monitors": {"enabled": 2, "loaded": 3}, "relaying": "on", "isolation": "netns",
+    "doors": {"doors": [{"name": "agent"}]}, "ipsec": {"esp": "kernel", "enrolled": 2, "key_exchange": ["x25519"]},
+}  # fmt: skip
+
+FREE = {"earlier": "nobody"}
+HISTORY: tuple[tuple[str, str, str, dict[str, Any]], ...] = (
+    ("2026-02-20 08:00:00", "appliance started", "", {"version": "0.4.0", "configuration": {"sso": "1"}, "off": {}}),
+    ("2026-02-20 08:00:05", "host enrolled", "", {"name": "tablet", "address": "10.77.0.5"}),
+    ("2026-03-02 09:00:00", "monitor set", "limit", {"who": "ann", "before": {"vMax": 1.5}, "values": {"vMax": 0.5}}),
+    ("2026-03-04 10:00:00", "monitor disabled", "limit", {"who": "bob", "earlier": "enabled"}),
+    ("2026-03-04 10:20:00", "monitor enabled", "limit", {"who": "ann", "earlier": "disabled"}),
+    ("2026-03-05 11:00:00", "policy loaded", "", {
+        "who": "eve", "sha256": "bb" * 32, "earlier_sha256": "aa" * 32,
+        "diff": ["-/cmd_vel = robot", "+/cmd_vel = joystick"],
+    }),
+    ("2026-03-06 14:00:00", "authority handed over", "base", {"who": "ann", "holder": "10.77.0.5", **FREE}),
+    ("2026-03-06 14:30:00", "authority handed over", "base", {"earlier": "10.77.0.5", "holder": "nobody"}),
+    ("2026-03-07 15:00:00", "approval given", "/arm/move", {"who": "ann", "earlier": "waits", "now": "approved once"}),
+    ("2026-03-08 16:00:00", "host blocked", "", {
+        "who": "bob", "address": "10.0.0.66", "earlier": "not blocked", "until": None,
+    }),
+    ("2026-03-09 17:00:00", "clock set back", "", {}),
+    ("2026-04-30 12:00:00", "appliance stopped", "", {}),
+    ("2026-04-30 12:05:00", "appliance started", "", {"version": "0.5.0", "configuration": {"sso": "2"}, "off": {}}),
+)  # fmt: skip
+
+
+def moment(text: str) -> int:
+    return parse_timestamp(f"{text.replace(' ', 'T')}Z", 0)
+
+
+def entries() -> list[LogEntry]:
+    return [
+        LogEntry(
+            number,
+            AuditRecord(
+                id=f"{number:020x}", time=moment(time), event=event, resource=what or None, detail=detail
+            ),
+        )
+        for number, (time, event, what, detail) in enumerate(HISTORY, start=1)
+    ]
+
+
+class Page(HTMLParser):
+    """The sections of a page by the words of their headings, each a list of rows; the first is that of the columns."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.sections: dict[str, list[list[str]]] = {}
+        self.scripts = 0
+        self._heading = ""
+        self._rows: list[list[str]] = []
+        self._into: str | None = None
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.scripts += tag == "script"
+        if tag == "h2":
+            self._heading, self._rows, self._into = "", [], "heading"
+        elif tag == "tr":
+            self._rows.append([])
+        elif tag in ("td", "th") and self._rows:
+            self._rows[-1].append("")
+            self._into = "cell"
+        elif tag in ("p", "pre"):
+            self._rows.append([""])
+            self._into = "cell"
+
+    def handle_data(self, data: str) -> None:
+        if self._into == "heading":
+            self._heading += data.strip()
+            self.sections[self._heading.partition(". ")[2] or self._heading] = self._rows
+        elif self._into == "cell" and self._rows and self._rows[-1]:
+            self._rows[-1][-1] += data
+
+    def handle_endtag(self, tag: str) -> None:
+        if tag in ("h2", "p", "pre", "table"):
+            self._into = None
+
+    def rows(self, title: str) -> list[list[str]]:
+        return [[cell.strip() for cell in row] for row in self.sections[title]]
+
+    def text(self, title: str) -> str:
+        return "\n".join(" | ".join(row) for row in self.rows(title))
+
+
+@pytest.fixture(scope="module")
+def found() -> Page:
+    tokens = Tokens([
+        Token(name="ann", role="operator", id="1", created=0.0, expires=1.0, revoked=None),
+        Token(name="root", role="admin", id="2", created=0.0, expires=1.0, revoked=None),
+    ])  # fmt: skip
+    in_force = PolicyInForce(
+        revision=2, text=POLICY, file="robot.ini", policy_file="robot.ini", differs_from_file=False, warnings=[],
+        confirm_by=None, site_keys=[], robot=["10.0.0.2/32"], hosts={"tablet": "10.77.0.5"}, loaded=0.0, who="eve",
+        note="", in_force=True, signature="",
+    )  # fmt: skip
+    policy = compile_policy(POLICY, file="robot.ini", robot=[ipaddress.ip_address("10.0.0.2")])
+    period = Period(moment("2026-03-01 00:00:00"), moment("2026-05-04 00:00:00"))
+    read = read_records(merged({"": entries()}), period)
+    result = VerificationResult(
+        time_utc="2026-05-03T04:00:00.000000000Z", complete=True, records=13, text="", log="ab", through=13
+    )
+    log = ReportedLog(
+        name="", id="ab", begins_utc="2026-02-20T08:00:00.000000000Z", last=13, verification=result
+    )
+    made = MachineReport(
+        robot="arm7", logs=[log], since_utc="2026-03-01T00:00:00.000000000Z",
+        until_utc="2026-05-04T00:00:00.000000000Z",
+        made_utc="2026-05-04T08:00:00.000000000Z", version="0.5.0", verify="rosrv audit verify",
+        interventions=read.interventions, switched_off=read.switched_off, blocks=read.blocks, software=read.software,
+        drivers=read.drivers, interfaces=list(live_facts.interfaces(STATUS, in_force, tokens)),
+        rights=list(live_facts.rights(policy, in_force, tokens)), live_reason="", gaps=read.gaps,
+    )  # fmt: skip
+    return Page(page(made))
+
+
+def test_the_page_runs_nothing(found: Page) -> None:
+    assert not found.scripts
+
+
+def test_the_page_says_who_may_stop_the_robot_remotely(found: Page) -> None:
+    rows = [row for row in found.rows("Rights on the machine now") if "stop the robot remotely" in row[0]]
+    assert any("ann" in who and "root" in who for _what, who, _by in rows)
+    assert any("/brake" in what and "joystick" in who for what, who, _by in rows)
+    assert any("end a node" in what and "robot" in who for what, who, _by in rows)
+    assert "ann" in found.text("Answers")
+
+
+def test_the_page_says_who_changed_the_speed_limit_in_march_from_what_to_what(found: Page) -> None:
+    row = next(row for row in found.rows("Guards and monitors") if "monitor set" in row)
+    assert row[:6] == ["2026-03-02 09:00:00", "monitor set", "limit", "vMax = 1.5", "vMax = 0.5", "ann"]
+
+
+def test_the_page_says_was_any_guard_off_when_and_by_whose_order(found: Page) -> None:
+    (row,) = found.rows("Guards and monitors that were off")[1:]
+    assert row[:6] == ["limit", "disabled", "2026-03-04 10:00:00", "2026-03-04 10:20:00", "bob", "ann"]
+
+
+def test_the_page_says_which_software_ran_on_3_may(found: Page) -> None:
+    rows = found.rows("Software that ran")[1:]
+    assert [
+        row[1]
+        for row in rows
+        if row[2] <= "2026-05-03 00:00:00" and (row[3] == "lasts" or row[3] > "2026-05-03")
+    ] == ["0.5.0"]
+    assert "appliance.yaml: sso changed" in found.text("Software")
+
+
+def test_the_page_says_which_interfaces_take_commands_and_what_protects_each(found: Page) -> None:
+    rows = found.rows("Interfaces now, and what protects each")[1:]
+    assert {row[0] for row in rows} >= {
+        "ROS Master API",
+        "topics and services (relay)",
+        "door agent",
+        "IPsec tunnels",
+    }
+    assert all(row[3] for row in rows)
+
+
+def test_the_page_says_who_drove_at_14_03(found: Page) -> None:
+    at = "2026-03-06 14:03:00"
+    rows = [row for row in found.rows("Drivers")[1:] if row[2] <= at < row[3]]
+    assert [row[:2] for row in rows] == [["base", "tablet (10.77.0.5)"]]
+
+
+def test_the_page_says_who_approved_the_agents_arm_motion(found: Page) -> None:
+    row = next(row for row in found.rows("Approvals") if "/arm/move" in row)
+    assert row[3:6] == ["waits", "approved once", "ann"]
+
+
+def test_the_page_says_which_hosts_were_blocked(found: Page) -> None:
+    (row,) = found.rows("Hosts that were blocked")[1:]
+    assert (row[0], row[2], row[3], row[4]) == ("10.0.0.66", "2026-03-08 16:00:00", "lasts", "bob")
+
+
+def test_the_page_says_are_there_gaps_and_why(found: Page) -> None:
+    text = found.text("Completeness of the log")
+    assert (
+        "clock set back" in text and "shut down in order until 2026-04-30T12:05:00.000000000Z (300 s)" in text
+    )
+
+
+def test_the_page_says_who_can_change_policies(found: Page) -> None:
+    (row,) = (row for row in found.rows("Rights on the machine now") if row[0].startswith("change policies"))
+    assert row[1:] == ["root", "token, role admin"]
+    assert "-/cmd_vel = robot\n+/cmd_vel = joystick" in found.text("Policy")
+
+
+def test_the_page_says_was_the_log_tampered_with_and_how_would_one_know(found: Page) -> None:
+    text = found.text("Verification")
+    assert "2026-05-03T04:00:00" in text and "complete and unchanged" in text
+    assert "checkpoints that were kept on another machine" in text
+
+
+def test_the_page_says_what_changed_since_the_last_report(found: Page) -> None:
+    """The period of a report that follows another one begins where that ended; all of its changes are in it."""
+    assert ["period (UTC)", "2026-03-01 00:00:00 to 2026-05-04 00:00:00"] in found.rows("About this report")
+    titles = [title for title in found.sections if title[0].isupper()]
+    listed = "\n".join(map(found.text, titles))
+    assert all(time in listed for time, *_ in HISTORY if time >= "2026-03")
+
+
+def test_each_question_names_the_section_that_answers_it(found: Page) -> None:
+    rows = found.rows("Answers")[1:]
+    assert len(rows) == 12
+    numbers = {row[2] for row in rows}
+    assert all(number.isdigit() for number in numbers) and all(row[1] for row in rows)
