@@ -8,6 +8,7 @@ from tests.support.page_steps import steps
 
 pytestmark = pytest.mark.timeout(3600)  # a machine boots, perhaps emulated
 _NETWORK = """
+grep -q "$(hostname)" /etc/hosts || echo "127.0.1.1 $(hostname)" >> /etc/hosts
 ip netns add visitor
 ip link add eth0 type veth peer name eth0 netns visitor
 ip address add 10.84.0.2/24 dev eth0

@@ -141,7 +141,7 @@ CALLS = {
     "follow_audit": of(after=0), "summarise_audit": of(),
     "policy": of(), "policy_revisions": of(), "policy_revision": of(revision=1),
     "explain": of(host=ROBOT, category="publish", resource="/cmd_vel", node="/joy"), "explain_under": of(),
-    "test_policy": of(),
+    "test_policy": of(), "policy_uses": of(),
     "load_policy": of(confirm_within=300), "confirm_policy": of(), "roll_back_policy": of(), "reload_policy": of(),
     "hosts": of(), "enrol_host": Call(body=reached), "host": of(name=NAME),
     "host_token": Call(lambda _done: {"name": NAME}, reached),

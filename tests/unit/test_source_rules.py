@@ -311,7 +311,7 @@ WALL_CLOCK = {
     "a moment that people ask for (`--since 1h`), or a page that is shown once": [
         "api/front/moments.py", "audit/search/filter_options.py",
         "features/evidence/evidence_verbs.py", "features/logbook/report_verb.py", "features/logbook/who_drove_verb.py",
-        "features/monitor_tools/offline.py", "features/policy_tools/recorded_requests.py",
+        "features/monitor_tools/offline.py", "features/policy_tools/policy_input.py",
         "features/tunnels/protect_verb.py",
         "base/timestamps.py",
         "features/topics/topic_verbs.py", "features/recorder/replay_input.py", "features/recorder/record_verbs.py",

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from ipaddress import ip_address
 from pathlib import Path
 from typing import Literal, NamedTuple
+from urllib.parse import urlsplit
 
 from appliance.base.counted import counted
 from appliance.features.adopt.adopt_record import AdoptRecord
@@ -96,12 +97,16 @@ def _master(state: CheckedRobot) -> Iterator[CheckLine]:
 
 def _nodes(state: CheckedRobot, inventory: GraphInventory) -> Iterator[CheckLine]:
     asked = [node for node in inventory.nodes if node.name != "/rosout"]
-    unknown = [node.name for node in asked if node.uri and not node.host]
+    unplaced = {node.name: _host_in(node.uri) for node in asked if node.uri and not node.host}
+    unknown = list(unplaced)
     loopback = [node.name for node in asked if state.is_here(node) and _only_on_loopback(node, state.sockets)]
     gone = [node.name for node in asked if node.problem and node.name not in {*unknown, *loopback}]
     if unknown:
         yield CheckLine(
-            "stop", "hosts", f"the host of {_some(unknown)} is not known here: add it to /etc/hosts"
+            "stop",
+            "hosts",
+            f"{_some(unplaced.values())}, the host of {_some(unknown)}, is not known here: add its address"
+            " to /etc/hosts",
         )
     if loopback:
         text = (
@@ -253,6 +258,12 @@ def depending_units(unit: str) -> list[str]:
 
 def sockets_of(host: Namespace) -> tuple[TcpSocket, ...]:
     return tuple(host.run(tcp_sockets))
+
+
+def _host_in(uri: str) -> str:
+    with suppress(ValueError):  # the node chose the text
+        return urlsplit(uri).hostname or uri
+    return uri
 
 
 def _some(names: Iterable[str]) -> str:

@@ -29,7 +29,7 @@ from appliance.features.adopt.robot_side import (
     write_drop_in,
 )
 from appliance.network.namespaces import Namespace, NetworkError
-from rosmop.tool.terminal import say
+from rosmop.tool.terminal import printable, say
 
 _VERB = "rosrv adopt"
 _START_SECONDS = 180.0
@@ -188,7 +188,7 @@ def _show_lines(lines: list[CheckLine], *, as_json: bool) -> None:
         if as_json:
             say_json({"level": line.level, "about": line.about, "text": line.text})
         else:
-            say(f"{line.level:<4}  {line.about:<{width}}  {line.text}")
+            say(printable(f"{line.level:<4}  {line.about:<{width}}  {line.text}"))
 
 
 def _show_report(report: TakeOverReport, *, as_json: bool) -> None:
@@ -202,7 +202,7 @@ def _show_report(report: TakeOverReport, *, as_json: bool) -> None:
     )
     _show_left(report.denied, report.missing)
     for left in report.left_out:
-        say(f"left out: {left}")
+        say(printable(f"left out: {left}"))
     say("Next: rosrv status, and `rosrv protect` to close the nodes' own ports to other hosts")
 
 
@@ -217,9 +217,9 @@ def _show_started(found: AdoptState, *, as_json: bool) -> None:
 
 def _show_left(denied: dict[str, str], missing: dict[str, str]) -> None:
     for entry, why in denied.items():
-        say(f"denied: {entry}: {why}")
+        say(printable(f"denied: {entry}: {why}"))
     for name, why in missing.items():
-        say(f"not adopted: {name}: {why}")
+        say(printable(f"not adopted: {name}: {why}"))
 
 
 def _show_status(appliance: Appliance) -> None:

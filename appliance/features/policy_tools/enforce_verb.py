@@ -18,9 +18,15 @@ from appliance.cli.output import say_json, write_told
 from appliance.features.policy_tools.audit_only import EnforcedText, EnforceError, enforced
 from appliance.features.policy_tools.learn import Observation, needed_rights
 from appliance.features.policy_tools.live_verbs import say_loaded
-from appliance.features.policy_tools.policy_input import body_in_force, context_of, live_now, usage_error
+from appliance.features.policy_tools.policy_input import (
+    body_in_force,
+    context_of,
+    live_now,
+    recorded_period,
+    usage_error,
+)
 from appliance.features.policy_tools.policy_verbs import compiled_with
-from appliance.features.policy_tools.recorded_requests import RecordedPeriod, recorded_period
+from appliance.features.policy_tools.recorded_requests import RecordedPeriod
 from appliance.policy.actions import BadWordError
 from appliance.policy.live_rights import Ending, LiveRight, endings
 from appliance.policy.model import Request

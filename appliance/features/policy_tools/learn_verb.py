@@ -16,8 +16,13 @@ from appliance.cli.connection.target import Appliance, speaks_with
 from appliance.cli.output import say_json
 from appliance.features.policy_tools.ask_rights import ask_rights
 from appliance.features.policy_tools.learn import LearnedPolicy, Observation, covered, learn
-from appliance.features.policy_tools.policy_input import Robot, networks_of, running_robot, usage_error
-from appliance.features.policy_tools.recorded_requests import recorded_period
+from appliance.features.policy_tools.policy_input import (
+    Robot,
+    networks_of,
+    recorded_period,
+    running_robot,
+    usage_error,
+)
 from appliance.policy.cases import run_cases
 from appliance.policy.host_sets import Network
 from appliance.policy.policy_compiler import compile_policy

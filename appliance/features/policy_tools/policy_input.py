@@ -13,13 +13,17 @@ import typer
 from msgspec.structs import asdict
 
 from appliance.audit.log.log_database import LogUnreadableError
+from appliance.audit.log.record_format import LogEntry
 from appliance.audit.search.query import Filter, FilterError
+from appliance.base import clock
 from appliance.base.input_files import read_given_text
+from appliance.base.timestamps import TimestampError, parse_timestamp
 from appliance.channel.admin import PolicyWanted, RegistrationsWanted
 from appliance.channel.answers.policy_answers import PolicyInForce
 from appliance.cli import output
 from appliance.cli.connection.admin_client import NotRunningError, RestProblemError
 from appliance.cli.connection.target import Appliance
+from appliance.features.policy_tools.recorded_requests import RecordedPeriod, period_since, request_of
 from appliance.policy.actions import BadWordError, find_host
 from appliance.policy.host_sets import Network, canonical_address, canonical_network
 from appliance.policy.judgement import PolicyContext, approvals_of
@@ -141,15 +145,27 @@ def requests_of_file(file: Path) -> Iterator[Request]:
             raise usage_error(f"{file}:{number}: not a request: {reason}") from error
 
 
-def request_of(host: str, caller_id: str, category: str, resource: str) -> Request:
-    address = canonical_address(ipaddress.ip_address(host))
-    return Request(address, str(caller_id or ""), Category(category), str(resource))
-
-
 def live_now(appliance: Appliance) -> list[LiveRight]:
     """Return the rights of running nodes. Exits if the appliance refuses; raises `NotRunningError`."""
     found = appliance.body_or_exit(appliance.ask(RegistrationsWanted())).registrations
     return [LiveRight.of(asdict(row)) for row in found]
+
+
+def recorded_period(appliance: Appliance, since: str | None) -> RecordedPeriod:
+    """Return the period since a time, or all of the log. Exits with usage errors, and if the log is unreadable."""
+
+    def read(wanted: Filter) -> Iterator[LogEntry]:
+        try:
+            yield from appliance.audit().export(wanted)
+        except (LogUnreadableError, NotRunningError, FilterError) as error:
+            raise usage_error(str(error)) from error
+
+    try:
+        now = clock.wall_ns()
+        asked = None if since is None else parse_timestamp(since, now, None)
+    except TimestampError as error:
+        raise usage_error(str(error)) from error
+    return period_since(read, asked, now)
 
 
 def requests_of_audit_log(appliance: Appliance) -> Iterator[Request]:

@@ -58,6 +58,30 @@ class RuleText(msgspec.Struct, frozen=True):
     line: int
 
 
+class RuleUsed(msgspec.Struct, frozen=True):
+    """A rule that grants something, and its use. The hosts are the words of the rule."""
+
+    rule: RuleText
+    state: Annotated[
+        Literal["used", "unused", "unknown"],
+        doc(
+            "`unknown`: the uses may be among records that the log removed, only counts, or that were not read"
+        ),
+    ]
+    used: Annotated[int, doc("number of uses")]
+    unused_hosts: Annotated[list[str], doc("without a use")]
+    unknown_hosts: Annotated[list[str], doc("perhaps without a use")]
+
+
+class PolicyUses(msgspec.Struct, frozen=True):
+    """The uses of the rules of the policy in force since a time. Registrations that live now count as uses."""
+
+    revision: int
+    since: Moment
+    whole: Annotated[bool, doc("whether all records since that time were read")]
+    rules: list[RuleUsed]
+
+
 class LostRule(msgspec.Struct, frozen=True):
     """A rule about the resource that does not decide."""
 

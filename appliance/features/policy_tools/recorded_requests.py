@@ -1,20 +1,21 @@
 """Read the requests of a period that passed, and say which of them the log no longer names."""
 
-from collections.abc import Iterator
+import ipaddress
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from itertools import islice
+from typing import TypeAlias
 
-from appliance.audit.log.log_database import LogUnreadableError
 from appliance.audit.log.record import AuditRecord
+from appliance.audit.log.record_format import LogEntry
 from appliance.audit.log.repetition import KIND, PARAMETERS, repetitions
-from appliance.audit.search.query import Filter, FilterError
-from appliance.base import clock
-from appliance.base.timestamps import TimestampError, parse_timestamp
-from appliance.cli.connection.admin_client import NotRunningError
-from appliance.cli.connection.target import Appliance
+from appliance.audit.search.query import Filter
 from appliance.features.policy_tools.learn import Observation
-from appliance.features.policy_tools.policy_input import request_of, usage_error
-from appliance.policy.model import Category
+from appliance.policy.host_sets import canonical_address
+from appliance.policy.model import Category, Request
+
+ReadRecords: TypeAlias = Callable[[Filter], Iterator[LogEntry]]
+"""Returns the records found, oldest first."""
 
 ADOPTED = "adopted"
 """The event of a registration that was taken over from a ROS master, not made by the node itself."""
@@ -42,22 +43,19 @@ class RecordedPeriod:
     of other names; `*` stands for several hosts.
     """
 
-    appliance: Appliance
+    read: ReadRecords
     since: int | None
     start: int
     removed: bool
     unnamed: dict[str, int] = field(default_factory=dict)
 
     def requests(self) -> Iterator[RecordedRequest]:
-        """Yield the requests by the kinds of their records, and fill `unnamed`. Exits if the log is unreadable."""
+        """Yield the requests by the kinds of their records, and fill `unnamed`. Raises what `read` raises."""
         self.unnamed.clear()
-        try:
-            for event in _EVENTS:
-                passed = Filter(decision=("allow", "would deny"), event=event, since=self.since)
-                for entry in self.appliance.audit().export(passed):
-                    yield from self._of(entry.record)
-        except (LogUnreadableError, NotRunningError, FilterError) as error:
-            raise usage_error(str(error)) from error
+        for event in _EVENTS:
+            passed = Filter(decision=("allow", "would deny"), event=event, since=self.since)
+            for entry in self.read(passed):
+                yield from self._of(entry.record)
 
     def _of(self, record: AuditRecord) -> Iterator[RecordedRequest]:
         detail, caller = record.detail, record.caller_id or ""
@@ -84,15 +82,16 @@ class RecordedPeriod:
         yield RecordedRequest(observation, repetitions(detail) if repeated else 1, repeated)
 
 
-def recorded_period(appliance: Appliance, since: str | None) -> RecordedPeriod:
-    """Return the period since a time, or all of the log. Exits with usage errors, and if the log is unreadable."""
-    try:
-        asked = None if since is None else parse_timestamp(since, clock.wall_ns(), None)
-        first = next(islice(appliance.audit().export(Filter()), 1), None)
-    except (LogUnreadableError, NotRunningError, TimestampError, FilterError) as error:
-        raise usage_error(str(error)) from error
+def period_since(read: ReadRecords, since: int | None, now: int) -> RecordedPeriod:
+    """Return the period since a time, or all of the log; an empty log begins `now`. Raises what `read` raises."""
+    first = next(islice(read(Filter()), 1), None)
     if first is None:
-        return RecordedPeriod(appliance, asked, asked or clock.wall_ns(), removed=False)
-    start = max(first.record.time, asked or first.record.time)
-    removed = first.sequence > 1 and (asked is None or first.record.time > asked)
-    return RecordedPeriod(appliance, asked, start, removed)
+        return RecordedPeriod(read, since, now if since is None else since, removed=False)
+    start = max(first.record.time, since or first.record.time)
+    removed = first.sequence > 1 and (since is None or first.record.time > since)
+    return RecordedPeriod(read, since, start, removed)
+
+
+def request_of(host: str, caller_id: str, category: str, resource: str) -> Request:
+    address = canonical_address(ipaddress.ip_address(host))
+    return Request(address, str(caller_id or ""), Category(category), str(resource))

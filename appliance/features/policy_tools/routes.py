@@ -1,4 +1,4 @@
-"""`/v1/policy/explain`, `/v1/policy/test`, and `/v1/audit/ID/why` and `/grant`: nothing is loaded."""
+"""`/v1/policy/explain`, `/v1/policy/uses`, `/v1/policy/test`, `/v1/audit/ID/why`, `/grant`: nothing is loaded."""
 
 import asyncio
 from dataclasses import asdict
@@ -8,6 +8,7 @@ import msgspec
 from fastapi import Query
 
 from appliance.api.front.access import Bearer
+from appliance.api.front.moments import given
 from appliance.api.front.problems import ProblemError
 from appliance.api.front.route_roles import Viewer, ask, ask_optional
 from appliance.api.front.routing import Responses, Routes, body
@@ -16,7 +17,7 @@ from appliance.api.routes.log_reader import UNKNOWN, LogReader, OneRecord
 from appliance.api.routes.named_hosts import host_in_words
 from appliance.api.routes.shown_records import readable_by
 from appliance.audit.search.search import recorded_in_full
-from appliance.channel.admin import PolicyWanted
+from appliance.channel.admin import PolicyWanted, RegistrationsWanted
 from appliance.channel.answers.policy_answers import Granted, Why
 from appliance.features.policy_tools import policy_routes
 from appliance.features.policy_tools.decision_reasons import DecisionExplanation
@@ -28,10 +29,12 @@ from appliance.features.policy_tools.policy_models import (
     Draft,
     Explained,
     LostRule,
+    PolicyUses,
     Question,
     RuleText,
     Tested,
 )
+from appliance.features.policy_tools.policy_uses import policy_uses
 from appliance.policy.cases import CaseResult
 from appliance.policy.model import Category
 
@@ -52,7 +55,7 @@ def routes(services: Services) -> Routes:
 
 def _of_policy(services: Services) -> Routes:
     router = Routes(prefix="/policy", tags=["policy"])
-    control = services.control
+    control, desk = services.control, LogReader(services)
 
     async def explained(question: Question, bearer: Bearer) -> Explained:
         current = await ask(control, PolicyWanted(), bearer)
@@ -82,6 +85,19 @@ def _of_policy(services: Services) -> Routes:
     async def explain_under(question: Annotated[Question, body(Question)], bearer: Viewer) -> Explained:
         """Explain the decision of a request under another text, which is not loaded."""
         return await explained(question, bearer)
+
+    @router.get("/uses", operation_id="policy_uses")
+    async def uses(
+        bearer: Viewer,
+        since: Annotated[
+            str, Query(max_length=64, description="30d (ago), a date, or RFC 3339", examples=["7d"])
+        ] = "30d",
+    ) -> PolicyUses:
+        """Which rules of the policy in force the recorded requests needed, as `rosrv policy unused` says it."""
+        moment = given(since)
+        current = await ask(control, PolicyWanted(), bearer)
+        live = (await ask(control, RegistrationsWanted(), bearer)).registrations
+        return await desk.read(bearer, policy_uses, desk.path, current, live, moment)
 
     @router.post("/test")
     async def test_policy(draft: Annotated[Draft, body(Draft)], bearer: Viewer) -> Tested:

@@ -8,9 +8,8 @@ from appliance.base.counted import counted
 from appliance.base.timestamps import local_text
 from appliance.cli.connection.target import Appliance, speaks_with
 from appliance.cli.output import say_json
-from appliance.features.policy_tools.policy_input import live_now
+from appliance.features.policy_tools.policy_input import live_now, recorded_period
 from appliance.features.policy_tools.policy_verbs import compiled
-from appliance.features.policy_tools.recorded_requests import recorded_period
 from appliance.features.policy_tools.rule_uses import RuleUse, RuleUses
 from rosmop.tool.terminal import printable, say
 

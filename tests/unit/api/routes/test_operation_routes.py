@@ -445,7 +445,7 @@ BY_HAND = {
         "GET /v1/audit/{record_id}/why",
         "GET /v1/hosts/{name}", "GET /v1/monitors/{name}", "GET /v1/monitors/{name}/history",
         "GET /v1/monitors/{name}/picture", "GET /v1/policy", "GET /v1/policy/explain", "POST /v1/policy/explain",
-        "GET /v1/policy/hosts",
+        "GET /v1/policy/hosts", "GET /v1/policy/uses",
         "POST /v1/policy/test", "GET /v1/recordings/{recording_id}/timeline",
     },
     "investigator": {

@@ -23,9 +23,10 @@ import { Explain } from "./explain.js";
 import { LoadDialog } from "./load.js";
 import { Revisions, RevisionText } from "./revisions.js";
 import { Tests } from "./tests.js";
+import { Uses } from "./uses.js";
 
 const PAUSE = 1200; // milliseconds between the last key and the check of the text
-const TABS = /** @type {[string, string][]} */ ([["check", "Check"], ["diff", "Diff"], ["explain", "Explain"], ["tests", "Tests"], ["revisions", "Revisions"]]);
+const TABS = /** @type {[string, string][]} */ ([["check", "Check"], ["diff", "Diff"], ["explain", "Explain"], ["tests", "Tests"], ["uses", "Uses"], ["revisions", "Revisions"]]);
 
 export function PolicyView() {
   const { live, text, base, findings, errors, error } = useStore(draft);
@@ -74,7 +75,7 @@ export function PolicyView() {
         ${tab === "check" && html`<${Check} pick=${pick} />`}
         ${tab === "diff" && html`<div class="panel-body"><${Difference} old=${live.text} now=${text} same="The text is the policy in force." /></div>`}
         ${tab === "explain" && html`<${Explain} key=${query.toString()} query=${query} pick=${pick} />`}
-        ${tab === "tests" && html`<${Tests} />`}${tab === "revisions" && html`<${Revisions} />`}</${Tabs}></section></div>
+        ${tab === "tests" && html`<${Tests} />`}${tab === "uses" && html`<${Uses} pick=${changed ? null : pick} />`}${tab === "revisions" && html`<${Revisions} />`}</${Tabs}></section></div>
     ${loading && html`<${LoadDialog} close=${() => setLoading(false)} />`}
     ${older(query, live) && html`<${RevisionText} revision=${Number(query.get("revision"))} line=${Number(query.get("line")) || 1} close=${() => go("/console/policy")} />`}`;
 }

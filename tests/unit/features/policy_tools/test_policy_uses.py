@@ -1,0 +1,44 @@
+from pathlib import Path
+
+import pytest
+
+from appliance.channel.answers.graph_answers import Registration
+from appliance.channel.answers.policy_answers import PolicyKnown
+from appliance.features.policy_tools.policy_uses import policy_uses
+from tests.support.answers import example
+from tests.support.audit import decision, settle
+from tests.support.engines import open_log
+
+TEXT = "[Nodes]\ndefault = *\n[Publishers]\n/cmd_0 = 10.0.0.0\n/cmd_1 = 10.0.0.1\n/cmd_2 = 10.0.0.9\n/scan = 10.0.0.7\n"
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> Path:
+    path = tmp_path / "audit.db"
+    made = open_log(path)
+    for number in (0, 1):
+        made.record(decision(made, number))
+    assert settle(made) is None
+    made.close()
+    return path
+
+
+def states(log: Path, most: int = 10) -> tuple[bool, dict[str, str]]:
+    current = example(PolicyKnown, revision=7, text=TEXT, file="p.ini")
+    found = policy_uses(
+        log, current, [Registration("10.0.0.7", "/laser", "registerPublisher", "/scan")], 0, most
+    )
+    return found.whole, {row.rule.key: row.state for row in found.rules}
+
+
+def test_each_rule_has_its_use_by_recorded_requests_and_by_registrations_of_now(log: Path) -> None:
+    assert states(log) == (
+        True,
+        {"default": "used", "/cmd_0": "used", "/cmd_1": "used", "/cmd_2": "unused", "/scan": "used"},
+    )
+
+
+def test_with_more_records_than_are_read_the_newest_count_and_the_unseen_is_unknown(log: Path) -> None:
+    whole, found = states(log, most=1)
+    assert not whole
+    assert (found["/cmd_0"], found["/cmd_1"], found["/cmd_2"]) == ("unknown", "used", "unknown")
