@@ -223,7 +223,8 @@ def _compile(
     shared.findings += traps(specification)
     if names.parameters:
         shared.findings += kept_slices(names.name, good, known, specification.properties)
-    variables = {one.name: one.code for one in names.variables.values() if one.name not in names.givens}
+    given = {*names.givens, *_given_tables(specification)}
+    variables = {one.name: one.code for one in names.variables.values() if one.name not in given}
     uses = frozenset(names.uses)
     return SpecificationCode(
         specification.name,
@@ -245,6 +246,14 @@ def _compile(
         tuple(names.givens.values()),
         withholdings=withheld,
     )
+
+
+def _given_tables(specification: tree.Specification) -> Iterator[str]:
+    """Yield the tables that operators set. Code has their items as literals, so a kept state does not have them."""
+    for declaration in specification.declarations:
+        for declarator in declaration.declarators:
+            if isinstance(declarator.value, tree.GivenItems):
+                yield declarator.name
 
 
 def _seen_changes(names: SpecificationNames) -> Iterator[Diagnostic]:
@@ -310,7 +319,9 @@ def _property(
 ) -> PropertyCode | None:
     events = tuple(dict.fromkeys(event.name for event in specification.events))
     try:
-        compiled = compile_property(node.logic, node.formula, events, node.formula_position, node.position)
+        compiled = compile_property(
+            node.logic, node.formula, events, node.formula_position, node.position, dict(node.times)
+        )
     except FormulaError as error:
         shared.findings += error.findings
         return None

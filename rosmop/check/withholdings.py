@@ -53,6 +53,7 @@ def _checked(
 
 
 def _networks(node: tree.WithholdDeclaration) -> Iterator[str]:
+    yield from node.given
     for network in node.networks:
         text = network.value.decode(errors="replace")
         try:

@@ -47,13 +47,18 @@ _REFUSED = {
 }
 
 
-def compile_property(
-    logic: str, formula: str, events: Sequence[str], origin: Position, logic_position: Position | None = None
+def compile_property(  # noqa: PLR0917  parts of a property, in the order of the text
+    logic: str,
+    formula: str,
+    events: Sequence[str],
+    origin: Position,
+    logic_position: Position | None = None,
+    times: Mapping[str, int] = MappingProxyType({}),
 ) -> CompiledProperty:
     """Compile a property. Raises `FormulaError`.
 
     The case of ``logic`` does not matter. ``events`` are in source order, each name once. ``origin`` is the position
-    of the formula.
+    of the formula. ``times`` are the nanoseconds of names that stand for time bounds.
     """
     found = LOGICS.get(logic.lower())
     if found is None:
@@ -61,7 +66,7 @@ def compile_property(
             _REFUSED.get(logic.lower()) or f"unknown logic `{logic}`{suggestion(logic.lower(), list(LOGICS))}"
         )
         raise FormulaError([Diagnostic(logic_position or origin, "error", text)])
-    source = Source(logic.lower(), formula, tuple(events), origin, found.suppresses)
+    source = Source(logic.lower(), formula, tuple(events), origin, found.suppresses, times)
     if not events:
         raise source.error(0, "a property needs at least one event in its specification")
     return found.compile(source)

@@ -93,7 +93,7 @@ def _read_state(
 
 def _read_transition(reader: TokenReader, state: StateText, used: list[FormulaToken], *, timed: bool) -> None:
     event = reader.expect("name", "a transition such as `event -> state`, `default state` or `]`")
-    if event.text == TIMEOUT and reader.token.kind == "number":
+    if event.text == TIMEOUT and (reader.token.kind == "number" or reader.token.text in reader.source.times):
         if not timed:
             raise reader.source.error(
                 event.offset, "a time bound in an untimed machine; write `tfsm:` for `fsm:`"
@@ -120,7 +120,8 @@ def _read_timeout(
     reader: TokenReader, state: StateText, clause: FormulaToken, used: list[FormulaToken]
 ) -> None:
     number = reader.token
-    nanoseconds = reader.duration("a time bound")
+    times = reader.source.times
+    nanoseconds = times[reader.take().text] if number.text in times else reader.duration("a time bound")
     if nanoseconds == 0:
         reader.note(number, "a timeout must be longer than 0")
     reader.expect("->", "`->` and the state that the timeout leads to")

@@ -16,8 +16,8 @@ is dropped. The time is not undone. No deadline expires between the two calls.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol, Self
 
 from rosmop.form.findings import Diagnostic, Position
@@ -80,6 +80,7 @@ class Source:
     events: tuple[str, ...]
     origin: Position
     suppresses: bool = False
+    times: Mapping[str, int] = field(default_factory=dict, compare=False)
 
     def finding(self, offset: int, text: str) -> Diagnostic:
         return Diagnostic(self.origin.within(self.text, min(offset, len(self.text))), "error", text)

@@ -17,8 +17,8 @@ from rosmop.tests.acting import definitions, load
 from rosmop.text.parser import MAX_CHARACTERS, MAX_DEPTH
 
 PAGE = (Path(__file__).parents[2] / "docs" / "reference" / "rv-language.md").read_text()
-EXAMPLE, GIVEN, ORDER, SAFE, WITHHELD, CALLS, VARIABLES, FUNCTIONS, PROPERTY, SLICED = re.findall(
-    r"```cpp\n(.*?)```", PAGE, re.DOTALL
+EXAMPLE, GIVEN, PRESET, ROLE, ORDER, SAFE, WITHHELD, CALLS, VARIABLES, FUNCTIONS, PROPERTY, SLICED = (
+    re.findall(r"```cpp\n(.*?)```", PAGE, re.DOTALL)
 )
 
 
@@ -59,6 +59,8 @@ HELPER = next(re.finditer(r"`(double half.*?})`", PAGE))[1]
         SLICED,
         SAFE + ORDER,
         GIVEN,
+        PRESET,
+        ROLE,
         in_specification(HELPER, "v = half(v);"),
     ],
 )

@@ -32,6 +32,10 @@ MAX_PERIOD_NS = 10**18
 """About 31 years."""
 
 
+_Parameters = tuple[tree.ParameterDeclaration, ...]
+_TYPED = tree.TypedTopic | tree.GivenList | tree.TypedEvent | tree.TypedSafe
+
+
 class _LiteralError(Exception):
     """An invalid literal; the text shows the correct form."""
 
@@ -85,10 +89,37 @@ class TreeBuilder(Transformer_NonRecursive[Token, Any]):
 
     # Files and specifications
 
-    def file(self, _: Meta, *children: Any) -> tree.SpecificationFile:
-        found = tuple(child for child in children if isinstance(child, tree.Specification))
-        orders = tuple(child for child in children if isinstance(child, tree.OrderStatement))
-        return tree.SpecificationFile(self._file, self._text, found, orders)
+    def file(self, _: Meta, *children: Any) -> tree.TypedFile:
+        def items(kind: type[_T]) -> tuple[_T, ...]:
+            return tuple(child for child in children if isinstance(child, kind))
+
+        found = (
+            child for child in children if isinstance(child, tree.Specification | tree.TypedSpecification)
+        )
+        file = tree.SpecificationFile(self._file, self._text, (), items(tree.OrderStatement))
+        return tree.TypedFile(file, tuple(found), items(tree.RoleDeclaration), items(tree.PresetStatement))
+
+    def preset(
+        self, meta: Meta, preset: Token, version: Token, name: Token | None, *settings: tree.Setting | None
+    ) -> tree.PresetStatement:
+        if not version.isdigit() or len(version) > 9:
+            self.refuse(version, f"`{version[:20]}` is not a version; write a whole number")
+        number = int(version) if version.isdigit() else 0
+        values = tuple(one for one in settings if one is not None)
+        return tree.PresetStatement(self.at(meta), str(preset), number, str(name or preset), values)
+
+    def setting(self, meta: Meta, name: Token, value: Token) -> tree.Setting:
+        return tree.Setting(self.at(meta), str(name), value.strip())
+
+    def role(
+        self, meta: Meta, name: Token, parameters: _Parameters | None, base: Token | None, *rows: tree.RoleRow
+    ) -> tree.RoleDeclaration:
+        return tree.RoleDeclaration(self.at(meta), str(name), parameters or (), str(base or ""), rows)
+
+    def row(self, meta: Meta, kind: Token, *parts: Any) -> tree.RoleRow:
+        parameters, pattern, cancels, action = (*parts, None)[:4]
+        name = "" if kind.type == "DEFAULT" else str(kind).replace("::", "/")
+        return tree.RoleRow(self.at(meta), name, parameters or (), pattern, cancels is not None, action)
 
     def order(self, meta: Meta, _word: Any, *names: Any) -> tree.OrderStatement:
         return tree.OrderStatement(
@@ -100,7 +131,7 @@ class TreeBuilder(Transformer_NonRecursive[Token, Any]):
     def nothing(self, meta: Meta) -> tree.Statement:
         return tree.Block(self.at(meta), ())
 
-    def specification(self, meta: Meta, *children: Any) -> tree.Specification:
+    def specification(self, meta: Meta, *children: Any) -> tree.Specification | tree.TypedSpecification:
         names = [
             child for child in children if isinstance(child, Token) and child.type in ("NAME", "MODIFIER")
         ]
@@ -111,7 +142,7 @@ class TreeBuilder(Transformer_NonRecursive[Token, Any]):
         def items(kind: type[_T]) -> tuple[_T, ...]:
             return tuple(child for child in children if isinstance(child, kind))
 
-        return tree.Specification(
+        known = tree.Specification(
             self.at(name) if not modifiers else self.at(meta),
             tuple(tree.Name(self.at(word), (str(word),)) for word in modifiers),
             str(name),
@@ -124,6 +155,15 @@ class TreeBuilder(Transformer_NonRecursive[Token, Any]):
             items(tree.SafeDeclaration),
             tuple(givens),
             items(tree.WithholdDeclaration),
+        )
+        if not any(isinstance(part, _TYPED) for part in (*children, *givens)):
+            return known
+        return tree.TypedSpecification(
+            known.position,
+            known,
+            tuple(givens),
+            tuple(one for one in children if isinstance(one, tree.EventDefinition | tree.TypedEvent)),
+            tuple(one for one in children if isinstance(one, tree.SafeDeclaration | tree.TypedSafe)),
         )
 
     def function(
@@ -149,8 +189,15 @@ class TreeBuilder(Transformer_NonRecursive[Token, Any]):
             self.at(meta), kind, str(name), found["value"], (found["unit"] or "").strip(), bounds
         )
 
-    def given_topic(self, meta: Meta, _word: Any, name: Any, topic: Any) -> tree.TopicDeclaration:
+    def given_topic(
+        self, meta: Meta, _word: Token, name: Token, role: Token | None, topic: Token
+    ) -> tree.TopicDeclaration | tree.TypedTopic:
+        if role is not None:
+            return tree.TypedTopic(self.at(meta), str(name), str(role), str(topic))
         return tree.TopicDeclaration(self.at(meta), str(name), str(topic))
+
+    def given_list(self, meta: Meta, kind: Token, name: Token, value: Token) -> tree.GivenList:
+        return tree.GivenList(self.at(meta), str(kind), str(name), value.strip())
 
     prototype = _unsaid
 
@@ -191,6 +238,14 @@ class TreeBuilder(Transformer_NonRecursive[Token, Any]):
         words = tuple(tree.Name(self.at(word), (str(word),)) for word in modifiers)
         return tree.EventDefinition(self.at(meta), words, str(name), parameters or (), trigger, action)
 
+    def typed_event(self, meta: Meta, *children: Any) -> tree.TypedEvent:
+        *modifiers, name, names, topic, when, action = children
+        words = tuple(tree.Name(self.at(word), (str(word),)) for word in modifiers)
+        return tree.TypedEvent(self.at(meta), words, str(name), names or (), str(topic), when, action)
+
+    def names(self, _: Meta, *words: Token) -> tuple[tree.Name, ...]:
+        return tuple(tree.Name(self.at(word), (str(word),)) for word in words)
+
     def trigger(
         self, meta: Meta, topic: Any, kind: Any, *rest: Any, part: str | None = None
     ) -> tree.MessageTrigger:
@@ -222,8 +277,17 @@ class TreeBuilder(Transformer_NonRecursive[Token, Any]):
             self.at(meta), name, place, tuple(fields or ()), str(topic), self._period_ns(period)
         )
 
+    def typed_safe(
+        self, meta: Meta, _: Token, _on: Token, topic: Token, _every: Token, period: Token
+    ) -> tree.TypedSafe:
+        return tree.TypedSafe(self.at(meta), str(topic), self._period_ns(period))
+
     def withhold(self, meta: Meta, _: Any, topic: Any, _from: Any, *rest: Any) -> tree.WithholdDeclaration:
         *networks, _while, condition = rest
+        networks = [
+            tree.Name(self.at(network), (str(network),)) if isinstance(network, Token) else network
+            for network in networks
+        ]
         return tree.WithholdDeclaration(
             self.at(meta), str(topic), tuple(networks), tree.Name(self.at(condition), (str(condition),))
         )

@@ -17,14 +17,19 @@ _AT = r"@(?=(?:bc?|c)(?!\w))(?!\w+<GAP>*\{)"
 _CONDITION = r"\{[^{}@]*@[A-Za-z_]\w*\.[^{}]*\}"
 
 _GRAMMAR = r"""
-file: (specification | using | order | ";")*
+file: (specification | using | order | preset | role | ";")*
 using: "using" "namespace" NAME ";"
 order: ORDER NAME ("<" NAME)* ";"
+preset: _PRESET NAME NUMBER ["as" NAME "{" setting* "}"]
+setting: NAME "=" GIVEN_VALUE ";"
+role: _ROLE NAME "(" [parameters] ")" [":" NAME] "{" row* "}"
+row: (ROW_TYPE | DEFAULT) ["(" [parameters] ")"] pattern [CANCEL] (block | ";")
 
 specification: NAME+ ["(" [parameters] ")" [given]] "{" item* "}"
-given: GIVEN "{" (given_value | given_topic)* "}"
+given: GIVEN "{" (given_value | given_topic | given_list)* "}"
 given_value: BUILTIN+ NAME "=" GIVEN_VALUE ";"
-given_topic: TOPIC_WORD NAME "=" TOPIC ";"
+given_topic: TOPIC_WORD NAME [":" NAME] "=" TOPIC ";"
+given_list: GIVEN_KIND NAME "=" GIVEN_VALUE ";"
 ?item: shared ";" | function | prototype | init | event | property | safe | withhold | ";" -> nothing
 
 function: type NAME "(" [parameters] ")" block
@@ -40,6 +45,8 @@ parameter: type NAME
          | type NAME "[" "]"                      -> array_parameter_behind
 
 event: MODIFIER* "event" NAME "(" [parameters] ")" trigger action
+     | MODIFIER* "event" NAME "(" [names] ")" TOPIC ["when" "(" expression ")"] action -> typed_event
+names: NAME ("," NAME)*
 ?action: block | "<<" statement* ">>"              -> block
 trigger: TOPIC MESSAGE_TYPE pattern ["when" "(" expression ")"]
        | SERVICE TOPIC MESSAGE_TYPE SERVICE_PART pattern ["when" "(" expression ")"] -> service_trigger
@@ -58,7 +65,8 @@ path_step: NAME ["[" NUMBER "]"]
          | NAME ("::" NAME)+                      -> name
 
 safe: SAFE MESSAGE_TYPE "{" [fields] "}" ON TOPIC EVERY DURATION ";"
-withhold: WITHHOLD TOPIC FROM string ("," string)* WHILE NAME ";"
+    | SAFE "{" "}" ON TOPIC EVERY DURATION ";"      -> typed_safe
+withhold: WITHHOLD TOPIC FROM (string ("," string)* | NAME) WHILE NAME ";"
 
 property: NAME ":" FORMULA handler*
 handler: AT CATEGORY block
@@ -199,13 +207,18 @@ STOP.5: /STOP(?=<GAP>*;)/
 RESET: "__RESET"
 PUBLISH: "PUBLISH"
 ORDER.5: /order(?=<GAP>+[A-Za-z_]\w*<GAP>*[<;])/
+_PRESET.5: /preset(?=<GAP>+[A-Za-z_]\w*<GAP>+\d)/
+_ROLE.5: /role(?=<GAP>+[A-Za-z_]\w*<GAP>*\()/
+ROW_TYPE.5: /[A-Za-z]\w*\/[A-Za-z]\w*(?=<GAP>*['(])/
+CANCEL: "cancel"
+GIVEN_KIND.5: /(corners|joints|hosts|time)(?!\w)/
 GIVEN.5: /given(?!\w)/
 TOPIC_WORD.5: /topic(?!\w)/
 GIVEN_VALUE.9: /[^;={}]+/
-SAFE.5: /safe(?=<GAP>+[A-Za-z]\w*(\/|::)[A-Za-z]\w*<GAP>*\{)/
+SAFE.5: /safe(?=<GAP>+[A-Za-z]\w*(\/|::)[A-Za-z]\w*<GAP>*\{|<GAP>*\{<GAP>*\}<GAP>*on(?!\w))/
 ON.5: /on(?!\w)/
-WITHHOLD.5: /withhold(?=<GAP>+[~\/A-Za-z_][\w\/]*<GAP>+from<GAP>*")/
-FROM.5: /from(?=<GAP>*")/
+WITHHOLD.5: /withhold(?=<GAP>+[~\/A-Za-z_][\w\/]*<GAP>+from(<GAP>*"|<GAP>+[A-Za-z_]\w*<GAP>+while(?!\w)))/
+FROM.5: /from(?=<GAP>*")|from(?=<GAP>+[A-Za-z_]\w*<GAP>+while(?!\w))/
 CALL.3: /CALL(?=<GAP>*\(<GAP>*["\/~])/
 SERVICE.5: /service(?!\w)/
 EVERY.5: /every(?!\w)/

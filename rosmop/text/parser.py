@@ -1,6 +1,7 @@
 """Parse the text of an ``.rv`` file into a tree, in time and memory linear in its length."""
 
 import re
+from collections.abc import Mapping
 from functools import lru_cache
 
 from lark import Lark, Token, Tree
@@ -11,6 +12,8 @@ from rosmop.text import tree
 from rosmop.text.builder import TreeBuilder, check
 from rosmop.text.complaints import FORBIDDEN, RESERVED, describe, misplaced
 from rosmop.text.grammar import GRAMMAR
+from rosmop.text.typed import made
+from rosmop.types.roles import ROLES
 
 MAX_CHARACTERS = 128 * 1024
 MAX_DEPTH = 100
@@ -49,16 +52,27 @@ def parse(text: str, file: str) -> tree.SpecificationFile:
             start.within(text, broken.start()), "these bytes are not UTF-8; save the file as UTF-8"
         )
     _check_directives(text, file)
-    parsed = _parse(text, file)
-    _check_depth(parsed, file)
-    builder = TreeBuilder(file, text)
-    result: tree.SpecificationFile = builder.transform(parsed)
-    check(builder)
+    result = made(_built(text, file), roles)
     if not result.specifications and not result.orders:
         raise SpecificationError.at(
             start, "there is no specification in this file; write `name() { event … }`"
         )
     return result
+
+
+def _built(text: str, file: str) -> tree.TypedFile:
+    parsed = _parse(text, file)
+    _check_depth(parsed, file)
+    builder = TreeBuilder(file, text)
+    result: tree.TypedFile = builder.transform(parsed)
+    check(builder)
+    return result
+
+
+@lru_cache(maxsize=1)
+def roles() -> Mapping[str, tree.RoleDeclaration]:
+    """Return the roles that every file has."""
+    return {role.name: role for role in _built(ROLES, "the roles").roles}
 
 
 def _parse(text: str, file: str) -> Tree[Token]:

@@ -449,6 +449,8 @@ class Property(SyntaxNode):
     formula: str
     formula_position: Position = field(compare=False)
     handlers: tuple[Handler, ...]
+    times: tuple[tuple[str, int], ...] = ()
+    """The names that stand for times in the formula, with nanoseconds."""
 
 
 @dataclass(frozen=True)
@@ -471,6 +473,51 @@ class TopicDeclaration(SyntaxNode):
 
 
 @dataclass(frozen=True)
+class TypedTopic(SyntaxNode):
+    """`topic name : role = /default;`: a topic whose type is one of those of a role."""
+
+    name: str
+    role: str
+    topic: str
+
+
+@dataclass(frozen=True)
+class GivenList(SyntaxNode):
+    """`kind name = default;`: corners, limits of joints, hosts, or a time."""
+
+    kind: str
+    name: str
+    default: str
+
+
+@dataclass(frozen=True)
+class TypedEvent(SyntaxNode):
+    """An event on a typed topic: `names` are values of its role."""
+
+    modifiers: tuple[Name, ...]
+    name: str
+    names: tuple[Name, ...]
+    topic: str
+    when: Expression | None
+    action: Block
+
+
+@dataclass(frozen=True)
+class TypedSafe(SyntaxNode):
+    """`safe { } on topic every period;`, of a typed topic."""
+
+    topic: str
+    period_ns: int
+
+
+@dataclass(frozen=True)
+class GivenItems(InitializerList):
+    """The items of a table that operators set. The identity of a state is without them, so the state stays."""
+
+    items: tuple[Expression, ...] = field(compare=False)
+
+
+@dataclass(frozen=True)
 class SafeDeclaration(SyntaxNode):
     """`safe type { field:value, … } on topic every period;`."""
 
@@ -488,6 +535,8 @@ class WithholdDeclaration(SyntaxNode):
     topic: str
     networks: tuple[StringLiteral, ...]
     condition: Name
+    given: tuple[str, ...] = field(default=(), compare=False)
+    """The networks that operators set, in place of `networks`."""
 
 
 @dataclass(frozen=True)
@@ -508,6 +557,59 @@ class Specification(SyntaxNode):
 
 
 @dataclass(frozen=True)
+class TypedSpecification(SyntaxNode):
+    """A specification with parts whose types or values are not known yet; `known` has all others."""
+
+    known: Specification
+    givens: tuple[GivenValue | TopicDeclaration | TypedTopic | GivenList, ...]
+    events: tuple[EventDefinition | TypedEvent, ...]
+    safes: tuple[SafeDeclaration | TypedSafe, ...]
+
+
+@dataclass(frozen=True)
+class RoleRow(SyntaxNode):
+    """The values of a role in messages of one type, or with an empty `type`, of every other type.
+
+    Without `action`, each value is a field. With it, the fields are `parameters`, and the statements make the values.
+    A message that `cancels` cannot stop a robot: it is dropped instead, and a stop cancels all goals.
+    """
+
+    type: str
+    parameters: tuple[ParameterDeclaration, ...]
+    pattern: tuple[Binding, ...]
+    cancels: bool
+    action: Block | None
+
+
+@dataclass(frozen=True)
+class RoleDeclaration(SyntaxNode):
+    """`role name(values) : base { rows }`."""
+
+    name: str
+    parameters: tuple[ParameterDeclaration, ...]
+    base: str
+    rows: tuple[RoleRow, ...]
+
+
+@dataclass(frozen=True)
+class Setting(SyntaxNode):
+    """`name = value;` of a `preset` statement; the meaning of the value depends on what `name` is."""
+
+    name: str
+    value: str
+
+
+@dataclass(frozen=True)
+class PresetStatement(SyntaxNode):
+    """`preset preset version as name { settings }`: the name and the values of the specification `preset`."""
+
+    preset: str
+    version: int
+    name: str
+    settings: tuple[Setting, ...]
+
+
+@dataclass(frozen=True)
 class OrderStatement(SyntaxNode):
     """`order first < second;`"""
 
@@ -522,3 +624,13 @@ class SpecificationFile:
     text: str
     specifications: tuple[Specification, ...]
     orders: tuple[OrderStatement, ...] = ()
+
+
+@dataclass(frozen=True)
+class TypedFile:
+    """A file as written, before types and values are chosen (`typed.py`)."""
+
+    file: SpecificationFile
+    specifications: tuple[Specification | TypedSpecification, ...]
+    roles: tuple[RoleDeclaration, ...]
+    presets: tuple[PresetStatement, ...]

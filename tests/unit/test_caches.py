@@ -33,7 +33,6 @@ FAILURES = {
     "appliance/configuration/inventory.py::inventory": OURS,
     "appliance/features/doors/rosbridge_frames.py::_publish_head": NEVER,
     "appliance/features/guards/released.py::versions_of": OURS,
-    "appliance/features/guards/presets.py::_value_of": OURS,
     "appliance/features/guards/released.py::origin_of": OURS,
     "appliance/features/standby/witness.py::tag_of": NEVER,
     "appliance/features/views.py::pair_view": OURS,
@@ -49,6 +48,8 @@ FAILURES = {
     "rosmop/fast/wasm_instance.py::load": OURS,
     "rosmop/run/interpreter.py::_nobody": OURS,
     "rosmop/text/parser.py::_parser": OURS,
+    "rosmop/text/parser.py::roles": OURS,
+    "rosmop/types/roles.py::types_of_roles": OURS,
     "roswire/parameter_tree.py::parts_of": NEVER,
     "roswire/uris.py::parse_node_uri": SHORT,
 }

@@ -27,6 +27,8 @@ PUBLIC = {
     "run.engine": "`MonitorSet`",
     "run.fast_path": "lanes of the fast path",
     "run.outcomes": "what came of a message, and why",
+    "types.given_lists": "values of lists that operators give",
+    "types.roles": "the message types of a topic's role",
 }
 """The modules of the language that the appliance imports, besides those of the command (`rosmop.tool`)."""
 

@@ -18,7 +18,7 @@ class PresetParameter(msgspec.Struct, frozen=True):
     least: Annotated[str, doc("the least value, or empty if it is not a number")]
     most: Annotated[str, doc("the greatest value, or empty if it is not a number")]
     what: Annotated[str, doc("its meaning, for a person")]
-    loads: Annotated[bool, doc("it is in the text: a change loads the guard again, and for admins only")]
+    loads: Annotated[bool, doc("it is in the guard's file: a change loads the file, and for admins only")]
     safe: Annotated[
         str, doc("the values that the standard asks for, such as `>= 1.6`, or empty if it asks for none")
     ] = ""

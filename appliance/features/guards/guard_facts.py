@@ -25,7 +25,7 @@ def preset_row(preset: Preset) -> PresetRow:
         preset.version,
         preset.what,
         preset.given_topics,
-        {given: list(rows) for given, rows in preset.topics.items()},
+        {given: [*types] for given, types in preset.topics.items()},
         [PresetParameter(one.name, one.kind, one.default, one.unit, one.least, one.most, one.what, one.loads,
                          one.safe)
          for one in preset.parameters],

@@ -34,6 +34,7 @@ from appliance.features.guards.presets import (
     Preset,
     below_the_standard,
     described,
+    keeps_state,
     loaded_values,
     preset_named,
     preset_of,
@@ -207,8 +208,9 @@ class GuardOrders:
             if request.upgrade:
                 changed = {**new.changed}
         warnings, refused = await self._judged(request, file, text, who, shadow=shadow)
+        begins = bool(file) and not (request.values and keeps_state(text, request.values))
         return GuardPlan(
-            monitors.revision, monitors.tag, name, file, text if file else "", bool(file), shadow, changed, topics,
+            monitors.revision, monitors.tag, name, file, text if file else "", begins, shadow, changed, topics,
             stops, kept + warnings, refused, off,
         )  # fmt: skip
 

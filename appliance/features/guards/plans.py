@@ -3,8 +3,8 @@
 from collections.abc import Iterable, Mapping
 from difflib import get_close_matches
 
-from appliance.features.guards.message_types import SENSORS, TypeRow, judges_arrival, row_of, works_with
-from appliance.features.guards.presets import Guard, GuardError, Preset
+from appliance.features.guards.message_types import VALUED
+from appliance.features.guards.presets import Guard, GuardError, Preset, works_with
 from appliance.features.guards.robot_graph import TopicFacts
 
 _UNKNOWN = "*"  # the type of a topic that has only subscribers which do not know it
@@ -26,29 +26,28 @@ def planned(  # noqa: PLR0917  one caller
         before = topics["command"].removesuffix("/goal")
         chosen = {"by": f"{before}/result", "cancel": f"{before}/cancel"} | chosen
     types = {}
-    for each, rows in preset.topics.items():
+    for each, fitting in preset.topics.items():
         if each not in chosen and each in given and given[each] not in known:
-            raise GuardError(_needed(preset, each, rows, known))
+            raise GuardError(_needed(preset, each, fitting, known))
         topic = chosen.setdefault(each, given[each])
-        types[each] = _type_of(topic, each, known, kinds, rows)
+        types[each] = _type_of(topic, each, known, kinds, fitting)
     return Guard(name, preset, chosen, types, _fitting(preset, types, values))
 
 
 def _fitting(preset: Preset, types: Mapping[str, str], values: Mapping[str, str]) -> Mapping[str, str]:
     """Switch off the comparison of values for a type of which only the time of arrival is known."""
-    row = row_of(preset.topics.get("by", {}), types.get("by", ""))
-    if preset.name != "sensor" or row is None or not judges_arrival(row):
+    if preset.name != "sensor" or types["by"] in VALUED:
         return values
     if values.get("frozen", "0") != "0":
         raise GuardError(
             f"of {types['by']} only the silence is judged: leave out frozen; a sensor that works with values has one"
-            f" of the types {', '.join(kind for kind in SENSORS if not judges_arrival(SENSORS[kind]))}"
+            f" of the types {', '.join(VALUED)}"
         )
     return {"frozen": "0", **values}
 
 
 def _type_of(
-    topic: str, given: str, known: Mapping[str, str], kinds: Mapping[str, str], rows: Mapping[str, TypeRow]
+    topic: str, given: str, known: Mapping[str, str], kinds: Mapping[str, str], fitting: tuple[str, ...]
 ) -> str:
     if topic in known:
         if given in kinds and kinds[given] != known[topic]:
@@ -56,20 +55,20 @@ def _type_of(
         return known[topic]
     if given in kinds:
         return kinds[given]
-    close = get_close_matches(topic, [name for name, kind in known.items() if kind in rows], 1, 0.5)
+    close = get_close_matches(topic, [name for name, kind in known.items() if kind in fitting], 1, 0.5)
     hint = f"; did you mean {close[0]}?" if close else "."
-    option = f"{given}={next(iter(rows))}" if len(rows) == 1 else f"{given}=TYPE, of {works_with(rows)}"
+    option = f"{given}={fitting[0]}" if len(fitting) == 1 else f"{given}=TYPE, of {works_with(fitting)}"
     raise GuardError(
         f"no node has the topic {topic} now{hint} If it comes later, give its type: --type {option}"
     )
 
 
-def _needed(preset: Preset, given: str, rows: Mapping[str, TypeRow], known: Mapping[str, str]) -> str:
+def _needed(preset: Preset, given: str, fitting: tuple[str, ...], known: Mapping[str, str]) -> str:
     option = "--by" if given == "by" else f"--topic {given}="
-    fitting = sorted(name for name, kind in known.items() if kind in rows)
+    there_are = sorted(name for name, kind in known.items() if kind in fitting)
     there = (
-        f"this robot has {', '.join(fitting[:5])}"
-        if fitting
-        else f"no topic now has a type of {works_with(rows)}"
+        f"this robot has {', '.join(there_are[:5])}"
+        if there_are
+        else f"no topic now has a type of {works_with(fitting)}"
     )
     return f"{preset.name} needs a topic for {given}: give {option}{'' if option.endswith('=') else ' '}TOPIC; {there}"

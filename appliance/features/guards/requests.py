@@ -98,8 +98,7 @@ class GuardNew(AdminRequest[Replacement], frozen=True, tag="guard new"):
     problems=_NO_GUARD,
 )  # fmt: skip
 class GuardSet(AdminRequest[GuardList], frozen=True, tag="guard set"):
-    """Set parameters of a guard. It keeps its state, unless a polygon, limits of joints, a deadline or hosts
-    are set.
+    """Set parameters of a guard. It keeps its state, unless limits of joints or a deadline are set.
 
     Operators set constants with `PATCH /v1/monitors/{name}/given`.
     """

@@ -8,7 +8,7 @@
 """
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -176,7 +176,7 @@ class RobotGraph:
         wanted = {*kinds}
         return any(topic.type in wanted and node in topic.publishers for topic in self.topics)
 
-    def unguarded(self, kinds: Mapping[str, object]) -> list[TopicFacts]:
+    def unguarded(self, kinds: Collection[str]) -> list[TopicFacts]:
         """Return topics that no preset works with: with both ends and a command's name, or goals of a driver."""
         drivers = frozenset(node for robot in self.robots for node in robot.drivers)
         return [

@@ -127,7 +127,7 @@ def advice(
             writer.add_goal(goal)
     for command in graph.velocities:
         writer.add_joystick(command)
-    unguarded = graph.unguarded(types.COMMANDS | types.GOALS)
+    unguarded = graph.unguarded({*types.COMMANDS, *types.GOALS})
     if unguarded and graph.robots:
         named = ", ".join(f"{topic.name} ({topic.type})" for topic in unguarded[:5])
         writer.left_out.append(f"no preset works with these commands, which may also move the robot: {named}")

@@ -221,8 +221,7 @@ def set_values(
     since: Annotated[str, typer.Option("--since", help="With --dry-run: from this time on")] = "1h",
     hold: _Hold = False,
 ) -> None:
-    """Set parameters of a guard while it runs. It keeps its state, unless a polygon, limits, a deadline or
-    hosts are set.
+    """Set parameters of a guard while it runs. It keeps its state, unless limits of joints or a deadline are set.
 
     Example: rosrv guard set fence margin=0.5
     """
@@ -514,8 +513,8 @@ def _say_suggestion(one: Suggestion) -> None:
 
 def _say_preset(preset: Preset) -> None:
     say(f"{preset.name}: {preset.what}")
-    for given, rows in preset.topics.items():
-        say(f"    {given}: {', '.join(rows)}", "dim")
+    for given, types in preset.topics.items():
+        say(f"    {given}: {', '.join(types)}", "dim")
     if preset.parameters:
         table = table_of("    parameter", "default", "range", "meaning")
         for one in preset.parameters:

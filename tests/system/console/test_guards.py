@@ -50,7 +50,7 @@ def test_a_fence_is_drawn_changed_and_enforced(
     expect(row).to_contain_text("unless confirmed")
     row.get_by_role("button", name="Confirm").click()
     expect(row).not_to_contain_text("unless confirmed")
-    assert "POLYGON[] = {-1, -1, 2, -1, 1, 1, -1, 1}" in appliance.rosrv("monitor", "show").stdout
+    assert "polygon = -1,-1 2,-1 1,1 -1,1;" in appliance.rosrv("monitor", "show").stdout
     viewed = opened(token("viewer")).go("robot").locator("tr[data-guard=fence]")
     expect(viewed.get_by_role("button", name="Remove")).to_have_attribute("aria-disabled", "true")
     row.get_by_role("button", name="Remove").click()
@@ -59,11 +59,11 @@ def test_a_fence_is_drawn_changed_and_enforced(
     page.get_by_role("button", name="Undo").click()
     expect(reader.toast("fence is back")).to_be_visible()
     expect(row).to_contain_text("/cmd_vel")
-    assert "POLYGON[] = {-1, -1, 2, -1, 1, 1, -1, 1}" in appliance.rosrv("monitor", "show").stdout
+    assert "polygon = -1,-1 2,-1 1,1 -1,1;" in appliance.rosrv("monitor", "show").stdout
     removed = appliance.rosrv("guard", "remove", "fence").stdout
     undo = shlex.split(removed.partition("undo: ")[2].splitlines()[0])
     assert appliance.rosrv(*undo[1:]).returncode == 0
-    assert "POLYGON[] = {-1, -1, 2, -1, 1, 1, -1, 1}" in appliance.rosrv("monitor", "show").stdout
+    assert "polygon = -1,-1 2,-1 1,1 -1,1;" in appliance.rosrv("monitor", "show").stdout
     appliance.rosrv("guard", "remove", "fence")
 
 

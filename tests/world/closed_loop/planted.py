@@ -57,17 +57,16 @@ def replaced(old: str, new: str, *, count: int = 0) -> Change:
 
 def _body(statements: str) -> Change:
     def change(text: str) -> str:
-        head, brace, rest = text.partition("\n} {\n")
-        kind = re.search(r"event \w+\([^)]*\) command\s+(\S+)", rest)
-        assert brace and kind is not None
-        return f"{head}{brace}{statements.replace('TYPE', kind[1])}\n}}\n"
+        head, brace, _rest = text.partition("\n} {\n")
+        assert brace
+        return f"{head}{brace}{statements}\n}}\n"
 
     return change
 
 
-no_guard = _body("event drive() command TYPE '{}' { }")
+no_guard = _body("event drive() command { }")
 """A guard that does nothing."""
-stops_everything = _body("safe TYPE { } on command every 100ms;\nevent drive() command TYPE '{}' { STOP; }")
+stops_everything = _body("safe { } on command every 100ms;\nevent drive() command { STOP; }")
 
 
 def _forgetful(guard: RunningGuard) -> None:
@@ -188,7 +187,7 @@ FAULTS: Mapping[str, Fault] = {
     ),
     # L5
     "estop begins anew after its state is lost": Fault(
-        "L5", "estop", replaced(r"(?m)^estop\(|^guard\(", "begin guard(")
+        "L5", "estop", replaced(r"(?m)^estop\(", "begin estop(")
     ),
     "a hold drops observed messages": Fault("L5", "estop", patch=(RunningGuard, "tell", _deaf)),
     "a hold of a fence drops observed messages": Fault("L5", "fence", patch=(RunningGuard, "tell", _deaf)),

@@ -171,7 +171,7 @@ async def test_a_plan_says_what_a_change_would_do(
     manager.givens.states = lambda _checked, _name: [SimpleNamespace(name="margin", value=0.2, kind="double")]
     manager.shadow = True
     plan = await orders.plan(guard_requests.GuardTry(**{"name": "fence", **request_}), "eve")
-    assert (plan.file, plan.begins, plan.changed) == (loads, bool(loads), changed)
+    assert (plan.file, plan.begins, plan.changed) == (loads, loads == "yard.rv", changed)
     assert plan.shadow is not (request_.keys() > {"topics"} or "enforce" in request_)
     assert plan.acts.keys() == ({"command", "by"} if loads == "yard.rv" else set())
     manager.objection = ["fence would hold /cmd_vel"]
@@ -197,7 +197,7 @@ async def test_values_are_set_in_one_change(manager: Manager, orders: GuardOrder
     values = {"polygon": "0,0 2,0 2,2", "margin": "0.5"}
     await orders.set(guard_requests.GuardSet("fence", values, "2.0"), "eve")
     [load] = manager.orders
-    assert "{0, 0, 2, 0, 2, 2}" in load.files["fence.rv"]
+    assert "\n    polygon = 0,0 2,0 2,2;\n" in load.files["fence.rv"]
     assert (load.given, load.shadow, load.expected) == ({"fence": {"margin": "0.5"}}, True, "2.0")
     manager.orders.clear()
     await orders.set(guard_requests.GuardSet("fence", {"margin": "0.5"}), "eve")
@@ -259,7 +259,7 @@ async def test_a_new_guard_is_in_shadow_mode_or_in_force(
     await orders.new(request, "eve")
     [load] = manager.orders
     assert manager.enabling == [not shadow]
-    assert "double vMax = 0.3 m/s" in load.files["speed.rv"]
+    assert "\n    vMax = 0.3;\n" in load.files["speed.rv"]
     assert (load.shadow, load.confirm_within, load.note[:14]) == (shadow, 300.0, "preset speed 2")
 
 

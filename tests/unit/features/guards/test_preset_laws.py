@@ -5,7 +5,6 @@ recipe, and each cell that its law does not cover needs a reason in `REASONS`.
 """
 
 import math
-import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import product
@@ -13,10 +12,13 @@ from typing import Any
 
 import pytest
 
-from appliance.features.guards.message_types import ANY_TYPE, GOAL, VELOCITIES
+from appliance.features.guards.message_types import GOAL, VELOCITIES
 from appliance.features.guards.presets import PRESETS, Guard, below_the_standard, text_of
 from rosmop.run.outcomes import MessageSender
 from rosmop.tests.acting import fields, message
+from rosmop.text import tree
+from rosmop.text.parser import parse, roles
+from rosmop.types.roles import ANY_TYPE
 from tests.support.examples import ALL
 from tests.unit.features.guards.guarding import BEGIN, MS, NODES, Guarded
 from tests.unit.features.guards.test_watching_presets import trajectory, with_id
@@ -165,7 +167,7 @@ REASONS: dict[tuple[str, str, str, str], str] = {
         "*",
     ): "muting is off by default: `test_muting_is_off_by_default_bounded_and_needs_a_signal_that_changes`",
     ("*", "*", "status", "NaN"): "a whole number has no NaN",
-    ("sensor", "by", "lacking", "NaN"): "an altitude is not known without a fix in three dimensions",
+    ("sensor", "by", "altitude", "NaN"): "an altitude is not known without a fix in three dimensions",
     ("*", "*", "fixed", "NaN"): "a whole number has no NaN",
     ("estop", "reset", "*", "absent"): "without a reset the stop stays",
     ("estop", "reset", "*", "out of range"): "every number but 0 is true",
@@ -198,7 +200,13 @@ class Place:
     path: str = ""
 
 
-_PATTERN = re.compile(r"event \w+\([^)]*\) (\w+)\s+(\w+/\w+)\s+'\{([^}]*)\}'")
+def paths_of(pattern: tuple[tree.Binding, ...]) -> list[tuple[str, str]]:
+    """Return the path and the name of each value."""
+    return [(".".join(step.name for step in one.path), one.variable or "") for one in pattern]
+
+
+PATHS = {row.type: {name: path for path, name in paths_of(row.pattern)} for row in roles()["Velocity"].rows}
+"""The path of each value in the types of velocities."""
 
 
 def kinds_of(preset: str) -> Iterator[dict[str, str]]:
@@ -213,11 +221,11 @@ def kinds_of(preset: str) -> Iterator[dict[str, str]]:
 def places_of(preset: str) -> list[Place]:
     found: dict[Place, None] = {}
     for kinds in kinds_of(preset):
-        text = text_of(Guard("guard", PRESETS[preset], types=kinds))
-        for topic, kind, pattern in _PATTERN.findall(text):
-            parts = [one.split(":") for one in pattern.split(", ") if one]
-            for path, name in parts or [("", "")]:
-                found[Place(preset, topic, kind, name, path)] = None
+        [guard] = parse(text_of(Guard("guard", PRESETS[preset], types=kinds)), "guard.rv").specifications
+        for event in guard.events:
+            if isinstance(on := event.trigger, tree.MessageTrigger):
+                for path, name in paths_of(on.pattern) or [("", "")]:
+                    found[Place(preset, on.topic, on.type, name, path)] = None
     bound = {(one.topic, one.kind) for one in found if one.name}
     return [one for one in found if one.name or (one.topic, one.kind) not in bound]
 
@@ -263,7 +271,7 @@ class Lab(Guarded):
     def command(self, change: Values | None = None, *, moves: bool = True) -> bytes:
         kind = self.kinds["command"]
         if kind in VELOCITIES:
-            x = VELOCITIES[kind].paths["x"].replace(".", "__")
+            x = PATHS[kind]["x"].replace(".", "__")
             return message(kind, **{x: 0.1 if moves else 0.0, **(change or {})})
         if kind == TRAJECTORY:
             return trajectory(["elbow"], (1.0, [0.0]), (2.0, [0.01]))
@@ -276,9 +284,7 @@ class Lab(Guarded):
         kind = self.kinds["command"]
         if kind in VELOCITIES:
             read = fields(kind, data)
-            return any(
-                _get(read, path) != 0 for name, path in VELOCITIES[kind].paths.items() if name in MOVING
-            )
+            return any(_get(read, path) != 0 for name, path in PATHS[kind].items() if name in MOVING)
         return kind != TRAJECTORY or len(fields(kind, data).points) > 0
 
     def passes(self, change: Values | None = None, *, moves: bool = True) -> bool:

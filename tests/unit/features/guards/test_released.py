@@ -1,7 +1,6 @@
 """Guards of released versions are recognised by their texts, and upgraded with their values."""
 
 import re
-import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import product
@@ -9,14 +8,14 @@ from pathlib import Path
 
 import pytest
 
-from appliance.features.guards import released, upgrades
-from appliance.features.guards.message_types import ANY_TYPE
+from appliance.features.guards import old_form, released, upgrades
 from appliance.features.guards.presets import (
     PRESETS,
     Guard,
     GuardError,
     Parameter,
     Preset,
+    name_in,
     preset_of,
     text_of,
     topics_in,
@@ -25,14 +24,22 @@ from appliance.features.guards.presets import (
     with_values,
 )
 from appliance.features.guards.released import FOLDER, origin_of
+from appliance.features.guards.robot_graph import TopicFacts
 from appliance.features.guards.upgrades import upgraded
 from distribution import released_presets
-from distribution.released_presets import lines_of
+from rosmop.text.parser import parse
+from rosmop.types.roles import ANY_TYPE
 from tests.support.examples import sample
 
+LAST_OLD = {
+    "agree": 1, "answer": 1, "arm": 1, "deadman": 2, "estop": 1, "fence": 2, "joints": 1, "rate": 1, "sane": 1,
+    "sensor": 2, "separation": 1, "speed": 1, "withhold": 1,
+}  # fmt: skip
+"""The versions whose guards have their types and values all over their texts."""
 VALUES = {"corners": "0,0 4,0 0,3.5", "joints": "a:-1..1 b:0..2.5", "time": "7s", "hosts": "10.0.0.7/32 10.8.0.0/16",
           "bool": "true"}  # fmt: skip
 RELEASED = [tuple(path.stem.rsplit("-", 1)) for path in sorted(FOLDER.glob("*.rv"))]  # names and versions
+OLD = [(name, version) for name, version in RELEASED if int(version) <= LAST_OLD.get(name, 0)]
 
 
 def another(parameter: Parameter) -> str:
@@ -46,9 +53,7 @@ def another(parameter: Parameter) -> str:
 
 def made(preset: Preset, kinds: tuple[str, ...] = ()) -> Guard:
     """Return a guard with other topics and values than those of the preset."""
-    types = dict(
-        zip(preset.topics, kinds or (next(iter(rows)) for rows in preset.topics.values()), strict=True)
-    )
+    types = dict(zip(preset.topics, kinds or (types[0] for types in preset.topics.values()), strict=True))
     topics = {name: f"/robot/{name}/goal" for name in preset.given_topics}
     values = {each.name: another(each) for each in preset.parameters}
     return Guard("mine", preset, topics, types, values)
@@ -75,44 +80,84 @@ def test_a_text_that_was_changed_is_not_the_presets(preset: Preset) -> None:
     for other in (
         text + "\n// more\n",
         text + "\nother() { }\n",
-        text.replace(") given {", ") given  {", 1) + " ",
+        text.replace(") given {", ") given  {", 1),
+        text + " ",
     ):
         assert origin_of(other) == "changed"
 
 
 @pytest.mark.parametrize("preset", PRESETS.values(), ids=PRESETS)
-def test_a_value_beyond_its_range_or_in_another_place_is_a_change(preset: Preset) -> None:
+def test_a_value_beyond_its_range_or_without_a_place_is_a_change(preset: Preset) -> None:
     text = text_of(made(preset))
     for each in preset.parameters:
         if each.most:
-            beyond = re.sub(rf"( {each.name} = )[^ ;]+", r"\g<1>1e9", text, count=1)
-            assert origin_of(beyond) == "changed"
-            inner = text.replace("} {\n", f"}} {{\n    {each.kind} {each.name} = {each.most};\n", 1)
-            assert origin_of(inner) == "changed"
-    for name, topic in topics_in(text).items():
-        assert origin_of(text.replace(f"{name}={topic}", f"{name}=/another", 1)) == "changed"
+            assert origin_of(re.sub(rf"( {each.name} = )[^ ;]+", r"\g<1>1e9", text, count=1)) == "changed"
+    for other in ("unknown = 1;", "command = cmd;", "command = /c std_msgs/Empty;"):
+        assert origin_of(text.replace("\n}\n", f"\n    {other}\n}}\n", 1)) == "changed"
 
 
-@pytest.mark.parametrize(("name", "version"), RELEASED)
-def test_a_guard_of_a_released_version_is_recognised(name: str, version: str) -> None:
-    """Also after `message_types.py` has changed: the rows of the release are those of its texts."""
-    old = released.released(name, int(version))
-    line, _, rest = text_of(replace(made(old), types={})).partition("\n")
-    for topic, kind in types_in(old.text).items():
-        line = re.sub(rf"\b({topic}=[^ ,]+)", rf"\g<1> {kind}", line)
-    text = f"{line}\n{rest}"
-    assert origin_of(text) == ("current" if int(version) == PRESETS[name].version else "older")
-    assert origin_of(text.replace("(", "( ", 1)) == "changed"
+def old_guard(name: str, version: str) -> str:
+    """Return a guard of an old release with another name, topics and values."""
+    base = released.released(name, int(version))
+    text = old_form.with_name(base.text, "mine")
+    text = old_form.with_values(text, {each.name: another(each) for each in base.parameters})
+    for topic, default in base.given_topics.items():
+        new = f"/robot/{'command/cancel' if topic == 'cancel' else topic}"
+        text = old_form.with_topic(text, topic, new).replace(f"{topic}={default}", f"{topic}={new}", 1)
+        if f"{topic}={new}" not in text.partition("\n")[0] and topic != "cancel":
+            text = text.replace("\n", f", {topic}={new}\n", 1)
+    return text
+
+
+@pytest.mark.parametrize(("name", "version"), OLD)
+def test_a_guard_of_an_old_release_is_recognised_and_made_again(name: str, version: str) -> None:
+    text = old_guard(name, version)
+    base = released.released(name, int(version))
+    topics = {
+        topic: f"/robot/{'command/cancel' if topic == 'cancel' else topic}" for topic in base.given_topics
+    }
     guard = preset_of(text)
-    assert guard is not None and guard.version == int(version)
-    for each in guard.parameters:
-        if each.most:
-            assert f" {each.name} = {each.least}" in with_values(text, {each.name: each.least})
+    assert guard is not None and (guard.version, name_in(text), topics_in(text)) == (
+        int(version),
+        "mine",
+        topics,
+    )
+    assert values_in(text) == {each.name: another(each) for each in base.parameters}
+    for own in (text, text + "\norder mine < other;\n", base.text):
+        assert origin_of(own) == "older"
+    for other in (text.replace("STOP;", "", 1), text.replace("return", "", 1), text + "\n// more\n"):
+        assert other == text or origin_of(other) == "changed"
+    for topic in topics.keys() - {"cancel"}:
+        assert origin_of(text.replace(f"{topic}=/robot", f"{topic}=/other", 1)) == "changed"
+    present = {one.name for one in PRESETS[name].parameters}
+    kept = {one.name for one in base.parameters} & present
+    by_default = {one: value for one, value in values_in(base.text).items() if one not in present}
+    graph = [*old_types(text), ("/joint_states", "sensor_msgs/JointState")]
+    facts = [TopicFacts(topic, kind, (), ()) for topic, kind in graph]
+    new = upgraded(old_form.with_values(text, by_default), {}, facts)
+    assert origin_of(new.text) == "current" and topics_in(new.text).items() >= topics.items()
+    assert {one: values_in(new.text)[one] for one in kept} == {one: values_in(text)[one] for one in kept}
 
 
-def test_the_table_of_released_texts_has_each_version_and_no_other() -> None:
-    there = {(name, str(version)) for name in PRESETS for version in released.versions_of(name)}
-    assert there == {*RELEASED}
+def old_types(text: str) -> Iterator[tuple[str, str]]:
+    for name, topic in topics_in(text).items():
+        if kind := types_in(text).get(name):
+            yield topic, kind
+
+
+@pytest.mark.parametrize(("name", "version"), OLD)
+def test_a_list_of_an_old_guard_is_set_in_its_text(name: str, version: str) -> None:
+    base = released.released(name, int(version))
+    for each in base.parameters:
+        text = with_values(base.text, {each.name: another(each)})
+        assert text.count("\n") == base.text.count("\n") and values_in(text)[each.name] == another(each)
+        parse(text, "guard.rv")
+        assert with_values(text, {each.name: each.default}) == base.text
+
+
+def test_the_table_of_released_texts_has_each_old_version_and_no_other() -> None:
+    assert {(name, str(version)) for name in PRESETS for version in released.versions_of(name)} == {*OLD}
+    assert {(name, str(version)) for name, version in LAST_OLD.items()} == {*OLD}
 
 
 @pytest.mark.parametrize("preset", PRESETS.values(), ids=PRESETS)
@@ -122,25 +167,18 @@ def test_a_preset_that_differs_from_its_released_text_has_a_higher_version(prese
         assert preset.text == released.released(preset.name, preset.version).text
     else:
         assert preset.version > max(versions, default=0)
-    types = {line.split(" ", 3)[3] for line in lines_of(preset)}
-    assert len(types) == len([*product(*preset.topics.values())])
 
 
 @pytest.fixture
 def older(monkeypatch: pytest.MonkeyPatch) -> Iterator[Preset]:
     """Release the present `speed`, and make it version 1000, with another range, default and parameter."""
     now = PRESETS["speed"]
-    text = now.text.replace(f"// preset speed {now.version}:", "// preset speed 1000:")
+    text = now.text.replace(f"preset speed {now.version};", "preset speed 1000;")
     text = text.replace("double vMax = 0.5 m/s in 0..50;", "double vMax = 0.3 m/s in 0..2;", 1)
     text = text.replace("double wMax =", "double turn =", 1) + "\n"
     assert text.count("0..2;") == 1
     new = replace(now, source=text)
     monkeypatch.setitem(PRESETS, "speed", new)
-    rows = {
-        line.split()[0]: dict(pair.split("=") for pair in line.split()[3:])
-        for line in lines_of(replace(now, source=now.text))
-    }
-    monkeypatch.setattr(released, "versions_of", lambda _name: {now.version: rows})
     monkeypatch.setattr(released, "released", lambda _name, _version: now)
     monkeypatch.setattr(upgrades, "released", lambda _name, _version: now)
     origin_of.cache_clear()
@@ -180,16 +218,13 @@ def test_a_value_that_cannot_be_kept_is_named(older: Preset) -> None:
 def test_a_release_is_refused_until_its_presets_are_kept(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    shutil.copytree(FOLDER, tmp_path / "released")
-    monkeypatch.setattr(released_presets, "FOLDER", tmp_path / "released")
+    monkeypatch.setattr(released_presets, "FOLDER", tmp_path)
     monkeypatch.setattr(released_presets, "PRESETS", {name: PRESETS[name] for name in ("sane", "rate")})
-    table = tmp_path / "released" / "texts.sha256"
-    for name in ("sane", "rate"):
-        (tmp_path / "released" / f"{name}-{PRESETS[name].version}.rv").unlink(missing_ok=True)
-        wanted = [*released_presets.lines_of(PRESETS[name])]
-        kept = [line for line in table.read_text().splitlines() if line not in wanted]
-        table.write_text("\n".join(kept) + "\n")
     with pytest.raises(SystemExit, match="sane, rate: run python -m"):
         released_presets.main(["--check"])
     released_presets.main([])
     released_presets.main(["--check"])
+    (tmp_path / f"rate-{PRESETS['rate'].version}.rv").write_text("another")
+    for arguments in (["--check"], []):
+        with pytest.raises(SystemExit, match="is released: give the changed preset rate another version"):
+            released_presets.main(arguments)

@@ -204,7 +204,7 @@ def test_a_topic_that_comes_later_has_the_type_that_is_given() -> None:
     later = planned(
         PRESETS["speed"], "later", {"command": "/new"}, [], {}, {"command": "ackermann_msgs/AckermannDrive"}
     )
-    assert "double jerk) command ackermann_msgs/AckermannDrive" in text_of(later)
+    assert "command = /new ackermann_msgs/AckermannDrive;" in text_of(later)
     goal = "/arm_controller/follow_joint_trajectory/goal"
     answer = planned(PRESETS["answer"], "answer", {"command": goal}, graph_of("fetch"), {}, {})
     assert answer.topics["cancel"] == goal.replace("/goal", "/cancel")

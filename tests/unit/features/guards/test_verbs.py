@@ -114,7 +114,7 @@ def test_a_new_guard_is_loaded_and_written(tmp_path: Path, capsys: pytest.Captur
     order = run(verbs.new, Robot(tmp_path), "fence", "/cmd_vel", ["margin=0.5"], by="/odom", shadow=True)
     topics = {"command": "/cmd_vel", "by": "/odom"}
     assert order == GuardNew("fence", topics, {"margin": "0.5"}, name="fence", shadow=True)
-    assert "double margin = 0.5 m" in (tmp_path / "fence.rv").read_text()
+    assert "\n    margin = 0.5;\n" in (tmp_path / "fence.rv").read_text()
     assert "rosrv guard enforce fence" in capsys.readouterr().out
 
 
@@ -147,7 +147,7 @@ def test_json_changes_no_less(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     run(verbs.new, robot, "speed", "/cmd_vel")
     assert (tmp_path / "speed.rv").exists()
     run(verbs.set_values, robot, "fence", ["margin=0.5", "polygon=0,0 1,0 1,1"])
-    assert "{0, 0, 1, 0, 1, 1}" in (tmp_path / "fence.rv").read_text()
+    assert "\n    polygon = 0,0 1,0 1,1;\n" in (tmp_path / "fence.rv").read_text()
     run(verbs.remove, robot, "fence")
     assert not (tmp_path / "fence.rv").exists()
     shown = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
@@ -233,7 +233,7 @@ def test_a_constant_is_set_and_a_polygon_is_loaded(tmp_path: Path) -> None:
     robot = Robot(tmp_path, FENCE, shadow=True)
     run(verbs.set_values, robot, "fence", ["margin=0.5", "polygon=0,0 1,0 1,1"])
     [load] = robot.orders  # one change of both, so that none of them is in force without the other
-    assert (load.shadow, "{0, 0, 1, 0, 1, 1}" in load.files["fence.rv"]) == (True, True)
+    assert (load.shadow, "\n    polygon = 0,0 1,0 1,1;\n" in load.files["fence.rv"]) == (True, True)
     assert load.given == {"fence": {"margin": "0.5"}}
     robot.orders.clear()
     for values in (["polygon=0,0 1,0 1,1", "margin=99"], ["nothing=1"], ["margin"]):

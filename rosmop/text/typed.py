@@ -1,0 +1,336 @@
+"""Choose types and values: make the specifications of a file from its typed parts, its `preset` statement and roles.
+
+The types of typed topics decide which rows of the roles (`types/roles.py`) the events get. Everything happens on the
+tree, so positions and messages are those of the text.
+"""
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, fields, replace
+from typing import NamedTuple, TypeVar, cast
+
+from rosmop.form.findings import Diagnostic, Position, SpecificationError
+from rosmop.text import tree
+from rosmop.types import given_lists
+from rosmop.types.messages import nearest, shown
+
+_T = TypeVar("_T")
+Roles = Mapping[str, tree.RoleDeclaration]
+_GOAL_ID = "actionlib_msgs/GoalID"
+_ALL_GOALS = "all_goals"
+"""The variable with the message that cancels all goals of an action."""
+_CANCEL = "cancel"
+_GOAL = "/goal"
+
+
+class _Chosen(NamedTuple):
+    """A typed topic, with the type that it has here."""
+
+    topic: str
+    type: str
+    role: tree.RoleDeclaration
+    row: tree.RoleRow
+
+
+def made(typed: tree.TypedFile, library: Callable[[], Roles]) -> tree.SpecificationFile:
+    """Return the specifications with their types and values. Raises `SpecificationError` with all errors.
+
+    `library()` returns the roles that each file has beside its own.
+    """
+    presets = {one.preset: one for one in typed.presets}
+    findings = [*_unknown_presets(typed)]
+    specifications = []
+    for one in typed.specifications:
+        preset = presets.get(one.known.name if isinstance(one, tree.TypedSpecification) else one.name)
+        try:
+            specifications.append(_Maker(typed, one, preset, library).specification())
+        except SpecificationError as error:
+            findings += error.findings
+    if findings:
+        raise SpecificationError(findings)
+    return replace(typed.file, specifications=tuple(specifications))
+
+
+def _unknown_presets(typed: tree.TypedFile) -> Iterable[Diagnostic]:
+    names = [one.known.name if isinstance(one, tree.TypedSpecification) else one.name
+             for one in typed.specifications]  # fmt: skip
+    seen = set()
+    for one in typed.presets:
+        if one.preset not in names:
+            text = f"this file has no specification {shown(one.preset)}{nearest(one.preset, names)}"
+            yield Diagnostic(one.position, "error", text)
+        if one.preset in seen:
+            yield Diagnostic(
+                one.position, "error", f"{shown(one.preset)} has a `preset` statement; leave this one out"
+            )
+        seen.add(one.preset)
+
+
+@dataclass
+class _Maker:
+    """Makes one specification."""
+
+    typed: tree.TypedFile
+    written: tree.Specification | tree.TypedSpecification
+    preset: tree.PresetStatement | None
+    library: Callable[[], Roles]
+    findings: list[Diagnostic] = field(default_factory=list)
+    topics: dict[str, _Chosen] = field(default_factory=dict)
+    tables: list[tree.Declaration] = field(default_factory=list)
+    hosts: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    times: list[tuple[str, int]] = field(default_factory=list)
+
+    def specification(self) -> tree.Specification:
+        written, preset = self.written, self.preset
+        known = written.known if isinstance(written, tree.TypedSpecification) else written
+        settings = {one.name: one for one in (preset.settings if preset else ())}
+        givens = tuple(
+            made
+            for given in written.givens
+            if (made := self._given(given, settings.get(given.name))) is not None
+        )
+        self._check_settings(settings, [given.name for given in written.givens])
+        cancels, safes, events = set[str](), [], []
+        for safe in written.safes:
+            made_safe = self._safe(safe) if isinstance(safe, tree.TypedSafe) else safe
+            if made_safe is None and isinstance(safe, tree.TypedSafe) and safe.topic in self.topics:
+                cancels.add(safe.topic)
+            elif made_safe is not None:
+                safes.append(made_safe)
+        events = [self._event(one) if isinstance(one, tree.TypedEvent) else one for one in written.events]
+        if self.findings:
+            raise SpecificationError(self.findings)
+        result = replace(
+            known,
+            name=preset.name if preset else known.name,
+            givens=givens,
+            events=tuple(event for event in events if event is not None),
+            safes=tuple(safes),
+            withholds=tuple(map(self._withhold, known.withholds)),
+            declarations=(*self.tables, *known.declarations),
+            properties=tuple(replace(one, times=tuple(self.times)) for one in known.properties),
+        )
+        for topic in cancels:
+            result = _cancelling(result, topic, self.topics[topic].topic)
+        if self.findings:
+            raise SpecificationError(self.findings)
+        return _with_values_of_roles(result, self.topics.values())
+
+    def _refuse(self, place: Position, text: str) -> None:
+        self.findings.append(Diagnostic(place, "error", text))
+
+    def _check_settings(self, settings: Mapping[str, tree.Setting], names: list[str]) -> None:
+        for name, one in settings.items():
+            if name not in names:
+                self._refuse(one.position, f"{shown(name)} is not given to it{nearest(name, names)}")
+
+    # Givens
+
+    def _given(
+        self,
+        node: tree.GivenValue | tree.TopicDeclaration | tree.TypedTopic | tree.GivenList,
+        setting: tree.Setting | None,
+    ) -> tree.GivenValue | tree.TopicDeclaration | None:
+        place = setting.position if setting else node.position
+        if isinstance(node, tree.TypedTopic):
+            topic, _, kind = (setting.value if setting else node.topic).partition(" ")
+            self._choose(node, topic, kind.strip(), place)
+            return tree.TopicDeclaration(node.position, node.name, topic)
+        if isinstance(node, tree.GivenList):
+            self._list(
+                node,
+                setting.value if setting else given_lists.without_unit(node.kind, node.default)[0],
+                place,
+            )
+            return None
+        if setting is None:
+            return node
+        if isinstance(node, tree.TopicDeclaration):
+            return replace(node, topic=setting.value)
+        return replace(node, position=place, default=setting.value)
+
+    def _choose(self, node: tree.TypedTopic, topic: str, kind: str, place: Position) -> None:
+        roles = {**self.library(), **{role.name: role for role in self.typed.roles}}
+        role = roles.get(node.role)
+        if role is None:
+            self._refuse(node.position, f"there is no role {shown(node.role)}{nearest(node.role, roles)}")
+            return
+        if role.base:
+            base = roles.get(role.base)
+            if base is None:
+                self._refuse(role.position, f"there is no role {shown(role.base)}{nearest(role.base, roles)}")
+                return
+            role = replace(role, parameters=base.parameters + role.parameters, rows=base.rows + role.rows)
+        rows = {row.type: row for row in role.rows}
+        kind = kind or next(iter(rows), "")
+        row = rows.get(kind) or (rows.get("") if kind else None)
+        if row is None:
+            text = f"{topic} cannot have the type {shown(kind)}; {role.name} has {', '.join(rows)}"
+            self._refuse(place, text)
+            return
+        self.topics[node.name] = _Chosen(topic, kind, role, row)
+
+    def _list(self, node: tree.GivenList, value: str, place: Position) -> None:
+        name = node.name
+        try:
+            match node.kind:
+                case "corners":
+                    self._table(
+                        node, "double", name, [n for corner in given_lists.corners(value) for n in corner]
+                    )
+                case "joints":
+                    rows = given_lists.joints(value)
+                    self._table(node, "", f"{name}_names", [row[0] for row in rows] or [""])
+                    self._table(node, "double", f"{name}_low", [row[1] for row in rows] or ["0"])
+                    self._table(node, "double", f"{name}_high", [row[2] for row in rows] or ["0"])
+                case "hosts":
+                    self.hosts[name] = given_lists.hosts(value)
+                case _:
+                    self.times.append((name, given_lists.nanoseconds(value)))
+        except ValueError as error:
+            why = f"{error}; " if str(error) else ""
+            self._refuse(
+                place, f"{shown(value)}: {why}write it like {name} = {given_lists.EXAMPLES[node.kind]}"
+            )
+
+    def _table(self, node: tree.GivenList, of: str, name: str, cells: Iterable[str]) -> None:
+        at = node.position
+        items = (tree.GivenItems if node.kind == "corners" else tree.InitializerList)(
+            at, tuple(_number(at, cell) if of else _text(at, cell) for cell in cells)
+        )
+        kind = tree.TypeName(at, (of,) if of else ("std", "string"), constant=True)
+        self.tables.append(tree.Declaration(at, kind, (tree.Declarator(at, name, items, is_array=True),)))
+
+    def _withhold(self, node: tree.WithholdDeclaration) -> tree.WithholdDeclaration:
+        names = [one for one in node.networks if isinstance(one, tree.Name)]
+        if not names:
+            return node
+        networks = self.hosts.get(names[0].parts[0])
+        if networks is None:
+            self._refuse(names[0].position, f"no `hosts` {shown(names[0].parts[0])} are given to it")
+            return node
+        return replace(node, networks=(), given=networks)
+
+    # Events and safe messages
+
+    def _topic(self, name: str, place: Position) -> _Chosen | None:
+        if name not in self.topics and not self.findings:
+            self._refuse(
+                place, f"{shown(name)} has no role here: write its type, or `topic {name} : Role = /topic;`"
+            )
+        return self.topics.get(name)
+
+    def _safe(self, node: tree.TypedSafe) -> tree.SafeDeclaration | None:
+        chosen = self._topic(node.topic, node.position)
+        if chosen is None or chosen.row.cancels:
+            return None
+        return tree.SafeDeclaration(node.position, chosen.type, node.position, (), node.topic, node.period_ns)
+
+    def _event(self, node: tree.TypedEvent) -> tree.EventDefinition | None:
+        chosen = self._topic(node.topic, node.position)
+        if chosen is None:
+            return None
+        row, role, at = chosen.row, chosen.role, node.position
+        types = {one.name: one.type for one in role.parameters} | {
+            one.name: one.type for one in row.parameters
+        }
+        names = [one.parts[0] for one in node.names]
+        for one in node.names:
+            if one.parts[0] not in types:
+                known = nearest(one.parts[0], [parameter.name for parameter in role.parameters])
+                self._refuse(one.position, f"{role.name} has no value {shown(one.parts[0])}{known}")
+        if self.findings:
+            return None
+        bound = {one.variable or "": one for one in row.pattern}
+        first: list[tree.Statement] = []
+        if row.action is not None and names:
+            parameters, pattern, first = row.parameters, row.pattern, [*row.action.statements]
+        else:
+            there = [name for name in names if name in bound]
+            parameters = tuple(tree.ParameterDeclaration(at, types[name], name) for name in there)
+            pattern = tuple(bound[name] for name in there)
+            lacking = [name for name in names if name not in bound]
+            if lacking:
+                zeros = tuple(tree.Declarator(at, name, tree.NumberLiteral(at, "0")) for name in lacking)
+                first = [tree.Declaration(at, tree.TypeName(at, ("double",)), zeros)]
+        trigger = tree.MessageTrigger(at, node.topic, chosen.type, at, None, _moved(pattern, at), node.when)
+        action = replace(node.action, statements=(*_moved(tuple(first), at), *node.action.statements))
+        return tree.EventDefinition(at, node.modifiers, node.name, _moved(parameters, at), trigger, action)
+
+
+def _number(at: Position, text: str) -> tree.Expression:
+    if text[0] in "+-":
+        return tree.UnaryExpression(at, text[0], tree.NumberLiteral(at, text[1:]))
+    return tree.NumberLiteral(at, text)
+
+
+def _text(at: Position, text: str) -> tree.Expression:
+    return tree.StringLiteral(at, text.encode())
+
+
+def _cancelling(known: tree.Specification, topic: str, name: str) -> tree.Specification:
+    """Cancel all goals of an action where the text stops its topic, whose messages are dropped instead."""
+    at = known.position
+    everything = tree.Declaration(
+        at, tree.TypeName(at, ("actionlib_msgs", "GoalID")), (tree.Declarator(at, _ALL_GOALS),)
+    )
+    drop, cancel = tree.DropStatement(at), tree.PublishStatement(
+        at, _CANCEL, _GOAL_ID, at, tree.Name(at, (_ALL_GOALS,))
+    )  # fmt: skip
+    events = tuple(
+        replace(event, action=_stopping(event.action, drop))
+        if isinstance(event.trigger, tree.MessageTrigger) and event.trigger.topic == topic
+        else event
+        for event in known.events
+    )
+    cancelled = tree.TopicDeclaration(at, _CANCEL, name.removesuffix(_GOAL) + "/cancel")
+    givens = tuple(
+        part for one in known.givens for part in ((one, cancelled) if one.name == topic else (one,))
+    )
+    known = replace(known, events=events, givens=givens, declarations=(everything, *known.declarations))
+    return _stopping(known, cancel)
+
+
+def _stopping(node: _T, instead: tree.Statement) -> _T:
+    return _changed(
+        node,
+        lambda part: (
+            replace(instead, position=part.position) if isinstance(part, tree.StopStatement) else None
+        ),
+    )
+
+
+def _with_values_of_roles(known: tree.Specification, topics: Iterable[_Chosen]) -> tree.Specification:
+    """Give variables of the type `Role::value` the type that the value has in the chosen row."""
+    types: dict[tuple[str, ...], tree.TypeName] = {}
+    for chosen in topics:
+        for one in (*chosen.role.parameters, *chosen.row.parameters):
+            array = one.type.name == ("[]",)
+            types[chosen.role.name, one.name] = (
+                replace(one.type, name=("std", "vector")) if array else one.type
+            )
+    if not types:
+        return known
+    return _changed(known, lambda part: types.get(part.name) if isinstance(part, tree.TypeName) else None)
+
+
+def _moved(node: _T, at: Position) -> _T:
+    """Return a part of a role with the position of the event that it is used in."""
+    return _changed(node, lambda _part: None, at)
+
+
+def _changed(
+    node: _T, change: Callable[[tree.SyntaxNode], tree.SyntaxNode | None], at: Position | None = None
+) -> _T:
+    """Return a tree with changed nodes, and if `at` is given, with this position everywhere."""
+    if isinstance(node, tuple):
+        return cast("_T", tuple(_changed(part, change, at) for part in node))
+    if isinstance(node, Position):
+        return cast("_T", at or node)
+    if not isinstance(node, tree.SyntaxNode):
+        return node
+    new = change(node)
+    if new is None:
+        names = (each.name for each in fields(node))
+        parts = zip(names, tree.fields_of(node), strict=True)
+        new = replace(node, **{name: _changed(part, change, at) for name, part in parts})
+    return cast("_T", new)

@@ -1,0 +1,102 @@
+"""Read the values of given lists: corners of a polygon, limits of joints, hosts, and times.
+
+An invalid value raises `ValueError` with the reason, which may be empty.
+"""
+
+import math
+import re
+from collections.abc import Callable, Mapping
+from fractions import Fraction
+from ipaddress import ip_network
+from types import MappingProxyType
+
+from rosmop.types.polygons import fault_of
+
+EXAMPLES: Mapping[str, str] = MappingProxyType(
+    {
+        "corners": "-2,-2 2,-2 2,2 -2,2",
+        "joints": "elbow:-1.5..1.5",
+        "time": "120s",
+        "hosts": "10.0.0.7 10.8.0.0/16",
+    }
+)
+"""An example for each kind of list."""
+NO_JOINTS = "none"
+_MOST_CORNERS = 100
+_NUMBER = re.compile(r"[-+]?(?:\d++(?:\.\d*+)?|\.\d++)(?:[eE][-+]?\d++)?", re.ASCII)
+_JOINT = re.compile(r"[\w/]++", re.ASCII)
+_SPAN = re.compile(r"(\d{1,9}+(?:\.\d{1,9}+)?)(ms|s)", re.ASCII)
+
+
+def corners(value: str) -> tuple[tuple[str, str], ...]:
+    """Return x and y of each corner, as numbers of the language."""
+    pairs = [word.split(",") for word in value.replace(" ,", ",").replace(", ", ",").split()]
+    if not 3 <= len(pairs) <= _MOST_CORNERS or any(len(pair) != 2 for pair in pairs):
+        raise ValueError
+    found = tuple((_number(x), _number(y)) for x, y in pairs)
+    if fault := fault_of([(float(x), float(y)) for x, y in found]):
+        raise ValueError(f"{fault}; give the corners in order along the edge")
+    return found
+
+
+def joints(value: str) -> tuple[tuple[str, str, str], ...]:
+    """Return name, lower and upper limit of each joint."""
+    if value == NO_JOINTS:
+        return ()
+    rows = []
+    for word in value.split():
+        name, _, limits = word.partition(":")
+        low, dots, high = limits.partition("..")
+        if not dots or not _JOINT.fullmatch(name):
+            raise ValueError
+        rows.append((name, _number(low), _number(high)))
+    if not rows:
+        raise ValueError
+    return tuple(rows)
+
+
+def hosts(value: str) -> tuple[str, ...]:
+    """Return the networks; an address is one too."""
+    if not value.split():
+        raise ValueError
+    return tuple(str(ip_network(word)) for word in value.split())
+
+
+def nanoseconds(value: str) -> int:
+    span = _SPAN.fullmatch(value)
+    time = Fraction(span[1]) * (10**6 if span[2] == "ms" else 10**9) if span else Fraction()
+    if time.denominator != 1 or time <= 0:
+        raise ValueError
+    return int(time)
+
+
+def _number(text: str) -> str:
+    if not _NUMBER.fullmatch(text) or not math.isfinite(float(text)):
+        raise ValueError
+    return text
+
+
+_READERS: Mapping[str, Callable[[str], object]] = {
+    "corners": corners,
+    "joints": joints,
+    "time": nanoseconds,
+    "hosts": hosts,
+}
+
+
+def normalised(kind: str, value: str) -> str:
+    """Return the value in one form. Raises `ValueError` if it is not one of the kind."""
+    _READERS[kind](value)
+    if kind == "hosts":
+        return " ".join(hosts(value))
+    if kind == "corners":
+        return " ".join(",".join(corner) for corner in corners(value))
+    return " ".join(value.split())
+
+
+def without_unit(kind: str, text: str) -> tuple[str, str]:
+    """Return the value and the unit of a default, such as `-2,-2 2,-2 2,2 m`."""
+    value, _, unit = text.rpartition(" ")
+    if kind in ("corners", "joints") and value and unit.isalpha():
+        return value.strip(), unit
+    return text, ""
