@@ -1,7 +1,7 @@
-"""Order the specifications of a set by their `order` statements.
+"""Order the specifications of a set by their phases and by `order` statements.
 
-Without a statement they keep the order of the text. A statement moves a specification after those that it names
-before it, no further than necessary.
+Without them they keep the order of the text. A phase or statement moves a specification after those that come before
+it, no further than necessary.
 """
 
 from collections.abc import Iterator, Sequence
@@ -13,10 +13,18 @@ from rosmop.types.messages import nearest, shown
 
 Phases = frozenset[tuple[str, str]]
 
+NAMED = ("stops", "drops", "limits", "watches", "smooths", "follows")
+"""The phases of specifications that have one (`name() in limits { … }`), in their order."""
 
-def phases_of(orders: Sequence[tree.OrderStatement]) -> Phases:
-    """Return all pairs that the statements order. Raises `SpecificationError` for a cycle."""
+
+def phases_of(
+    orders: Sequence[tree.OrderStatement], specifications: Sequence[tree.Specification] = ()
+) -> Phases:
+    """Return all pairs that phases and statements order. Raises `SpecificationError` for a cycle."""
     behind: dict[str, set[str]] = {}
+    placed = [(one.name, _place(one.phase)) for one in specifications if one.phase is not None]
+    for first, place in placed:
+        behind[first] = {second for second, other in placed if place < other}
     for order in orders:
         names = [name.parts[0] for name in order.names]
         for place, name in enumerate(names):
@@ -25,9 +33,17 @@ def phases_of(orders: Sequence[tree.OrderStatement]) -> Phases:
     for order in orders:
         for word in order.names:
             if (word.parts[0], word.parts[0]) in pairs:
-                text = f"{shown(word.parts[0])} would come before itself; leave out one of the `order` statements"
+                text = f"{shown(word.parts[0])} would come before itself; leave out an `order` statement or a phase"
                 raise SpecificationError.at(word.position, text)
     return pairs
+
+
+def _place(phase: tree.Name) -> int:
+    name = phase.parts[0]
+    if name not in NAMED:
+        text = f"there is no phase {shown(name)}{nearest(name, NAMED)}; there are {', '.join(NAMED)}"
+        raise SpecificationError.at(phase.position, text)
+    return NAMED.index(name)
 
 
 def _reached(behind: dict[str, set[str]], name: str) -> set[str]:

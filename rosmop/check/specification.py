@@ -77,7 +77,7 @@ def compile_files(
     pairs = [(file, specification) for file in files for specification in file.specifications]
     orders = [order for file in files for order in file.orders]
     compiled: Sequence[SpecificationCode] = ()
-    phases = _noted(shared, partial(phases_of, orders))
+    phases = _noted(shared, partial(phases_of, orders, [specification for _, specification in pairs]))
     if phases is not None:
         names = [specification.name for _, specification in pairs]
         shared.findings += unknown_phases(orders, names)

@@ -159,3 +159,22 @@ def test_lists_are_read_and_written_in_one_form() -> None:
     assert given_lists.normalised("corners", " 0,0  4 ,0 0, 3.5 ") == "0,0 4,0 0,3.5"
     assert given_lists.normalised("hosts", "10.0.0.7 10.8.0.0/16") == "10.0.0.7/32 10.8.0.0/16"
     assert (given_lists.joints("none"), given_lists.nanoseconds("0.5s")) == ((), 5 * 10**8)
+
+
+def test_phases_order_specifications_and_statements_do_not_contradict_them() -> None:
+    def text(name: str, phase: str) -> str:
+        return f"{name}() {phase} {{ event e() /t std_msgs/Empty '{{}}' {{ }} }}\n"
+
+    def names(files: str) -> list[str]:
+        return [one.name for one in compiled_from({"x.rv": files}, definitions(), lints=False).specifications]
+
+    written = [("a", "in follows"), ("own", ""), ("b", "in smooths"), ("c", "in stops"), ("d", "in stops")]
+    files = "".join(text(*one) for one in written)
+    assert names(files) == ["own", "c", "d", "b", "a"]
+    assert names(f"{files} order d < c; order a < own;") == ["d", "c", "b", "a", "own"]
+    assert any("would come before itself" in one.text for one in refused(f"{files} order a < b;"))
+    assert any("no phase `stop`; did you mean `stops`" in one.text for one in refused(text("e", "in stop")))
+    plain, phased = (
+        compiled_from({"x.rv": text("e", one)}, definitions()).specifications for one in ("", "in stops")
+    )
+    assert plain[0].identity == phased[0].identity

@@ -155,6 +155,7 @@ class TreeBuilder(Transformer_NonRecursive[Token, Any]):
             items(tree.SafeDeclaration),
             tuple(givens),
             items(tree.WithholdDeclaration),
+            next((child for child in children if isinstance(child, tree.Name)), None),
         )
         if not any(isinstance(part, _TYPED) for part in (*children, *givens)):
             return known
@@ -172,6 +173,9 @@ class TreeBuilder(Transformer_NonRecursive[Token, Any]):
         if name == "init" and kind.name == ("void",):
             return self.init(meta, parameters, body)
         return tree.FunctionDefinition(self.at(meta), kind, str(name), parameters or (), body)
+
+    def phase(self, meta: Meta, name: Token) -> tree.Name:
+        return tree.Name(self.at(meta), (str(name),))
 
     def given(self, _: Meta, _word: Any, *items: Any) -> list[Any]:
         return [*items]

@@ -25,7 +25,8 @@ setting: NAME "=" GIVEN_VALUE ";"
 role: _ROLE NAME "(" [parameters] ")" [":" NAME] "{" row* "}"
 row: (ROW_TYPE | DEFAULT) ["(" [parameters] ")"] pattern [CANCEL] (block | ";")
 
-specification: NAME+ ["(" [parameters] ")" [given]] "{" item* "}"
+specification: NAME+ ["(" [parameters] ")" [phase] [given]] "{" item* "}"
+phase: "in" NAME
 given: GIVEN "{" (given_value | given_topic | given_list)* "}"
 given_value: BUILTIN+ NAME "=" GIVEN_VALUE ";"
 given_topic: TOPIC_WORD NAME [":" NAME] "=" TOPIC ";"

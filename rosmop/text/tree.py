@@ -554,6 +554,7 @@ class Specification(SyntaxNode):
     safes: tuple[SafeDeclaration, ...] = ()
     givens: tuple[GivenValue | TopicDeclaration, ...] = ()
     withholds: tuple[WithholdDeclaration, ...] = ()
+    phase: Name | None = field(default=None, compare=False)
 
 
 @dataclass(frozen=True)

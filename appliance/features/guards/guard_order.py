@@ -1,6 +1,7 @@
 """The pairs of presets whose order on a topic changes what they promise.
 
-Guards see messages in the order of their files. A new guard whose name breaks a row gets an `order` statement.
+The phases of the presets keep each row. Guards of releases before 0.4 have no phase, and see messages in the order of
+their files: until 0.5, a new guard beside them whose name breaks a row gets an `order` statement.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -83,6 +84,8 @@ class Placed:
     preset: str
     command: str
     file: str
+    phased: bool = True
+    """Whether it has the phase of its preset, unlike guards of releases before 0.4."""
 
 
 def statements(new: Placed, loaded: Iterable[Placed]) -> str:
@@ -106,7 +109,7 @@ def faults(guards: Sequence[Placed]) -> Iterator[str]:
 
 def _broken(first: Placed, second: Placed) -> str:
     """Return what happens if `first` acts before `second`, or nothing if this order is right."""
-    if first.command != second.command:
+    if first.command != second.command or (first.phased and second.phased):
         return ""
     rows = (one.otherwise for one in PRECEDENCES if second.preset in one.first and first.preset in one.then)
     return next(rows, "")

@@ -275,9 +275,15 @@ class GuardOrders:
         return {name: preset for name, preset in found.items() if preset is not None}
 
     def _placed(self) -> list[Placed]:
-        files, file_of = self._monitors.sources.files, self._monitors.checked.monitors
+        file_of = self._monitors.checked.monitors
         return [
-            Placed(name, preset.name, topics_in(files[file_of[name]]).get("command", ""), file_of[name])
+            Placed(
+                name,
+                preset.name,
+                topics_in(preset.text).get("command", ""),
+                file_of[name],
+                preset.text.startswith("preset "),
+            )
             for name, preset in self._guards().items()
         ]
 

@@ -11,7 +11,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from appliance.features.guards.guard_order import Placed, statements
 from appliance.features.guards.presets import Guard, preset_named, text_of
 from tests.support.features.guards.running_guard import Change, Value
 from tests.world.closed_loop.guard_run import Beside
@@ -61,15 +60,13 @@ WITHOUT = {
 
 
 @functools.lru_cache(maxsize=512)
-def _text(preset: str, name: str, kind: str, first: str) -> str:
+def _text(preset: str, name: str, kind: str) -> str:
     side, chosen = SIDES[preset], preset_named(preset)
     topics = {
         topic: f"/side{default}" for topic, default in chosen.given_topics.items() if topic != "command"
     }
     in_text = {one: str(value) for one, value in side.values.items() if chosen.parameter(one).loads}
-    text = text_of(Guard(name, chosen, topics, {**side.types, "command": kind}, in_text))
-    guard = Placed("guard", first, "", "guard.rv")
-    return text + statements(Placed(name, preset, "", f"{name}.rv"), [guard])
+    return text_of(Guard(name, chosen, topics, {**side.types, "command": kind}, in_text))
 
 
 def paired(worlds: Mapping[str, type[World]]) -> Callable[..., World]:
@@ -92,13 +89,13 @@ class _Accompanied:
 
     def __init__(self, r: random.Random, preset: str, world: World) -> None:
         self._random, self._preset, self._world = r, preset, world
-        self._name = r.choice(("early", "zz"))  # before or behind `guard`, unless the presets have an order
+        self._name = r.choice(("early", "zz"))  # before or behind `guard`, unless the presets have phases
         self._lost = (0, 0)
 
     def begin(self) -> Beside:
         """Plan the evidence, and return the guard."""
         r, world, side = self._random, self._world, SIDES[self._preset]
-        text = _text(self._preset, self._name, world.kind, world.preset)
+        text = _text(self._preset, self._name, world.kind)
         if r.random() < 0.6:
             begin = r.randrange(300, 5000)
             self._lost = begin, begin + r.choice((700, 1500, 3000))

@@ -1,6 +1,6 @@
 import math
+import re
 from collections.abc import Callable
-from graphlib import TopologicalSorter
 from itertools import product
 from pathlib import Path
 
@@ -18,19 +18,18 @@ from tests.unit.features.guards.test_watching_presets import button, with_id
 
 
 class Together(Guarded):
-    """Two guards of one topic, of which `last` is made last and acts first by its name."""
+    """Two guards of one topic, of which `last` acts first by its name; `ordered`: they have their phases."""
 
     def __init__(self, first: str, last: str, types: dict[str, str] | None = None, *, ordered: bool,
                  **values: dict[str, object]) -> None:  # fmt: skip
-        placed, files = list[Placed](), {}
+        files = {}
         for name, preset in (("z", first), ("a", last)):
             wanted = {each: str(value) for each, value in values.get(preset, {}).items()}
             topics = {"command": "/move_base/goal"} if types else {}
             guard = Guard(name, PRESETS[preset], topics, {"command": next(iter(PRESETS[preset].topics["command"])),
                           **(types or {})}, wanted)  # fmt: skip
-            new = Placed(name, preset, "/c", f"{name}.rv")
-            files[new.file] = text_of(guard) + (statements(new, placed) if ordered else "")
-            placed.append(new)
+            text = text_of(guard)
+            files[f"{name}.rv"] = text if ordered else re.sub(r" in \w+ given \{", " given {", text, count=1)
         self.monitors = MonitorSet.of(compiled_from(dict(sorted(files.items())), DEFINITIONS))
         self.monitors.name_senders(lambda source: ("10.0.0.1", NODES[source]))
         self.topics = PRESETS[last].given_topics | PRESETS[first].given_topics
@@ -165,7 +164,7 @@ CONSEQUENCES: list[Callable[[bool], bool]] = [
 
 
 @pytest.mark.parametrize("happens", CONSEQUENCES, ids=[one.__name__ for one in CONSEQUENCES])
-def test_the_wrong_order_has_its_consequence_and_a_new_guard_is_put_right(
+def test_the_wrong_order_has_its_consequence_and_phases_prevent_it(
     happens: Callable[[bool], bool],
 ) -> None:
     assert happens(False)
@@ -181,14 +180,12 @@ def test_a_stop_by_another_guard_is_never_a_zero_of_the_node(moves: Callable[[bo
     assert not moves(False) and not moves(True)
 
 
-def test_each_row_of_the_table_has_its_test_and_no_order_contradicts_another() -> None:
+def test_each_row_of_the_table_has_its_test_and_the_phases_keep_it() -> None:
     assert len(PRECEDENCES) == len(CONSEQUENCES)
-    pairs = [pair for row in PRECEDENCES for pair in product(row.first, row.then)]
-    assert {name for pair in pairs for name in pair} <= PRESETS.keys()
-    before: dict[str, set[str]] = {}
-    for first, second in pairs:
-        before.setdefault(second, set()).add(first)
-    assert len([*TopologicalSorter(before).static_order()]) == len({name for pair in pairs for name in pair})
+    for pair in (pair for row in PRECEDENCES for pair in product(row.first, row.then)):
+        texts = {f"{name}.rv": text_of(Guard(name, PRESETS[name])) for name in reversed(pair)}
+        compiled = compiled_from(texts, DEFINITIONS, lints=False, without_code=texts)
+        assert [one.name for one in compiled.specifications] == [*pair]
 
 
 def test_the_page_has_the_table() -> None:
@@ -198,17 +195,20 @@ def test_the_page_has_the_table() -> None:
         assert f"| {names[0]} | {names[1]} | {otherwise} |" in page
 
 
-def test_a_guard_is_ordered_among_those_of_its_topic_only_where_its_name_is_wrong() -> None:
-    def placed(name: str, preset: str, command: str = "/cmd_vel") -> Placed:
-        return Placed(name, preset, command, f"{name}.rv")
+def test_an_old_guard_is_ordered_among_those_of_its_topic_only_where_a_name_is_wrong() -> None:
+    def placed(name: str, preset: str, command: str = "/cmd_vel", *, phased: bool = False) -> Placed:
+        return Placed(name, preset, command, f"{name}.rv", phased)
 
     stop, fence = placed("estop", "estop"), placed("yard", "fence")
+    cap = placed("cap", "speed", phased=True)
     assert statements(placed("speed", "speed"), [stop, placed("z", "fence", "/arm/cmd_vel")]) == ""
-    assert statements(placed("cap", "speed"), [stop, fence]) == "\norder estop < cap;\n\norder yard < cap;\n"
-    assert statements(fence, [placed("cap", "speed")]) == "\norder yard < cap;\n"
+    assert statements(cap, [stop, fence]) == "\norder estop < cap;\n\norder yard < cap;\n"
+    assert statements(cap, [placed("yard", "fence", phased=True)]) == ""
+    assert statements(fence, [cap]) == "\norder yard < cap;\n"
     [fault] = faults([stop, placed("speed", "speed"), fence])
     assert (
         fault.startswith("speed acts before yard: after a stop")
         and "order yard < speed; into speed.rv" in fault
     )
     assert not [*faults([stop, fence, placed("speed", "speed")])]
+    assert not [*faults([cap, placed("yard", "fence", phased=True)])]

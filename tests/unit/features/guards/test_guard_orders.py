@@ -16,6 +16,7 @@ from appliance.features.guards import requests as guard_requests
 from appliance.features.guards.guard_answers import LastStop
 from appliance.features.guards.guard_orders import GuardOrders
 from appliance.features.guards.presets import PRESETS, Guard, text_of
+from appliance.features.guards.released import released
 from appliance.features.guards.upgrades import Upgrade
 from appliance.features.guards.view import ActingGuard, GuardsState
 from appliance.specifications.episodes import Stops
@@ -229,11 +230,14 @@ async def test_an_order_without_sense_changes_nothing(
     assert not manager.orders
 
 
-async def test_a_new_guard_acts_in_the_right_order_and_a_wrong_one_is_reported(
+async def test_a_new_guard_acts_behind_an_old_one_and_a_wrong_order_is_reported(
     manager: Manager, orders: GuardOrders
 ) -> None:
     types = {"command": TYPES["command"]}
     request = guard_requests.GuardNew("speed", {"command": "/cmd_vel"}, types=types, name="cap")
+    await orders.new(request, "eve")
+    assert "\norder " not in manager.orders.pop().files["cap.rv"]  # both have phases
+    manager.sources.files["fence.rv"] = released("fence", 2).text
     await orders.new(request, "eve")
     [load] = manager.orders
     assert load.files["cap.rv"].endswith("\norder fence < cap;\n")

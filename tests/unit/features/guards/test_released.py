@@ -80,7 +80,7 @@ def test_a_text_that_was_changed_is_not_the_presets(preset: Preset) -> None:
     for other in (
         text + "\n// more\n",
         text + "\nother() { }\n",
-        text.replace(") given {", ") given  {", 1),
+        text.replace(" given {", " given  {", 1),
         text + " ",
     ):
         assert origin_of(other) == "changed"
