@@ -97,6 +97,9 @@ def test_hosts_and_times_are_given() -> None:
     assert machine.timeouts[0] == (250 * 10**6, 1)
     plain = parse(text.replace("to = 10.0.0.7; ", ""), "x.rv").specifications[0]
     assert plain.withholds[0].given == ("0.0.0.0/0",)
+    others = [text.replace("10.0.0.7", "10.0.0.8"), text.replace("250ms", "251ms")]
+    codes = [compiled_from({"x.rv": other}, definitions()).specifications[0] for other in others]
+    assert [code.identity == one.identity for code in codes] == [True, False]
 
 
 WRONG = [
@@ -105,6 +108,7 @@ WRONG = [
     ("topic t = /t;", "e(x) t", "", "`t` has no role here"),
     ("topic t : Velocity = /t;", "e(x) t", "t = /t std_msgs/Bool;", "/t cannot have the type `std_msgs/Bool`"),
     ("topic t : Velocity = /t;", "e(x) t", "tt = /t;", "`tt` is not given to it"),
+    ("topic t : Velocity = /t;", "e(x) t", "t = /t; t = /u;", "`t` is set twice"),
     ("topic t : Velocity = /t; double d = 1 in 0..2;", "e(x) t", "d = 3;", "the default 3 of `d` is outside"),
     ("topic t : Velocity = /t; corners c = 0,0 1,1 1,0;", "e(x) t", "c = 0,0 1,1;", "write it like c = -2,-2"),
     ("topic t : Velocity = /t; corners c = 0,0 1,1 1,0;", "e(x) t", "c = 0,0 2,2 2,0 0,2;", "edges cross"),
@@ -132,6 +136,18 @@ def test_a_file_has_roles_of_its_own() -> None:
     monitors = load(f"{role} s() given {{ topic t : Level = /t; }} {{ event e(v) t {{ v = 1; }} }}")
     outcome = monitors.process("/t", message("std_msgs/Float64"), 1)
     assert fields("std_msgs/Float64", bytes(outcome.buffer)).data == 1
+
+
+def test_a_role_has_the_values_of_all_that_it_extends() -> None:
+    def roles_with(base: str) -> str:
+        row = "std_msgs/Float64 '{data:v}';"
+        return f"role Own(double v) : Other {{ {row} }} role Other(double w) : {base} {{ }}"
+
+    code = "s() given { topic t : Own = /t; } { event e(px, v, w) t { } }"
+    kind = "preset s 1 as s { t = /t nav_msgs/Odometry; }"
+    [event] = parse(f"{kind} {roles_with('Position')} {code}", "x.rv").specifications[0].events
+    assert [one.name for one in event.parameters] == ["px"]
+    assert any("circle of roles" in one.text for one in refused(f"{roles_with('Own')} {code}"))
 
 
 @pytest.mark.parametrize("role", types_of_roles())

@@ -82,7 +82,11 @@ class _Maker:
     def specification(self) -> tree.Specification:
         written, preset = self.written, self.preset
         known = written.known if isinstance(written, tree.TypedSpecification) else written
-        settings = {one.name: one for one in (preset.settings if preset else ())}
+        settings: dict[str, tree.Setting] = {}
+        for one in preset.settings if preset else ():
+            if one.name in settings:
+                self._refuse(one.position, f"{shown(one.name)} is set twice")
+            settings[one.name] = one
         givens = tuple(
             made
             for given in written.givens
@@ -149,17 +153,9 @@ class _Maker:
         return replace(node, position=place, default=setting.value)
 
     def _choose(self, node: tree.TypedTopic, topic: str, kind: str, place: Position) -> None:
-        roles = {**self.library(), **{role.name: role for role in self.typed.roles}}
-        role = roles.get(node.role)
+        role = self._role(node.role, node.position)
         if role is None:
-            self._refuse(node.position, f"there is no role {shown(node.role)}{nearest(node.role, roles)}")
             return
-        if role.base:
-            base = roles.get(role.base)
-            if base is None:
-                self._refuse(role.position, f"there is no role {shown(role.base)}{nearest(role.base, roles)}")
-                return
-            role = replace(role, parameters=base.parameters + role.parameters, rows=base.rows + role.rows)
         rows = {row.type: row for row in role.rows}
         kind = kind or next(iter(rows), "")
         row = rows.get(kind) or (rows.get("") if kind else None)
@@ -168,6 +164,23 @@ class _Maker:
             self._refuse(place, text)
             return
         self.topics[node.name] = _Chosen(topic, kind, role, row)
+
+    def _role(self, name: str, place: Position) -> tree.RoleDeclaration | None:
+        """Return a role with the values and rows of those that it extends."""
+        roles = {**self.library(), **{role.name: role for role in self.typed.roles}}
+        chain: list[tree.RoleDeclaration] = []
+        while name:
+            role = roles.get(name)
+            if role is None or role in chain:
+                why = "there is no role" if role is None else "there is a circle of roles with"
+                self._refuse(place, f"{why} {shown(name)}{'' if role else nearest(name, roles)}")
+                return None
+            chain.insert(0, role)
+            name, place = role.base, role.position
+        parameters = tuple(parameter for role in chain for parameter in role.parameters)
+        return replace(
+            chain[-1], parameters=parameters, rows=tuple(row for role in chain for row in role.rows)
+        )
 
     def _list(self, node: tree.GivenList, value: str, place: Position) -> None:
         name = node.name

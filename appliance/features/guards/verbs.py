@@ -456,7 +456,8 @@ def _plan(appliance: Appliance, request: GuardTry) -> None:
     else:
         how = "in shadow mode" if plan.shadow else "disabled" if plan.off else "in force"
         if plan.file:
-            say(f"would load {plan.file}; {plan.name} would begin in its initial state, {how}")
+            state = "begin in its initial state" if plan.begins else "keep its state"
+            say(f"would load {plan.file}; {plan.name} would {state}, {how}")
         elif plan.changed:
             say(f"would load nothing; {plan.name} would keep its state, {how}")
         elif request.enforce:
