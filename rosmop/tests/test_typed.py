@@ -126,6 +126,8 @@ def test_a_preset_statement_needs_its_specification() -> None:
     for text, why in (
         (f"preset cup 1;\n{CAP}", "no specification `cup`; did you mean `cap`"),
         (f"preset cap 1; preset cap 2;\n{CAP}", "leave this one out"),
+        (f"preset cap 1 as own {{ most = 2 }}\n{CAP}", "a preset is `preset name 1 as other"),
+        ("role V(double x) { std_msgs/Float64 {data:x} }", "a role is `role Name"),
     ):
         with pytest.raises(SpecificationError, match=why):
             parse(text, "x.rv")

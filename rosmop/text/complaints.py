@@ -74,6 +74,14 @@ _FORMS = tuple(
         (r"@\s*\w+\s*\Z", "a handler is `@category { … }`"),
         (r"(?:\A|[};])\s*order\s[^{};]*\Z", "an order is `order first < second;`"),
         (
+            r"(?:\A|[};])\s*preset\s[^{};]*(?:\{[^{}]*)?\Z",
+            "a preset is `preset name 1 as other { topic = /topic package/Type; value = 0.5; }`, or `preset name 1;`",
+        ),
+        (
+            r"(?:\A|[};])\s*role\s[^{};]*(?:\{[^{};]*)?\Z",
+            "a role is `role Name(double x) { package/Type '{field:x}'; }`",
+        ),
+        (
             r"\bgiven\s*\{[^{}]*\Z",
             "a given is `double name = 0.22 m/s in 0..2;`, `bool name = true;` or `topic name = /topic;`",
         ),
@@ -135,7 +143,9 @@ _WORDS = {
     "ORDER": "`order`",
     "GIVEN": "`given`",
     "GIVEN_VALUE": "a value such as `0.22 m/s in 0..2`",
+    "GIVEN_KIND": "a list such as `corners`",
     "TOPIC_WORD": "`topic`",
+    "ROW_TYPE": "a message type such as `std_msgs/String`",
     "SAFE": "`safe`",
     "WITHHOLD": "`withhold`",
     "FROM": "`from`",

@@ -28,7 +28,7 @@ export const policyLanguage = {
   },
 };
 
-const KEYWORDS = new Set("event when every service request response init return if else for while do switch case default break continue const true false MESSAGE PUBLISH DROP STOP safe withhold on given topic in order hold unsynchronized fsm ere ltl ptltl cfg tfsm mtl pattern alias ptcaret srs new sizeof".split(" "));
+const KEYWORDS = new Set("event when every service request response init return if else for while do switch case default break continue const true false MESSAGE PUBLISH DROP STOP safe withhold on given topic preset as role in order hold unsynchronized fsm ere ltl ptltl cfg tfsm mtl pattern alias ptcaret srs new sizeof".split(" "));
 const TYPES = /^(bool|u?int(8|16|32|64)?(_t)?|float|double|char|string|void|auto|std::\w+|ros::\w+|\w+(::|\/)\w+)$/;
 
 /** Specifications of monitors (.rv). */
