@@ -3,6 +3,7 @@
 import re
 from collections.abc import Iterator
 from dataclasses import replace
+from hashlib import sha256
 from itertools import product
 from pathlib import Path
 
@@ -27,6 +28,7 @@ from appliance.features.guards.released import FOLDER, origin_of
 from appliance.features.guards.robot_graph import TopicFacts
 from appliance.features.guards.upgrades import upgraded
 from distribution import released_presets
+from rosmop.check.reachable_types import identity
 from rosmop.text.parser import parse
 from rosmop.types.roles import ANY_TYPE
 from tests.support.examples import sample
@@ -36,6 +38,7 @@ LAST_OLD = {
     "sensor": 2, "separation": 1, "speed": 1, "withhold": 1,
 }  # fmt: skip
 """The versions whose guards have their types and values all over their texts."""
+IDENTITIES = "14b8ca5929d4b92c99ab646d0257efd0c3ed54976246012112ecd3dbb3033b1d"
 VALUES = {"corners": "0,0 4,0 0,3.5", "joints": "a:-1..1 b:0..2.5", "time": "7s", "hosts": "10.0.0.7/32 10.8.0.0/16",
           "bool": "true"}  # fmt: skip
 RELEASED = [tuple(path.stem.rsplit("-", 1)) for path in sorted(FOLDER.glob("*.rv"))]  # names and versions
@@ -153,6 +156,13 @@ def test_a_list_of_an_old_guard_is_set_in_its_text(name: str, version: str) -> N
         assert text.count("\n") == base.text.count("\n") and values_in(text)[each.name] == another(each)
         parse(text, "guard.rv")
         assert with_values(text, {each.name: each.default}) == base.text
+
+
+def test_guards_in_use_keep_their_state_with_this_language() -> None:
+    """Of texts that use nothing new, a state has the identity that 0.3.0 wrote."""
+    texts = [released.released(name, int(version)).text for name, version in OLD]
+    identities = [identity(one) for text in texts for one in parse(text, "guard.rv").specifications]
+    assert sha256(b"".join(identities)).hexdigest() == IDENTITIES
 
 
 def test_the_table_of_released_texts_has_each_old_version_and_no_other() -> None:
