@@ -159,7 +159,7 @@ def test_a_list_of_an_old_guard_is_set_in_its_text(name: str, version: str) -> N
 
 
 def test_guards_in_use_keep_their_state_with_this_language() -> None:
-    """Of texts that use nothing new, a state has the identity that 0.3.0 wrote."""
+    """The identity of a state is that of 0.3.0 for texts that use nothing new."""
     texts = [released.released(name, int(version)).text for name, version in OLD]
     identities = [identity(one) for text in texts for one in parse(text, "guard.rv").specifications]
     assert sha256(b"".join(identities)).hexdigest() == IDENTITIES
