@@ -77,6 +77,10 @@ EVENTS: dict[str, str] = {
     " text no longer declares it with this range; `detail` has who ordered it, `values` and `before`.",
     "driver checked": "An operator measured whether a robot's driver stops its base when commands end; `detail` has"
     " `outcome`, `seconds` from the last command, and who ordered it.",
+    "guard loaded": "A guard has another text or other values than before, after any kind of change; at each start"
+    " of control, every guard. `detail` has its preset with the version, `origin` (`current`, `older` or `changed`),"
+    " the values in force, those `below` the standard, and the `digest` that binds them, as in"
+    " `rosrv guard list --json`.",
     "guard bypassed": "A node took a guarded command from a publisher that the appliance did not give it, twice in a"
     " row; `detail` has `node`, `host` and `publishers`. It is recorded again when this has ended and begins again.",
     "monitor resumed": "The topics that a monitor held after a restart resume; `detail` has who ordered it.",
@@ -226,7 +230,8 @@ SEVERITIES: dict[str, Severity] = {
             "authority asked", "authority handed over", "host block ended", "motion stopped", "host unblocked",
             "appliance started", "appliance stopped", "bundle in force", "clock not synchronised", "clock synchronised",
             "evidence exported", "forwarding resumed", "handed over", "host awaited", "host awaited no longer",
-            "host enrolled", "host renewed", "hosts reloaded", "driver checked", "monitor resumed", "monitor set",
+            "host enrolled", "host renewed", "hosts reloaded", "driver checked", "guard loaded", "monitor resumed",
+            "monitor set",
             "policy loaded", "stop ended",
             "recording closed", "door added", "door removed", "door ticket made", "signed off", "signed on",
             "recording ordered", "recording fetched", "recording read", "recording removed", "specifications loaded",

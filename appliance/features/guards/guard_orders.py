@@ -76,6 +76,9 @@ class GuardOrders:
         self._acts: dict[str, int] = {}
         self._acted_at: dict[str, float] = {}
         self._acting_since: dict[str, float] = {}
+        self._digests: dict[str, str] = {}
+        self._recorded = ""
+        """The tag of the monitors whose guards are recorded."""
 
     def methods(self) -> tuple[RequestMethod[Any], ...]:
         return (
@@ -103,6 +106,32 @@ class GuardOrders:
         self._acts = {name: acts for name, acts in self._acts.items() if name in guards}
         acting, now = [name for name in guards if self._state(name) == "stopping"], clock.wall()
         self._acting_since = {name: self._acting_since.get(name, now) for name in acting}
+        self._record_loaded()
+
+    def _record_loaded(self) -> None:
+        """Record the guards whose text or values are others than before, after any change; at the start: all."""
+        if self._recorded == self._monitors.tag:
+            return
+        self._recorded = self._monitors.tag
+        rows = [self._row(name, preset) for name, preset in self._guards().items()]
+        for row in rows:
+            if row.digest != self._digests.get(row.name):
+                self._trail.happened(
+                    "guard loaded",
+                    f"{row.name} has the text and values with the digest {row.digest}"
+                    f" ({row.preset} {row.version}, {row.origin})",
+                    category="monitor",
+                    resource=row.topics.get("command", ""),
+                    monitor=row.name,
+                    preset=row.preset,
+                    version=row.version,
+                    origin=row.origin,
+                    digest=row.digest,
+                    values=values_of(row.given) | row.loads,
+                    below=row.below,
+                    revision_of_specifications=self._monitors.revision,
+                )
+        self._digests = {row.name: row.digest for row in rows}
 
     def state(self) -> GuardsState | None:
         loaded = len(self._guards())
@@ -152,6 +181,7 @@ class GuardOrders:
             shadow=request.shadow, hold=request.hold,
         )  # fmt: skip
         loaded = await self._monitors.load(order, who, enable=not request.shadow)
+        self._record_loaded()
         elsewhere = self.placement.sentences(request.topics["command"])
         return (
             msgspec.structs.replace(loaded, warnings=[*loaded.warnings, *elsewhere]) if elsewhere else loaded
@@ -169,6 +199,7 @@ class GuardOrders:
             await monitors.load(order, who)
         elif constants:
             await monitors.give(admin.MonitorGive(name, dict(constants), request.expected), who)
+        self._record_loaded()
         return await self.guards(guard_requests.GuardsWanted())
 
     async def upgrade(self, request: guard_requests.GuardUpgrade, who: str) -> Replacement:
@@ -178,7 +209,9 @@ class GuardOrders:
             {monitors.checked.monitors[name]: new.text}, note=described(new.text), expected=request.expected,
             confirm_within=request.confirm_within, shadow=monitors.switches.in_shadow(name), hold=request.hold,
         )  # fmt: skip
-        return await monitors.load(order, who)
+        loaded = await monitors.load(order, who)
+        self._record_loaded()
+        return loaded
 
     async def plan(self, request: guard_requests.GuardTry, who: str) -> GuardPlan:
         monitors, name = self._monitors, request.name or request.preset

@@ -47,8 +47,8 @@ GAPS = (
 NO_INTERVENTION = frozenset(
     {
         # what hosts and nodes did, and what the rules and monitors made of it
-        "decision", "registered", "adopted", "guard bypassed", "unregistered", "revoked", "node lost", "node returned",
-        "replaced", "takeover",
+        "decision", "registered", "adopted", "guard bypassed", "guard loaded", "unregistered", "revoked", "node lost",
+        "node returned", "replaced", "takeover",
         "approval used", "approval wanted", "authority asked", "authority refused", "motion not stopped",
         "motion stopped", "topics held", "monitor verdict", "message dropped", "message changed", "monitor fault",
         "monitor log", "monitor called", "monitor published", "shadow observed", "stop begun", "stop ended",

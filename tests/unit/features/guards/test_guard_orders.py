@@ -146,6 +146,27 @@ async def test_a_guard_has_the_digest_of_its_preset_text_and_values(
     assert (await row(orders)).digest != before
 
 
+async def test_each_change_of_a_guard_is_recorded_with_its_digest(manager: Manager) -> None:
+    trail = FakeTrail()
+    orders = GuardOrders(manager, lambda: Graph([], [], []), Connections(), trail)  # type: ignore[arg-type]  # as much as guards need
+
+    def recorded() -> list[Any]:
+        orders.look()
+        return [one.detail for one in trail.records if one.event == "guard loaded"]
+
+    [first] = recorded()
+    assert first["digest"] == (await row(orders)).digest
+    assert (first["monitor"], first["preset"], first["origin"]) == ("fence", "fence", "current")
+    assert first["values"]["polygon"] == "0,0 1,0 1,1"
+    manager.tag = "3.0"
+    assert recorded() == [first]  # something else was changed
+    other = Guard("fence", PRESETS["fence"], types=TYPES, values={"polygon": "0,0 2,0 2,2"})
+    manager.tag, manager.sources.files["fence.rv"] = "4.0", text_of(other)
+    _, second = recorded()
+    assert second["digest"] == (await row(orders)).digest != first["digest"]
+    assert second["values"]["polygon"] == "0,0 2,0 2,2"
+
+
 async def test_a_guard_names_the_nodes_that_it_awaits(manager: Manager, orders: GuardOrders) -> None:
     manager.rollout.rows["fence"] = SimpleNamespace(withholds=False, awaits="/lidar on /scan")
     assert (await row(orders)).awaits == "/lidar on /scan"
