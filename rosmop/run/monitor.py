@@ -208,8 +208,10 @@ class MonitorInstance:
         self.held, self.why_held = True, why
 
     def resume(self) -> None:
+        """End a hold; without one, hear any node instead of those that it awaits."""
+        forgets = bool(self.awaits) and not self.held
         self.held, self.why_held = False, ""
-        for source in self.sources.values() if self.awaits else ():
+        for source in self.sources.values() if forgets else ():
             source.forget()
 
     def sending(self, *, passes: bool) -> list[SafeSender]:

@@ -72,10 +72,13 @@ def main(arguments: list[str]) -> int:
     parser.add_argument(
         "--replay", nargs=2, metavar=("PRESET", "SEED"), help="run one world, and print all that happens"
     )
+    parser.add_argument(
+        "--alone", default="", metavar="TOPIC", help="with --replay: where a second node publishes alone"
+    )
     chosen = parser.parse_args(arguments)
     if chosen.replay:
         preset, seed = chosen.replay
-        report = run_one(preset, int(seed), trace=_print)
+        report = run_one(preset, int(seed), trace=_print, alone=chosen.alone)
         return 1 if report.violations else 0
     presets = chosen.preset or [*WORLDS, PAIRS]
     summaries = {preset: Summary() for preset in presets}

@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 from tests.world.closed_loop.messages import header
-from tests.world.closed_loop.streams import NEVER
-from tests.world.closed_loop.world import World
+from tests.world.closed_loop.world import COMMAND, NEVER, World
 
 JOINTS: Sequence[str] = ("shoulder", "elbow", "wrist")
 TRAJECTORY = "trajectory_msgs/JointTrajectory"
@@ -53,10 +52,15 @@ class JointsWorld(World):
 
     preset: ClassVar[str] = "joints"
     span = 8000
+    one_source: ClassVar[Mapping[str, tuple[str, ...]]] = {"state": ("dead", "half dead")}
+    not_yet: ClassVar[Mapping[str, str]] = {
+        "switch beside a third node": "of two nodes, the first keeps its place, and the next one gets the other",
+        "cut beside a third node": "as with *switch*",
+    }
 
     def plan(self) -> None:
         r = self.random
-        self.live = r.random() < 0.2
+        self.live = not self.alone and r.random() < 0.2
         self.fastest, self.most = round(r.uniform(0.5, 3), 2), round(r.uniform(1, 3), 2)
         self.jump, self.silent = round(r.uniform(0.02, 0.2), 2), round(r.uniform(0.1, 0.6), 2)
         self.growth = 20.0
@@ -71,7 +75,7 @@ class JointsWorld(World):
         values = {"vMax": self.fastest, "aMax": self.growth, "jump": self.jump, "silent": self.silent}
         bounds = {"limits": limits} if limits else {"low": -self.most, "high": self.most}
         self.guarded({**values, **bounds}, {"command": TRAJECTORY})
-        halves = r.random() < 0.4
+        halves = r.random() < (0.7 if self.alone else 0.4)
         self.reports = {3: JOINTS[:1], 4: JOINTS[1:]} if halves else {3: JOINTS}
         for node, names in self.reports.items():
             period = r.uniform(15, 50 if self.live else self.silent * 800)
@@ -83,10 +87,30 @@ class JointsWorld(World):
         self.every(lambda: r.uniform(300, 1200), self._command, first=600)
         if not self.live:
             self.after(r.uniform(1000, 6000), self._fails)
-            self.interrupt("hold restart switch", 0.3)
+            self.with_second()
+            self.interrupt("hold restart" if self.third else "hold restart switch", 0.3)
+
+    @property
+    def third(self) -> bool:
+        """Whether a node may report beside two others."""
+        return self.second is not None and len(self.reports) == 2
+
+    def counts(self, topic: str) -> bool:
+        return self.third  # two nodes may report, and both have to
+
+    def stops_for(self, topic: str) -> float:
+        return self.silent * 1000
+
+    def good(self, topic: str) -> bytes:
+        return states(self.now, JOINTS, self.place)
+
+    def damages(self, topic: str) -> bool:
+        return not self.third
 
     def _fails(self) -> None:
-        self.fault = self.random.choice(("dead", "NaN", "cut", "no names"))
+        self.fault = self.random.choice(
+            ("dead", "half dead", "NaN", "no names", "dead" if self.third else "cut")
+        )
         self.trace(f"the positions fail: {self.fault}")
         if self.random.random() < 0.5:
             self.after(self.now + self.random.uniform(300, 2000), lambda: setattr(self, "fault", ""))
@@ -96,6 +120,8 @@ class JointsWorld(World):
         match self.fault:
             case "dead":
                 return
+            case "half dead" if node == max(self.reports):
+                return
             case "NaN":
                 places = [math.nan] * len(places)
             case "no names":
@@ -104,7 +130,7 @@ class JointsWorld(World):
                 self.heard[node] = NEVER
                 self.say("state", states(self.now, names, places)[:20], node, whole=False)
                 return
-        self.heard[node] = NEVER if self.fault else self.now
+        self.heard[node] = self.now if self.fault in {"", "half dead"} else NEVER
         self.say("state", states(self.now, names, places), node)
 
     # Commands
@@ -130,13 +156,13 @@ class JointsWorld(World):
             names, points, bad = JOINTS, [], "empty"
         self.trace(f"a trajectory of {len(points)} points: {bad or 'good'}")
         data = trajectory(self.now, names, points)
-        passed, sent = self.guard.tell(self.guard.topics["command"], data, self.now, 1)
+        passed, sent = self.guard.tell(self.guard.topics[COMMAND], data, self.now, self.commander)
         for one in sent:
             self._receive(*one)
         self._judge(bad, points, passes=passed == data)
         if passed is not None:
             self._receive(
-                self.now, self.guard.topics["command"], passed, points if passed == data and not bad else ()
+                self.now, self.guard.topics[COMMAND], passed, points if passed == data and not bad else ()
             )
 
     def _judge(self, bad: str, points: Sequence[Point], *, passes: bool) -> None:
@@ -146,18 +172,21 @@ class JointsWorld(World):
             return
         if self.holding or self.guard.holds:
             self.broken("L5", "a trajectory passes a guard that holds")
+        if why := self.beside_source():
+            self.broken("L4", f"a trajectory passes: {why}")
         law = {"NaN": "L2", "infinite": "L2", "jump": "L3"}.get(bad, "L1")
         if bad:
             self.broken(law, f"a trajectory passes that is wrong: {bad}")
         for node in self.reports:
             if self.now > self.heard.get(node, NEVER) + self.silent * 1000 and self.now > self.fresh_from:
                 self.broken(
-                    "L2", f"a trajectory passes, and node {node} does not report where the joints are"
+                    "L4" if self.foreign else "L2",
+                    f"a trajectory passes, and node {node} does not report where the joints are",
                 )
 
     def _receive(self, at: int, topic: str, data: bytes, points: Sequence[Point] = ()) -> None:
         """Take a trajectory; one of the guard is empty, and stops the arm where it is."""
-        if topic != self.guard.topics["command"]:
+        if topic != self.guard.topics[COMMAND]:
             return
         now = max(at, self.now)
         if points and not self.switched_off:

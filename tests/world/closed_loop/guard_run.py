@@ -11,7 +11,7 @@ from rosmop.run.outcomes import MessageSender, Outcome
 from tests.support.features.guards.running_guard import Change, Value, on_its_module, part_with, unchanged
 from tests.world.closed_loop.messages import EPOCH
 
-NODES = ("", "/a", "/b", "/c", "/d", "/e", "/f")
+NODES = ("", "/a", "/b", "/c", "/d", "/e", "/f", "/g")
 MS = 10**6
 
 

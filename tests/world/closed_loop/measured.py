@@ -1,6 +1,7 @@
 """Worlds of the guards that judge the measured velocity of a base, which may not obey: `overspeed` and `standstill`."""
 
 import math
+from collections.abc import Mapping
 from typing import ClassVar
 
 from tests.world.closed_loop.bases import DIFFERENTIAL, OMNIDIRECTIONAL, STEERED, Base
@@ -14,8 +15,8 @@ from tests.world.closed_loop.messages import (
     Legs,
     odometry,
 )
-from tests.world.closed_loop.streams import NEVER, straight
-from tests.world.closed_loop.world import SLACK, World
+from tests.world.closed_loop.streams import straight
+from tests.world.closed_loop.world import NEVER, SLACK, World
 
 KINDS = {
     DIFFERENTIAL: (TWIST, TWIST_STAMPED),
@@ -30,6 +31,7 @@ FAULTS = ("dead", "NaN", "infinite", "cut")
 class MeasuredWorld(World):
     """A base that at times drives without a command, and its odometry, which may fail."""
 
+    one_source: ClassVar[Mapping[str, tuple[str, ...]]] = {"by": ("dead", "cut")}
     still = 0.05
     silent: float
     waits = True
@@ -42,14 +44,13 @@ class MeasuredWorld(World):
         self.base = Base(kind, r.randrange(10, 150), r.uniform(1, 4), r.uniform(1, 8), top)
         self.push: tuple[float, float] = (0.0, 0.0)
         """Velocities, linear and angular, that no command asks for."""
-        self.live = r.random() < 0.2
+        self.live = not self.alone and r.random() < 0.2
         self.silent = round(r.uniform(0.1, 0.6), 2)
         self.fault = ""
         self.quiet = r.random() < 0.5  # it commands zero once
         self.measure: tuple[int, float, float] = (NEVER, math.nan, math.nan)
         self.bad_from = NEVER
         """Since when each measurement is not a number."""
-        self.other_at = NEVER
         self.sent = self.passing = 0
 
     def happens(self) -> None:
@@ -65,10 +66,7 @@ class MeasuredWorld(World):
             self.after(r.uniform(500, 6000), self._pushes)
         if r.random() < 0.5:
             self.after(r.uniform(500, 6000), self._fails)
-        if r.random() < 0.2:
-            self.foreign = True
-            period_of = r.choice((50, 200))
-            self.every(lambda: period_of, self._another, first=2000)
+        self.with_second()
         self.interrupt("hold restart switch", 0.3)
 
     def _command(self) -> None:
@@ -94,9 +92,12 @@ class MeasuredWorld(World):
         if self.random.random() < 0.6:
             self.after(self.now + self.random.uniform(300, 2000), lambda: setattr(self, "fault", ""))
 
-    def _another(self) -> None:
-        self.other_at = self.now
-        self.say("by", odometry(self.now, (0, 0, 0, 0, 0, 0, 1)), 4)
+    def good(self, topic: str) -> bytes:
+        return odometry(self.now, (0, 0, 0, 0, 0, 0, 1))
+
+    def forgets(self) -> None:
+        self.measure = (NEVER, math.nan, math.nan)
+        self.noted()
 
     def _sense(self) -> None:
         if self.fault == "dead":
@@ -143,9 +144,7 @@ class MeasuredWorld(World):
             return "the odometry is silent or unreadable"
         if self.bad_from != NEVER and self.now > self.bad_from + slack:
             return "the measured velocity is not a number"
-        if self.now <= self.other_at + 1000 - slack:
-            return "another node measures the velocity too"
-        return ""
+        return self.beside_source(slack)
 
     @property
     def stands(self) -> bool:
@@ -157,7 +156,7 @@ class MeasuredWorld(World):
 
     def enable_guard(self) -> None:
         super().enable_guard()
-        self.measure, self.other_at, self.bad_from = (NEVER, math.nan, math.nan), NEVER, NEVER
+        self.measure, self.bad_from = (NEVER, math.nan, math.nan), NEVER
         self.waits = True
 
     def ended(self) -> None:

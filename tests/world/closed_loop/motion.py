@@ -1,7 +1,7 @@
 """Worlds with a base that moves: among obstacles and persons (`separation`), and inside a fence (`fence`)."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -40,13 +40,11 @@ class DrivenWorld(World):
     """A base, and a node that drives it somewhere at any rate, with pauses."""
 
     base: Base
-    fault = ""
+    one_source: ClassVar[Mapping[str, tuple[str, ...]]] = {"by": ("dead", "cut")}
     heard = -1
     """When the last valid measurement arrived, or -1."""
     blind_from: int | None = None
     """When the first measurement without any evidence arrived that no valid one has followed."""
-    tick = 20
-    """Milliseconds between two looks of the guard."""
 
     def built(self, kinds: "tuple[str, ...]", lag: int, braking: float, top: float) -> None:
         r = self.random
@@ -100,12 +98,8 @@ class DrivenWorld(World):
     def law(self, otherwise: str = "L2") -> str:
         return "L4" if self.foreign else "L2" if self.fault else otherwise
 
-    def another(self, say: Callable[[], object]) -> None:
-        """Plan, in a part of the worlds, another node that publishes on the topic of the sensor."""
-        if self.random.random() < 0.15:
-            self.foreign = True
-            period = self.random.choice((50, 200))
-            self.every(lambda: period, lambda: void(say()), first=2000)
+    def is_motion(self, legs: Legs) -> bool:
+        return travels(legs)
 
     def measured(self, *, valid: "bool | None") -> None:
         """Note the arrival of a measurement: valid, valid in parts (None), or without any evidence."""
@@ -160,7 +154,7 @@ class SeparationWorld(DrivenWorld):
         self.walls: list[Segment] = []
         self.persons: list[Person] = []
         self.fault = ""
-        self.live = r.random() < 0.12
+        self.live = not self.alone and r.random() < 0.12
         if self.live:
             self._plan_honest()
             return
@@ -188,10 +182,10 @@ class SeparationWorld(DrivenWorld):
         )  # fmt: skip
         if r.random() < 0.5:
             self.after(r.uniform(300, 6000), self._fail)
-        self.another(lambda: self.say("by", self._elsewhere(), 4))
+        self.with_second()
         self.interrupt("hold restart", 0.2)
 
-    def _elsewhere(self) -> bytes:
+    def good(self, topic: str) -> bytes:
         return scan(self.now, -math.pi, math.pi / 50, self.near, self.far, np.full(101, self.far * 0.9))
 
     def _surroundings(self) -> None:
@@ -263,7 +257,7 @@ class SeparationWorld(DrivenWorld):
         self.measured(valid=valid)
 
     def _fail(self) -> None:
-        self.fault = self.one_of(SCAN_FAULTS)
+        self.fault = self.random.choice(SCAN_FAULTS)
         self.trace(f"the scanner fails: {self.fault}")
         if self.fault != "dead" and self.random.random() < 0.5:
             self.after(self.now + self.random.uniform(500, 3000), self._repair)
@@ -391,7 +385,7 @@ class FenceWorld(DrivenWorld):
 
     def plan(self) -> None:
         r = self.random
-        self.fault, self.live = "", r.random() < 0.1
+        self.fault, self.live = "", not self.alone and r.random() < 0.1
         self.field = FIELDS[0] if self.live else r.choice(FIELDS)
         self.margin, ahead, self.silent = 0.2, 0.5, 0.5
         if not self.live:
@@ -422,8 +416,11 @@ class FenceWorld(DrivenWorld):
         self.driven(self.field, turns=not self.outside)
         if r.random() < 0.4:
             self.after(r.uniform(300, 6000), self._fail)
-        self.another(lambda: self.say("by", position(self.by, self.now, -1.0, 0.0, 0.0), 4))
+        self.with_second()
         self.interrupt("hold restart", 0.2)
+
+    def good(self, topic: str) -> bytes:
+        return position(self.by, self.now, -1.0, 0.0, 0.0)
 
     def _place(self) -> None:
         r = self.random
@@ -474,7 +471,7 @@ class FenceWorld(DrivenWorld):
         self.measured(valid=valid)
 
     def _fail(self) -> None:
-        self.fault = self.one_of(POSITION_FAULTS)
+        self.fault = self.random.choice(POSITION_FAULTS)
         self.trace(f"the position fails: {self.fault}")
         if self.fault == "gap" or (self.fault != "dead" and self.random.random() < 0.5):
             self.after(self.now + self.random.uniform(500, 3000), self._repair)
@@ -483,7 +480,7 @@ class FenceWorld(DrivenWorld):
         self.trace("the position is right again")
         self.fault = ""
 
-    def drive(self, legs: Legs, node: int = 1, made: int | None = None) -> "Legs | None":
+    def drive(self, legs: Legs, node: int | None = None, made: int | None = None) -> "Legs | None":
         """Publish a command. One in the frame of the world is turned into that of the base only behind the guard."""
         return super().drive(legs, node, made)
 

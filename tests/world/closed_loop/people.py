@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from tests.world.closed_loop.messages import STILL, Legs, boolean
-from tests.world.closed_loop.streams import NEVER, VELOCITIES, straight
-from tests.world.closed_loop.world import SLACK, World
+from tests.world.closed_loop.streams import VELOCITIES, straight
+from tests.world.closed_loop.world import NEVER, SLACK, World
 
 TICK = 20
 """Milliseconds between two looks of these guards."""

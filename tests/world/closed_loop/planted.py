@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 from unittest import mock
 
+from rosmop.run.origins import Origin
 from tests.support.features.guards.running_guard import Change, unchanged
 from tests.world.closed_loop.bases import Base
 from tests.world.closed_loop.guard_run import RunningGuard
@@ -98,6 +99,11 @@ def _slow(base: Base, legs: Legs) -> tuple[float, float, float]:
 
 def _late(base: Base, at: int, legs: Legs) -> None:
     base.orders.append((at + 3 * base.lag + 150, legs))
+
+
+def _hears_any(origin: Origin, _node: str) -> bool:
+    origin.first = None
+    return True
 
 
 resume_guard, _tell, _restart, _wanted = (
@@ -271,6 +277,18 @@ _ROWS: Sequence[tuple[str, str, str, str, str]] = (
         ("L4", preset, "takes any node for its source", r'source == "" \|\| caller\(\w+\) == source', "true")
         for preset in ("separation", "fence", "zone", "overspeed", "standstill")
     ),
+    ("L4", "zone", "takes any node for that which mutes",
+     r'muteNode == "" \|\| caller\(muteSignal\) == muteNode', "true"),
+    *(
+        ("L4", preset, "does not stop while another node publishes", r"age\(foreign\) <= 1\b", "false")
+        for preset in ("separation", "fence")
+    ),
+    ("L4", "sensor", "does not see another node", r"&& !\(sinceForeign <= 1\)", ""),
+    ("L4", "agree", "does not see another node", r"&& !\(sinceForeign <= 1\)", ""),
+    ("L4", "zone", "does not see another node", r"\|\| sinceForeign <= 1", ""),
+    ("L4", "arm", "does not see another battery", r"&& !\(otherBattery <= silent\)", ""),
+    ("L4", "joints", "does not see a third node", r"&& !\(age\(foreign\) <= silent\)", ""),
+    ("L4", "joints", "asks one of two nodes", r"\(row < 0 \|\| known && ", "(row < 0 || !known || "),
     ("L4", "agree", "takes any node for its second source",
      r'otherSource == "" \|\| caller\(two\) == otherSource', "true"),
     ("L6", "enable", "needs no zero", r"else if \(zeroFirst\)", "else if (false)"),
@@ -301,6 +319,10 @@ FAULTS = {
             "speed", "separation", "fence", "sensor", "estop", "arm", "agree", "sane", "enable", "mode", "overspeed",
             "standstill", "zone",
         )
+    },
+    **{
+        f"{preset} hears any node when it begins again": Fault("L4", preset, patch=(Origin, "hears", _hears_any))
+        for preset in ("sensor", "arm", "agree", "overspeed", "standstill", "zone")
     },
     **{
         f"a hold of {preset} drops observed messages": Fault("L5", preset, patch=(RunningGuard, "tell", _deaf))

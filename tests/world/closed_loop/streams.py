@@ -4,7 +4,7 @@ A base executes the last command that it got. So each oracle asks which motion i
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -28,9 +28,8 @@ from tests.world.closed_loop.messages import (
     steering,
     values,
 )
-from tests.world.closed_loop.world import SLACK, World, void
+from tests.world.closed_loop.world import NEVER, SLACK, World
 
-NEVER = -(10**9)
 VELOCITIES = (TWIST, TWIST, TWIST, TWIST_STAMPED, ACKERMANN, ACKERMANN_STAMPED)
 
 
@@ -300,7 +299,7 @@ class RateWorld(World):
 
     before: Legs = STILL
 
-    def publish(self, data: bytes, node: int = 1) -> "Legs | None":
+    def publish(self, data: bytes, node: int | None = None) -> "Legs | None":
         self.before = self.force[1]
         return super().publish(data, node)
 
@@ -314,8 +313,6 @@ class EvidenceWorld(World):
     span = 6000
     steady = 1.0
     sent = got = 0
-    tick = 20
-    """Milliseconds between two looks of the guard."""
     fit_since = NEVER
     """Since when an honest node's commands must pass; `NEVER`: they need not."""
 
@@ -339,14 +336,6 @@ class EvidenceWorld(World):
 
     def law(self) -> str:
         return "L4" if self.foreign else "L2"
-
-    def another(self, act: Callable[[], object]) -> None:
-        """Plan, in a part of the worlds, another node that publishes good values."""
-        r = self.random
-        if r.random() < 0.25:
-            self.foreign = True
-            period = r.choice((50, 200))
-            self.every(lambda: period, lambda: void(act()), first=2000)
 
     def watch(self) -> None:
         self.only_fresh()
@@ -385,6 +374,7 @@ class SensorWorld(EvidenceWorld):
     """A sensor that is silent, frozen, blind or unreadable."""
 
     preset: ClassVar[str] = "sensor"
+    one_source: ClassVar[Mapping[str, tuple[str, ...]]] = {"by": ("dead", "cut")}
 
     def plan(self) -> None:
         r = self.random
@@ -396,12 +386,12 @@ class SensorWorld(EvidenceWorld):
         self.heard, self.repeated, self.seeing, self.fault = NEVER, 0, False, ""
         self.known: list[float] = []
         self.shown: list[float] = []
-        live = r.random() < 0.2
+        live = not self.alone and r.random() < 0.2
         self.fit_since = 1500 if live else NEVER
         if not live:
             self.interrupt("hold restart switch")
             self.after(r.uniform(500, 4000), self._fail)
-            self.another(lambda: self.say("by", self._good(), 5))
+            self.with_second()
         period = r.uniform(15, min(200, self.silent * 800))
         self.every(
             lambda: -1 if self.fault == "dead" else period * r.uniform(0.7, 1),
@@ -410,7 +400,7 @@ class SensorWorld(EvidenceWorld):
         )
 
     def _fail(self) -> None:
-        self.fault = self.one_of(("dead", "frozen", "NaN", "infinite", "some", "cut", "frozen NaN"))
+        self.fault = self.random.choice(("dead", "frozen", "NaN", "infinite", "some", "cut", "frozen NaN"))
         self.trace(f"the sensor fails: {self.fault}")
         if self.fault != "dead" and self.random.random() < 0.5:
             self.after(self.now + self.random.uniform(300, 2000), lambda: setattr(self, "fault", ""))
@@ -419,7 +409,10 @@ class SensorWorld(EvidenceWorld):
         super().enable_guard()
         self.shown, self.repeated = [], 0  # the guard counts from its new beginning
 
-    def _good(self) -> bytes:
+    def forgets(self) -> None:
+        self.seeing, self.shown, self.repeated = False, [], 0
+
+    def good(self, topic: str) -> bytes:
         return values(
             self.by, self.now, [self.random.uniform(1, 5) for _value in range(SENSOR_VALUES[self.by])]
         )
@@ -445,6 +438,8 @@ class SensorWorld(EvidenceWorld):
             self.say("by", values(self.by, self.now, numbers)[:14], whole=False)
             self.seeing, self.shown = False, []
             return
+        if self.second is not None and self.second.in_doubt:
+            self.shown = []  # the guard does not hear this sensor
         finite = sum(map(math.isfinite, numbers))
         same = repr(numbers) == repr(self.shown)
         self.repeated = self.repeated + 1 if same else 0
@@ -466,6 +461,11 @@ class ArmWorld(EvidenceWorld):
     """A battery, a position fix and a check, each of which may be absent, old, invalid or too low."""
 
     preset: ClassVar[str] = "arm"
+    one_source: ClassVar[Mapping[str, tuple[str, ...]]] = {
+        "by": ("no battery", "cut"),
+        "fix": ("no fix",),
+        "check": ("no check",),
+    }
     span = 8000
     tick = 100
 
@@ -474,8 +474,8 @@ class ArmWorld(EvidenceWorld):
         self.silent, self.checked = round(r.uniform(0.3, 2), 2), r.choice((1, 3, 600))
         self.charge, self.needs_fix, self.needs_check = (
             round(r.uniform(0.1, 0.5), 2),
-            r.random() < 0.5,
-            r.random() < 0.5,
+            self.alone == "fix" or r.random() < 0.5,
+            self.alone == "check" or r.random() < 0.5,
         )
         self.commands(r.choice((30, 100, 250)))
         self.guarded({
@@ -484,7 +484,7 @@ class ArmWorld(EvidenceWorld):
         })  # fmt: skip
         self.battery = self.fix = self.check = (NEVER, False)
         self.fault = ""
-        live = r.random() < 0.2
+        live = not self.alone and r.random() < 0.2
         self.fit_since = 1500 if live else NEVER
         period = min(400, self.silent * 800)
         for given in (self._battery, self._fix):
@@ -492,7 +492,7 @@ class ArmWorld(EvidenceWorld):
         self.every(lambda: r.uniform(100, 900), self._check, first=r.uniform(0, 500))
         if not live:
             self.interrupt("hold restart switch")
-            self.another(lambda: (self.say("by", battery(0.9), 5), self.say("check", boolean(True), 5)))
+            self.with_second()
             for _fault in range(2):
                 self.after(r.uniform(500, 6000), self._fail)
 
@@ -511,8 +511,19 @@ class ArmWorld(EvidenceWorld):
             "unready",
             "",
         )
-        self.fault = self.one_of(faults)
+        self.fault = self.random.choice(faults)
         self.trace(f"it fails: {self.fault}")
+
+    def good(self, topic: str) -> bytes:
+        if topic == "by":
+            return battery(0.9)
+        return boolean(True) if topic == "check" else position(FIX, self.now, 1.0, 1.0, 0)
+
+    def stops_for(self, topic: str) -> float:
+        return (self.checked if topic == "check" else self.silent) * 1000
+
+    def counts(self, topic: str) -> bool:
+        return {"fix": self.needs_fix, "check": self.needs_check}.get(topic, True)
 
     def _battery(self) -> None:
         bad = {"low": self.charge - 0.02, "percent": 15.0, "NaN": math.nan, "minus": -1.0}.get(self.fault)
@@ -551,6 +562,10 @@ class AgreeWorld(EvidenceWorld):
     """Two sources of the velocity that agree or not, in any part of it."""
 
     preset: ClassVar[str] = "agree"
+    one_source: ClassVar[Mapping[str, tuple[str, ...]]] = {
+        "by": ("dead by", "cut by"),
+        "other": ("dead", "cut"),
+    }
 
     def plan(self) -> None:
         r = self.random
@@ -565,20 +580,24 @@ class AgreeWorld(EvidenceWorld):
         self.heard = {"by": NEVER, "other": NEVER}
         self.count = {"by": 0, "other": 0}
         """Messages since the fault began."""
-        live = r.random() < 0.2
+        live = not self.alone and r.random() < 0.2
         self.fit_since = 1500 if live else NEVER
         if not live:
             self.interrupt("hold restart switch")
             self.after(r.uniform(1000, 4000), self._fail)
-            good = (1.0, 0.2, 0.0, 0.0, 0.0, 0.5)
-            self.another(lambda: self.say("other", odometry(self.now, (0, 0, 0, 0, 0, 0, 1), good), 5))
+            self.with_second()
         for given, period in (("by", r.uniform(15, 80)), ("other", r.uniform(15, 80))):
             self._source(given, period)
 
     def _fail(self) -> None:
-        self.fault = self.one_of(("x", "y", "turn", "opposite turn", "NaN", "dead", "dead by", "both NaN"))
+        self.fault = self.random.choice(
+            ("x", "y", "turn", "opposite turn", "NaN", "dead", "dead by", "both NaN", "cut", "cut by")
+        )
         self.trace(f"it fails: {self.fault}")
         self.count = dict.fromkeys(self.count, 0)
+
+    def good(self, topic: str) -> bytes:
+        return odometry(self.now, (0, 0, 0, 0, 0, 0, 1), (1.0, 0.2, 0.0, 0.0, 0.0, 0.5))
 
     def _source(self, given: str, period: float) -> None:
         r = self.random
@@ -601,6 +620,10 @@ class AgreeWorld(EvidenceWorld):
                         velocity[r.choice((0, 1, 5))] = math.nan
             if self.fault == "both NaN":
                 velocity = [math.nan] * 6
+            if self.fault == {"other": "cut", "by": "cut by"}[given]:
+                self.heard[given] = NEVER
+                self.say(given, odometry(self.now, (0, 0, 0, 0, 0, 0, 1), velocity)[:20], whole=False)
+                return
             self.heard[given] = self.now
             self.count[given] += 1
             self.say(given, odometry(self.now, (0, 0, 0, 0, 0, 0, 1), velocity))
@@ -611,7 +634,8 @@ class AgreeWorld(EvidenceWorld):
         for given, at in self.heard.items():
             if self.now > at + self.silent * 1000:
                 return f"{given} is silent since {at} ms"
-        if self.fault not in {"", "dead", "dead by"} and min(self.count.values()) > 2 * self.samples + 1:
+        differs = self.fault not in {"", "dead", "dead by", "cut", "cut by"}
+        if differs and min(self.count.values()) > 2 * self.samples + 1:
             return f"the two do not agree: {self.fault}"
         return ""
 

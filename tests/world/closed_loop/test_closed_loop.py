@@ -1,18 +1,29 @@
+import re
+
 import pytest
 
 from appliance.features.guards.presets import PRESETS
 from tests.support.examples import ALL
 from tests.world.closed_loop.planted import FAULTS, WITHIN, no_guard, stops_everything
-from tests.world.closed_loop.worlds import NOT_MODELLED, PAIRS, WORLDS, replay, run_many, run_one
+from tests.world.closed_loop.world import COMMAND
+from tests.world.closed_loop.worlds import (
+    EACH_NODE,
+    NOT_MODELLED,
+    PAIRS,
+    WORLDS,
+    replay,
+    run_many,
+    run_one,
+)
 
 AT_GATE = {"separation": 10, "fence": 10, "zone": 6}
 """Worlds at the gate of presets whose worlds cost 0.1 to 0.2 s; the others cost 5 to 40 ms, and have 15."""
 AT_NIGHT = {"separation": 2500, "fence": 2500, "zone": 1500, PAIRS: 1500}
 
 
-def judge(preset: str, first: int, worlds: int) -> None:
-    summary = run_many(preset, range(first, first + worlds))
-    found = [f"{text}\n    {replay(preset, seed)}" for seed, text in summary.broken]
+def judge(preset: str, first: int, worlds: int, alone: str = "") -> None:
+    summary = run_many(preset, range(first, first + worlds), alone=alone)
+    found = [f"{text}\n    {replay(preset, seed, alone)}" for seed, text in summary.broken]
     assert not found, f"{len(found)} of {worlds} worlds of {preset} break a law:\n" + "\n".join(found[:5])
 
 
@@ -32,6 +43,46 @@ def test_no_world_of_a_night_breaks_a_law(preset: str) -> None:
 def test_every_preset_has_a_world_or_a_reason() -> None:
     assert WORLDS.keys() | NOT_MODELLED.keys() == PRESETS.keys()
     assert not WORLDS.keys() & NOT_MODELLED.keys()
+
+
+ALONE = [
+    (preset, topic)
+    for preset, world in WORLDS.items()
+    if world.one_source
+    for topic in (*world.one_source, COMMAND)
+]
+"""The topics on which a second node publishes, while the source of one of them fails in most worlds."""
+
+
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize(("preset", "topic"), ALONE)
+def test_a_second_publisher_alone_moves_nothing(preset: str, topic: str) -> None:
+    judge(preset, 50_000, 200 if ALL else 3, topic)
+
+
+def test_each_observed_topic_has_one_source_and_a_second_publisher_or_each_node_counts() -> None:
+    observed = {
+        (name, topic)
+        for name, preset in PRESETS.items()
+        for topic in preset.given_topics.keys() - {COMMAND, "cancel"}
+    }
+    with_one = {one for one in ALONE if one[1] != COMMAND}
+    assert with_one | EACH_NODE.keys() == observed and not with_one & EACH_NODE.keys()
+
+
+def _takes_any_node(text: str) -> str:
+    """Let a guard take each node for the source of a topic, and see no other node beside it."""
+    taken, heard = re.subn(r'when \((\w+) == "" \|\| caller\(\w+\) == \1\)', "", text)
+    foreign = r"(event foreign\w*\(\) \w+(?: \S+\s+'\{\}')?\s+)when \("
+    unseen, others = re.subn(foreign, r"\1when (false && ", taken)
+    assert heard and others
+    return unseen
+
+
+@pytest.mark.parametrize(("preset", "topic"), [one for one in ALONE if one[1] != COMMAND])
+def test_a_guard_that_takes_any_node_for_its_source_is_found(preset: str, topic: str) -> None:
+    found = (run_one(preset, seed, _takes_any_node, alone=topic).violations for seed in range(100))
+    assert any(one.law == "L4" for violations in found for one in violations)
 
 
 LAWS_OF = {

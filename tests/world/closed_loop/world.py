@@ -28,7 +28,7 @@ The declared assumptions:
 import heapq
 import math
 import random
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import ClassVar, Protocol
 
@@ -36,7 +36,10 @@ from tests.support.features.guards.running_guard import Change, Value, unchanged
 from tests.world.closed_loop.guard_run import Beside, RunningGuard, parameters_of
 from tests.world.closed_loop.messages import STILL, TWIST, Legs, command, legs_of, moves, travels
 
-BESIDE = "a start again beside another node"
+NEVER = -(10**9)
+SECOND, COMMANDER = 7, 2
+"""The node that publishes where another one is the source, and the one that takes over the commands."""
+COMMAND = "command"
 LAWS = ("L1", "L2", "L3", "L4", "L5", "L6", "live")
 SLACK = 30
 """Milliseconds that a guard has for an act: its timers run every 10 or 20 ms."""
@@ -70,12 +73,32 @@ class Companion(Protocol):
         """Plan its evidence, and return it."""
 
 
+@dataclass
+class Second:
+    """A node that publishes good values on a topic of which another node is the source."""
+
+    topic: str
+    heard: int = NEVER
+    """When the guard heard it last, since it began."""
+    since: int = NEVER
+    """When it has begun to speak, so that the base had to stop."""
+    in_doubt: bool = False
+    """Whether its last bytes were not a message: then the guard hears no other node on this topic."""
+
+
 class World:
     """One world, by the number of its seed."""
 
     preset: ClassVar[str]
     span = 8000
     """Milliseconds."""
+    tick = 20
+    """Milliseconds between two looks of the guard."""
+    one_source: ClassVar[Mapping[str, tuple[str, ...]]] = {}
+    """The topics of which one node is the source, each with the faults by which it is silent or unreadable there."""
+    alone = ""
+    """Where a second node must publish alone: a topic of `one_source`, or `command`; by default chance decides."""
+    fault = ""
     foreign = False
     """Whether another node publishes good values on the sensor's topic."""
     not_yet: ClassVar[Mapping[str, str]] = {}
@@ -100,6 +123,13 @@ class World:
         """A motion is only allowed if its command came after this time."""
         self.made = 0
         """When the command was made that goes through the guard now."""
+        self.second: Second | None = None
+        self.commander = 1
+        """The node that commands the base."""
+        self._spoken: set[str] = set()
+        """The topics on which the guard has heard the source since it began, so that it hears others."""
+        self._known: set[str] = set()
+        """The topics whose source has ever sent a message."""
         self._change, self._trace = change, trace
         self._queue: list[tuple[int, int, Callable[[], None]]] = []
         self._number = 0
@@ -123,7 +153,7 @@ class World:
     # For `plan`
 
     def guarded(self, values: Mapping[str, Value], types: Mapping[str, str] | None = None) -> None:
-        types = {"command": self.kind, **(types or {})}
+        types = {COMMAND: self.kind, **(types or {})}
         values = {name: value for name, value in values.items() if name in parameters_of(self.preset)}
         beside = None if self.beside is None else self.beside.begin()
         self.guard = RunningGuard(self.preset, types, values, self._change, beside)
@@ -149,11 +179,6 @@ class World:
 
         self.after(first, again)
 
-    def one_of(self, faults: Sequence[str]) -> str:
-        """Choose a fault of a sensor."""
-        ready = [one for one in faults if not (one == "cut" and self.foreign and BESIDE in self.not_yet)]
-        return self.random.choice(ready)
-
     def trace(self, text: str) -> None:
         if self._trace is not None:
             self._trace(f"{self.now / 1000:8.3f}  {text}")
@@ -169,7 +194,7 @@ class World:
 
     def run(self) -> Report:
         self.plan()
-        self.every(lambda: 10, self.watch, first=10)
+        self.every(lambda: 10, self._look, first=10)
         try:
             while self._queue and self._queue[0][0] <= self.span:
                 at, _number, act = heapq.heappop(self._queue)
@@ -188,11 +213,15 @@ class World:
         self.move(at)
         self.now = at
 
+    def _look(self) -> None:
+        self.watch()
+        self._watch_second()
+
     def move(self, until: int) -> None:
         """Move what moves."""
 
     def _receive(self, at: int, topic: str, data: bytes) -> None:
-        if topic == self.guard.topics["command"]:
+        if topic == self.guard.topics[COMMAND]:
             self.received(max(at, self.now), legs_of(self.kind, data))
 
     def received(self, at: int, legs: Legs) -> None:
@@ -204,23 +233,26 @@ class World:
     def say(self, given: str, data: bytes, node: int = 6, *, whole: bool = True) -> bytes | None:
         """Publish a message on a topic of the guard that is not the command's; not `whole`: bytes that are none."""
         held = self.guard.holds
+        if given in self.one_source and not self.switched_off:
+            self._note(given, node, whole=whole)
         passed, sent = self.guard.tell(self.guard.topics[given], data, self.now, node)
         for one in sent:
             self._receive(*one)
-        if passed is None and held and whole and given != "command":
+        if passed is None and held and whole and given != COMMAND:
             self.broken(
                 "L5", f"a guard that holds drops a message on {self.guard.topics[given]}, which it observes"
             )
         return passed
 
-    def drive(self, legs: Legs, node: int = 1, made: int | None = None) -> Legs | None:
-        """Publish a command that was made at `made` (now)."""
+    def drive(self, legs: Legs, node: int | None = None, made: int | None = None) -> Legs | None:
+        """Publish a command that was made at `made` (now) by a node (the commander)."""
         self.made = self.now if made is None else made
         return self.publish(command(self.kind, legs, self.made), node)
 
-    def publish(self, data: bytes, node: int = 1) -> Legs | None:
+    def publish(self, data: bytes, node: int | None = None) -> Legs | None:
+        node = self.commander if node is None else node
         legs = legs_of(self.kind, data)
-        passed, sent = self.guard.tell(self.guard.topics["command"], data, self.now, node)
+        passed, sent = self.guard.tell(self.guard.topics[COMMAND], data, self.now, node)
         got = None if passed is None else legs_of(self.kind, passed)
         for one in sent:
             self._receive(*one)
@@ -231,6 +263,8 @@ class World:
             if self.moves(got) and (self.holding or self.guard.holds):
                 self.broken("L5", f"a motion passes a guard that holds: {_shown(got)}")
         if not self.switched_off:
+            if got is not None and self.is_motion(got) and (why := self.beside_source()):
+                self.broken("L4", f"a motion passes: {why}")
             self.passed(node, legs, got)
         return got
 
@@ -245,6 +279,116 @@ class World:
             not abs(leg * scale - other) <= near for leg, other in zip(wanted[:3], got[:3], strict=True)
         ):
             self.broken("L1", f"{_shown(wanted)} becomes {_shown(got)}: another direction, or more")
+
+    # Another node beside the source
+
+    def good(self, topic: str) -> bytes:
+        """Return a message on a topic of `one_source` that permits a motion."""
+        raise NotImplementedError
+
+    def stops_for(self, topic: str) -> float:
+        """Return the milliseconds for which a message of another node than the source stops the base."""
+        return 1000
+
+    def is_motion(self, legs: Legs) -> bool:
+        """Whether the guard has to stop this command when a node publishes beside the source."""
+        return self.moves(legs)
+
+    def counts(self, topic: str) -> bool:
+        """Whether the guard has to stop while another node than the source publishes on this topic."""
+        return True
+
+    def damages(self, topic: str) -> bool:
+        """Whether the other node may also send bytes that are not a message."""
+        return True
+
+    def forgets(self) -> None:
+        """Note that the guard knows nothing any more, because of the bytes of another node than the source."""
+
+    def with_second(self, part: float = 0.25) -> None:
+        """Let, in a part of the worlds, another node publish beside a source, or take over the commands.
+
+        In half of them the source also fails.
+        """
+        r = self.random
+        topics = [*self.one_source]
+        if self.alone == COMMAND or r.random() < part / 2:
+            self.after(r.uniform(1000, 4000), self._take_over)
+        if not self.alone and r.random() >= part:
+            return
+        topic = r.choice(topics) if self.alone in {"", COMMAND} else self.alone
+        begin = r.uniform(1500, 3500)
+        if self.alone != COMMAND:
+            self.foreign, self.second = True, Second(topic)
+            self._speak(topic, begin)
+        if faults := self.one_source[topic] if self.alone or r.random() < 0.5 else ():
+            self.after(begin + r.uniform(-700, 700), lambda: self._end_source(r.choice(faults)))
+
+    def _take_over(self) -> None:
+        self.trace("another node commands the base, and the first one no longer")
+        self.commander = COMMANDER
+
+    def _end_source(self, fault: str) -> None:
+        self.trace(f"the source fails: {fault}")
+        self.fault = fault
+
+    def _speak(self, topic: str, begin: float) -> None:
+        r = self.random
+        period, end = r.choice((50, 200, 700)), r.choice((self.span, begin + r.uniform(0, 1500)))
+        damage = r.choice((0.0, 0.0, 0.0, 0.2)) if self.damages(topic) else 0.0
+
+        def tell() -> None:
+            if topic not in self._known:
+                return
+            data, whole = self.good(topic), r.random() >= damage
+            self.say(topic, data if whole else data[: len(data) // 2], SECOND, whole=whole)
+
+        self.every(lambda: -1 if self.now > end else period * r.uniform(0.8, 1), tell, first=begin)
+
+    def _note(self, topic: str, node: int, *, whole: bool) -> None:
+        """Note a message, as the guard hears it: after other bytes, it hears their node alone on the topic."""
+        second = self.second if self.second is not None and self.second.topic == topic else None
+        if not whole:
+            in_doubt = second is not None and second.in_doubt
+            if (topic not in self._spoken and not in_doubt) if node == SECOND else in_doubt:
+                return  # it awaits another node
+            since = NEVER if second is None else second.since
+            self._forget_second()
+            if node == SECOND and second is not None:
+                self.trace("another node sends bytes that are no message")
+                second.since = since if second.in_doubt else self.now
+                second.in_doubt = True
+                self.forgets()
+        elif node != SECOND:
+            self._known.add(topic)
+            if second is None or not second.in_doubt:
+                self._spoken.add(topic)
+        elif second is not None:
+            second.in_doubt = False
+            if topic in self._spoken:
+                second.since = self.now if not self.beside_source() else second.since
+                second.heard = self.now
+
+    def _forget_second(self) -> None:
+        self._spoken.clear()
+        if self.second is not None:
+            self.second.heard = self.second.since = NEVER
+
+    def beside_source(self, slack: int = 0) -> str:
+        """Return that a node speaks beside the source, so that nothing may move, or an empty text."""
+        one = self.second
+        if one is None or not self.counts(one.topic) or self.now < one.since + slack:
+            return ""
+        if not one.in_doubt and self.now >= one.heard + self.stops_for(one.topic) - slack:
+            return ""
+        return f"another node than the source publishes on `{one.topic}`"
+
+    def _watch_second(self) -> None:
+        slack = self.tick + SLACK
+        if self.switched_off or self.guard.holds or self.now <= self.fresh_from + 100 + slack:
+            return
+        if (why := self.beside_source(slack)) and self.is_motion(self.force[1]):
+            self.broken("L4", f"a motion stays in force: {why}")
 
     # Acts of operators
 
@@ -273,8 +417,6 @@ class World:
         self.fresh_from = self.now
 
     def switch(self) -> None:
-        if self.foreign and BESIDE in self.not_yet:
-            return
         self.trace("the guard is disabled")
         self.switched_off = True
         self.guard.switch(self.now, enabled=False)
@@ -285,6 +427,7 @@ class World:
         self.switched_off = False
         self.guard.switch(self.now, enabled=True)
         self.fresh_from = self.now
+        self._forget_second()
 
     def only_fresh(self) -> None:
         """Check that no motion from before a restart, an `enable` or a hold is still in force."""

@@ -43,14 +43,38 @@ NOT_MODELLED = {
 """Presets without a world, each with the reason."""
 
 
+EACH_NODE = {
+    ("estop", "stop"): "each node is a button: worlds of `estop`",
+    ("estop", "reset"): "each node is a hand: worlds of `estop`",
+    ("enable", "by"): "each node is a device: worlds of `enable`",
+    ("mode", "by"): "each node says the mode: worlds of `mode`",
+    (
+        "withhold",
+        "by",
+    ): "each node is a switch: `test_the_topic_is_withheld_until_each_known_switch_has_spoken`",
+    (
+        "answer",
+        "by",
+    ): "a result of another node ends no deadline: `test_a_goal_without_a_result_is_cancelled`",
+}
+"""Topics that a preset observes without one source in a world, each with the reason."""
+
+
 def run_one(
-    preset: str, seed: int, change: Change = unchanged, trace: Callable[[str], None] | None = None
+    preset: str,
+    seed: int,
+    change: Change = unchanged,
+    trace: Callable[[str], None] | None = None,
+    alone: str = "",
 ) -> Report:
-    return (_PAIRS if preset == PAIRS else WORLDS[preset])(seed, change, trace).run()
+    """Run a world; `alone` is the topic on which a second node publishes alone."""
+    world = (_PAIRS if preset == PAIRS else WORLDS[preset])(seed, change, trace)
+    world.alone = alone
+    return world.run()
 
 
-def replay(preset: str, seed: int) -> str:
-    return f"python -m tests.world.closed_loop --replay {preset} {seed}"
+def replay(preset: str, seed: int, alone: str = "") -> str:
+    return f"python -m tests.world.closed_loop --replay {preset} {seed}{alone and f' --alone {alone}'}"
 
 
 @dataclass
@@ -91,11 +115,11 @@ class Summary:
         return f"{self.worlds} worlds, {self.seconds:.0f} simulated s, {self.cost:.1f} s{near}; violations: {laws}"
 
 
-def run_many(preset: str, seeds: Iterable[int], change: Change = unchanged) -> Summary:
+def run_many(preset: str, seeds: Iterable[int], change: Change = unchanged, alone: str = "") -> Summary:
     summary = Summary()
     began = time.process_time()
     for seed in seeds:
-        summary.add(seed, run_one(preset, seed, change))
+        summary.add(seed, run_one(preset, seed, change, alone=alone))
     summary.cost = time.process_time() - began
     return summary
 

@@ -1,6 +1,7 @@
 """Worlds of `zone`: a base with a square zone around it, which covers its way until it stands."""
 
 import math
+from collections.abc import Mapping
 from typing import ClassVar
 
 import numpy as np
@@ -10,8 +11,8 @@ from tests.world.closed_loop import geometry
 from tests.world.closed_loop.bases import DIFFERENTIAL, OMNIDIRECTIONAL, STEERED
 from tests.world.closed_loop.messages import SCAN, STILL, Legs, boolean
 from tests.world.closed_loop.motion import WHOLE, Person, SeparationWorld
-from tests.world.closed_loop.streams import NEVER, straight
-from tests.world.closed_loop.world import SLACK, void
+from tests.world.closed_loop.streams import straight
+from tests.world.closed_loop.world import NEVER, SLACK, void
 
 MUTED = 2.0
 """Seconds of the longest muting."""
@@ -21,11 +22,12 @@ class ZoneWorld(SeparationWorld):
     """Walls and persons around a base that stops, or slows, while something is in its zone."""
 
     preset: ClassVar[str] = "zone"
+    one_source: ClassVar[Mapping[str, tuple[str, ...]]] = {"by": ("dead", "cut"), "mute": ()}
 
     def plan(self) -> None:
         r = self.random
         self.walls, self.persons = [], []
-        self.live = r.random() < 0.15
+        self.live = not self.alone and r.random() < 0.15
         self.sector, self.speed = WHOLE, 0.0 if self.live else r.choice((0.0, 1.6))
         self.silent = 0.3 if self.live else round(r.uniform(0.15, 0.5), 2)
         self.clear = 0.5 if self.live else round(r.uniform(0, 1), 2)
@@ -50,7 +52,7 @@ class ZoneWorld(SeparationWorld):
             self.base.heading = 0.0
         else:
             self._around()
-        mutes = not self.live and r.random() < 0.2
+        mutes = self.alone == "mute" or (not self.live and r.random() < 0.2)
         values: dict[str, Value] = {
             "slow": self.slow, "points": self.points, "silent": self.silent, "clear": self.clear,
             "muteFor": MUTED if mutes else 0.0, "polygon": self._square(),
@@ -68,7 +70,7 @@ class ZoneWorld(SeparationWorld):
             self.after(r.uniform(500, 4000), self._mute)
         if r.random() < 0.4:
             self.after(r.uniform(300, 6000), self._fail)
-        self.another(lambda: self.say("by", self._elsewhere(), 4))
+        self.with_second()
         self.interrupt("hold restart switch", 0.25)
 
     def _square(self) -> str:
@@ -100,11 +102,30 @@ class ZoneWorld(SeparationWorld):
         self.trace("the zone is to be muted")
         self.say("mute", boolean(False), 6)
         self.muted_from, self.muted_until = self.now, self.now + 50 + int(MUTED * 1000) + self.tick + SLACK
+        if self.second is not None and self.second.topic == "mute":
+            self.muted_until += 4000  # it begins when the other node is silent
         for at in range(self.now + 50, self.now + 4000, 200):
             self.after(at, lambda: void(self.say("mute", boolean(True), 6)))
 
+    def good(self, topic: str) -> bytes:
+        return boolean(self.random.random() < 0.8) if topic == "mute" else super().good(topic)
+
+    def counts(self, topic: str) -> bool:
+        return topic != "mute"
+
+    def is_motion(self, legs: Legs) -> bool:
+        return not self.muted and self._fast(legs)
+
     @property
     def muted(self) -> bool:
+        """Whether the zone may be muted: one node alone says so."""
+        second = self.second
+        if (
+            second is not None
+            and second.topic == "mute"
+            and second.heard + 50 < self.now < second.heard + 1000
+        ):
+            return False
         return self.muted_from <= self.now <= self.muted_until
 
     def scan(self, found: "np.ndarray") -> "tuple[bytes, bool | None]":

@@ -269,6 +269,9 @@ def test_a_person_lets_a_guard_hear_a_sensor_with_another_name(
     for _ in range(200):
         result = told(monitors, "sensor", now := now + SECOND // 100, {"": 2})
     assert result == "changed" and monitors.monitor("sensor").awaits == "/sensor on /scan"
+    monitors.hold(monitors.monitor("sensor"), "an operator asks for it")
+    monitors.resume("sensor")  # ends the hold, and changes no source
+    assert monitors.monitor("sensor").awaits == "/sensor on /scan"
     monitors.resume("sensor")
     assert not monitors.monitor("sensor").awaits
     for _ in range(4):
