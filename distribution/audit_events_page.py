@@ -1,4 +1,4 @@
-"""Print docs/reference/audit-events.md, from the registry and from the calls that record events.
+"""Print docs/reference/generated/audit-events.md, from the registry and from the calls that record events.
 
 These calls define the fields of `detail`, and the severities that the registry lacks. `ELSEWHERE` lists the fields of
 events whose calls do not show them, such as the log's own records and the actions of monitors.
@@ -73,7 +73,7 @@ _HEAD = """\
 # Audit events
 
 Every event by its stable name (`rosrv audit search --event NAME`), what it means, the severities it is recorded
-with, and the fields of its `detail`. The fields that every record has are in [audit-log.md](audit-log.md). A name is
+with, and the fields of its `detail`. The fields that every record has are in [audit-log.md](../audit-log.md). A name is
 never renamed or given another meaning.
 
 | event | meaning | severity | fields of `detail` |

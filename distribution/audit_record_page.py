@@ -33,7 +33,7 @@ def markdown() -> str:
     lines += [f"| `{name}` | {text} |" for name, (_form, text) in FIELDS.items()]
     lines += [
         "",
-        "The names of `event`, each with its fields of `detail`: [audit-events.md](audit-events.md).",
+        "The names of `event`, each with its fields of `detail`: [audit-events.md](generated/audit-events.md).",
     ]
     lines += ["", "## JSON schema", "", "```json", json.dumps(json_schema(), indent=2), "```", ""]
     lines += [

@@ -1,4 +1,4 @@
-"""Print docs/reference/command-line.md: `python -m distribution.command_line_page > docs/reference/command-line.md`."""
+"""Print docs/reference/generated/command-line.md."""
 
 import re
 import sys

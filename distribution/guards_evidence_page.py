@@ -1,4 +1,4 @@
-"""Write the evidence page: `python -m distribution.guards_evidence_page > docs/reference/guards-evidence.md`.
+"""Print the evidence page, docs/reference/generated/guards-evidence.md.
 
 The page is made from the presets, from the table of proofs in docs/dev/assurance.md, from the last long run of the
 simulated worlds (`tests/world/closed_loop/results.json`), and from the rows below.
@@ -249,12 +249,12 @@ level.
   page had no access to the texts of ISO and IEC standards. The equation of speed and separation monitoring is discussed
   in a [public article of NIST](https://pmc.ncbi.nlm.nih.gov/articles/PMC5117641).
 - **Proved** means that for every message and state the compiled code of the event does what its text says
-  ([the proofs](../dev/assurance.md#the-code-of-an-event)). Whether the text keeps the promise is not proved. Timers
+  ([the proofs](../../dev/assurance.md#the-code-of-an-event)). Whether the text keeps the promise is not proved. Timers
   (`tick`) are outside of the proofs, and the `tick` of a `deadman` is the guard: it is tested and simulated.
-- **Simulated** means random [worlds](../dev/assurance.md#guards-in-simulated-worlds) with a robot, its sensors, persons
-  and operators, within the assumptions that are listed for each preset. **Left out of the worlds** are events at which
-  the preset may break a law: the guard is disabled and enabled (*switch*), is held and resumed (*hold*), gets bytes
-  that are not a message (*cut*), or its process is replaced (*restart*).
+- **Simulated** means random [worlds](../../dev/assurance.md#guards-in-simulated-worlds) with a robot, its sensors,
+  persons and operators, within the assumptions that are listed for each preset. **Left out of the worlds** are events
+  at which the preset may break a law: the guard is disabled and enabled (*switch*), is held and resumed (*hold*), gets
+  bytes that are not a message (*cut*), or its process is replaced (*restart*).
 - **Pairs** are worlds with two guards of different presets on one topic: {pairs}.
 - **Tested in the engine** names tests of the preset's text. With real nodes, the stops of the engine are tested by a
   guard that is written for the test, not by each preset: `test_a_restart_sends_stops_until_a_command_comes`,
@@ -265,7 +265,7 @@ level.
 
 From the cause to the stop at the base. The guard's part follows from its text, with the values by default. The relay's
 part has no guaranteed bound: of 1,000 stops on a busy machine the slowest took {relay} ms
-([measured](monitor-cost.md#how-fast-a-guard-stops)). Add the base's own reaction and the time in which it brakes from
+([measured](../monitors.md#how-fast-a-guard-stops)). Add the base's own reaction and the time in which it brakes from
 its speed, and choose the values so that the sum is safe.
 
 | preset | it notices | silence | timer | relay, at most measured | sum |
@@ -274,7 +274,7 @@ its speed, and choose the values so that the sum is safe.
 
 _COMMON = (
     ("the appliance's machine, its power or its network dies", "no message comes, and no stop",
-     "the driver's timeout: [measure it](../guards.md#does-the-driver-stop-the-base)"),
+     "the driver's timeout: [measure it](../../guards.md#does-the-driver-stop-the-base)"),
     ("guard and controller on one computer, which hangs or is overloaded", "commands and stops are late together",
      "the driver's timeout, on another processor"),
     ("one sensor is the source of navigation and of the guard", "both believe the same wrong measurement",

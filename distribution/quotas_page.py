@@ -1,4 +1,4 @@
-"""Write docs/reference/quotas.md: `python -m distribution.quotas_page > docs/reference/quotas.md`."""
+"""Print docs/reference/generated/quotas.md."""
 
 import sys
 from collections.abc import Callable, Iterator

@@ -1,6 +1,6 @@
 """Define every finite resource that hosts can exhaust: its size, the quota of each host, and the effect of the limit.
 
-The code and docs/reference/quotas.md take the bounds from the same rows.
+The code and docs/reference/generated/quotas.md take the bounds from the same rows.
 """
 
 from typing import Literal, NamedTuple

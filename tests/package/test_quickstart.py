@@ -20,7 +20,7 @@ ip -n visitor link set eth0 up
 _DRIVES = "until ROS_MASTER_URI=http://localhost:11311 rosnode ping -c 1 /drive; do sleep 1; done"
 
 
-@pytest.mark.parametrize("page", ["quickstart.md", "quickstart-running.md"])
+@pytest.mark.parametrize("page", ["quickstart.md", "try-for-an-hour.md"])
 def test_the_page_is_true(page: str, package: Path, tmp_path: Path) -> None:
     record = "ID"
     with clean_machine(

@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-PAGE = (ROOT / "docs" / "from-recordings.md").read_text(encoding="utf-8")
+PAGE = (ROOT / "docs" / "reference" / "from-recordings.md").read_text(encoding="utf-8")
 _STEP = re.compile(r"```sh\n(?P<script>.*?)```\n```text\n(?P<shown>.*?)```\n", re.DOTALL)
 
 

@@ -40,7 +40,7 @@ class Cluster:
         own = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": self.token, "RAY_USAGE_STATS_ENABLED": "0"}
         own["RAY_health_check_period_ms"] = "500"  # a dead node is noticed after five checks
         own["RAY_worker_niceness"] = "0"  # Ray's own is 15, so that other tests would take the processors
-        own["GRPC_ENABLE_FORK_SUPPORT"] = "0"  # as docs/from-recordings.md says
+        own["GRPC_ENABLE_FORK_SUPPORT"] = "0"  # as docs/reference/from-recordings.md says
         # Ray's own is 30 s. After it, the command still has time to say so.
         own["RAY_CLIENT_SERVER_CHECK_CHANNEL_TIMEOUT_S"] = str(PATIENCE // 2)
         own |= {"PATH": f"{BIN}:{os.environ['PATH']}", "RAY_ADDRESS": f"127.0.0.1:{PORT}"}

@@ -1,4 +1,4 @@
-"""Collect how much of each finite resource is used. docs/reference/quotas.md has all quotas."""
+"""Collect how much of each finite resource is used. docs/reference/generated/quotas.md has all quotas."""
 
 import shutil
 from collections import Counter

@@ -99,7 +99,8 @@ DENIALS: dict[str, str | Callable[[AuditRecord], DecidedRequest]] = {
     "connection refused": _of_connection,
     "denials folded": _of_folded,
     "rate limited": _of_limited,
-    "limit exceeded": "the bounds on what one peer may send, hold and open are settings (docs/reference/quotas.md)",
+    "limit exceeded": "the bounds on what one peer may send, hold and open are settings"
+    " (docs/reference/generated/quotas.md)",
     "malformed": "the data did not follow the protocol; the reason of the record says how",
     "message dropped": "the monitor dropped it; change its specification, or disable it (rosrv monitor disable)",
     "publication refused": "the specifications in force are for another type definition; load specifications for this"

@@ -29,9 +29,7 @@ from rosrv_fleet.rollouts.service import BundleService, RolloutRefusedError
 from rosrv_fleet.tokens import FleetRole, OperatorToken, OperatorTokens
 
 _LONGEST_FORM = 4096
-_NO_BUNDLES = (
-    "This collector has no bundles: its configuration has no section `bundles` (docs/fleet-bundles.md)."
-)
+_NO_BUNDLES = "This collector has no bundles: its configuration has no section `bundles` (docs/fleet.md)."
 _LOGIN = (
     '<div class="login"><h1>ROSRV fleet</h1>{wrong}<form method="post" action="/login"><label>Token '
     '<input name="token" type="password" autocomplete="current-password" required autofocus></label>'

@@ -35,7 +35,7 @@ class RobotSeen(msgspec.Struct, frozen=True):
 
 
 class HealthGates(msgspec.Struct, frozen=True):
-    """The conditions for a healthy ring (docs/fleet-bundles.md): shares of the ring's robots, and times in seconds."""
+    """The conditions for a healthy ring (docs/fleet.md): shares of the ring's robots, and times in seconds."""
 
     share: float = 0.95
     tolerance: float = 0.05

@@ -24,7 +24,7 @@ _HISTORY = 20
 
 
 class Gates(BaseModel):
-    """The health gates of a ring; see docs/fleet-bundles.md."""
+    """The health gates of a ring; see docs/fleet.md."""
 
     model_config = ConfigDict(extra="forbid")
 

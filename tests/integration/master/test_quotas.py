@@ -1,7 +1,7 @@
 """Two hundred addresses take as much as they can of every limited resource, and the robot does not notice.
 
-Each test attacks a row of docs/reference/quotas.md. A hundred guests may do everything below `/guest`, and a hundred
-unknown hosts nothing.
+Each test attacks a row of docs/reference/generated/quotas.md. A hundred guests may do everything below `/guest`,
+and a hundred unknown hosts nothing.
 """
 
 import contextlib

@@ -34,8 +34,7 @@ from tests.system.fleet.fleet_site import FleetRobot, push_joined
 pytestmark = pytest.mark.timeout(2400)  # for the first test: the images are built, and twenty robots join
 
 PAGE = (ROOT / "docs" / "fleet.md").read_text()
-BUNDLES = (ROOT / "docs" / "fleet-bundles.md").read_text()
-_MARKED = re.findall(r"<!-- on: \w+(?:, ([\w ]+))? -->\n```sh\n(.*?)```", PAGE + BUNDLES, re.DOTALL)
+_MARKED = re.findall(r"<!-- on: \w+(?:, ([\w ]+))? -->\n```sh\n(.*?)```", PAGE, re.DOTALL)
 BLOCKS = [block for name, block in _MARKED if not name]  # the four steps
 NAMED = {name: block for name, block in _MARKED if name}
 BUILD = "docker compose --file fleet/compose.yaml build"
@@ -296,11 +295,11 @@ def test_a_bundle_reaches_a_robot_in_a_container(walk: Walk) -> None:
     signs = re.sub(r" --ring \S+", "", NAMED["signs"])  # its robots are not enrolled here
     walk.run(signs.replace("--repository bundles", "--repository bundles --passphrase-file passphrase"))
     walk.run(NAMED["gives"])
-    (line,) = re.findall(r"^(bundles: {.*\n)", BUNDLES, re.MULTILINE)
+    (line,) = re.findall(r"^(bundles: {.*\n)", PAGE, re.MULTILINE)
     with (walk.folder / "fleet" / "fleet.yaml").open("a") as config:
         config.write(line)
     walk.run(NAMED["restarts"])
-    (text,) = re.findall(r"`compose.override.yaml`.*?```yaml\n(.*?)```", BUNDLES, re.DOTALL)
+    (text,) = re.findall(r"`compose.override.yaml`.*?```yaml\n(.*?)```", PAGE, re.DOTALL)
     override = yaml.safe_load(text)
     override["services"]["appliance"]["environment"] |= {
         "ROSRV_AUDIT__CHECKPOINT_SECONDS": "1", "ROSRV_FLEET__BUNDLES__CONFIRM_SECONDS": "2",

@@ -3,7 +3,7 @@ from pathlib import Path
 from appliance.audit.log.events import EVENTS
 from distribution.audit_events_page import ELSEWHERE, markdown, uses
 
-PAGE = Path(__file__).parents[4] / "docs" / "reference" / "audit-events.md"
+PAGE = Path(__file__).parents[4] / "docs/reference/generated/audit-events.md"
 
 
 def test_the_page_matches_the_program() -> None:

@@ -9,7 +9,7 @@ ROOT = Path(__file__).parents[4]
 
 
 def test_the_page_is_up_to_date() -> None:
-    assert (ROOT / "docs/reference/guards-evidence.md").read_text() == page()
+    assert (ROOT / "docs/reference/generated/guards-evidence.md").read_text() == page()
 
 
 def test_every_preset_has_its_evidence() -> None:
