@@ -3,6 +3,7 @@
 import datetime
 import re
 from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -10,10 +11,10 @@ from cryptography import x509
 
 from appliance.api.front.certificate import CERTIFICATE, renew, tls_context
 from appliance.base import clock, shipped
-from appliance.features.standby.link_certificates import make_link_certificate
 from appliance.ipsec.certificate_authority import CertificateAuthority
 from appliance.ipsec.requests import make_key, signing_request
 from appliance.signing.own_certificate import make_own_certificate
+from tests.support.rows import require_rows
 from tests.support.sources import ROOT
 from tests.support.virtual_clock import VirtualClock
 
@@ -36,21 +37,19 @@ MADE: dict[str, Callable[[Path], list[bytes]]] = {
     "appliance/ipsec/certificate_authority.py": _of_the_authority,
     "appliance/api/front/certificate.py": _of_rest,
     "appliance/signing/own_certificate.py": lambda _folder: [make_own_certificate("robot", 90)[1]],
-    "appliance/features/standby/link_certificates.py": lambda _folder: [
-        make_link_certificate().certificate.encode()
-    ],
 }
+for path in sorted((ROOT / "tests/unit/features").glob("*/certificates.py")):
+    MADE |= import_module(".".join(path.relative_to(ROOT).with_suffix("").parts)).MADE
 
 
 def test_every_maker_of_certificates_has_its_row() -> None:
-    """A new maker of certificates has its row in `MADE`."""
     makers = {
         str(path.relative_to(ROOT))
         for folder in ("appliance", "fleet/rosrv_fleet")
         for path in (ROOT / folder).rglob("*.py")
         if _MAKES.search(path.read_text(encoding="utf-8"))
     }
-    assert makers == MADE.keys()
+    require_rows(makers, MADE, "MADE here; of a feature, to MADE in the certificates.py of its tests")
 
 
 @pytest.mark.parametrize("wall", [10.0, IMAGE], ids=["1970", "the date of an image"])

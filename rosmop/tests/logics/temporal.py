@@ -44,7 +44,7 @@ class Printer:
     def __init__(
         self, spelled: Mapping[str, Sequence[str]], levels: Sequence[Sequence[str]], once: Sequence[str]
     ) -> None:
-        self._spelled = {**SPELLED, **spelled}
+        self.spelled = {**SPELLED, **spelled}
         self._strength = {operator: number for number, level in enumerate(levels, 1) for operator in level}
         self._once = set(once)
 
@@ -63,7 +63,7 @@ class Printer:
             ),
             "",
         )
-        sign = random.choice(self._spelled[operator]) + bounds
+        sign = random.choice(self.spelled[operator]) + bounds
         strength = self._strength.get(operator, 0)
         if len(operands) == 1:
             return f"{sign} {self._inside(operands[0], 0, random)}"

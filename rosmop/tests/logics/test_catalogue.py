@@ -1,8 +1,11 @@
 import json
+import re
 import subprocess
 import sys
+from collections import defaultdict
 from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 from typing import Any, get_type_hints
 
 import msgspec
@@ -11,12 +14,16 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from rosmop.form.findings import Position
+from rosmop.logics import ltl, mtl, ptltl
 from rosmop.logics.catalogue import LOGICS, compile_property
+from rosmop.logics.formula import Syntax
 from rosmop.logics.interface import ClockedProperty, CompiledProperty, FormulaError, Source
 from rosmop.logics.lexer import TokenReader
 from rosmop.tests.examples import examples
+from rosmop.tests.logics import test_bounded, test_ltl, test_ptltl
 from rosmop.tests.logics.driving import ABC, ORIGIN, compiled, play, refusal, seeded
 
+ROOT = Path(__file__).parents[3]
 VERDICTS = ("violation", "validation")
 # A new logic adds a row: an example, its categories, and the events of its example in docs/reference/logics.md.
 ROWS: dict[str, tuple[str, tuple[str, ...], tuple[str, ...]]] = {
@@ -96,10 +103,36 @@ def test_categories_that_may_block(logic: str) -> None:
 
 @pytest.mark.parametrize("logic", LOGICS)
 def test_the_documented_example_compiles(logic: str) -> None:
-    page = Path(__file__).parents[3].joinpath("docs", "reference", "logics.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "reference" / "logics.md").read_text(encoding="utf-8")
     example = page.split(f"\n## {logic}\n")[1].split("\n\n")[0]
     formula = example.split("```")[1] if "```" in example else example.strip("`")
     assert compiled(logic, formula, ROWS[logic][2]).categories
+
+
+@pytest.mark.complete
+@pytest.mark.parametrize(
+    ("tests", "syntax"), [(test_ltl, ltl.SYNTAX), (test_ptltl, ptltl.SYNTAX), (test_bounded, mtl.SYNTAX)]
+)
+def test_every_operator_is_compared_with_a_naive_meaning_and_described(
+    tests: ModuleType, syntax: Syntax
+) -> None:
+    spellings = defaultdict(set)
+    for operators in (syntax.unary, *(level.operators for level in syntax.levels)):
+        for sign, operator in operators.items():
+            spellings[operator].add(sign)
+    drawn = {sign.strip() for signs in tests.PRINTER.spelled.values() for sign in signs}
+    missing = [
+        f"{operator}: add it to PRINTER, and its naive meaning, in {tests.__name__}"
+        for operator, signs in spellings.items()
+        if not signs & drawn
+    ]
+    page = (ROOT / "docs" / "reference" / "logics.md").read_text(encoding="utf-8")
+    missing += [
+        f"{operator}: describe it in docs/reference/logics.md"
+        for operator, signs in spellings.items()
+        if not any(re.search(rf"(?<!\w){re.escape(sign)}(?!\w)", page) for sign in signs)
+    ]
+    assert not missing, "\n".join(missing)
 
 
 def test_a_logic_may_have_no_signs() -> None:

@@ -16,6 +16,7 @@ from appliance.configuration.settings import Settings
 from appliance.policy import sections
 from appliance.policy.model import Category
 from tests.support.asgi import requested
+from tests.support.rows import require_rows
 
 FILES = Path(appliance.api.__file__).parent / "console"
 VENDOR = FILES / "vendor"
@@ -241,12 +242,16 @@ def _luminance(colour: str) -> float:
     return 0.2126 * red + 0.7152 * green + 0.0722 * blue
 
 
+@pytest.mark.complete
 def test_the_editor_completes_every_section() -> None:
     text = (FILES / "js" / "policy" / "complete.js").read_text()
     table = text.partition("SECTIONS = ")[2].partition("});")[0]
-    assert set(re.findall(r"^  (\w+): {", table, re.MULTILINE)) == {*sections.NAMES}
+    require_rows(
+        sections.NAMES, re.findall(r"^  (\w+): {", table, re.MULTILINE), "SECTIONS of js/policy/complete.js"
+    )
 
 
+@pytest.mark.complete
 def test_the_console_explains_every_category_of_decision() -> None:
     text = (FILES / "js" / "categories.js").read_text()
-    assert set(re.findall(r'\["(\w+)", "', text)) == {*Category}
+    require_rows(Category, re.findall(r'\["(\w+)", "', text), "js/categories.js of the console")
