@@ -112,6 +112,8 @@ def cross_check(seed: int, events: int = 80) -> None:
                 alive = trace.now - sources["other"].heard < silent
                 agreeing = agreeing + 1 if same and alive else 0
                 differing = 0 if same else differing + 1 if finite(one) and finite(other) else samples
+            if given == "other" and not foreign and not finite(legs):
+                agreeing, differing = 0, samples
             if foreign or differing >= samples:
                 bad_since = trace.now if bad_since is None else bad_since
             elif sources["by"].alone(trace.now, 1020) and sources["other"].alone(trace.now, 1020):

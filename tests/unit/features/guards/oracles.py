@@ -253,6 +253,8 @@ def stop_button(seed: int, events: int = 60, *, two_hands: bool = False) -> None
                 zeros.stop(buttons.silence(trace.now))
             if legs == STILL and going():
                 zeros.add(node)
+            elif legs == STILL and going(zeros.tick):
+                zeros.perhaps.add(node)
         if latched or not buttons.all_are(False):
             zeros.stop()
             assert not trace.moving or buttons.all_are(False), trace.said(
