@@ -10,223 +10,47 @@ nothing changes, and helper functions are followed into. An unknown number may b
 
 import math
 import operator
-from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
+from rosmop.check.abstract_values import (
+    ANY,
+    CALL,
+    CAST,
+    COMPARISON,
+    DROPPED,
+    EMPTY,
+    LIVE,
+    NAN,
+    PASSES,
+    REPLACED,
+    SENT,
+    TEST,
+    UNKNOWN,
+    AbstractParts,
+    AbstractValue,
+    Path,
+    PathState,
+    Places,
+    is_tainted,
+    joined,
+    key_of,
+    merged,
+    negated,
+    of_compared,
+    of_number,
+    shared_of,
+    unset,
+    why_of,
+)
+from rosmop.check.flow_work import BlockFacts, FlowWork, PureCall
 from rosmop.form import nodes
 from rosmop.types import value_types
-from rosmop.types.value_types import Type
-
-NAN = math.nan  # this one object, so that values with it are equal
-UNKNOWN = object()
-LIVE, SENT, DROPPED, REPLACED = "live", "sent", "dropped", "replaced"
-"""The fate of a message: it passes, passes while safe messages of other topics are sent, or does not pass."""
-PASSES = (LIVE, SENT)
-COMPARISON, TEST, CAST, CALL = "comparison", "test", "cast", "call"
-ANY = "*"
-"""The index of every element of a vector."""
 
 _DEPTH = 12
 _ROUNDS = 6
 _WIDENED = 3
 """The round of a loop after which a number that still changes is unknown."""
-
-MOST_WORK = 40_000
-"""The most statements that are followed in a specification: less than a second."""
-
-MOST_WORK_OF_SET = 10 * MOST_WORK
-_NONE: frozenset[Any] = frozenset()
-
-Place = tuple[str, int]
-"""Where NaN decided something: the kind (or the name of a function such as `min`), and the site."""
-Places = frozenset[Place]
-Path = tuple[int | str, ...]
-
-
-class AbstractValue(NamedTuple):
-    """An abstract value; `known` is a number, NaN, a `AbstractParts`, the parts of a result, or `UNKNOWN`.
-
-    NaN decided it at the places in `why`. If it is an unknown truth, NaN took a reason away to be true (`less_true`)
-    or to be false (`less_false`). It depends on `inputs`: shared variables, and the fields whose
-    numbers it carries.
-    """
-
-    known: Any = UNKNOWN
-    why: Places = _NONE
-    less_true: Places = _NONE
-    less_false: Places = _NONE
-    may_be_nan: bool = False
-    inputs: frozenset[str] = _NONE
-
-    @property
-    def is_nan(self) -> bool:
-        return self.known is NAN
-
-    @property
-    def is_number(self) -> bool:
-        return isinstance(self.known, bool | int | float)
-
-    @property
-    def is_constant(self) -> bool:
-        return isinstance(self.known, bool | int | float | bytes)
-
-    def part(self, number: int | str, kind: Type) -> "AbstractValue":
-        if isinstance(self.known, tuple):
-            return self.known[number] if isinstance(number, int) else AbstractValue(inputs=self.inputs)
-        if not isinstance(self.known, AbstractParts):
-            return AbstractValue(inputs=self.inputs)
-        return self.known.part(number, kind, self.inputs)
-
-
-_ANYTHING = AbstractValue()
-
-
-@dataclass(frozen=True)
-class AbstractParts:
-    """A message or a vector: its known parts by path, and the value of all other numbers."""
-
-    parts: Mapping[Path, AbstractValue] = field(default_factory=dict)
-    others: AbstractValue = _ANYTHING
-
-    def part(self, number: int | str, kind: Type, inputs: frozenset[str]) -> AbstractValue:
-        if value_types.is_number(kind):
-            found = self.parts.get((number,)) or self.parts.get((ANY,)) or self.others
-            return found._replace(inputs=found.inputs | inputs)
-        inner = {path[1:]: value for path, value in self.parts.items() if path[0] == ANY and len(path) > 1}
-        inner |= {
-            path[1:]: value for path, value in self.parts.items() if path[0] == number and len(path) > 1
-        }
-        return AbstractValue(AbstractParts(inner, self.others), inputs=inputs)
-
-    def with_part(self, path: Path, value: AbstractValue) -> "AbstractParts":
-        size = len(path)
-        parts = {known: one for known, one in self.parts.items() if known[:size] != path}
-        if isinstance(value.known, AbstractParts):
-            parts |= {(*path, *inner): one for inner, one in value.known.parts.items()}
-        else:
-            parts[path] = value
-        return AbstractParts(parts, self.others)
-
-
-@dataclass(eq=False, slots=True)
-class PathState:
-    """The state on a path: variables, the places where NaN skipped a restriction, and what is true of the message."""
-
-    values: dict[str, AbstractValue] = field(default_factory=dict)
-    skipped: Places = _NONE
-    control: Places = _NONE
-    """The places where NaN decided that this path is taken."""
-    inputs: frozenset[str] = _NONE
-    """The inputs on which it depends that this path is taken."""
-    fate: str = LIVE
-    spoke: bool = False
-    """Something may have been printed or published."""
-    written: frozenset[int] = _NONE
-    """The sites that assigned a field."""
-    result: AbstractValue = _ANYTHING
-
-    def branched(self) -> "PathState":
-        return PathState(
-            dict(self.values), self.skipped, self.control, self.inputs, self.fate, self.spoke, self.written,
-            self.result,
-        )  # fmt: skip
-
-    def set(self, name: str, value: AbstractValue) -> None:
-        if self.control and value.is_constant:
-            value = value._replace(why=value.why | self.control)
-        if isinstance(value.known, float) and value.known == 0:  # a robot at rest
-            value = value._replace(why=_NONE)
-        self.values[name] = value._replace(inputs=value.inputs | self.inputs)
-
-
-def joined(one: AbstractValue | None, other: AbstractValue | None) -> AbstractValue:
-    if one is None or other is None or one == other:
-        return one if one is not None else other if other is not None else AbstractValue()
-    inputs = one.inputs | other.inputs
-    if one.known is other.known or (one.is_constant and other.is_constant and _same(one.known, other.known)):
-        return AbstractValue(
-            one.known, one.why | other.why, one.less_true | other.less_true,
-            one.less_false | other.less_false, one.may_be_nan or other.may_be_nan, inputs,
-        )  # fmt: skip
-    if isinstance(one.known, AbstractParts) and isinstance(other.known, AbstractParts):
-        paths = {*one.known.parts, *other.known.parts}
-        parts = {
-            path: joined(
-                one.known.parts.get(path, one.known.others), other.known.parts.get(path, other.known.others)
-            )
-            for path in paths
-        }
-        return AbstractValue(
-            AbstractParts(parts, joined(one.known.others, other.known.others)), inputs=inputs
-        )
-    true, false = _NONE, _NONE
-    for value in (one, other):
-        true |= value.less_true | (value.why if value.known is False else _NONE)
-        false |= value.less_false | (value.why if value.known is True else _NONE)
-    nan = any(value.is_nan or value.may_be_nan for value in (one, other))
-    why = one.why | other.why if nan or one.known is UNKNOWN or other.known is UNKNOWN else _NONE
-    return AbstractValue(UNKNOWN, why, true, false, nan, inputs)
-
-
-def _same(one: Any, other: Any) -> bool:
-    return type(one) is type(other) and one == other
-
-
-def merged(states: Iterable[PathState]) -> PathState:
-    first, *rest = states
-    made = first.branched()
-    for state in rest:
-        for name in made.values.keys() - state.values.keys():
-            made.values[name] = joined(made.values[name], _unset(name))
-        for name, theirs in state.values.items():
-            ours = made.values.get(name)
-            if ours is not theirs:
-                made.values[name] = joined(_unset(name) if ours is None else ours, theirs)
-        made.skipped |= state.skipped
-        made.control |= state.control
-        made.inputs |= state.inputs
-        made.written |= state.written
-        made.spoke = made.spoke or state.spoke
-        made.result = joined(made.result, state.result)
-    return made
-
-
-def _unset(name: str) -> AbstractValue:
-    return AbstractValue(inputs=frozenset({name})) if is_shared(name) else _ANYTHING
-
-
-def key_of(value: AbstractValue | None) -> Hashable:
-    """Return a key that distinguishes values also by the types of their numbers."""
-    if value is None:
-        return None
-    known = value.known
-    if isinstance(known, AbstractParts):
-        parts = frozenset((path, key_of(one)) for path, one in known.parts.items())
-        return (parts, key_of(known.others), *value[1:])
-    if isinstance(known, tuple):
-        known = tuple(map(key_of, known))
-    return (type(known), known, *value[1:])
-
-
-def is_tainted(value: AbstractValue) -> bool:
-    """Whether it is NaN, or NaN decided it."""
-    if isinstance(value.known, AbstractParts):
-        return any(map(is_tainted, (*value.known.parts.values(), value.known.others)))
-    return bool(value.is_nan or value.may_be_nan or value.why or value.less_true or value.less_false)
-
-
-def why_of(values: Iterable[AbstractValue]) -> Places:
-    return frozenset[Place]().union(*(one.why for one in values))
-
-
-def shared_of(inputs: frozenset[str]) -> frozenset[str]:
-    """Return the shared variables among the inputs: a truth depends on them, and carries no number of a field."""
-    return frozenset(filter(is_shared, inputs)) if inputs else inputs
-
-
-def is_shared(name: str) -> bool:
-    return name.startswith("g")
 
 
 class Exit(NamedTuple):
@@ -238,66 +62,6 @@ class Exit(NamedTuple):
 
 
 Exits = dict[Exit, PathState]
-
-
-class FlowLimitError(Exception):
-    """There is too much to follow."""
-
-
-class _PureCall(NamedTuple):
-    """The result of a call of a function without effects, and what the call adds to the analysis and its state."""
-
-    result: AbstractValue
-    skipped: Places
-    spoke: bool
-    compared: frozenset[str]
-    operations: frozenset[int]
-
-
-@dataclass
-class FlowWork:
-    """The rest of the work for a specification, and what is known of its functions, calls and blocks."""
-
-    left: int = MOST_WORK
-    functions: dict[str, "_FunctionFacts"] = field(default_factory=dict)
-    own: dict[str, "_FunctionFacts"] = field(default_factory=dict)
-    calls: dict[Hashable, _PureCall] = field(default_factory=dict)
-    facts: dict[int, "_BlockFacts"] = field(default_factory=dict)
-    others: dict[tuple[int, bool], Sequence[nodes.Statement]] = field(default_factory=dict)
-
-    def facts_of(self, body: Sequence[nodes.Statement]) -> "_BlockFacts":
-        """Return the possible effects of a block of the form, which the caller keeps: its identity is the key."""
-        found = self.facts.get(id(body))
-        if found is None:
-            found = self.facts[id(body)] = _facts_of(body)
-        return found
-
-    def facts_of_function(
-        self, function: nodes.Function, functions: Mapping[str, nodes.Function]
-    ) -> "_FunctionFacts":
-        """Return the facts of a function together with all functions that it calls."""
-        found = self.functions.get(function.name)
-        if found is None:
-            own, waiting = dict[str, _FunctionFacts](), [function.name]
-            while waiting:
-                name = waiting.pop()
-                if name in functions and name not in own:
-                    if name not in self.own:
-                        self.own[name] = _own_facts(functions[name])
-                    own[name] = self.own[name]
-                    waiting += own[name].calls
-            found = self.functions[function.name] = _FunctionFacts(
-                frozenset[str]().union(*(one.shared for one in own.values())),
-                frozenset[int]().union(*(one.sites for one in own.values())),
-                frozenset(own),
-                all(one.pure for one in own.values()),
-            )
-        return found
-
-    def spend(self) -> None:
-        self.left -= 1
-        if self.left < 0:
-            raise FlowLimitError
 
 
 class FlowAnalysis:
@@ -450,7 +214,7 @@ class FlowAnalysis:
         return {Exit("leave", state.fate): state}
 
     def _suppressed(self, node: nodes.Drop | nodes.StopMessage, state: PathState, fate: str) -> Exits:
-        self.drops[node.site] = self.drops.get(node.site, _NONE) | state.inputs
+        self.drops[node.site] = self.drops.get(node.site, EMPTY) | state.inputs
         state.fate = fate
         return {Exit("next", fate): state}
 
@@ -528,7 +292,7 @@ class FlowAnalysis:
                         part = part._replace(why=part.why | lost)
                         state.values[found[0]] = whole._replace(known=whole.known.with_part(path, part))
 
-    def _suppresses_message(self, facts: "_BlockFacts") -> bool:
+    def _suppresses_message(self, facts: BlockFacts) -> bool:
         return facts.drops and (None in facts.stops or self._topic in facts.stops)
 
     def _loop(self, state: PathState, body: Callable[[PathState], Exits], *, ends: bool) -> Exits:
@@ -577,11 +341,11 @@ class FlowAnalysis:
     def _literal(self, node: nodes.Literal, _: PathState) -> AbstractValue:
         if isinstance(node.value, bytes):
             return AbstractValue(node.value) if node.type == value_types.STRING else AbstractValue()
-        return AbstractValue() if node.value is None else _of_number(node.value)
+        return AbstractValue() if node.value is None else of_number(node.value)
 
     def _read(self, name: str, state: PathState) -> AbstractValue:
         found = state.values.get(name)
-        return _unset(name) if found is None else found
+        return unset(name) if found is None else found
 
     def _variable(self, node: nodes.Read, state: PathState) -> AbstractValue:
         return self._read(node.name, state)
@@ -621,7 +385,7 @@ class FlowAnalysis:
                 if node.site == self._source:
                     return AbstractValue(NAN, inputs=inputs)
             elif left.is_number and right.is_number and node.operator in _CALCULATED:
-                return _of_number(
+                return of_number(
                     _CALCULATED[node.operator](left.known, right.known), left.why | right.why, inputs
                 )
             return AbstractValue(may_be_nan=left.may_be_nan or right.may_be_nan, inputs=inputs)
@@ -649,7 +413,7 @@ class FlowAnalysis:
             place = frozenset({(TEST, node.site)})
         if left.is_nan or right.is_nan:
             tells = node.operator not in ("==", "!=") or node.left == node.right
-            why = place | left.why | right.why if tells else _NONE
+            why = place | left.why | right.why if tells else EMPTY
             return AbstractValue(node.operator == "!=", why, inputs=inputs)
         match node:
             case nodes.Compare("<=", nodes.Read(name=name), nodes.Literal(value=int(least))) if (
@@ -657,7 +421,7 @@ class FlowAnalysis:
             ):
                 return AbstractValue(True, inputs=inputs)
         if left.is_number and right.is_number:
-            why = _of_compared(left) | _of_compared(right)
+            why = of_compared(left) | of_compared(right)
             if node.operator in ("==", "!="):  # a bounded number is compared, such as 0
                 why = frozenset(place for place in why if place[0] == COMPARISON)
             return AbstractValue(_COMPARED[node.operator](left.known, right.known), why, inputs=inputs)
@@ -682,7 +446,7 @@ class FlowAnalysis:
         deciding = [one for one in (left, right) if one.known is not UNKNOWN and bool(one.known) is decisive]
         if deciding:
             plain = any(not one.why for one in deciding)
-            why = _NONE if plain else frozenset().union(*(one.why for one in deciding))
+            why = EMPTY if plain else frozenset().union(*(one.why for one in deciding))
             return AbstractValue(decisive, why, inputs=inputs)
         if left.known is not UNKNOWN and right.known is not UNKNOWN:
             return AbstractValue(not decisive, left.why | right.why, inputs=inputs)
@@ -692,7 +456,7 @@ class FlowAnalysis:
         return AbstractValue(less_true=true, less_false=false, inputs=inputs)
 
     def _not(self, node: nodes.Not, state: PathState) -> AbstractValue:
-        return _negated(self.value(node.value, state))
+        return negated(self.value(node.value, state))
 
     def _conditional(self, node: nodes.Conditional, state: PathState) -> AbstractValue:
         test = self.value(node.test, state)
@@ -709,7 +473,7 @@ class FlowAnalysis:
             why = taken.why | test.why if kept else taken.why
             return taken._replace(why=why, inputs=inputs)
         if isinstance(yes.known, bool) and isinstance(no.known, bool) and yes.known is not no.known:
-            return (test if yes.known else _negated(test))._replace(inputs=inputs)
+            return (test if yes.known else negated(test))._replace(inputs=inputs)
         both = joined(yes, no)
         if both.may_be_nan:
             both = both._replace(why=both.why | test.less_true | test.less_false)
@@ -753,7 +517,7 @@ class FlowAnalysis:
         start = self.value(node.start, state)
         known = NAN if element.is_nan or start.is_nan else UNKNOWN
         return AbstractValue(
-            known, element.why | start.why if known is NAN else _NONE, inputs=element.inputs | start.inputs
+            known, element.why | start.why if known is NAN else EMPTY, inputs=element.inputs | start.inputs
         )
 
     def _call(self, node: nodes.Call, state: PathState) -> AbstractValue:
@@ -768,7 +532,7 @@ class FlowAnalysis:
         if name == "l_nearest":
             self.compared |= inputs
             nan = arguments[0].part(ANY, value_types.DOUBLE).is_nan
-            why = frozenset({("nearest", self._site)}) if nan else _NONE
+            why = frozenset({("nearest", self._site)}) if nan else EMPTY
             return AbstractValue(math.inf if nan else UNKNOWN, why, inputs=inputs)
         if word != name and arguments and isinstance(node.arguments[0].type, value_types.FloatingType):
             return self._calculated(node, word, arguments, inputs)
@@ -819,7 +583,7 @@ class FlowAnalysis:
             return AbstractValue(choose(first.known, second.known), first.why | second.why, inputs=inputs)
         nan = first.may_be_nan or second.may_be_nan
         return AbstractValue(
-            UNKNOWN, first.why | second.why | (place if nan else _NONE), may_be_nan=nan, inputs=inputs
+            UNKNOWN, first.why | second.why | (place if nan else EMPTY), may_be_nan=nan, inputs=inputs
         )
 
     def _put(self, node: nodes.Call, state: PathState) -> AbstractValue:
@@ -874,14 +638,14 @@ class FlowAnalysis:
         """Return the result of a function of the library, whose own comparisons are not reported."""
         if function.same_as:  # `sin` and others, of numbers only
             nan = any(one.is_nan for one in arguments)
-            return AbstractValue(NAN if nan else UNKNOWN, why_of(arguments) if nan else _NONE, inputs=inputs)
+            return AbstractValue(NAN if nan else UNKNOWN, why_of(arguments) if nan else EMPTY, inputs=inputs)
         self.compared |= inputs
         if not any(map(is_tainted, arguments)):
             return AbstractValue(inputs=inputs)
-        plain = tuple(one._replace(inputs=_NONE) for one in arguments)
+        plain = tuple(one._replace(inputs=EMPTY) for one in arguments)
         aside = FlowAnalysis(self._functions, {}, None, work=self._work)
         aside._depth = self._depth
-        found, why = aside._called(function, plain, _NONE, PathState()), why_of(arguments)
+        found, why = aside._called(function, plain, EMPTY, PathState()), why_of(arguments)
         if found.is_number and not found.is_nan and found.why:
             return AbstractValue(found.known, frozenset({(CALL, self._site)}), inputs=inputs)
         true, false = (
@@ -889,7 +653,7 @@ class FlowAnalysis:
             for places in (found.less_true, found.less_false)
         )
         return AbstractValue(
-            found.known, why if found.is_nan else _NONE, true, false, found.may_be_nan, inputs
+            found.known, why if found.is_nan else EMPTY, true, false, found.may_be_nan, inputs
         )
 
     def _called(
@@ -915,7 +679,7 @@ class FlowAnalysis:
             self.compared, self.operations = set(), set()
             inner = PathState(read, control=state.control, inputs=state.inputs)
             result = self._followed(function, arguments, inputs, inner)
-            call = _PureCall(
+            call = PureCall(
                 result, inner.skipped, inner.spoke, frozenset(self.compared), frozenset(self.operations)
             )
             self._work.calls[key] = call
@@ -1009,22 +773,6 @@ _EXPRESSIONS: Mapping[type[Any], Callable[[FlowAnalysis, Any, PathState], Abstra
 }
 
 
-def _of_number(known: Any, why: Places = _NONE, inputs: frozenset[str] = _NONE) -> AbstractValue:
-    return AbstractValue(NAN if known != known else known, why, inputs=inputs)  # noqa: PLR0124  NaN
-
-
-def _of_compared(value: AbstractValue) -> Places:
-    """Return the places that decided a number; a 0 that a comparison decided is a robot at rest, or no distance."""
-    if isinstance(value.known, float) and value.known == 0:
-        return frozenset(place for place in value.why if place[0] != COMPARISON)
-    return value.why
-
-
-def _negated(value: AbstractValue) -> AbstractValue:
-    known = value.known if value.known is UNKNOWN else not value.known
-    return value._replace(known=known, less_true=value.less_false, less_false=value.less_true)
-
-
 def _assume(test: nodes.Expression, state: PathState, *, truth: bool) -> None:
     """Set the unknown truths of variables that a test decides."""
     match test:
@@ -1039,86 +787,15 @@ def _assume(test: nodes.Expression, state: PathState, *, truth: bool) -> None:
                 if isinstance(side, nodes.Read) and known is not None and known.may_be_nan:
                     state.values[side.name] = known._replace(may_be_nan=False)  # the comparison is true
         case nodes.Read(type=value_types.BoolType(), name=name):
-            known = state.values.get(name) or _unset(name)
+            known = state.values.get(name) or unset(name)
             if known.known is UNKNOWN:
-                state.values[name] = known._replace(known=truth, less_true=_NONE, less_false=_NONE)
+                state.values[name] = known._replace(known=truth, less_true=EMPTY, less_false=EMPTY)
 
 
 def _widen(known: Mapping[str, AbstractValue], head: PathState) -> None:
     for name, value in head.values.items():
         if known.get(name) != value and not isinstance(value.known, tuple):
             head.values[name] = value._replace(known=UNKNOWN, may_be_nan=value.may_be_nan or value.is_nan)
-
-
-@dataclass(frozen=True)
-class _BlockFacts:
-    """The effects that a block may have; `stops` are the topics that it stops, with None if it drops the message."""
-
-    stops: frozenset[str | None]
-    leaves: bool
-    assigned: Sequence[tuple[str, nodes.Expression]]
-    flags: frozenset[str]
-    puts: Sequence[nodes.Call]
-
-    @property
-    def drops(self) -> bool:
-        return bool(self.stops)
-
-    def acts(self, fields: Mapping[str, str]) -> bool:
-        return self.drops or not self.flags.isdisjoint(fields)
-
-
-@dataclass(frozen=True)
-class _FunctionFacts:
-    """The shared variables that a function names, its sites and calls.
-
-    It is `pure` if it changes only variables of its own, and is not recursive.
-    """
-
-    shared: frozenset[str]
-    sites: frozenset[int]
-    calls: frozenset[str]
-    pure: bool
-
-
-_EFFECTS = (
-    nodes.Leave | nodes.Drop | nodes.StopMessage | nodes.Publish | nodes.Require | nodes.WriteBack
-    | nodes.ReadNumbers | nodes.ReadValue
-)  # fmt: skip
-
-
-def _own_facts(function: nodes.Function) -> _FunctionFacts:
-    changed, read, calls, pure = {*function.parameters}, set[str](), set[str](), True
-    for node in nodes.walk(function.body):
-        match node:
-            case nodes.Read(name=name):
-                read.add(name)
-            case nodes.Assign(name=name) | nodes.Select(name=name) | nodes.ForEach(name=name):
-                changed.add(name)
-            case nodes.Call(function="a_put" | "a_slot" | "l_append", arguments=(base, *_)):
-                changed |= {one.name for one in nodes.walk(base) if isinstance(one, nodes.Read)}
-            case nodes.Invoke(function=called, depth=depth):
-                pure = pure and depth is None
-                calls.add(called)
-        pure = pure and not isinstance(node, _EFFECTS)
-    pure = pure and not any(map(is_shared, changed)) and all(map(is_shared, read - changed))
-    shared = frozenset(filter(is_shared, changed | read))
-    return _FunctionFacts(shared, frozenset(nodes.sites_of(function.body)), frozenset(calls), pure)
-
-
-def _facts_of(body: Sequence[nodes.Statement]) -> _BlockFacts:
-    inside = [*nodes.walk(tuple(body))]
-    stops = {safe.topic for node in inside if isinstance(node, nodes.StopMessage) for safe in node.safes}
-    dropped = {None} if any(isinstance(node, nodes.Drop) for node in inside) else set[None]()
-    assigned = [(node.name, node.value) for node in inside if isinstance(node, nodes.Assign)]
-    kinds = nodes.Leave | nodes.Return | nodes.Break | nodes.Continue
-    return _BlockFacts(
-        frozenset({*stops, *dropped}),
-        any(isinstance(node, kinds) for node in inside),
-        assigned,
-        frozenset(name for name, _ in assigned),
-        [node for node in inside if isinstance(node, nodes.Call) and node.function in ("a_put", "a_slot")],
-    )
 
 
 def _bounds(form: nodes.Expression) -> bool:

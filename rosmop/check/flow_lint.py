@@ -12,16 +12,13 @@ from dataclasses import dataclass, field
 from itertools import count, groupby, product
 from typing import NamedTuple
 
-from rosmop.check.enforcement import bringing
-from rosmop.check.flow import (
+from rosmop.check.abstract_values import (
     ANY,
     CALL,
     CAST,
     COMPARISON,
     DROPPED,
     LIVE,
-    MOST_WORK,
-    MOST_WORK_OF_SET,
     NAN,
     PASSES,
     SENT,
@@ -29,10 +26,6 @@ from rosmop.check.flow import (
     UNKNOWN,
     AbstractParts,
     AbstractValue,
-    Exits,
-    FlowAnalysis,
-    FlowLimitError,
-    FlowWork,
     Path,
     PathState,
     Places,
@@ -41,6 +34,9 @@ from rosmop.check.flow import (
     key_of,
     merged,
 )
+from rosmop.check.enforcement import bringing
+from rosmop.check.flow import Exits, FlowAnalysis
+from rosmop.check.flow_work import MOST_WORK, MOST_WORK_OF_SET, FlowLimitError, FlowWork
 from rosmop.check.message_fields import PatternField
 from rosmop.check.scope import CompilationContext
 from rosmop.form import nodes
