@@ -61,7 +61,7 @@ def watchdog(seed: int, events: int = 40, slower: float = 1) -> None:
         others = sum(1 for other, at in moving.items() if other != node and trace.now - at <= silent)
         lately = [other for other, one in runs.items() if trace.now - one.heard <= 2 * silent + resume]
         may = trace.now - run.begun >= resume and others < 2
-        must = trace.now - run.motions >= resume and len(lately) <= 2
+        must = trace.now - run.motions > resume and len(lately) <= 2
         drops = bool(moving.keys() - {node})
         passed = trace.judge(legs, node, may=may, must=must, drops=drops)
         moving.pop(node, None)
@@ -133,9 +133,9 @@ def enabling_device(seed: int, events: int = 40) -> None:
     nodes = (1, 2) if chance.random() < 0.3 else (1,)
     period = 60 if len(hands) == 1 else 40
 
-    def held() -> bool:
+    def held(tick: int = 0) -> bool:
         return (
-            devices.all_heard(trace.now) and devices.all_are(True) and devices.off_once >= devices.on.keys()
+            devices.all_heard(trace.now - tick) and devices.all_are(True) and devices.off_once >= devices.on.keys()
         )
 
     was_silent: set[int] = set()
@@ -166,10 +166,12 @@ def enabling_device(seed: int, events: int = 40) -> None:
         node, legs = chance.choice(nodes), motion(chance)
         sure, perhaps = node in zeros.sure or not zero_first, node in zeros.perhaps or not zero_first
         if not held():
-            zeros.stop()
-        trace.judge(legs, node, may=held() and perhaps, must=held() and sure and not was_silent)
+            zeros.stop(devices.silence(trace.now))
+        trace.judge(legs, node, may=held(zeros.tick) and perhaps, must=held() and sure and not was_silent)
         if legs == STILL and held():
             zeros.add(node)
+        elif legs == STILL and held(zeros.tick):
+            zeros.perhaps.add(node)
 
 
 def stop_button(seed: int, events: int = 60, *, two_hands: bool = False) -> None:  # noqa: PLR0912  one branch for each kind of event
@@ -307,3 +309,5 @@ def operating_mode(seed: int, events: int = 40) -> None:
             assert got is not None and near(got, limited), trace.said(f"{got} is not {limited}")
         if slow(legs, v_max, w_max) and automatic():
             zeros.add(1)
+        elif slow(legs, v_max, w_max) and automatic(zeros.tick):
+            zeros.perhaps.add(1)
