@@ -99,10 +99,10 @@ def cross_check(seed: int, events: int = 80) -> None:
             if chance.random() < 0.01:
                 legs = (math.nan, *legs[1:])
             node = (6 if given == "by" else 5) if chance.random() < 0.01 else (3 if given == "by" else 4)
-            if sources[given].hear(node, trace.now):
+            foreign = not sources[given].hear(node, trace.now)
+            if not foreign:
                 velocity[given] = legs
             trace.observe(given, odometry(trace.now, (0, 0, 0, 0, 0, 0, 1), legs), node, legs)
-            foreign = node in (5, 6)
             if given == "by" and not foreign and len(velocity) == 2:
                 one, other = velocity["by"], velocity["other"]
                 same = (

@@ -135,7 +135,9 @@ def enabling_device(seed: int, events: int = 40) -> None:
 
     def held(tick: int = 0) -> bool:
         return (
-            devices.all_heard(trace.now - tick) and devices.all_are(True) and devices.off_once >= devices.on.keys()
+            devices.all_heard(trace.now - tick)
+            and devices.all_are(True)
+            and devices.off_once >= devices.on.keys()
         )
 
     was_silent: set[int] = set()
