@@ -303,7 +303,7 @@ _ROWS: Sequence[tuple[str, str, str, str, str]] = (
     ("L6", "standstill", "asks not whether the base stands",
      r"escaped && !moves && good && slow", "escaped && !moves && good"),
     ("L6", "zone", "needs no zero", r"\|\| standing != node && standingToo != node", ""),
-    ("L6", "zone", "takes the zero of any node", r"standing != node && standingToo != node\)\)", 'standing == "")'),
+    ("L6", "zone", "takes the zero of any node", r"standing != node && standingToo != node\)\)", 'standing == ""))'),
     ("L6", "zone", "takes a zero from before the stop",
      r'if \(there\) \{ standing = ""; standingToo = ""; \}', "if (there) { }"),
     ("L6", "zone", "is free at once", r"\|\| !\(now - freeSince >= clear\)", "|| !(now - freeSince >= 0)"),
