@@ -16,7 +16,7 @@ not proved. If the function leaves the message, each variable that it wrote must
 each byte in the log (`module_terms.py`).
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from typing import Any
@@ -44,7 +44,7 @@ from rosmop.prove.form_terms import FormTerms, wrapped
 from rosmop.prove.loops import BUDGET_SLOT, assumed, loop_conditions
 from rosmop.prove.model_states import state_of
 from rosmop.prove.module_terms import LoopGuess, ModuleExecution, ModuleResult, Pointer, ReadableBytes
-from rosmop.prove.questions import MayDifferError, Questions, first_difference
+from rosmop.prove.questions import Effort, MayDifferError, Questions, first_difference
 from rosmop.prove.random_states import STATES, RandomStates
 from rosmop.prove.terms import (
     DOUBLE,
@@ -75,6 +75,7 @@ EQUAL = "equal"
 IN_PYTHON = "not compiled: Python evaluates the messages of this topic"
 LEFT = f"the module leaves each of {STATES} messages to Python"
 PATIENCE = 30.0
+"""Seconds of a processor for an event, which z3 counts as an effort: see `rosmop.prove.questions.Effort`."""
 
 _UNROLLED = (1, 2, 3)
 
@@ -98,12 +99,10 @@ class ProofFinding:
     differs: bool = False
 
 
-def findings_of(
-    compiled: Compiled, clock: Callable[[], float], patience: float = PATIENCE
-) -> Iterator[ProofFinding]:
+def findings_of(compiled: Compiled, patience: float = PATIENCE) -> Iterator[ProofFinding]:
     found = list(groups(compiled.specifications))
     module = written(compiled.functions, [group.component for group in found], ValueCodec(compiled.messages))
-    validation = Validation(compiled, module, clock, patience)
+    validation = Validation(compiled, module, patience)
     for group in found:
         for (topic, _), numbers in zip(group.component.topics, group.events, strict=True):
             for place, (number, index) in enumerate(numbers):
@@ -122,14 +121,11 @@ class Validation:
     module.
     """
 
-    def __init__(
-        self, compiled: Compiled, module: WasmModule, clock: Callable[[], float], patience: float = PATIENCE
-    ) -> None:
+    def __init__(self, compiled: Compiled, module: WasmModule, patience: float = PATIENCE) -> None:
         self._compiled = compiled
         self._forms = compiled.functions
         self._values = ValueCodec(compiled.messages)
         self._module = module
-        self._clock = clock
         self._patience = patience
         self._codes = functions_of(module.code)
         self._runs = ConcreteRuns(compiled, module)
@@ -193,15 +189,17 @@ class Validation:
         return answer
 
     def _decided(self, event: EventPair, states: Iterable[EventState]) -> str:
-        until = self._clock() + self._patience
+        effort = Effort(self._patience)
         try:
-            return self._answer(event, until, states)
+            return self._answer(event, effort, states)
         except MayDifferError as error:
             for most in _UNROLLED:
-                self._answer(event, until, states, most)
+                self._answer(event, effort, states, most)
             raise NotProvedError(f"its loops are not known to be equal: {error}") from None
 
-    def _answer(self, event: EventPair, until: float, states: Iterable[EventState], unrolled: int = 0) -> str:
+    def _answer(
+        self, event: EventPair, effort: Effort, states: Iterable[EventState], unrolled: int = 0
+    ) -> str:
         """`states` are those that are run if z3's first question leaves open whether there is a difference."""
         begin, cells, known = self._beginning()
         module, context = self._module, self._forms[event.name].context
@@ -252,7 +250,7 @@ class Validation:
         decided = both(reached, opposite(unknown))
         wrong |= {text: both(decided, condition) for text, condition in others.items()}
         wrong |= loop_conditions(form_cuts, done.loops.cuts, either(meant.left, unknown), left)
-        questions = Questions(self._clock, until, known)
+        questions = Questions(effort, known)
         if not questions.exclude(wrong.values()):
             self._search(event, states)
 

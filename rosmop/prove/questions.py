@@ -8,25 +8,59 @@ import z3
 from rosmop.prove.concrete_runs import READS_BEYOND
 from rosmop.prove.terms import Abstraction, DiffersError, Term, either
 
+_A_SECOND = 6_500_000
+"""The effort of z3, in its own unit, that took a second of a processor for the events of the presets, on average."""
 _TOGETHER = 20_000_000
-"""The effort of z3, in its own unit, for all conditions at once: a few seconds, and a fifth of the time at most."""
+"""The effort for all conditions at once: a few seconds, and a fifth of all at most."""
+_MOST = 2**32 - 1
+_SLOWEST = 20
+"""The seconds after which z3 is ended, for each of `patience`: for work that it does not count."""
 
 
 class MayDifferError(Exception):
     """The induction over the iterations of a loop fails for a state that may not occur."""
 
 
-class Questions:
-    """Asks z3 about one event, up to the time `until`. The conditions `known` hold."""
+class Effort:
+    """The effort that is left for an event, so that the load of the machine decides nothing.
 
-    def __init__(self, clock: Callable[[], float], until: float, known: Sequence[Term]) -> None:
-        self._clock, self._until, self._known = clock, until, known
+    `patience` is in seconds of a processor on the machine where `_A_SECOND` was measured.
+    """
+
+    def __init__(self, patience: float) -> None:
+        self._patience = patience
+        self._left = int(patience * _A_SECOND)
+
+    def check(self, conditions: Sequence[Term], *, most: int = 0) -> tuple[Any, Any]:
+        """Return whether the conditions are satisfiable, and a model, with the effort that is left, or with `most`."""
+        if self._left <= 0:
+            return z3.unknown, None
+        solver, before = z3.Solver(), _counted(z3.Solver())
+        effort = min(most, self._left // 5) if most else self._left
+        solver.set(rlimit=min(max(1, effort), _MOST), timeout=int(1000 * _SLOWEST * self._patience))
+        solver.add(*conditions)
+        answer = solver.check()
+        self._left -= _counted(z3.Solver()) - before
+        return answer, solver.model() if answer == z3.sat else None
+
+
+def _counted(solver: z3.Solver) -> int:
+    """Return the effort of this process until now."""
+    solver.check()
+    return int(solver.statistics().get_key_value("rlimit count"))
+
+
+class Questions:
+    """Asks z3 about one event. The conditions `known` hold."""
+
+    def __init__(self, effort: Effort, known: Sequence[Term]) -> None:
+        self._effort, self._known = effort, known
         self._abstractions = Abstraction(floats=True), Abstraction()
 
     def exclude(self, conditions: Iterable[Term]) -> bool:
         """Whether none of the conditions can hold, whatever operations on floats calculate."""
         question = [*self._known, either(*map(z3.simplify, conditions))]
-        answer, _ = self._asked(self._abstractions[0].of(question), effort=_TOGETHER)
+        answer, _ = self._effort.check(self._abstractions[0].of(question), most=_TOGETHER)
         return bool(answer == z3.unsat)
 
     def decide(self, condition: Term, replay: Callable[[Any], None] = lambda _: None) -> tuple[Any, Any]:
@@ -35,28 +69,17 @@ class Questions:
         """
         question, guess = [*self._known, condition], None
         for abstraction in self._abstractions:
-            answer, guess = self._asked(abstraction.of(question))
+            answer, guess = self._effort.check(abstraction.of(question))
             if answer == z3.unsat:
                 return answer, None
         if guess is not None:
             replay(guess)
             if _holds(question, guess):
                 return z3.sat, guess
-        answer, model = self._asked(question)
+        answer, model = self._effort.check(question)
         if model is not None:
             replay(model)
         return answer, model
-
-    def _asked(self, conditions: Sequence[Term], *, effort: int = 0) -> tuple[Any, Any]:
-        """Return whether the conditions are satisfiable, and a model, within the time that is left."""
-        rest = int(1000 * (self._until - self._clock()))
-        if rest <= 0:
-            return z3.unknown, None
-        solver = z3.Solver()
-        solver.set(timeout=rest // 5 if effort else rest, rlimit=effort)
-        solver.add(*conditions)
-        answer = solver.check()
-        return answer, solver.model() if answer == z3.sat else None
 
 
 def first_difference(

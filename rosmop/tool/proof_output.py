@@ -1,7 +1,5 @@
 """Report the proofs of events."""
 
-import time
-
 from rosmop.prove.equality import findings_of
 from rosmop.run.engine import MonitorSet
 from rosmop.tool.terminal import say, say_json
@@ -9,7 +7,7 @@ from rosmop.tool.terminal import say, say_json
 
 def say_proofs(monitors: MonitorSet, *, as_json: bool) -> int:
     different = 0
-    for found in findings_of(monitors.compiled, time.monotonic):
+    for found in findings_of(monitors.compiled):
         different += found.differs
         if as_json:
             say_json(

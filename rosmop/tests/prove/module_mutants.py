@@ -1,6 +1,5 @@
 """Modules with one fault: every mistake that a generator of modules may make in an instruction."""
 
-import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import islice
@@ -164,7 +163,7 @@ def faulty_event(
     ]
 
     def answer(module: WasmModule) -> str:
-        validation = Validation(code, module, time.monotonic, patience=patience)
+        validation = Validation(code, module, patience)
         return validation.finding(topic, event, meant, place).answer
 
     assert answer(module) == EQUAL

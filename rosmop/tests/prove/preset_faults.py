@@ -6,7 +6,6 @@ The module of the faulty text is compared with the form of the right one. Timers
 """
 
 import re
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import TypeVar
@@ -94,7 +93,7 @@ def _validation(
         for (topic, _), numbers in zip(group.component.topics, group.events, strict=True)
         for place, (number, index) in enumerate(numbers)
     ]
-    return Validation(form, module, time.monotonic, patience=patience), events
+    return Validation(form, module, patience), events
 
 
 def _variables(code: Compiled) -> list[str]:
