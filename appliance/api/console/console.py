@@ -19,7 +19,7 @@ from typing import NamedTuple
 from fastapi import APIRouter, Request
 from starlette.responses import Response
 
-from appliance.api.console.console_bundle import ModuleError, join_late_modules, join_modules, join_styles
+from appliance.api.console.console_bundle import ModuleError, join_modules, join_styles
 from appliance.api.front.problems import ProblemError
 from appliance.configuration.settings import Settings
 from appliance.features.feature import Feature
@@ -30,6 +30,7 @@ _PREFIX = "/console/static/"
 # The other files of the folder are Python.
 _SERVED = ("css", "icon-calls.svg", "icon.svg", "index.html", "js", "vendor")
 _PAGE, _SCRIPT, _STYLE, _PARTS = "index.html", "js/main.js", "css/main.css", "js/features.js"
+_LATE = ("view", "robot", "record")
 _ADDRESS = re.compile(rf"{_PREFIX}([\w./-]++)")
 _GZIP = re.compile(r"\bgzip\b(?!\s*+;\s*+q=0(?:\.0*+)?\s*+(?:,|$))", re.IGNORECASE)
 _LEVEL = 9  # of gzip; the files are compressed once
@@ -69,7 +70,7 @@ def routes(settings: Settings) -> APIRouter:
     styles = [name for name in texts if name.startswith("features/") and name.endswith(".css")]
     addresses: dict[str, str] = {}
     joined = {
-        _SCRIPT: join_modules(texts, _SCRIPT),
+        **join_modules(texts, _SCRIPT, _PREFIX),
         _STYLE: "".join(join_styles(texts, one) for one in (_STYLE, *styles)),
     }
 
@@ -78,13 +79,14 @@ def routes(settings: Settings) -> APIRouter:
         if name not in served:
             raise ModuleError(f"the console names {_PREFIX}{name}, which does not exist")
         if name not in addresses:
-            if name.startswith("features/") and name.endswith(".js"):
-                joined[name] = join_late_modules(texts, name)
+            addresses[name] = ""  # until its content is known
             body = _ADDRESS.sub(named, joined[name]).encode() if name in joined else served[name].body
             lasting = _file(body, served[name].media_type, lasting=True)
             stem, _, ending = name.rpartition(".")
             addresses[name] = f"{stem}.{lasting.digest}.{ending}"
             served[addresses[name]] = lasting
+        if not addresses[name]:
+            raise ModuleError(f"the console's script {name} loads itself late")
         return _PREFIX + addresses[name]
 
     page = served[_PAGE] = _file(
@@ -129,14 +131,19 @@ def views() -> tuple[str, ...]:
 
 
 def _parts(features: Iterable[Feature]) -> str:
-    imports: list[str] = []
+    """Return the module of the features' components. Those of a page of their own are loaded when it is opened."""
+    imports: list[str] = ['import { late } from "./parts/late.js";\n']
     rows: list[str] = []
     parts = ((feature.name, part) for feature in features for part in feature.console)
     for name, part in sorted(parts, key=lambda row: row[1].order):
-        alias = f"part{len(rows)}"
-        imports.append(f'import {{ {part.component} as {alias} }} from "../features/{name}/{part.file}";\n')
+        address = f'"../features/{name}/{part.file}"'
+        shown = f"part{len(rows)}"
+        if part.place in _LATE:
+            shown = f"late(() => import({address}), {json.dumps(part.component)})"
+        else:
+            imports.append(f"import {{ {part.component} as {shown} }} from {address};\n")
         rows.append(
-            f"{{ place: {json.dumps(part.place)}, title: {json.dumps(part.title)}, Part: {alias} }},\n"
+            f"{{ place: {json.dumps(part.place)}, title: {json.dumps(part.title)}, Part: {shown} }},\n"
         )
     return "".join([*imports, "export const PARTS = [", *rows, "];\n"])
 

@@ -1,17 +1,18 @@
-"""Join the console's modules into one script, and its style sheets into one.
+"""Join the console's modules into one script and one more for each part that is loaded late, and its style sheets.
 
 The sources stay plain modules without a build tool. Imports have the form `import { a, b as c } from "./x.js";`,
 in a feature also from `"#console/x.js"`; an absolute address stays a separate file. Exports have the forms
 `export function`, `export async function`, `export class`, `export const NAME` and `export { a, b } from "…";`.
 
-Every module becomes one function scope, so private names do not collide. Everything else raises `ModuleError`, at
-the start of the API.
+`import("./x.js")` makes a script of the module and of those that only it needs: a page is loaded when it is opened.
+Every module becomes one function scope, so private names do not collide, and its exports are kept in one table, `$m`:
+a module in several scripts runs once. Everything else raises `ModuleError`, at the start of the API.
 """
 
 import posixpath
 import re
 from collections.abc import Iterator, Mapping
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 _TOKEN = re.compile(
     r"""(?P<space>\s+|//[^\n\r\u2028\u2029]*|/\*.*?\*/)|(?P<text>"(?:\\.|[^"\\\n])*"|'(?:\\.|[^'\\\n])*')"""
@@ -25,7 +26,11 @@ _BEFORE_A_VALUE = frozenset({
 })  # fmt: skip
 _LINE_BREAK = re.compile(r"[\n\r\u2028\u2029]")
 _CONSOLE = "#console/"
-_RELATIVE = ('"./', "'./", "`./", '"../', "'../", "`../")
+_WITHIN = tuple(
+    quote + start for quote in "\"'`" for start in ("./", "../", _CONSOLE)
+)  # of the console itself
+_PAGE_HEAD = "const $m=[],$late=async(from)=>(await import(from)).load($m,$late);\n"
+_LATE_HEAD = "export const load=($m,$late)=>{\n"
 _OPENING = {")": "(", "]": "[", "}": "{"}
 _AMBIGUOUS = re.compile(r"/(?![/*=\s])")
 _NO_BREAK_AFTER = frozenset("{([,;")  # a statement never ends here by a line break, or it has ended already
@@ -47,22 +52,26 @@ class _Token(NamedTuple):
     outermost: bool  # outside of all brackets
 
 
-def join_modules(sources: Mapping[str, str], entry: str) -> str:
-    """Return one script; `sources` maps paths, such as `js/main.js`, to texts. Raises `ModuleError`."""
-    joining = _Joining(sources)
-    joining.include(entry)
-    return joining.script()
+def join_modules(sources: Mapping[str, str], entry: str, root: str = "/") -> dict[str, str]:
+    """Return the scripts by the path of their entry; the first one is the page's. Raises `ModuleError`.
 
-
-def join_late_modules(sources: Mapping[str, str], entry: str) -> str:
-    """Return a script of the entry's folder. Raises `ModuleError`.
-
-    Modules of other folders are in the page's script, with their state, so the entry gets them as arguments.
+    `sources` maps paths, such as `js/main.js`, to texts. A script is loaded late from `root` and its path.
     """
-    folder = f"{posixpath.dirname(entry)}/"
-    joining = _Joining({name: text for name, text in sources.items() if name.startswith(folder)})
-    joining.include(entry)
-    return f"{joining.script()}{joining.exports(entry)}"
+    numbers: dict[str, int] = {}
+    page = _Joining(sources, root, numbers)
+    page.include(entry)
+    scripts = {entry: page.page_script()}
+    waiting = page.late
+    while waiting:
+        path = waiting.pop(0)
+        if page.includes(path):
+            raise ModuleError(f"{path} is loaded with the page, and cannot be loaded late")
+        if path not in scripts:
+            later = _Joining(sources, root, numbers, page)
+            later.include(path)
+            scripts[path] = later.late_script(path)
+            waiting += later.late
+    return scripts
 
 
 def join_styles(sources: Mapping[str, str], entry: str, within: tuple[str, ...] = ()) -> str:
@@ -82,23 +91,37 @@ def join_styles(sources: Mapping[str, str], entry: str, within: tuple[str, ...] 
 
 
 class _Joining:
-    def __init__(self, sources: Mapping[str, str]) -> None:
+    def __init__(
+        self, sources: Mapping[str, str], root: str, numbers: dict[str, int], page: Self | None = None
+    ) -> None:
+        self.late: list[str] = []  # the modules that are loaded when they are asked for
         self._sources = sources
-        self._exports: dict[str, set[str]] = {}  # of each included module
-        self._constants: dict[str, str] = {}  # with the exports of each included module
+        self._root = root
+        self._numbers = numbers  # the place of each module's exports in the table of all scripts
+        self._exports: dict[str, set[str]] = dict(page._exports) if page else {}  # of each included module
         self._open: list[str] = []
         self._separate: dict[tuple[str, str], str] = {}  # the alias of each name of a separate file
         self._scopes: list[str] = []
 
-    def script(self) -> str:
+    def includes(self, path: str) -> bool:
+        return path in self._exports
+
+    def page_script(self) -> str:
+        return f"{self._imports()}{_PAGE_HEAD}{''.join(self._scopes)}"
+
+    def late_script(self, path: str) -> str:
+        return f"{self._imports()}{_LATE_HEAD}{''.join(self._scopes)}return {self._constant(path)};}};\n"
+
+    def _imports(self) -> str:
         heads: dict[str, list[str]] = {}
         for (address, name), alias in self._separate.items():
             heads.setdefault(address, []).append(f"{name} as {alias}")
-        imports = [f'import {{{",".join(names)}}} from "{address}";\n' for address, names in heads.items()]
-        return "".join(imports + self._scopes)
+        return "".join(
+            f'import {{{",".join(names)}}} from "{address}";\n' for address, names in heads.items()
+        )
 
-    def exports(self, path: str) -> str:
-        return f"export const {{{','.join(sorted(self._exports[path]))}}}={self._constants[path]};\n"
+    def _constant(self, path: str) -> str:
+        return f"$m[{self._numbers.setdefault(path, len(self._numbers))}]"
 
     def include(self, path: str) -> None:
         if path in self._open:
@@ -120,7 +143,7 @@ class _Joining:
             at += 1
             following = [one for one in tokens[at : at + 8] if one.kind != "space"]
             if token.text == "import" and token.kind == "word":
-                _require_separate(path, token, following)
+                token = self._dynamic(path, token, following, tokens, at)
             if not token.outermost or token.kind != "word" or token.text not in ("import", "export", "await"):
                 body.append(token)
                 continue
@@ -144,11 +167,10 @@ class _Joining:
                     head.append(f"{renamed}={value}")
             at = end + 1
         self._exports[path] = set(exports)
-        constant = self._constants[path] = f"$m{len(self._constants)}"
         bound = f"const {','.join(head)};\n" if head else ""
         given = ",".join(f"{name}:{value}" for name, value in exports.items())
         text = _tightened(body).strip()
-        self._scopes.append(f"const {constant}=(()=>{{{bound}{text}\nreturn {{{given}}};}})();\n")
+        self._scopes.append(f"{self._constant(path)}??=(()=>{{{bound}{text}\nreturn {{{given}}};}})();\n")
         self._open.pop()
 
     def _names(self, path: str, text: str, line: int) -> Iterator[tuple[str, str]]:
@@ -165,7 +187,30 @@ class _Joining:
         self.include(imported)
         if name not in self._exports[imported]:
             raise ModuleError(f"{path}:{line}: {imported} does not export {name}")
-        return f"{self._constants[imported]}.{name}"
+        return f"{self._constant(imported)}.{name}"
+
+    def _dynamic(
+        self, path: str, token: _Token, following: list[_Token], tokens: list[_Token], at: int
+    ) -> _Token:
+        """Return what stands for the word `import`, and name the script of a module of the console."""
+        words = [one.text for one in following]
+        if words[:1] == ["."]:
+            raise ModuleError(
+                f"{path}:{token.line}: unsupported in a module of the console: import.{words[1]}"
+            )
+        if words[:1] != ["("] or not words[1:] or not words[1].startswith(_WITHIN):
+            return token
+        if following[1].kind != "text" or words[2:3] != [")"]:
+            raise ModuleError(
+                f"{path}:{token.line}: unsupported in a module of the console: import({words[1]}"
+            )
+        named = _path(path, words[1][1:-1])
+        if named not in self._sources:
+            raise ModuleError(f"there is no file {named}, imported by {path}")
+        self.late.append(named)
+        place = tokens.index(following[1], at)
+        tokens[place] = following[1]._replace(text=f'"{self._root}{named}"')
+        return token._replace(text="$late")
 
 
 def _tightened(pieces: list[_Token]) -> str:
@@ -194,14 +239,6 @@ def _declared(tokens: list[_Token]) -> str | None:
     if len(words) > 1 and words[0] in ("const", "class", "function") and re.fullmatch(r"[\w$]+", words[1]):
         return words[1]
     return None
-
-
-def _require_separate(path: str, token: _Token, following: list[_Token]) -> None:
-    """Raise `ModuleError` for `import()` of a joined module, and for the address of the module: neither exists."""
-    words = [one.text for one in following]
-    if words[:1] == ["."] or (words[:1] == ["("] and words[1:2] and words[1].startswith(_RELATIVE)):
-        shown = "".join(["import", *words[:3]])
-        raise ModuleError(f"{path}:{token.line}: unsupported in a module of the console: {shown}")
 
 
 def _path(of: str, address: str) -> str:

@@ -46,7 +46,7 @@ FEATURE = Feature(
     ),
     console=(
         ConsolePart("banner", "bar.js", "WaitingCalls"),
-        ConsolePart("situation", "panel.js", "Waits", order=3),
+        ConsolePart("situation", "situation.js", "Waits", order=3),
         ConsolePart("robot", "panel.js", "Approvals", order=3),
     ),
     verbs={

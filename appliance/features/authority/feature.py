@@ -11,7 +11,7 @@ FEATURE = Feature(
     "authority",
     settings=AuthoritySettings,
     console=(
-        ConsolePart("situation", "panel.js", "Drives", order=1),
+        ConsolePart("situation", "situation.js", "Drives", order=1),
         ConsolePart("robot", "panel.js", "Drive", order=1),
     ),
     verbs={

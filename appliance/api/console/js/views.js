@@ -1,14 +1,17 @@
 /** The views, in the order of their keys. Those of features follow those of the core; the robot's page is the last one. */
 
-import { Audit } from "./audit/view.js";
 import { PARTS } from "./features.js";
-import { GraphView } from "./graph/view.js";
-import { Monitors } from "./monitors/view.js";
 import { Now } from "./now/view.js";
-import { PolicyView } from "./policy/view.js";
+import { late } from "./parts/late.js";
 import { RobotView } from "./robot.js";
 
-const OWN = { Now, Graph: GraphView, Audit, Policy: PolicyView, Monitors };
+const OWN = {
+  Now,
+  Graph: late(() => import("./graph/view.js"), "GraphView"),
+  Audit: late(() => import("./audit/view.js"), "Audit"),
+  Policy: late(() => import("./policy/view.js"), "PolicyView"),
+  Monitors: late(() => import("./monitors/view.js"), "Monitors"),
+};
 
 export const VIEWS = [
   ...Object.entries(OWN).map(([title, View]) => ({ title, View })),

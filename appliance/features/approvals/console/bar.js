@@ -17,7 +17,7 @@ import { Link } from "#console/router.js";
 import { session } from "#console/session.js";
 import { useStore } from "#console/store.js";
 import { decide, held, useHeldCalls } from "./held.js";
-import { LEASES, wants } from "./panel.js";
+import { LEASES, wants } from "./call.js";
 import { asleep, placed, pruned, waitingOf } from "./slots.js";
 import { Sound } from "./sound.js";
 

@@ -2,28 +2,15 @@
 
 import { html } from "#console/html.js";
 import { lasting } from "#console/moments.js";
-import { counted } from "#console/numbers.js";
 import { Badge } from "#console/parts/badge.js";
 import { Button } from "#console/parts/button.js";
-import { Fact } from "#console/parts/fact.js";
 import { Given } from "#console/parts/given.js";
 import { Host } from "#console/parts/host.js";
 import { Failure } from "#console/parts/notice.js";
 import { useStore } from "#console/store.js";
+import { LEASES, wants } from "./call.js";
 import { again, decide, held } from "./held.js";
-import { waitingOf } from "./slots.js";
 import { Sound } from "./sound.js";
-
-export const LEASES = [30, 300]; // seconds
-const SHOWN = 160; // characters; the number of bytes tells that the arguments have more
-
-/** How many calls wait, in the situation. */
-export function Waits() {
-  const rows = useStore(held, (one) => one.rows);
-  const waiting = waitingOf(rows).length;
-  const lasts = (rows ?? []).filter((one) => one.state === "lease").length;
-  return html`<${Fact} name="Waits" to="/console/robot" tone=${waiting ? "warn" : ""}>${waiting ? counted(waiting, "call waits for you", "calls wait for you") : "no call waits"}${lasts > 0 && html` <span class="muted">${counted(lasts, "approval lasts", "approvals last")}</span>`}</${Fact}>`;
-}
 
 export function Approvals() {
   const { rows, error } = useStore(held);
@@ -43,17 +30,4 @@ function Row(/** @type {{one: any}} */ { one }) {
     <td><div class="row row-end">${once && html`<${Button} small role="operator" tone="primary" onClick=${() => decide(one.number, "approve", {})}>Approve once</${Button}>`}
       ${waits && LEASES.map((seconds) => html`<${Button} key=${seconds} small role="operator" onClick=${() => decide(one.number, "approve", { seconds })}>For ${lasting(seconds)}</${Button}>`)}
       ${one.state !== "refused" && html`<${Button} small role="operator" onClick=${() => decide(one.number, "refuse")}>${waits ? "Refuse" : "End"}</${Button}>`}</div></td></tr>`;
-}
-
-/** What a held call does, with its arguments. @param {any} one */
-export function wants(one) {
-  const size = one.size > SHOWN && html` of ${one.size} bytes`;
-  const call = one.sha256 ? html`<${Given} value=${`${one.type} ${printable(one.arguments)}`} mono most=${SHOWN} />${size}` : "with any arguments";
-  return html`${one.category} <${Given} value=${one.resource} mono most=${80} />${one.category === "call" && html`<div class="muted small">${call}</div>`}`;
-}
-
-/** Return the text in the arguments of a call, and a point for every other byte. @param {string} hex */
-function printable(hex) {
-  const codes = (hex.match(/../g) ?? []).map((byte) => parseInt(byte, 16));
-  return codes.length ? String.fromCharCode(...codes.map((code) => (code > 31 && code < 127 ? code : 0xb7))) : "without arguments";
 }

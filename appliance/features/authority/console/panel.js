@@ -1,49 +1,19 @@
 /** Command authority on the robot's page: who holds each group of topics and services, who waits, and the hand-over. */
 
-import { html, useEffect, useId, useState } from "#console/html.js";
+import { html, useId, useState } from "#console/html.js";
 import { lasting } from "#console/moments.js";
 import { Badge } from "#console/parts/badge.js";
 import { Button } from "#console/parts/button.js";
 import { Dialog } from "#console/parts/dialog.js";
-import { Fact } from "#console/parts/fact.js";
 import { Field } from "#console/parts/field.js";
 import { Given } from "#console/parts/given.js";
 import { Host, useHosts } from "#console/parts/host.js";
 import { Empty, Failure, Loading } from "#console/parts/notice.js";
-import { useResource } from "#console/parts/resource.js";
 import { done, failed } from "#console/parts/toast.js";
-import { ask, get } from "#console/rest.js";
+import { ask } from "#console/rest.js";
+import { isSilent, isStuck, useGroups } from "./situation.js";
 
-const EVERY = 2000; // milliseconds
 const SAID = { take: "Take", give: "Give", ask: "Ask" };
-
-function useGroups() {
-  const { value, error, again } = useResource((signal) => get("/v1/drive", {}, signal), []);
-  useEffect(() => {
-    const timer = setInterval(again, EVERY);
-    return () => clearInterval(timer);
-  }, []);
-  return { value, error, again, rows: value?.groups ?? [] };
-}
-
-/** Who drives, in the situation: one line for each group. */
-export function Drives() {
-  const { value, error, rows } = useGroups();
-  const silent = rows.some((/** @type {any} */ one) => isSilent(one));
-  const waits = rows.some((/** @type {any} */ one) => one.waiting.length);
-  return html`<${Fact} name="Drives" to="/console/robot" tone=${silent || waits || rows.some(isStuck) ? "warn" : ""}>${error && !value ? "not known" : !value ? "…" : !rows.length ? html`<span class="muted">every host that may: no [Authority]</span>` : rows.map((/** @type {any} */ one) => html`<div key=${one.group}>
-    ${one.ranks.length ? html`<${Given} value=${one.group} most=${40} /> <${Badge} word=${one.standing} tone=${isStuck(one) ? "warn" : ""} /> <span class="muted"><${Given} value=${one.why} most=${200} /></span>` : one.holder ? html`<${Host} value=${one.holder} /> <span class="muted">drives</span> <${Given} value=${one.group} most=${40} /> <span class="muted nowrap">for ${lasting(one.held_seconds)}</span>${isSilent(one) && html` <${Badge} word=${`silent: ${one.left_seconds.toFixed(1)} s left`} tone="warn" />`}` : html`<span class="muted">no host drives</span> <${Given} value=${one.group} most=${40} />`}
-    ${one.waiting.length > 0 && html` <${Badge} word="waits" tone="warn" /> <${Host} value=${one.waiting[0]} />${one.waiting.length > 1 && ` and ${one.waiting.length - 1} more`}`}</div>`)}</${Fact}>`;
-}
-
-function isSilent(/** @type {any} */ group) {
-  return group.left_seconds !== null && group.left_seconds < group.lease / 2;
-}
-
-/** Whether lower ranks wait for a person. */
-function isStuck(/** @type {any} */ group) {
-  return group.standing === "lost" || group.standing === "unknown";
-}
 
 export function Drive() {
   const { value, error, again, rows } = useGroups();
@@ -61,7 +31,7 @@ function Group(/** @type {{group: any, again: () => void}} */ { group, again }) 
     <td class="first"><strong><${Given} value=${group.group} most=${64} /></strong><div class="muted small">${group.names.map((/** @type {string} */ name) => html`<div key=${name}><${Given} value=${name} mono most=${80} /></div>`)}</div></td>
     <td data-label="Holder"><div>${group.ranks.length ? html`<${Badge} word=${group.standing} tone=${isStuck(group) ? "warn" : ""} /> <${Given} value=${group.why} most=${200} /><div class="muted small"><${Given} value=${group.ranks.join(" > ")} mono most=${200} /></div>` : group.holder ? html`<${Host} value=${group.holder} /><div class="muted small">for ${lasting(group.held_seconds)}; ends after ${lasting(group.lease)} of silence${isSilent(group) && html` <${Badge} word=${`silent: ${group.left_seconds.toFixed(1)} s left`} tone="warn" />`}</div>` : html`<${Badge} word="no host" />`}</div></td>
     <td data-label="Waits"><div>${group.waiting.length ? group.waiting.map((/** @type {string} */ host) => html`<div key=${host}><${Host} value=${host} /></div>`) : html`<span class="muted">–</span>`}</div></td>
-    <td><div class="row row-end">${group.ranks.length ? button("give", { disabled: !isStuck(group), why: "Nobody waits for a person" }) : html`${button("take", { tone: group.holder ? "" : "primary" })}${button("give", { disabled: !group.holder, why: "No host holds it" })}${button("ask")}`}</div>
+    <td><div class="row row-end">${group.ranks.length ? button("give", { disabled: !isStuck(group), why: "No lower rank waits for a person" }) : html`${button("take", { tone: group.holder ? "" : "primary" })}${button("give", { disabled: !group.holder, why: "No host holds it" })}${button("ask")}`}</div>
       ${open && html`<${HandOver} verb=${open} group=${group} again=${again} close=${() => setOpen("")} />`}</td></tr>`;
 }
 

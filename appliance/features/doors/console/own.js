@@ -14,7 +14,6 @@ import { Link } from "#console/router.js";
 import { session } from "#console/session.js";
 import { useStore } from "#console/store.js";
 
-const SOURCE = "/console/static/features/doors/teleop/view.js";
 const STARTING = 2000; // milliseconds between two looks at a door that does not serve yet
 const PARTS = { Button, Failure, Field, Given, Loading, Notice, ask, failed, optional };
 
@@ -69,7 +68,7 @@ export function OwnDoor() {
 
 async function loaded() {
   try {
-    return await import(SOURCE);
+    return await import("./teleop/view.js");
   } catch {
     throw new Error(OUTDATED);
   }

@@ -1,13 +1,15 @@
 import pytest
 
-from appliance.api.console.console_bundle import ModuleError, join_late_modules, join_modules, join_styles
+from appliance.api.console.console_bundle import ModuleError, join_modules, join_styles
+
+HEAD = "const $m=[],$late=async(from)=>(await import(from)).load($m,$late);\n"
 
 
 def test_only_comments_and_indentation_are_removed() -> None:
     kept = "[\"// {\",'/* ( */',/[/`]\\/\\/{/g,`//\n   ${`}${1 / 2} /* b */`} `]"
     text = f"const a = {kept};  // c\n  let b  /* d */ = 1\n  /* e\n */ a / a / 2 + +b;\n\n"
-    assert join_modules({"a.js": text}, "a.js") == (
-        f"const $m0=(()=>{{const a={kept};let b=1\na / a / 2 + +b;\nreturn {{}};}})();\n"
+    assert join_modules({"a.js": text}, "a.js")["a.js"] == (
+        f"{HEAD}$m[0]??=(()=>{{const a={kept};let b=1\na / a / 2 + +b;\nreturn {{}};}})();\n"
     )
 
 
@@ -19,12 +21,13 @@ def test_only_comments_and_indentation_are_removed() -> None:
     ],
 )  # fmt: skip
 def test_a_slash_is_read_as_its_place_demands(kept: str) -> None:
-    assert join_modules({"a.js": kept}, "a.js") == f"const $m0=(()=>{{{kept}\nreturn {{}};}})();\n"
+    joined = join_modules({"a.js": kept}, "a.js")["a.js"]
+    assert joined == f"{HEAD}$m[0]??=(()=>{{{kept}\nreturn {{}};}})();\n"
 
 
 @pytest.mark.parametrize("end", ["\n", "\r", "\u2028", "\u2029"])
 def test_a_comment_ends_with_its_line(end: str) -> None:
-    assert "{a\nb;" in join_modules({"a.js": f"a // c{end}b;"}, "a.js")
+    assert "{a\nb;" in join_modules({"a.js": f"a // c{end}b;"}, "a.js")["a.js"]
 
 
 @pytest.mark.parametrize(
@@ -53,10 +56,17 @@ def test_a_comment_ends_with_its_line(end: str) -> None:
         ({"a.js": "f(]"}, "a.js:1: unexpected ]"),
         ({"a.js": "\nif (a) /b  c/.test(d);"}, "a.js:2: put a regular expression in brackets"),
         ({"a.js": "function f() { }\n/b  c/.test(d);"}, "a.js:2: put a regular expression in brackets"),
-        ({"a.js": 'const f = () => import("./b.js");'}, "a.js:1: unsupported in a module"),
+        ({"a.js": 'const f = () => import("./b.js");'}, "there is no file b.js, imported by a.js"),
         (
-            {"a.js": 'function f() { return import("../b.js"); }'},
-            'a.js:1: unsupported in a module of the console: import("../b.js"',
+            {"a.js": "function f() { return import(`../${b}.js`); }"},
+            "a.js:1: unsupported in a module of the console: import(`../${",
+        ),
+        (
+            {
+                "a.js": 'import { b } from "./b.js";\nconst f = () => import("./b.js");',
+                "b.js": "export const b = 1;",
+            },
+            "b.js is loaded with the page, and cannot be loaded late",
         ),
         ({"a.js": "function f() { return import.meta.url; }"}, "a.js:1: unsupported in a module"),
     ],
@@ -78,15 +88,24 @@ def test_styles_are_joined_in_the_order_of_their_imports() -> None:
         join_styles(sources | {"c/b.css": '@import "./a.css";'}, "c/a.css")
 
 
-def test_a_late_module_has_its_folder_and_exports_its_entry() -> None:
-    """It cannot include a module of the page, whose state would then exist twice."""
+def test_a_late_module_shares_the_state_of_the_page() -> None:
+    """A module of the page is used there, and one that two late scripts need is run by the first of them."""
     sources = {
-        "features/x/late/view.js": 'import { a } from "./a.js";\nexport const view = a;\n',
-        "features/x/late/a.js": "export const a = 1;\n",
+        "js/main.js": (
+            'import { state } from "./state.js";\nopen = () => import("#console/x.js") || import("../y.js");\n'
+        ),
         "js/state.js": "export const state = {};\n",
+        "js/x.js": (
+            'import { state } from "./state.js";\nimport { a } from "../a.js";\nexport const x = [state, a];\n'
+        ),
+        "y.js": 'import { a } from "./a.js";\nexport const y = a;\n',
+        "a.js": 'export const a = () => import("./y.js");\n',
     }
-    script = join_late_modules(sources, "features/x/late/view.js")
-    assert script.splitlines()[-1] == "export const {view}=$m1;"
-    sources["features/x/late/a.js"] = 'import { state } from "#console/state.js";\nexport const a = state;\n'
-    with pytest.raises(ModuleError, match=r"there is no file js/state.js, imported by features/x/late/a.js"):
-        join_late_modules(sources, "features/x/late/view.js")
+    scripts = join_modules(sources, "js/main.js", "/files/")
+    assert next(iter(scripts)) == "js/main.js"
+    assert 'open=()=>$late("/files/js/x.js")||$late("/files/y.js");' in scripts["js/main.js"]
+    assert scripts["js/x.js"].count("??=") == scripts["y.js"].count("??=") == 2
+    assert "state=$m[0].state,a=$m[2].a;" in scripts["js/x.js"]
+    assert "$m[2]??=" in scripts["y.js"]
+    assert scripts["y.js"].startswith("export const load=($m,$late)=>{\n")
+    assert scripts["y.js"].endswith("return $m[4];};\n")

@@ -1,0 +1,40 @@
+/** Who drives, in the situation, and what both this line and the robot's page read. */
+
+import { html, useEffect } from "#console/html.js";
+import { lasting } from "#console/moments.js";
+import { Badge } from "#console/parts/badge.js";
+import { Fact } from "#console/parts/fact.js";
+import { Given } from "#console/parts/given.js";
+import { Host } from "#console/parts/host.js";
+import { useResource } from "#console/parts/resource.js";
+import { get } from "#console/rest.js";
+
+const EVERY = 2000; // milliseconds
+
+export function useGroups() {
+  const { value, error, again } = useResource((signal) => get("/v1/drive", {}, signal), []);
+  useEffect(() => {
+    const timer = setInterval(again, EVERY);
+    return () => clearInterval(timer);
+  }, []);
+  return { value, error, again, rows: value?.groups ?? [] };
+}
+
+/** Who drives, in the situation: one line for each group. */
+export function Drives() {
+  const { value, error, rows } = useGroups();
+  const silent = rows.some((/** @type {any} */ one) => isSilent(one));
+  const waits = rows.some((/** @type {any} */ one) => one.waiting.length);
+  return html`<${Fact} name="Drives" to="/console/robot" tone=${silent || waits || rows.some(isStuck) ? "warn" : ""}>${error && !value ? "not known" : !value ? "…" : !rows.length ? html`<span class="muted">every host that may: no [Authority]</span>` : rows.map((/** @type {any} */ one) => html`<div key=${one.group}>
+    ${one.ranks.length ? html`<${Given} value=${one.group} most=${40} /> <${Badge} word=${one.standing} tone=${isStuck(one) ? "warn" : ""} /> <span class="muted"><${Given} value=${one.why} most=${200} /></span>` : one.holder ? html`<${Host} value=${one.holder} /> <span class="muted">drives</span> <${Given} value=${one.group} most=${40} /> <span class="muted nowrap">for ${lasting(one.held_seconds)}</span>${isSilent(one) && html` <${Badge} word=${`silent: ${one.left_seconds.toFixed(1)} s left`} tone="warn" />`}` : html`<span class="muted">no host drives</span> <${Given} value=${one.group} most=${40} />`}
+    ${one.waiting.length > 0 && html` <${Badge} word="waits" tone="warn" /> <${Host} value=${one.waiting[0]} />${one.waiting.length > 1 && ` and ${one.waiting.length - 1} more`}`}</div>`)}</${Fact}>`;
+}
+
+export function isSilent(/** @type {any} */ group) {
+  return group.left_seconds !== null && group.left_seconds < group.lease / 2;
+}
+
+/** Whether lower ranks wait for a person. */
+export function isStuck(/** @type {any} */ group) {
+  return group.standing === "lost" || group.standing === "unknown";
+}
