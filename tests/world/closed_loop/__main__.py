@@ -2,6 +2,7 @@
 
 python -m tests.world.closed_loop --worlds 100000 --seed 1 --jobs 2    run many worlds, as many for each preset
 python -m tests.world.closed_loop --replay PRESET SEED                 run one world, with everything that happens in it
+python -m tests.world.closed_loop --join A.json B.json --json C.json   add runs of one commit, with seeds that follow
 """
 
 import argparse
@@ -10,8 +11,11 @@ import json
 import multiprocessing
 import subprocess
 import sys
+from collections import Counter
 from collections.abc import Iterator
+from operator import itemgetter
 from pathlib import Path
+from typing import Any
 
 from appliance.features.guards.evidence import text_digest
 from appliance.features.guards.presets import PRESETS
@@ -56,6 +60,49 @@ def _result(one: Summary) -> dict[str, object]:
     }
 
 
+def joined(runs: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return the sum of runs of one commit, each with the seeds that follow those of the run before it."""
+    first = runs[0]
+    for key in ("commit", "presets"):
+        kept = [_fixed(one, key) for one in runs]
+        if any(one != kept[0] for one in kept):
+            raise ValueError(f"the runs differ in {key}, so they are not one run")
+    seed = first["first_seed"]
+    for one in runs:
+        if one["first_seed"] != seed:
+            raise ValueError(f"a run begins with the seed {one['first_seed']}, not with {seed}")
+        [count] = {row["worlds"] for row in _rows(one).values()}
+        seed += count
+    return {
+        **first,
+        "date": runs[-1]["date"],
+        "presets": {name: _sum([one["presets"][name] for one in runs]) for name in first["presets"]},
+        PAIRS: _sum([one[PAIRS] for one in runs]) if first[PAIRS] else None,
+    }
+
+
+def _fixed(run: dict[str, Any], key: str) -> Any:
+    return run[key] if key == "commit" else {name: row["digest"] for name, row in run["presets"].items()}
+
+
+def _rows(run: dict[str, Any]) -> dict[str, Any]:
+    return {**run["presets"], **({PAIRS: run[PAIRS]} if run[PAIRS] else {})}
+
+
+def _sum(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    near = [one["closest"] for one in rows if one["closest"] is not None]
+    broken: Counter[str] = Counter()
+    for one in rows:
+        broken.update(one["violations"])
+    return {
+        **rows[0],
+        "worlds": sum(one["worlds"] for one in rows),
+        "seconds": sum(one["seconds"] for one in rows),
+        "closest": min(near, default=None),
+        "violations": dict(broken),
+    }
+
+
 def main(arguments: list[str]) -> int:
     parser = argparse.ArgumentParser(
         prog="python -m tests.world.closed_loop", description=(__doc__ or "").partition("\n")[0]
@@ -75,7 +122,14 @@ def main(arguments: list[str]) -> int:
     parser.add_argument(
         "--alone", default="", metavar="TOPIC", help="with --replay: where a second node publishes alone"
     )
+    parser.add_argument("--join", nargs="+", type=Path, help="add these runs, instead of running worlds")
     chosen = parser.parse_args(arguments)
+    if chosen.join:
+        if not chosen.json:
+            parser.error("--join needs --json FILE for the sum")
+        runs = sorted((json.loads(one.read_text()) for one in chosen.join), key=itemgetter("first_seed"))
+        chosen.json.write_text(json.dumps(joined(runs), indent=1) + "\n", encoding="utf-8")
+        return 0
     if chosen.replay:
         preset, seed = chosen.replay
         report = run_one(preset, int(seed), trace=_print, alone=chosen.alone)

@@ -1,10 +1,12 @@
 import re
+from typing import Any
 
 import pytest
 
 from appliance.features.guards.presets import PRESETS
 from tests.support.examples import ALL
 from tests.support.rows import require_rows
+from tests.world.closed_loop.__main__ import joined
 from tests.world.closed_loop.planted import FAULTS, WITHIN, no_guard, stops_everything
 from tests.world.closed_loop.world import COMMAND
 from tests.world.closed_loop.worlds import (
@@ -86,6 +88,25 @@ def _takes_any_node(text: str) -> str:
 def test_a_guard_that_takes_any_node_for_its_source_is_found(preset: str, topic: str) -> None:
     found = (run_one(preset, seed, _takes_any_node, alone=topic).violations for seed in range(100))
     assert any(one.law == "L4" for violations in found for one in violations)
+
+
+def test_runs_of_one_commit_are_added() -> None:
+    def run(seed: int, commit: str = "c") -> dict[str, Any]:
+        row = {"worlds": 300, "seconds": 9, "closest": seed / 1000, "violations": {"L1": 1}}
+        return {
+            "commit": commit,
+            "date": "d",
+            "first_seed": seed,
+            "presets": {"a": {"digest": "x", **row}},
+            PAIRS: row,
+        }
+
+    both = joined([run(1000), run(1300)])
+    added = {"worlds": 600, "seconds": 18, "closest": 1.0, "violations": {"L1": 2}}
+    assert both == {**run(1000), "presets": {"a": {"digest": "x", **added}}, PAIRS: added}
+    for other in (run(1300, "d"), run(1299), run(1301)):
+        with pytest.raises(ValueError, match="run"):
+            joined([run(1000), other])
 
 
 LAWS_OF = {
