@@ -103,7 +103,7 @@ EVIDENCE: Mapping[str, Evidence] = {
         "a sensor that is silent for `silent`, repeats its values `frozen` times, or has too few valid values",
         "silent",
         ("a working sensor never repeats all its values",),
-        ("wrong values that change",),
+        ("wrong values that change", "measurements that come late, at their usual rate"),
         unit=(
             "test_a_sensor_is_silent_frozen_or_blind",
             "test_a_moving_base_is_stopped_when_its_sensor_falls_silent",
@@ -196,7 +196,11 @@ EVIDENCE: Mapping[str, Evidence] = {
         "a measured velocity beyond the limit, in that message; one that is silent for `silent`",
         "silent",
         ("the velocity is measured, and not copied from the command",),
-        ("wheels that slip", "a base that ignores a zero velocity"),
+        (
+            "wheels that slip",
+            "a measurement that is frozen, or comes late",
+            "a base that ignores a zero velocity",
+        ),
         unit=("test_a_base_that_is_measured_too_fast_stops_until_it_stands_and_zero_is_commanded",),
     ),
     "standstill": Evidence(
@@ -204,7 +208,10 @@ EVIDENCE: Mapping[str, Evidence] = {
         "a measured motion `settle` after the command to stand; a measurement that is silent for `silent`",
         "settle",
         ("the velocity is measured, and not copied from the command",),
-        ("a base that ignores a zero velocity: a guard has no brake",),
+        (
+            "a measurement that is frozen, or comes late",
+            "a base that ignores a zero velocity: a guard has no brake",
+        ),
         unit=("test_a_base_that_moves_without_a_command_is_stopped_again_and_again",),
     ),
     "zone": Evidence(
@@ -248,13 +255,15 @@ level.
 - **Clauses** name the subject of a standard that a preset follows in part. All are *unchecked*: the authors of this
   page had no access to the texts of ISO and IEC standards. The equation of speed and separation monitoring is discussed
   in a [public article of NIST](https://pmc.ncbi.nlm.nih.gov/articles/PMC5117641).
-- **Proved** means that for every message and state the compiled code of the event does what its text says
-  ([the proofs](../../dev/assurance.md#the-code-of-an-event)). Whether the text keeps the promise is not proved. Timers
-  (`tick`) are outside of the proofs, and the `tick` of a `deadman` is the guard: it is tested and simulated.
+- **Proved** means that for every message of up to 512 KiB and every state the compiled code of the event does what its
+  text says ([the proofs](../../dev/assurance.md#the-code-of-an-event)). Whether the text keeps the promise is not
+  proved. Timers (`tick`) are outside of the proofs, and the `tick` of a `deadman` is the guard: it is tested and
+  simulated.
 - **Simulated** means random [worlds](../../dev/assurance.md#guards-in-simulated-worlds) with a robot, its sensors,
-  persons and operators, within the assumptions that are listed for each preset. **Left out of the worlds** are events
-  at which the preset may break a law: the guard is disabled and enabled (*switch*), is held and resumed (*hold*), gets
-  bytes that are not a message (*cut*), or its process is replaced (*restart*).
+  persons and operators, within the assumptions that are listed for each preset. Timers are due on time there: the delay
+  of a relay is measured (below), not simulated. **Left out of the worlds** are events at which the preset may break a
+  law: the guard is disabled and enabled (*switch*), is held and resumed (*hold*), gets bytes that are not a message
+  (*cut*), or its process is replaced (*restart*).
 - **Pairs** are worlds with two guards of different presets on one topic: {pairs}.
 - **Tested in the engine** names tests of the preset's text. With real nodes, the stops of the engine are tested by a
   guard that is written for the test, not by each preset: `test_a_restart_sends_stops_until_a_command_comes`,
@@ -267,6 +276,10 @@ From the cause to the stop at the base. The guard's part follows from its text, 
 part has no guaranteed bound: of 1,000 stops on a busy machine the slowest took {relay} ms
 ([measured](../monitors.md#how-fast-a-guard-stops)). Add the base's own reaction and the time in which it brakes from
 its speed, and choose the values so that the sum is safe.
+
+The sum is for a silent source (`standstill`: for `settle`). A thing that a message shows is noticed in that message:
+then the interval of the messages takes the place of the silence, `frozen` (`sensor`) or `samples` (`agree`) times. The
+check of `arm` has `checked` instead of `silent`, and the goal of `answer` its deadline before the sum.
 
 | preset | it notices | silence | timer | relay, at most measured | sum |
 |---|---|---|---|---|---|

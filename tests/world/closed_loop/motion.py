@@ -148,6 +148,9 @@ class SeparationWorld(DrivenWorld):
     """Walls and persons around a base with a scanner: ISO 13855 and ISO/TS 15066, speed and separation."""
 
     preset: ClassVar[str] = "separation"
+    not_yet: ClassVar[Mapping[str, str]] = {
+        "switch": "a base that drove without the guard may be so fast that no stop prevents a collision"
+    }
 
     def plan(self) -> None:
         r = self.random
@@ -381,6 +384,9 @@ class FenceWorld(DrivenWorld):
     """A base inside a polygon, or at first outside: not a centimetre is left outside."""
 
     preset: ClassVar[str] = "fence"
+    not_yet: ClassVar[Mapping[str, str]] = {
+        "switch": "a base that drove without the guard may already be outside"
+    }
     tick = 50
 
     def plan(self) -> None:

@@ -22,6 +22,7 @@ class ZoneWorld(SeparationWorld):
     """Walls and persons around a base that stops, or slows, while something is in its zone."""
 
     preset: ClassVar[str] = "zone"
+    not_yet: ClassVar[Mapping[str, str]] = {}
     one_source: ClassVar[Mapping[str, tuple[str, ...]]] = {"by": ("dead", "cut"), "mute": ()}
 
     def plan(self) -> None:
