@@ -124,11 +124,11 @@ class ParkedRobot(FleetRobot):
     def _approve(self, number: int, checkpoint: bytes, newest: bytes) -> None:
         assert self._notary is not None
         try:
-            text = self._notary.approve(checkpoint, newest)
+            text = self._notary.accept(checkpoint, newest)
         except RemovalRefusedError as error:
             self.log.removal_refused(number, str(error), early=error.early)
         else:
-            self.log.removal_approved(number, text, self.key.sign(text), self.public)
+            self.log.removal_signed(number, text, self.key.sign(text), self.public)
 
     def note(self, count: int) -> None:
         """Record decisions, without waiting for their checkpoint."""

@@ -32,7 +32,7 @@ tokens = _names(admin.TokenList(), lambda body: [row.name for row in body.tokens
 topics = _names(admin.GraphWanted(), lambda body: [row.name for row in body.topics])
 
 
-def _names_of_feature(verb: str, of: Callable[[Any], Iterable[str]]) -> Complete:
+def names_of_feature(verb: str, of: Callable[[Any], Iterable[str]]) -> Complete:
     def complete(context: typer.Context, incomplete: str) -> list[str]:
         from appliance.channel.operations import request_named  # noqa: PLC0415  only completion needs all features
 
@@ -42,5 +42,4 @@ def _names_of_feature(verb: str, of: Callable[[Any], Iterable[str]]) -> Complete
     return complete
 
 
-hosts = _names_of_feature("host list", lambda body: [row.name for row in body.hosts])
-recordings = _names_of_feature("recordings", lambda body: [row.id for row in body.recordings])
+hosts = names_of_feature("host list", lambda body: [row.name for row in body.hosts])

@@ -189,9 +189,9 @@ def _grid(body: Status, host_in_words: HostInWords) -> Table:
     lines = [view.line(state) for view, state in states_of(body) if view.line is not None]
     forwarded = "".join(f", {text}" for name, text in lines if not name)
     grid.add_row("audit log", f"{counted(audit.lag_records, 'record')} waiting to be written{forwarded}")
-    for name, text in lines:
+    for name, line in lines:
         if name:
-            grid.add_row(name, text)
+            grid.add_row(name, line if isinstance(line, str) else Text.assemble(*line))
     return grid
 
 

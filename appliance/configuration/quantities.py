@@ -11,45 +11,30 @@ from typing import Annotated, Any, ClassVar
 
 @dataclass(frozen=True)
 class Metadata:
-    """Metadata that pydantic takes as several, and makes when it reads them."""
+    """Metadata that pydantic takes as several, and makes with its own module when it reads them."""
 
-    make: Callable[[], Iterable[Any]]
+    make: Callable[[Any], Iterable[Any]]
     __is_annotated_types_grouped_metadata__: ClassVar[bool] = True
 
     def __iter__(self) -> Iterator[Any]:
-        return iter(self.make())
+        import pydantic  # noqa: PLC0415  see the head
+
+        return iter(self.make(pydantic))
 
 
 def rules(**given: Any) -> Metadata:
     """Return the rules of pydantic's `Field`, such as `gt=0`."""
-
-    def make() -> Iterable[Any]:
-        from pydantic import Field  # noqa: PLC0415  see the head
-
-        found: list[Any] = Field(**given).metadata
-        return found
-
-    return Metadata(make)
+    return Metadata(lambda pydantic: pydantic.Field(**given).metadata)
 
 
 def check(function: Callable[[Any], Any]) -> Metadata:
     """Return a check that a value has to pass; the function raises `ValueError`."""
-
-    def make() -> Iterable[Any]:
-        from pydantic import AfterValidator  # noqa: PLC0415  see the head
-
-        return (AfterValidator(function),)
-
-    return Metadata(make)
+    return Metadata(lambda pydantic: (pydantic.AfterValidator(function),))
 
 
-def _bytes() -> Iterable[Any]:
-    from pydantic import ByteSize, GetPydanticSchema  # noqa: PLC0415  see the head
-
-    return (GetPydanticSchema(lambda _source, handler: handler(ByteSize)),)
-
-
-BYTES = Metadata(_bytes)
+BYTES = Metadata(
+    lambda pydantic: (pydantic.GetPydanticSchema(lambda _source, handler: handler(pydantic.ByteSize)),)
+)
 Seconds = Annotated[float, rules(gt=0, le=86_400 * 365, allow_inf_nan=False)]
 Milliseconds = Annotated[float, rules(ge=1.0, le=1000.0, allow_inf_nan=False)]
 Count = Annotated[int, rules(gt=0)]

@@ -1,6 +1,6 @@
 """Define what a feature adds to views of commands and pages, without settings: `rosrv status` must start fast."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, Literal, NamedTuple, TypeVar
@@ -12,6 +12,10 @@ S = TypeVar("S")
 
 Samples = Iterable[tuple[tuple[str, ...], Any]]
 """The samples of a metric: the values of labels, and the value."""
+
+
+Pieces = Sequence[tuple[str, str]]
+"""The pieces of a text, each with its style on a terminal; an empty style is that of other text."""
 
 
 class Trouble(NamedTuple):
@@ -39,9 +43,9 @@ class StateView(Generic[S]):
     alarms: Callable[[S], Iterable[Trouble]] = lambda _state: ()
     metrics: tuple[Metric, ...] = ()
     samples: Callable[[S], Mapping[str, Samples]] = lambda _state: {}
-    line: Callable[[S], tuple[str, Any]] | None = None
-    """Returns what `rosrv status` prints: a name, and a text in rich's markup. An empty name adds the text to the
-    line of the audit log.
+    line: Callable[[S], tuple[str, str | Pieces]] | None = None
+    """Returns what `rosrv status` prints: a name, and a text in rich's markup, or its pieces. An empty name adds the
+    text to the line of the audit log.
     """
 
 

@@ -19,7 +19,7 @@ from typing import Annotated, NamedTuple, Protocol
 import msgspec
 
 from appliance.audit.log.columns import StoredColumns, from_columns, packed, to_columns
-from appliance.audit.log.log_database import COLUMNS, LogUnreadableError, reading
+from appliance.audit.log.log_database import LogUnreadableError, chained_rows, number_of_records, reading
 from appliance.audit.log.record_format import LogEntry, entry_of
 from appliance.audit.proof.chain_proofs import ChainProof, evidence_line
 from appliance.audit.proof.checkpoints import last_removal
@@ -118,17 +118,11 @@ def write_segment(log: Path, number: int, write: Callable[[bytes], object]) -> S
             return None
         end = header.end
         sequence, digest = header.start
-        count = "SELECT count(*) FROM record WHERE sequence > ? AND sequence <= ?"
-        (present,) = connection.execute(count, (sequence, end.sequence)).fetchone()
-        if present != end.sequence - sequence:
+        if number_of_records(connection, sequence, end.sequence) != end.sequence - sequence:
             return None
         done = _Bytes()
         write(done.add(header.line()))
-        found = connection.execute(
-            f"SELECT {COLUMNS}, hash FROM record WHERE sequence > ? AND sequence <= ? ORDER BY sequence",  # noqa: S608  fixed names
-            (sequence, end.sequence),
-        )
-        for row in found:
+        for row in chained_rows(connection, sequence, end.sequence):
             columns = StoredColumns(*row[:-1])
             write(done.add(_line(columns, digest, row[-1], end)))
             done.saw(columns.time)

@@ -35,7 +35,7 @@ class RetentionLimits:
     size: int | None = None
 
 
-class RemovalApprover:
+class RemovalJudge:
     """Approves removals by the signatures in `signed` and the limits in `kept`.
 
     `dated` corrects a date of `clock` from a time when a long gap did not count yet.
@@ -53,7 +53,7 @@ class RemovalApprover:
         self._clock = clock
         self._dated = dated
 
-    def approve(self, checkpoint: bytes, newest: bytes) -> bytes:
+    def accept(self, checkpoint: bytes, newest: bytes) -> bytes:
         """Return the text to sign. `newest` is the last signed checkpoint.
 
         Raises `RemovalRefusedError`, `CheckpointRefusedError`, `OSError`.

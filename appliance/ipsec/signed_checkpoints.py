@@ -51,7 +51,7 @@ class CheckpointMemory:
         self._directory = directory
         self._clock = clock
 
-    def approve(self, text: bytes) -> None:
+    def accept(self, text: bytes) -> None:
         """Remember a checkpoint that may be signed. Raises `CheckpointRefusedError`, `OSError`."""
         wanted = read_checkpoint(text)
         path = self._path(wanted.log, "signed")
@@ -100,21 +100,21 @@ class CheckpointMemory:
         write_whole(self._path(log, "removed"), sequence.to_bytes(_NUMBER, "big"), 0o600)
 
     def _may_be_removed(self, wanted: Checkpoint) -> None:
-        approved = self.removed(wanted.log)
+        accepted = self.removed(wanted.log)
         if wanted.removed is None:
-            if approved is not None:
+            if accepted is not None:
                 raise CheckpointRefusedError(
                     f"checkpoint {wanted.number} does not state how many records are removed"
                 )
             return
-        if approved is None and wanted.number > 1:
+        if accepted is None and wanted.number > 1:
             self.remember_removed(wanted.log, wanted.removed)
-        elif wanted.removed > (approved or 0):
+        elif wanted.removed > (accepted or 0):
             raise CheckpointRefusedError(
                 f"checkpoint {wanted.number} states that records up to {wanted.removed} are removed; only removal"
-                f" up to {approved or 0} was approved"
+                f" up to {accepted or 0} was approved"
             )
-        elif approved is None:
+        elif accepted is None:
             self.remember_removed(wanted.log, 0)
 
     def _note_time(self, wanted: Checkpoint, first: int) -> None:

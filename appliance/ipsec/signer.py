@@ -33,7 +33,7 @@ from appliance.ipsec.brought_authority import open_authority
 from appliance.ipsec.certificate_authority import CertificateAuthority
 from appliance.ipsec.key_files import SignerKeyError, require_private
 from appliance.ipsec.proof_of_possession import RequestRefusedError
-from appliance.ipsec.removals import RemovalApprover, RemovalRefusedError, RetentionLimits
+from appliance.ipsec.removals import RemovalJudge, RemovalRefusedError, RetentionLimits
 from appliance.ipsec.signed_checkpoints import CheckpointMemory, CheckpointRefusedError, newest_signing
 from appliance.signing.signed_logs import sync_index
 
@@ -104,7 +104,7 @@ class Signer:
         clock = AgeClock(directory / "age", lambda: newest_signing(directory))
         sync_index(directory)
         self._signed = CheckpointMemory(directory, clock)
-        self._removals = RemovalApprover(self._signed, kept, clock, clock.dated)
+        self._removals = RemovalJudge(self._signed, kept, clock, clock.dated)
         self._key = key
         self._public_key = key.public_key().public_bytes_raw()
 
@@ -123,7 +123,7 @@ class Signer:
             case messages.SignatureWanted(number, text):
                 return self._sign(number, text)
             case messages.RemovalWanted(number, checkpoint, newest):
-                return self._approve_removal(number, checkpoint, newest)
+                return self._accept_removal(number, checkpoint, newest)
             case messages.AuthorityRequest(number):
                 return messages.AuthorityStated(number, self._authority.certificate, self._trouble)
             case messages.CertificateWanted():
@@ -136,19 +136,19 @@ class Signer:
 
     def _sign(self, number: int, text: bytes) -> messages.Message:
         try:
-            self._signed.approve(text)
+            self._signed.accept(text)
             others = tuple(self._signed.others(text))
         except (CheckpointRefusedError, OSError, ValueError) as error:
             return messages.SignatureRefused(number, str(error))
         return messages.SignatureMade(number, self._key.sign(text), self._public_key, others)
 
-    def _approve_removal(self, number: int, checkpoint: bytes, newest: bytes) -> messages.Message:
+    def _accept_removal(self, number: int, checkpoint: bytes, newest: bytes) -> messages.Message:
         try:
-            text = self._removals.approve(checkpoint, newest)
+            text = self._removals.accept(checkpoint, newest)
         except (RemovalRefusedError, CheckpointRefusedError, OSError) as error:
             early = isinstance(error, RemovalRefusedError) and error.early
             return messages.RemovalRefused(number, str(error), early)
-        return messages.RemovalApproved(number, text, self._key.sign(text), self._public_key)
+        return messages.RemovalSigned(number, text, self._key.sign(text), self._public_key)
 
     def _issue(self, wanted: messages.CertificateWanted) -> messages.Message:
         try:

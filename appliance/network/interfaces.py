@@ -232,8 +232,7 @@ def source_address_for(namespace: Namespace, peer: str) -> str:
 
 
 def _netlink(namespace: Namespace, what: str, work: Callable[[Any], T]) -> T:
-    from pyroute2 import IPRoute  # noqa: PLC0415  a hundred modules, only needed to change a network
-    from pyroute2.netlink.exceptions import NetlinkError  # noqa: PLC0415  likewise
+    from pyroute2 import IPRoute, NetlinkError  # noqa: PLC0415  a hundred modules, only to change a network
 
     def inside() -> T:
         with IPRoute() as route:

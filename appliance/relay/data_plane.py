@@ -272,7 +272,7 @@ class DataPlane:
 
     def _attach_monitors(self, relayed: RelayedTopic) -> None:
         interceptor, topic = self.interceptor, relayed.topic
-        wanted, guarded = interceptor.wants(topic), interceptor.is_guarded(topic)
+        wanted, guarded = interceptor.wants(topic), interceptor.has_stoppers(topic)
         if interceptor.intercepts(topic):
             pipeline = TopicPipeline(interceptor, relayed.point)
             relayed.monitor(pipeline.through, wanted=wanted, call=pipeline.module_call, guarded=guarded)
@@ -327,7 +327,7 @@ class DataPlane:
         publisher = self._own.get(topic)
         if publisher is not None:
             publisher.publish(data)
-        if self.interceptor.is_guarded(topic):
+        if self.interceptor.has_stoppers(topic):
             commands, stop = topic, data if self.interceptor.is_stop(topic, data) else None
         elif topic.endswith("/cancel"):  # no message stops an action, but a goal must not be repeated
             commands, stop = topic.removesuffix("cancel") + "goal", None

@@ -505,7 +505,7 @@ class MonitorSet:
         monitor.hold(why)
         self._agenda.schedule()
 
-    def guards(self, topic: str) -> list[str]:
+    def stoppers(self, topic: str) -> list[str]:
         return [monitor.name for monitor in self._monitors if monitor.enabled and topic in monitor.safes]
 
     def is_safe(self, topic: str, data: bytes) -> bool:

@@ -5,12 +5,15 @@ Control characters of untrusted strings are escaped, and nothing is read as mark
 
 import inspect
 import json
+import os
 import sys
 from collections.abc import Iterable
 from typing import Any
 
 import msgspec
 import typer
+
+_MODES = {"bold", "dim"}
 
 
 def printable(text: str) -> str:
@@ -25,14 +28,13 @@ def refused(findings: Iterable[object]) -> typer.Exit:
 
 
 def say(line: str, style: str = "") -> None:
+    """Write a line; `style` is a colour, `bold`, `dim`, or a colour with one of them."""
     shown = printable(line)
-    if sys.stdout.isatty():
-        from rich.console import Console  # noqa: PLC0415  `rosrv up` shall not load it
-        from rich.text import Text  # noqa: PLC0415  as above
-
-        Console(highlight=False, soft_wrap=True).print(Text(shown, style=style))
-    else:
-        sys.stdout.write(shown + "\n")
+    if style and sys.stdout.isatty() and "NO_COLOR" not in os.environ and os.environ.get("TERM") != "dumb":
+        words = set(style.split())
+        colours = words - _MODES
+        shown = typer.style(shown, fg=next(iter(colours), None), **dict.fromkeys(words & _MODES, True))
+    sys.stdout.write(shown + "\n")
 
 
 def say_json(fields: Any) -> None:

@@ -66,7 +66,7 @@ class AuditLog:
     """The log at `path`, open for writing; `drive` makes the driver that calls its turns, in one thread.
 
     `durability`: `strict` writes at once (group commit), `batched` after 20 ms; both fsync. The owner passes the
-    answers of `signer` to `signed` or `refused`, those of `removals` to `removal_approved` or `removal_refused`.
+    answers of `signer` to `signed` or `refused`, those of `removals` to `removal_signed` or `removal_refused`.
     `held_by` gets the ids of processes that lock the log.
     """
 
@@ -188,10 +188,10 @@ class AuditLog:
     def refused(self, number: int, reason: str) -> None:
         self._put(partial(self.housekeeping.refused, number, reason))
 
-    def removal_approved(self, number: int, text: bytes, signature: bytes, public_key: bytes) -> None:
+    def removal_signed(self, number: int, text: bytes, signature: bytes, public_key: bytes) -> None:
         """Remove records, if the signer's signature of exactly that removal is valid."""
-        approved = self.housekeeping.remover.approved
-        self._soon(lambda writer: approved(writer, number, text, signature, public_key))
+        signed = self.housekeeping.remover.signed
+        self._soon(lambda writer: signed(writer, number, text, signature, public_key))
 
     def removal_refused(self, number: int, reason: str, *, early: bool = False) -> None:
         """Request a removal again later; `early`: the records are too young for the signer."""

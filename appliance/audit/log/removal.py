@@ -26,13 +26,13 @@ class _Wanted(NamedTuple):
 
 
 class Remover:
-    """Applies a log's retention; `approve` requests a signature, and `now` returns the time of the turn."""
+    """Applies a log's retention; `sign` requests a signature, and `now` returns the time of the turn."""
 
     def __init__(
         self,
         retention: Retention,
         signatures: Signatures,
-        approve: RemovalSigner | None,
+        sign: RemovalSigner | None,
         *,
         clock: Callable[[], int],
         now: Callable[[], float],
@@ -40,7 +40,7 @@ class Remover:
     ) -> None:
         self._retention = retention
         self._signatures = signatures
-        self._approve = approve
+        self._sign = sign
         self._clock = clock
         self._now = now
         self._make = make
@@ -58,17 +58,17 @@ class Remover:
             return
         if not self._signatures.has_signer:
             self._remove(writer, wanted, {})
-        elif self._approve is None:
+        elif self._sign is None:
             self.unremoved = "old records are not removed: no process signs their removal"
         elif (checkpoint := writer.checkpoint_text(wanted.gone.last_checkpoint)) is not None:
             self._wanted, self._asked_until = wanted, now + _ANSWER_SECONDS
-            self._approve(wanted.gone.last_checkpoint, checkpoint, writer.newest_signed())
+            self._sign(wanted.gone.last_checkpoint, checkpoint, writer.newest_signed())
 
     def ask_again(self) -> None:
         """Forget earlier requests, because a new signer may not have got them."""
         self._wanted, self._asked_until, self.due = None, 0.0, 0.0
 
-    def approved(self, writer: ChainWriter, number: int, text: bytes, signature: bytes, key: bytes) -> None:
+    def signed(self, writer: ChainWriter, number: int, text: bytes, signature: bytes, key: bytes) -> None:
         wanted, self._wanted = self._wanted, None
         if wanted is None or wanted.gone.last_checkpoint != number:
             return

@@ -13,7 +13,7 @@ from typing import Annotated
 import msgspec
 
 from appliance.audit.log.columns import StoredColumns, content_hash
-from appliance.audit.log.log_database import COLUMNS, LogUnreadableError, reading
+from appliance.audit.log.log_database import LogUnreadableError, chained_rows, reading, record_hash
 from appliance.audit.log.record_format import LogEntry, as_json
 from appliance.audit.proof.checkpoints import last_removal
 from appliance.audit.proof.copies import SignedCheckpoint, select_signed
@@ -76,7 +76,7 @@ class ChainReader:
 
     def place(self, sequence: int, following: int) -> ChainProof | None:
         """Return the proof up to the record `following` (0: none); None for a removed record."""
-        digest = self._hash(sequence)
+        digest = record_hash(self._connection, sequence)
         if digest is None:
             return None
         checkpoint = self._checkpoint(sequence)
@@ -94,17 +94,13 @@ class ChainReader:
     def _previous(self, sequence: int) -> str:
         if self._before[0] == sequence - 1:
             return self._before[1]
-        digest = self._hash(sequence - 1)
+        digest = record_hash(self._connection, sequence - 1)
         if digest is not None:
             return digest.hex()
         if sequence == 1:
             return genesis(str(self._log)).hex()
         removed = last_removal(self._connection)
         return NO_CHECKPOINT if removed is None else removed.last_hash
-
-    def _hash(self, sequence: int) -> bytes | None:
-        rows = self._connection.execute("SELECT hash FROM record WHERE sequence = ?", (sequence,))
-        return next((digest for (digest,) in rows), None)
 
     def _checkpoint(self, sequence: int) -> SignedCheckpoint | None:
         known = self._sealing
@@ -116,12 +112,8 @@ class ChainReader:
         return self._sealing
 
     def _contents(self, digest: bytes, after: int, upto: int) -> list[str] | None:
-        rows = self._connection.execute(
-            f"SELECT {COLUMNS}, hash FROM record WHERE sequence > ? AND sequence <= ? ORDER BY sequence",  # noqa: S608  fixed names
-            (after, upto),
-        )
         contents = []
-        for row in rows:
+        for row in chained_rows(self._connection, after, upto):
             content = content_hash(row[:-1])
             digest = link(digest, content)
             if digest != row[-1]:

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import msgspec
 
+from appliance.audit.log.log_database import last_detail
 from appliance.audit.log.retention import RemovedRange
 from appliance.audit.log.signatures import ASKED_AT_ONCE, signature_is_valid
 from appliance.audit.proof.chain_findings import FindingKind, LogFinding
@@ -32,9 +33,8 @@ class StoredCheckpoint(NamedTuple):
 
 def last_removal(connection: sqlite3.Connection) -> RemovedRange | None:
     """Return the last removal on record, or None. Raises the errors of `msgspec` for a damaged record."""
-    query = "SELECT detail FROM record WHERE event = 'records removed' ORDER BY sequence DESC LIMIT 1"
-    row = connection.execute(query).fetchone()
-    return None if row is None else msgspec.json.decode(row[0], type=RemovedRange)
+    detail = last_detail(connection, "records removed")
+    return None if detail is None else msgspec.json.decode(detail, type=RemovedRange)
 
 
 class CheckpointVerifier:

@@ -54,9 +54,9 @@ def read_signer_memory(directory: Path, log: str) -> SignerMemory | None:
     beside = others(logs, log)
     if signed is None:
         return SignerMemory(others=beside, lost=has_run and (own is None or own.lacks_memory))
-    approved = None if removed is None else int.from_bytes(removed, "big")
+    removed_to = None if removed is None else int.from_bytes(removed, "big")
     first = int.from_bytes(signed[:HEADER_BYTES], "big")
-    return SignerMemory(first, signed[HEADER_BYTES:], approved, beside, _is_cut(own))
+    return SignerMemory(first, signed[HEADER_BYTES:], removed_to, beside, _is_cut(own))
 
 
 def _is_cut(own: RememberedLog | None) -> bool:

@@ -42,7 +42,7 @@ class RemovalWanted(Message):
     newest: bytes
 
 
-class RemovalApproved(Message):
+class RemovalSigned(Message):
     """The settings require the removal; the signature is over `text`."""
 
     number: int
@@ -129,7 +129,7 @@ class RevocationsMade(Message):
 
 
 SignerLink = (
-    SignatureWanted | SignatureMade | SignatureRefused | RemovalWanted | RemovalApproved | RemovalRefused
+    SignatureWanted | SignatureMade | SignatureRefused | RemovalWanted | RemovalSigned | RemovalRefused
     | AuthorityRequest | AuthorityStated | CertificateWanted | CertificateMade | CertificateRefused | RevocationsRequest
     | RevocationsMade
 )  # fmt: skip

@@ -74,8 +74,8 @@ class SignerRequests:
                 self.signed.set()
             case messages.SignatureRefused(number, reason):
                 self._audit().refused(number, reason)
-            case messages.RemovalApproved(number, text, signature, public_key):
-                self._audit().removal_approved(number, text, signature, public_key)
+            case messages.RemovalSigned(number, text, signature, public_key):
+                self._audit().removal_signed(number, text, signature, public_key)
             case messages.RemovalRefused(number, reason, early):
                 self._audit().removal_refused(number, reason, early=early)
             case (

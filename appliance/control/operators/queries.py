@@ -23,6 +23,7 @@ from appliance.channel.answers.status import (
     Status,
     SwitchedOff,
 )
+from appliance.configuration.inventory import inventory as product_inventory
 from appliance.control.assembly.assembly import Parts
 from appliance.control.assembly.hosts import SiteHosts
 from appliance.control.assembly.monitor_states import monitors_of, monitors_status
@@ -63,9 +64,7 @@ class Queries:
         return self.present()
 
     async def inventory(self, _request: admin.InventoryWanted) -> Inventory:
-        from appliance.configuration.inventory import inventory  # noqa: PLC0415  only for this query
-
-        found = await asyncio.to_thread(inventory)
+        found = await asyncio.to_thread(product_inventory)
         around = self.surroundings
         sandbox = {process.role: process.sandbox for process in around.processes if process.sandbox}
         used = InUse(

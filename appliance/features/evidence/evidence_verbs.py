@@ -46,7 +46,9 @@ def export_evidence(
         typer.Argument(
             metavar="[RECORDING]",
             help="Export the messages and the time of this recording",
-            autocompletion=completion.recordings,
+            autocompletion=completion.names_of_feature(
+                "recordings", lambda body: [row.id for row in body.recordings]
+            ),
         ),
     ] = None,
     *,

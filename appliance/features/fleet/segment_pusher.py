@@ -22,7 +22,7 @@ from typing import Annotated
 import msgspec
 import structlog
 
-from appliance.audit.log.log_database import LogUnreadableError, reading
+from appliance.audit.log.log_database import LogUnreadableError, first_time, reading, record_extent
 from appliance.audit.proof.copies import signed_checkpoints
 from appliance.base import clock
 from appliance.base.atomic_files import write_whole
@@ -293,8 +293,8 @@ def _newest_signed(log: Path) -> tuple[str, int]:
 def _removed(log: Path) -> int:
     """Return the sequence before the first record."""
     with reading(log, advice="") as connection:
-        (first,) = connection.execute("SELECT coalesce(min(sequence), 1) FROM record").fetchone()
-    return int(first) - 1
+        first, _last = record_extent(connection)
+    return first - 1
 
 
 def _sequence_of(log: Path, number: int, hashes: list[str]) -> int | None:
@@ -314,6 +314,4 @@ def _waiting(log: Path, sequence: int) -> tuple[int, int]:
     with reading(log, advice="") as connection:
         query = "SELECT coalesce(max(sequence), 0) FROM checkpoint WHERE signature IS NOT NULL"
         (sealed,) = connection.execute(query).fetchone()
-        query = "SELECT time FROM record WHERE sequence > ? AND sequence <= ? ORDER BY sequence LIMIT 1"
-        row = connection.execute(query, (sequence, sealed)).fetchone()
-    return int(sealed), 0 if row is None else int(row[0])
+        return int(sealed), first_time(connection, sequence, sealed)

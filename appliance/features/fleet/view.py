@@ -1,7 +1,7 @@
 """Show the push and the bundles in the status, the alarms and the metrics."""
 
 from collections.abc import Iterator
-from typing import Annotated, Any
+from typing import Annotated
 
 import msgspec
 
@@ -9,7 +9,7 @@ from appliance.base import clock
 from appliance.base.metric import counter, gauge
 from appliance.base.timestamps import age
 from appliance.channel.answers.field_docs import Moment, doc
-from appliance.features.view import FeatureView, Samples, StateView, Trouble
+from appliance.features.view import FeatureView, Pieces, Samples, StateView, Trouble
 from appliance.forwarding.forwarding_state import ForwardingState, samples_of
 
 
@@ -87,18 +87,16 @@ def _bundle_samples(bundles: BundlesState) -> dict[str, Samples]:
     }
 
 
-def _bundle_line(bundles: BundlesState) -> tuple[str, Any]:
-    from rich.text import Text  # noqa: PLC0415  only the command needs it
-
-    line = Text(f"{bundles.in_force or 'none'}{' in force' if bundles.in_force else ''}")
+def _bundle_line(bundles: BundlesState) -> tuple[str, Pieces]:
+    line = [(f"{bundles.in_force or 'none'}{' in force' if bundles.in_force else ''}", "")]
     if bundles.changed:
-        line.append("; changed on this robot since", style="yellow")
+        line.append(("; changed on this robot since", "yellow"))
     if bundles.trying:
-        line.append(f"; {bundles.trying} waits for its confirmation")
+        line.append((f"; {bundles.trying} waits for its confirmation", ""))
     if bundles.refused:
-        line.append(f"; {bundles.refused} REFUSED", style="yellow")
+        line.append((f"; {bundles.refused} REFUSED", "yellow"))
     checked = "not verified yet" if bundles.checked is None else f"verified {age(bundles.checked)} ago"
-    line.append(f"; the collector's metadata {'were ' if bundles.checked else ''}{checked}")
+    line.append((f"; the collector's metadata {'were ' if bundles.checked else ''}{checked}", ""))
     return "bundle", line
 
 

@@ -22,7 +22,7 @@ FEATURE = Tool(
                 "enable": Verb(f"{_LIVE}:enable"),
                 "promote": Verb(f"{_LIVE}:promote"),
                 "disable": Verb(f"{_LIVE}:disable"),
-                "load": Verb(f"{_LIVE}:load"),
+                "load": Verb(f"{_PLACE}load_verb:load"),
                 "remove": Verb(f"{_LIVE}:remove"),
                 "reload": Verb(f"{_LIVE}:reload"),
                 "revisions": Verb(

@@ -1,6 +1,5 @@
-"""`rosrv monitor list|enable|promote|disable|load|remove|reload|resume`: monitors of the running appliance."""
+"""`rosrv monitor list|enable|promote|disable|remove|reload|resume`: monitors of the running appliance."""
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -8,7 +7,6 @@ from rich.table import Column
 
 from appliance.api.front.moments import in_full
 from appliance.channel import admin
-from appliance.channel.admin import AdminAnswer
 from appliance.channel.answers.monitor_answers import MonitorState, Switched
 from appliance.channel.messages import GivenValue
 from appliance.cli import completion
@@ -31,15 +29,15 @@ _Names = Annotated[
 ]
 
 _SHADOW = "shadow mode"
-_Shadow = Annotated[
+Shadow = Annotated[
     bool,
     typer.Option("--shadow", help="Shadow mode: only record what the monitors would have done"),
 ]
-_Hold = Annotated[
+Hold = Annotated[
     bool,
     typer.Option("--hold", help="Load even if monitors then hold topics with traffic until they are resumed"),
 ]
-_Force = Annotated[
+Force = Annotated[
     bool, typer.Option("--force", help="Load even if this cuts a topic whose publisher has another type")
 ]
 
@@ -106,7 +104,7 @@ def enable(
 
 @speaks
 def promote(
-    appliance: Appliance, names: _Names, *, force: _Force = False, confirm_within: ConfirmWithin = None
+    appliance: Appliance, names: _Names, *, force: Force = False, confirm_within: ConfirmWithin = None
 ) -> None:
     """Enable monitors that are in shadow mode. They keep their state.
 
@@ -143,62 +141,6 @@ def disable(
 
 
 @speaks
-def load(
-    appliance: Appliance,
-    files: Annotated[
-        list[Path],
-        typer.Argument(readable=False, metavar="FILE…", help="Specification files (.rv)", show_default=False),
-    ],
-    msg: Annotated[
-        list[Path] | None,
-        typer.Option("--msg", metavar="DIR", help="Folder of message definitions (repeatable)"),
-    ] = None,
-    *,
-    note: Annotated[str, typer.Option(help="Reason, kept with the revision")] = "",
-    confirm_within: ConfirmWithin = None,
-    shadow: _Shadow = False,
-    force: _Force = False,
-    hold: _Hold = False,
-    given: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set", metavar="MONITOR.NAME=VALUE", help="Constant or topic given to a monitor (repeatable)"
-        ),
-    ] = None,
-) -> None:
-    """Load specifications while the robot runs; files of the same name are replaced.
-
-    They are compiled and compared with the robot's topics first. After an error nothing changes and the exit status is
-    1. A monitor whose text changes loses its state; if it then holds topics with traffic, the load needs --hold. With
-    --shadow, monitors only record what they would have done. Message definitions come from `msg/` beside the files and
-    from --msg.
-
-    Example: rosrv monitor load safe_zone.rv --shadow
-    """
-    from appliance.features.monitor_tools.sources_to_send import read_to_send  # noqa: PLC0415  slow to import
-    from rosmop.form.findings import SpecificationError  # noqa: PLC0415  as above
-
-    try:
-        sent = read_to_send(files, msg or [])
-    except SpecificationError as error:
-        found = [printable(str(finding)) for finding in error.findings]
-        appliance.body_or_exit(AdminAnswer(False, error="nothing was sent", findings=found))
-        return
-    order = admin.MonitorLoad(
-        sent.files,
-        sent.definitions,
-        note,
-        confirm_within=seconds_within(confirm_within, "monitor"),
-        signatures=sent.signatures,
-        force=force,
-        shadow=shadow,
-        hold=hold,
-        given=_given_to_monitors(given or []),
-    )
-    say_replaced(appliance.answer_or_exit(order))
-
-
-@speaks
 def remove(appliance: Appliance, names: _Names, confirm_within: ConfirmWithin = None) -> None:
     """Remove specifications, by the names of their monitors or files.
 
@@ -216,9 +158,9 @@ def reload(
     ] = False,
     confirm_within: ConfirmWithin = None,
     *,
-    shadow: _Shadow = False,
-    force: _Force = False,
-    hold: _Hold = False,
+    shadow: Shadow = False,
+    force: Force = False,
+    hold: Hold = False,
 ) -> None:
     """Load the folder of specifications again. Specifications that are not in it stay loaded and are listed.
 
@@ -302,7 +244,7 @@ def _assigned(text: str, form: str) -> tuple[str, str]:
     return name, value
 
 
-def _given_to_monitors(given: list[str]) -> dict[str, dict[str, GivenValue]]:
+def given_to_monitors(given: list[str]) -> dict[str, dict[str, GivenValue]]:
     found: dict[str, dict[str, GivenValue]] = {}
     for text in given:
         path, value = _assigned(text, "--set MONITOR.NAME=VALUE")

@@ -9,6 +9,7 @@ import typer
 
 from appliance.audit.log.ids import ID_OR_SEQUENCE
 from appliance.audit.log.record_format import LogEntry
+from appliance.audit.search.search import recorded_in_full
 from appliance.base.counted import counted
 from appliance.base.input_files import read_given
 from appliance.channel.admin import PolicyLoad, PolicyWanted
@@ -19,6 +20,9 @@ from appliance.cli.commit_confirm import ConfirmWithin, seconds_within
 from appliance.cli.connection.admin_client import AdminSocket, NotRunningError, RestProblemError
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.output import say_json, usage_error, write_told
+from appliance.features.policy_tools.denials import asks_policy
+from appliance.features.policy_tools.explanations import explained, granted
+from appliance.features.policy_tools.grant import UngrantableError
 from appliance.features.policy_tools.live_verbs import say_loaded
 from rosmop.tool.terminal import printable, say
 
@@ -45,9 +49,6 @@ def why(appliance: Appliance, record: RecordArgument) -> None:
 def _explained(appliance: Appliance, record: str) -> Why:
     if appliance.place is not None:
         return msgspec.convert(_over_rest(appliance, record, "why"), Why)
-    from appliance.audit.search.search import recorded_in_full  # noqa: PLC0415  as above
-    from appliance.features.policy_tools.denials import asks_policy  # noqa: PLC0415  not for every verb
-    from appliance.features.policy_tools.explanations import explained  # noqa: PLC0415  as above
 
     with Errors():
         entry = _entry(appliance, record)
@@ -141,8 +142,6 @@ def _show(found: Granted, record: str) -> None:
 def _granted(appliance: Appliance, record: str, *, tool: bool) -> Granted:
     if appliance.place is not None:
         return msgspec.convert(_over_rest(appliance, record, "grant", tool=tool), Granted)
-    from appliance.features.policy_tools.explanations import granted  # noqa: PLC0415  not for every verb
-    from appliance.features.policy_tools.grant import UngrantableError  # noqa: PLC0415  as above
 
     with Errors():
         found = _entry(appliance, record).record

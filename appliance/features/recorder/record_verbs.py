@@ -45,7 +45,9 @@ _Id = Annotated[
         metavar="ID",
         help="As in `rosrv record list`",
         show_default=False,
-        autocompletion=completion.recordings,
+        autocompletion=completion.names_of_feature(
+            "recordings", lambda body: [row.id for row in body.recordings]
+        ),
     ),
 ]
 _SECOND = 1_000_000_000

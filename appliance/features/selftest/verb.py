@@ -18,6 +18,9 @@ from appliance.cli.connection.target import Appliance, speaks_with
 from appliance.cli.output import say_json
 from appliance.configuration.config_sources import ConfigError, resolve
 from appliance.configuration.settings import Settings, load_resolved
+from appliance.features.selftest.file_checks import files
+from appliance.features.selftest.live_checks import running
+from appliance.features.selftest.machine_checks import machine
 from appliance.features.selftest.selftest_findings import SelftestFinding, fail
 from rosmop.tool.tables import say_table
 from rosmop.tool.terminal import printable
@@ -67,8 +70,6 @@ def selftest(
 
 
 def _all(appliance: Appliance, config: Path | None) -> Iterator[SelftestFinding]:
-    from appliance.features.selftest.live_checks import running  # noqa: PLC0415  slow to import
-
     if appliance.place is not None:
         yield from running(appliance)
         return
@@ -78,9 +79,6 @@ def _all(appliance: Appliance, config: Path | None) -> Iterator[SelftestFinding]
 
 
 def _here(appliance: Appliance, config: Path | None) -> Iterator[SelftestFinding]:
-    from appliance.features.selftest.file_checks import files  # noqa: PLC0415  slow to import
-    from appliance.features.selftest.machine_checks import machine  # noqa: PLC0415  slow to import
-
     try:
         settings = _settings(appliance, config)
     except ConfigError as error:

@@ -1,28 +1,25 @@
-"""The views of two appliances. Each method imports its view, which only one process or command needs."""
+"""The views of two appliances. A method imports what only one command needs."""
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from appliance.features.standby.requests import StandbyWanted
+from appliance.features.standby.samples import samples_of
 from appliance.features.standby.standby_answers import StandbyState
 from appliance.features.view import PairView, Samples
 
 if TYPE_CHECKING:
     from appliance.audit.proof.chain_findings import Verification
-    from appliance.features.standby.requests import StandbyWanted
 
 
 class StandbyPairView(PairView):
     """The views of an appliance that can be one of two."""
 
-    def request(self) -> "StandbyWanted":
-        from appliance.features.standby.requests import StandbyWanted  # noqa: PLC0415  it imports the views
-
+    def request(self) -> StandbyWanted:
         return StandbyWanted()
 
     def samples(self, state: StandbyState) -> Mapping[str, Samples]:
-        from appliance.features.standby.samples import samples_of  # noqa: PLC0415  only the api needs it
-
         return samples_of(state)
 
     def status(self, state: StandbyState) -> Any:
@@ -39,15 +36,6 @@ class StandbyPairView(PairView):
         verify: "Callable[[], Verification]",
     ) -> tuple[Any, Callable[[Any], None]]:
         from appliance.features.standby import takeover_table  # noqa: PLC0415  only one command needs it
-        from appliance.features.standby.takeover_verification import (  # noqa: PLC0415  as above
-            VerifiedLog,
-            verify_alone,
-            verify_takeovers,
-        )
 
-        first = VerifiedLog(own, verified)
-        absent = takeover_table.absent(other, state)
-        pair = (
-            verify_alone(first, absent) if absent else verify_takeovers(first, VerifiedLog(other, verify()))
-        )
+        pair = takeover_table.verified_pair(own, verified, other, state, verify)
         return pair, takeover_table.print_pair

@@ -1,15 +1,14 @@
 """Write the state of two appliances in one line."""
 
-from rich.text import Text
-
 from appliance.features.standby.standby_answers import OtherAppliance, StandbyState, WitnessSeen
 from appliance.features.standby.standby_summary import is_silent, lag_of, lasting
+from appliance.features.view import Pieces
 
 
-def standby_line(state: StandbyState) -> Text:
+def standby_line(state: StandbyState) -> tuple[str, Pieces]:
     other, witness = lag_in_words(state.other), answer_in_words(state.witness)
     line = f"{state.name} is {state.role}; {state.other.name}: {other}; witness: {witness}"
-    return Text(line, style="yellow" if state.troubles else "")
+    return "standby", [(line, "yellow" if state.troubles else "")]
 
 
 def lag_in_words(other: OtherAppliance) -> str:

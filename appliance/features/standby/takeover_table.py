@@ -1,16 +1,30 @@
 """Print the verification of two logs and of the takeovers between them."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from appliance.audit.log.record_format import printable, rfc3339
+from appliance.audit.proof.chain_findings import Verification
 from appliance.cli.audit.audit_errors import fail
 from appliance.cli.audit.verification_text import print_verification, write
 from appliance.features.standby.membership import MembershipError, load_membership, path_of
-from appliance.features.standby.takeover_verification import PairVerification, TakeoverProof
+from appliance.features.standby.takeover_verification import (
+    PairVerification,
+    TakeoverProof,
+    VerifiedLog,
+    verify_alone,
+    verify_takeovers,
+)
 
 
-def absent(log: Path, state: Path) -> str:
+def verified_pair(
+    own: Path, verified: Verification, other: Path, state: Path, verify: Callable[[], Verification]
+) -> PairVerification:
+    first, missing = VerifiedLog(own, verified), _absent(other, state)
+    return verify_alone(first, missing) if missing else verify_takeovers(first, VerifiedLog(other, verify()))
+
+
+def _absent(log: Path, state: Path) -> str:
     if log.exists():
         return ""
     try:

@@ -1,10 +1,9 @@
 """Show two appliances in the status, the alarms and the metrics."""
 
-from typing import Any
-
 from appliance.base.metric import counter, gauge
 from appliance.features.standby.samples import samples_of
 from appliance.features.standby.standby_answers import StandbyState
+from appliance.features.standby.standby_line import standby_line
 from appliance.features.standby.standby_summary import PATIENCE_SECONDS, follower_troubles, standby_troubles
 from appliance.features.view import FeatureView, StateView
 
@@ -48,12 +47,6 @@ _METRICS = (
 )
 
 
-def _line(state: StandbyState) -> tuple[str, Any]:
-    from appliance.features.standby.standby_line import standby_line  # noqa: PLC0415  only the command needs it
-
-    return "standby", standby_line(state)
-
-
 STANDBY_VIEW = FeatureView(
     "standby",
     (
@@ -65,7 +58,7 @@ STANDBY_VIEW = FeatureView(
             alarms=lambda state: (*standby_troubles(state, PATIENCE_SECONDS), *follower_troubles(state)),
             metrics=_METRICS,
             samples=samples_of,
-            line=_line,
+            line=standby_line,
         ),
     ),
     pair="appliance.features.standby.pair_view:StandbyPairView",

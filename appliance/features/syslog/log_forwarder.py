@@ -13,7 +13,7 @@ from typing import Any, Literal
 import msgspec
 import structlog
 
-from appliance.audit.log.log_database import LogUnreadableError, reading
+from appliance.audit.log.log_database import LogUnreadableError, reading, record_extent
 from appliance.audit.log.record import AuditRecord, Severity
 from appliance.audit.log.record_format import LogEntry
 from appliance.audit.proof.copies import signed_checkpoints
@@ -167,10 +167,8 @@ class LogForwarder:
 
 def _extent(path: Path) -> tuple[int, int, str]:
     with reading(path, advice="") as connection:
-        query = "SELECT coalesce(min(sequence), 1), coalesce(max(sequence), 0) FROM record"
-        first, last = connection.execute(query).fetchone()
         (log_id,) = connection.execute("SELECT id FROM log").fetchone()
-    return int(first), int(last), str(log_id)
+        return *record_extent(connection), str(log_id)
 
 
 def _in_log(path: Path, position: ForwardingPosition) -> ForwardingPosition:
@@ -186,7 +184,7 @@ def _in_log(path: Path, position: ForwardingPosition) -> ForwardingPosition:
             return None if row is None else row[0]
 
         found = ask("SELECT id FROM record WHERE sequence = ?", position.sequence)
-        head = ask("SELECT coalesce(max(sequence), 0) FROM record")
+        _first, head = record_extent(connection)
         is_there = not position.record or found is None or found == position.record
         if is_there and position.sequence <= head:
             return position

@@ -210,7 +210,7 @@ class Interceptor:
         if isinstance(message, MonitorSwitched):
             self.switch(message.name, message.enabled)
         elif isinstance(message, StopWanted):
-            self._reporter.send(StopBegun(message.number, self._guards(message.topic, begin=message.begin)))
+            self._reporter.send(StopBegun(message.number, self._stoppers(message.topic, begin=message.begin)))
         else:
             self._given[message.name] = dict(message.values)
             self._apply()
@@ -229,8 +229,8 @@ class Interceptor:
         self.keep_all()
         return self.monitors.topics_of(held)
 
-    def is_guarded(self, topic: str) -> bool:
-        return self.monitors is not None and bool(self.monitors.guards(topic))
+    def has_stoppers(self, topic: str) -> bool:
+        return self.monitors is not None and bool(self.monitors.stoppers(topic))
 
     def is_stop(self, topic: str, data: bytes) -> bool:
         return self.monitors is not None and self.monitors.is_safe(topic, data)
@@ -238,10 +238,10 @@ class Interceptor:
     def refuse_replay(self, point: ObservationPoint, body: memoryview) -> None:
         self.observer.dropped(dropped(body, self.now(), _REPLAYED), point, body)
 
-    def _guards(self, topic: str, *, begin: bool) -> list[str]:
+    def _stoppers(self, topic: str, *, begin: bool) -> list[str]:
         if self.monitors is None:
             return []
-        names = self.monitors.guards(topic)
+        names = self.monitors.stoppers(topic)
         if begin and names:
             self.invalidate_prepared()
             self.monitors.stop(topic)

@@ -8,7 +8,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from appliance.audit.log.log import AuditLog
 from appliance.base import clock
-from appliance.ipsec.removals import RemovalApprover, RemovalRefusedError, RetentionLimits
+from appliance.ipsec.removals import RemovalJudge, RemovalRefusedError, RetentionLimits
 from appliance.ipsec.signed_checkpoints import CheckpointMemory, CheckpointRefusedError
 from tests.support.engines import ByHand
 from tests.support.virtual_clock import VirtualClock
@@ -30,10 +30,10 @@ class Notary:
 
     def sign(self, text: bytes) -> None:
         with contextlib.suppress(CheckpointRefusedError):
-            self._signed.approve(text)
+            self._signed.accept(text)
 
-    def approve(self, checkpoint: bytes, newest: bytes) -> bytes:
-        return RemovalApprover(self._signed, self.kept, clock=self._now).approve(checkpoint, newest)
+    def accept(self, checkpoint: bytes, newest: bytes) -> bytes:
+        return RemovalJudge(self._signed, self.kept, clock=self._now).accept(checkpoint, newest)
 
 
 @pytest.fixture(autouse=True)
@@ -69,20 +69,20 @@ def make_log(path: Path, key: Ed25519PrivateKey, notary: Notary) -> Iterator[Mak
             notary.sign(text)
             logs[-1].signed(number, key.sign(text), public)
 
-    def approve(number: int, checkpoint: bytes, newest: bytes) -> None:
+    def accept(number: int, checkpoint: bytes, newest: bytes) -> None:
         if not logs:
             return
         try:
-            text = notary.approve(checkpoint, newest)
+            text = notary.accept(checkpoint, newest)
         except RemovalRefusedError as error:
             logs[-1].removal_refused(number, str(error), early=error.early)
             notary.refused(error.early)
         else:
-            logs[-1].removal_approved(number, text, key.sign(text), public)
+            logs[-1].removal_signed(number, text, key.sign(text), public)
 
     def make(**settings: Any) -> AuditLog:
         settings.setdefault("signer", sign)
-        settings.setdefault("removals", approve)
+        settings.setdefault("removals", accept)
         logs.clear()
         if "retention" in settings:
             notary.kept = RetentionLimits(settings["retention"].days, settings["retention"].size)

@@ -83,7 +83,7 @@ def made(folder: Path, seed: int) -> Site:
             log.record(decision(log, number, reason="é\x1b", **fields))
             assert settle(log) is None
             for checkpoint, text in asked:
-                signer.approve(text)
+                signer.accept(text)
                 log.signed(checkpoint, key.sign(text), key.public_key().public_bytes_raw())
             asked.clear()
 

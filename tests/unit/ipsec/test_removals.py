@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 
 from appliance.base.age_clock import AgeClock
-from appliance.ipsec.removals import LARGEST_RECORD, RemovalApprover, RemovalRefusedError, RetentionLimits
+from appliance.ipsec.removals import LARGEST_RECORD, RemovalJudge, RemovalRefusedError, RetentionLimits
 from appliance.ipsec.signed_checkpoints import CheckpointMemory, CheckpointRefusedError, read_checkpoint
 from tests.support.aging import DAY, HISTORIES, KEPT, ages_of
 
@@ -17,7 +17,7 @@ class Desk:
     def __init__(self, directory: Path, kept: RetentionLimits) -> None:
         self.now = 1000 * _DAY
         self.signed = CheckpointMemory(directory, clock=lambda: self.now)
-        self.removals = RemovalApprover(self.signed, kept, clock=lambda: self.now)
+        self.removals = RemovalJudge(self.signed, kept, clock=lambda: self.now)
         self.texts: list[bytes] = []
         for _ in range(10):
             self.sign(removed=0)
@@ -34,41 +34,41 @@ class Desk:
 
     def sign(self, *, removed: int | None) -> None:
         text = self.text(removed=removed)
-        self.signed.approve(text)
+        self.signed.accept(text)
         self.texts.append(text)
 
-    def approve(self, number: int) -> str:
-        return self.removals.approve(self.texts[number - 1], self.texts[-1]).decode()
+    def accept(self, number: int) -> str:
+        return self.removals.accept(self.texts[number - 1], self.texts[-1]).decode()
 
 
 def test_records_expire_by_the_signers_clock(tmp_path: Path) -> None:
     desk = Desk(tmp_path, RetentionLimits(days=5))
-    text = desk.approve(5)
+    text = desk.accept(5)
     assert text.startswith("rosrv audit removal 1\n")
     assert f"checkpoint 5\nsequence {5 * _STEP}\n" in text
     assert text.endswith("limit 5 days\n")
     with pytest.raises(RemovalRefusedError, match="not old enough") as refused:
-        desk.approve(7)
+        desk.accept(7)
     assert refused.value.early
 
 
 def test_nothing_goes_that_is_kept_for_ever(tmp_path: Path) -> None:
     desk = Desk(tmp_path, RetentionLimits())
     with pytest.raises(RemovalRefusedError, match="kept forever"):
-        desk.approve(1)
+        desk.accept(1)
 
 
 def test_a_removal_by_size_leaves_enough_records(tmp_path: Path) -> None:
     desk = Desk(tmp_path, RetentionLimits(size=3 * _STEP * LARGEST_RECORD))
-    assert desk.approve(7).endswith("bytes\n")
+    assert desk.accept(7).endswith("bytes\n")
     with pytest.raises(RemovalRefusedError, match="too few came after"):
-        desk.approve(8)
+        desk.accept(8)
 
 
 def test_an_unsigned_newest_checkpoint_is_ignored(tmp_path: Path) -> None:
     desk = Desk(tmp_path, RetentionLimits(size=3 * _STEP * LARGEST_RECORD))
     with pytest.raises(RemovalRefusedError, match="too few came after"):
-        desk.removals.approve(desk.texts[7], desk.text(removed=0, number=1000))
+        desk.removals.accept(desk.texts[7], desk.text(removed=0, number=1000))
 
 
 def test_only_signed_checkpoints_allow_a_removal(tmp_path: Path) -> None:
@@ -76,9 +76,9 @@ def test_only_signed_checkpoints_allow_a_removal(tmp_path: Path) -> None:
     forged = desk.texts[2].replace(b"b" * 64, b"c" * 64)
     for text in (forged, desk.text(removed=0), desk.texts[0].replace(LOG.encode(), b"d" * 32)):
         with pytest.raises(RemovalRefusedError, match="was not signed here"):
-            desk.removals.approve(text, desk.texts[-1])
+            desk.removals.accept(text, desk.texts[-1])
     with pytest.raises(CheckpointRefusedError, match="not an audit checkpoint"):
-        desk.removals.approve(b"", desk.texts[-1])
+        desk.removals.accept(b"", desk.texts[-1])
 
 
 def test_a_checkpoint_claims_only_approved_removals(tmp_path: Path) -> None:
@@ -87,7 +87,7 @@ def test_a_checkpoint_claims_only_approved_removals(tmp_path: Path) -> None:
         desk.sign(removed=_STEP)
     with pytest.raises(CheckpointRefusedError, match="does not state how many records are removed"):
         desk.sign(removed=None)
-    desk.approve(3)
+    desk.accept(3)
     with pytest.raises(CheckpointRefusedError, match="only removal up to 300 was approved"):
         desk.sign(removed=301)
     desk.sign(removed=0)
@@ -122,16 +122,16 @@ class SignedLog:
 
     def __init__(self, folder: Path, age: AgeClock) -> None:
         self._signed = CheckpointMemory(folder, age)
-        self._removals = RemovalApprover(self._signed, RetentionLimits(days=KEPT / DAY), age, age.dated)
+        self._removals = RemovalJudge(self._signed, RetentionLimits(days=KEPT / DAY), age, age.dated)
         head = f"rosrv audit checkpoint 1\nlog {LOG}\nnumber 1\nsequence 9\nhash {'b' * 64}\n"
         self._text = f"{head}time 1\nprevious {'0' * 64}\n".encode()
 
     def make(self) -> None:
-        self._signed.approve(self._text)
+        self._signed.accept(self._text)
 
     def is_due(self) -> bool:
         try:
-            self._removals.approve(self._text, self._text)
+            self._removals.accept(self._text, self._text)
         except RemovalRefusedError:
             return False
         return True

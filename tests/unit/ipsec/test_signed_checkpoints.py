@@ -24,7 +24,7 @@ def test_each_follows_the_one_before(tmp_path: Path) -> None:
     previous = _NONE
     for number in range(1, 10):
         text = checkpoint(number, previous)
-        CheckpointMemory(tmp_path, wall_ns).approve(text)
+        CheckpointMemory(tmp_path, wall_ns).accept(text)
         previous = digest(text)
 
 
@@ -33,7 +33,7 @@ def test_asked_again(tmp_path: Path) -> None:
     second = checkpoint(2, digest(first))
     signed = CheckpointMemory(tmp_path, wall_ns)
     for text in (first, second, first, second):
-        signed.approve(text)
+        signed.accept(text)
 
 
 @pytest.mark.parametrize(
@@ -56,28 +56,28 @@ def test_asked_again(tmp_path: Path) -> None:
 )
 def test_refused(tmp_path: Path, text: bytes, reason: str) -> None:
     signed = CheckpointMemory(tmp_path, wall_ns)
-    signed.approve(checkpoint(1))
+    signed.accept(checkpoint(1))
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
     with pytest.raises(CheckpointRefusedError, match=reason):
-        signed.approve(text)
+        signed.accept(text)
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
 def test_logs_are_separate_and_bounded(tmp_path: Path) -> None:
     signed = CheckpointMemory(tmp_path, wall_ns)
     for number in range(MOST_LOGS):
-        signed.approve(checkpoint(1, log=f"{number:032x}"))
+        signed.accept(checkpoint(1, log=f"{number:032x}"))
     with pytest.raises(CheckpointRefusedError, match="rosrv audit acknowledge"):
-        signed.approve(checkpoint(1, log="f" * 32))
+        signed.accept(checkpoint(1, log="f" * 32))
 
 
 def test_cut_by_a_crash(tmp_path: Path) -> None:
     first = checkpoint(1)
     second = checkpoint(2, digest(first))
     signed = CheckpointMemory(tmp_path, wall_ns)
-    signed.approve(first)
-    signed.approve(second)
+    signed.accept(first)
+    signed.accept(second)
     (memory,) = tmp_path.glob("*.signed")
     memory.write_bytes(memory.read_bytes()[:-5])
-    signed.approve(second)
+    signed.accept(second)
     assert len(memory.read_bytes()) == 8 + 2 * 32

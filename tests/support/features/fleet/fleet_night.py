@@ -244,11 +244,11 @@ class NightRobot:
 
     def _approve(self, number: int, checkpoint: bytes, newest: bytes) -> None:
         try:
-            text = self._notary.approve(checkpoint, newest)
+            text = self._notary.accept(checkpoint, newest)
         except RemovalRefusedError as error:
             self.log.removal_refused(number, str(error), early=error.early)
         else:
-            self.log.removal_approved(number, text, self._key.sign(text), self._public)
+            self.log.removal_signed(number, text, self._key.sign(text), self._public)
 
 
 class FleetNight:

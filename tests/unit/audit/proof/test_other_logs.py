@@ -45,7 +45,7 @@ class Machine:
 
         def sign(number: int, text: bytes, *, oldest: bool = True) -> None:
             if running:
-                memory.approve(text)
+                memory.accept(text)
                 if others:
                     running[0].other_logs(memory.others(text))
                 running[0].signed(number, self.key.sign(text), public)
@@ -245,15 +245,15 @@ def test_logs_that_are_set_aside_leave_places(tmp_path: Path) -> None:
     memory = CheckpointMemory(tmp_path, clock.wall_ns)
     text = "rosrv audit checkpoint 1\nlog {}\nnumber 1\nsequence 1\nhash {}\ntime 1\nprevious {}\n"
 
-    def approve(number: int) -> None:
-        memory.approve(text.format(f"{number:032x}", "b" * 64, "0" * 64).encode())
+    def accept(number: int) -> None:
+        memory.accept(text.format(f"{number:032x}", "b" * 64, "0" * 64).encode())
 
     for number in range(MOST_LOGS):
-        approve(number)
+        accept(number)
     with pytest.raises(CheckpointRefusedError, match="rosrv audit acknowledge"):
-        approve(MOST_LOGS)
+        accept(MOST_LOGS)
     acknowledge(tmp_path, remembered_logs(tmp_path)[0], 1, 0)
-    approve(MOST_LOGS)
+    accept(MOST_LOGS)
 
 
 def test_the_order_on_the_machine(machine: Machine) -> None:

@@ -59,7 +59,7 @@ class _Signer:
         requests.attach(ours)
 
     def _sign(self, link: MemoryChannel, wanted: messages.SignatureWanted) -> None:
-        self._memory.approve(wanted.text)
+        self._memory.accept(wanted.text)
         public = self._key.public_key().public_bytes_raw()
         link.send(messages.SignatureMade(wanted.number, self._key.sign(wanted.text), public))
 

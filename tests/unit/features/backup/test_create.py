@@ -37,7 +37,7 @@ def state(tmp_path: Path) -> Path:
     memory = CheckpointMemory(state / "signer", wall_ns)
 
     def sign(number: int, text: bytes, *, oldest: bool = True) -> None:
-        memory.approve(text)
+        memory.accept(text)
         logs[0].signed(number, key.sign(text), key.public_key().public_bytes_raw())
 
     logs: list[AuditLog] = []
