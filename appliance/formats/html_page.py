@@ -21,15 +21,22 @@ tr {{ border-top: 1px solid #8884; break-inside: avoid }}
 td {{ overflow-wrap: anywhere }}
 td.number {{ text-align: right; white-space: nowrap }}
 pre, code, .time {{ font-family: ui-monospace, monospace }}
-.time {{ white-space: nowrap }}
+.time, .unbroken {{ white-space: nowrap }}
 pre {{ overflow-x: auto; white-space: pre-wrap; border: 1px solid #8884; padding: .6rem }}
 .warning, .deny {{ color: #b50 }}
 .alarm {{ color: #d00; font-weight: 600 }}
-@media print {{ body {{ font-size: 10px; margin: 0; max-width: none }} h2 {{ break-after: avoid }} }}
+@page {{ margin: 14mm; @bottom-right {{ content: counter(page) " of " counter(pages); font-size: 9px }} }}
+@media print {{ body {{ font-size: 10px; margin: 0; max-width: none; padding: 0 }} h2, p {{ break-after: avoid }} }}
 </style>
 """
 
 Cells = Sequence[object]
+
+
+class Unbroken(str):
+    """A cell that stays on one line, such as a time or an address."""
+
+    __slots__ = ()
 
 
 def head(title: str) -> str:
@@ -52,12 +59,15 @@ def section(title: str, columns: Sequence[str], rows: Iterable[Cells], empty: st
             yield f"<h2>{text(title)}</h2>\n<p>{text(empty)}</p>\n"
         return
     yield f"<h2>{text(title)}</h2>\n<table>\n"
-    if columns:
-        yield f"<tr>{''.join(f'<th>{column}' for column in columns)}\n"
+    if columns:  # repeated on each page of paper
+        yield f"<thead><tr>{''.join(f'<th>{column}' for column in columns)}</thead>\n"
     for row in table:
         yield f"<tr>{''.join(map(_cell, row))}\n"
     yield "</table>\n"
 
 
 def _cell(cell: object) -> str:
-    return f'<td class="number">{cell:,}' if isinstance(cell, int | float) else f"<td>{text(str(cell))}"
+    if isinstance(cell, int | float):
+        return f'<td class="number">{cell:,}'
+    kind = ' class="unbroken"' if isinstance(cell, Unbroken) else ""
+    return f"<td{kind}>{text(str(cell))}"

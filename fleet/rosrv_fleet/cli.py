@@ -6,14 +6,14 @@ import os
 import ssl
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import msgspec
 import psycopg
 import typer
 
 from appliance.audit.log.record_format import printable
-from appliance.audit.search.filter_options import FILTER, FilteredCommand
+from appliance.audit.search.filter_options import FilteredCommand
 from appliance.audit.search.query import FilterError
 from appliance.base.counted import counted
 from appliance.base.timestamps import TimestampError
@@ -23,6 +23,7 @@ from rosrv_fleet.config import LEAST_SILENT_SECONDS, FleetConfigError, load_conf
 from rosrv_fleet.database import migrate
 from rosrv_fleet.enrolment import EnrolmentError
 from rosrv_fleet.evidence.commands import evidence
+from rosrv_fleet.index_commands import report_app, search, who_drove
 from rosrv_fleet.indexer import NOT_INDEXABLE, index
 from rosrv_fleet.options import DEFAULT_CONFIG, Config, Json
 from rosrv_fleet.output import configure_log
@@ -30,8 +31,7 @@ from rosrv_fleet.receipt_key import ReceiptKeyError, make_receipt_key
 from rosrv_fleet.robot_commands import robot_app
 from rosrv_fleet.robots import Robots, make_folder
 from rosrv_fleet.rollouts.commands import rollout
-from rosrv_fleet.search import LARGEST_FLEET_PAGE, IndexDownError, SearchTooLongError, search_fleet
-from rosrv_fleet.search_sql import FleetFilter
+from rosrv_fleet.search import IndexDownError, SearchTooLongError
 from rosrv_fleet.segment_store import SegmentStore
 from rosrv_fleet.server import serve
 from rosrv_fleet.server_certificate import ServerCertificateError, make_certificate
@@ -42,6 +42,9 @@ app = typer.Typer(no_args_is_help=True, add_completion=False, help=__doc__)
 token_app = typer.Typer(no_args_is_help=True, help="Make and remove tokens of operators.")
 app.add_typer(robot_app, name="robot")
 app.add_typer(token_app, name="token")
+app.add_typer(report_app, name="report")
+app.command(cls=FilteredCommand)(search)
+app.command("who-drove")(who_drove)
 app.add_typer(bundle, name="bundle")
 app.add_typer(rollout, name="rollout")
 app.add_typer(evidence, name="evidence")
@@ -55,7 +58,6 @@ _ADVICE = {
     errno.EACCES: "; run this as the collector's user",
     errno.EPERM: "; run this as the collector's user",
 }
-_MOST_WAITING = 1000
 
 
 def main() -> None:
@@ -151,44 +153,6 @@ def list_tokens(config: Config = DEFAULT_CONFIG) -> None:
 
 def _tokens(config: Path) -> OperatorTokens:
     return OperatorTokens(load_config(config).data / "tokens.json")
-
-
-@app.command(cls=FilteredCommand)
-def search(
-    context: typer.Context,
-    robot: Annotated[str | None, typer.Option("--robot", help="Name of the robot; a glob")] = None,
-    limit: Annotated[
-        int, typer.Option("--limit", min=1, max=LARGEST_FLEET_PAGE, help="Largest number of records")
-    ] = 100,
-    cursor: Annotated[str | None, typer.Option("--cursor", help="Continue where a search ended")] = None,
-    config: Config = DEFAULT_CONFIG,
-    *,
-    as_json: Json = False,
-) -> None:
-    """Find records of all robots, newest first.
-
-    Example: rosrv-fleet search --deny --since 1h --topic '/cmd_*' --robot 'arm*'
-    """
-    wanted = FILTER.value(context.params)
-    collector = make_collector(load_config(config))
-    waiting = collector.store.waiting(_MOST_WAITING)
-    database = collector.searches.database
-    database.open()
-    try:
-        page = search_fleet(database, FleetFilter(robot, wanted), cursor, limit, waiting)
-    finally:
-        database.close()
-    for record in page.records:
-        typer.echo(json.dumps(record, separators=(",", ":")) if as_json else _line(record))
-    if page.waiting:
-        _note(f"{page.waiting} stored segments are not indexed yet: this search misses them")
-    if page.cursor is not None:
-        _note(f"more records match: --cursor {page.cursor}, or a larger --limit")
-
-
-def _line(record: dict[str, Any]) -> str:
-    names = ("robot", "time", "severity", "decision", "event", "host", "caller_id", "resource", "reason")
-    return "  ".join(printable(str(record[name])) for name in names if record.get(name))
 
 
 def _note(text: str) -> None:

@@ -19,7 +19,8 @@ _MIGRATION_LOCK = 0x726F7372  # one collector migrates at a time
 _CONNECT_SECONDS = 5.0
 _log = structlog.get_logger()
 
-Connection = psycopg.Connection[tuple[Any, ...]]
+Row = tuple[Any, ...]
+Connection = psycopg.Connection[Row]
 
 
 class IndexDatabase:

@@ -6,6 +6,7 @@ comes before the id, a robot cannot hide another's records behind equal ids.
 
 import base64
 import binascii
+from collections.abc import Collection
 from typing import LiteralString, NamedTuple
 
 import msgspec
@@ -134,6 +135,22 @@ def search_statement(
     if record.until is not None:
         found.add("time < %s", record.until)
     return found.statement(_HEAD, _ORDER, limit)
+
+
+def records_statement(events: Collection[str], robot: str | None) -> SearchStatement:
+    """Return the query for all records of some events, in the order of each robot's logs. Raise `FilterError`."""
+    found = _Conditions()
+    found.add("event = ANY(%s)", list(events))
+    found.matching("robot", "robot = %s", "robot ~ %s", robot)
+    return found.statement(_HEAD, " ORDER BY robot, log, sequence")
+
+
+def logs_statement(robot: str | None) -> SearchStatement:
+    """Return the query for all logs: robot, log, last record, and the earliest time. Raise `FilterError`."""
+    found = _Conditions()
+    found.matching("robot", "robot = %s", "robot ~ %s", robot)
+    head: LiteralString = "SELECT robot, log, max(last), min(first_time) FROM segment"
+    return found.statement(head, " GROUP BY robot, log ORDER BY robot, log")
 
 
 def _escaped(text: str) -> str:

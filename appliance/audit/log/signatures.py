@@ -38,9 +38,15 @@ def pinned_key_path(log: Path) -> Path:
 def read_public_key(path: Path) -> bytes:
     """Return the raw key (32 bytes). Raises `KeyUnreadableError`."""
     try:
-        key = load_pem_public_key(read_given(path))
+        return parse_public_key(read_given(path), path)
     except OSError as error:
         raise KeyUnreadableError(f"{path}: {error.strerror}") from error
+
+
+def parse_public_key(pem: bytes, path: Path) -> bytes:
+    """Return the raw key (32 bytes) of the file at `path`. Raises `KeyUnreadableError`."""
+    try:
+        key = load_pem_public_key(pem)
     except (ValueError, UnsupportedAlgorithm) as error:
         raise KeyUnreadableError(f"{path}: not a public key in PEM: {error}") from error
     if not isinstance(key, Ed25519PublicKey):

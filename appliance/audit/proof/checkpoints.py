@@ -19,6 +19,7 @@ from appliance.audit.proof.signer_memory import SignerMemory
 from appliance.signing.log_proof import ProofFault, checkpoint_hash, parse_checkpoint, signature_fault
 
 _TYPES = (int, int, bytes, bytes | None, bytes | None)
+_ROWS = "SELECT number, sequence, text, signature, public_key FROM checkpoint ORDER BY number LIMIT ?"
 
 
 class StoredCheckpoint(NamedTuple):
@@ -49,26 +50,38 @@ class CheckpointVerifier:
         self.other_logs = remembered.others
         self.signed = 0
         self.signed_through = 0
-        self.rows: list[StoredCheckpoint] = []
+        self.count = 0
+        """The number of stored checkpoints: half a million in a year, so they are read twice and not kept."""
+        self.sequences: set[int] = set()
+        self._connection: sqlite3.Connection | None = None
         self.removed = [] if remembered.removed is None else [remembered.removed]
         """The values of `removed` in the signer's memory and in checkpoints."""
         self._signature_missing: list[int] = []
         """The checkpoints that the signer signed, and that have no signature; the last ones may be under way."""
 
     def read(self, connection: sqlite3.Connection) -> None:
-        """Read all checkpoints. Raises `sqlite3.DatabaseError` after the readable ones."""
-        query = "SELECT number, sequence, text, signature, public_key FROM checkpoint ORDER BY number"
-        for row in connection.execute(query):
+        """Read all checkpoints of a snapshot. Raises `sqlite3.DatabaseError` after the readable ones."""
+        self._connection = connection
+        for row in connection.execute(_ROWS, (-1,)):
             if not all(map(isinstance, row, _TYPES)):
                 raise sqlite3.DataError("a column has a value of another type than a log's tables hold")
-            self.rows.append(StoredCheckpoint(*row))
+            self.count += 1
+            self.sequences.add(row[1])
+
+    def rows(self) -> Iterator[StoredCheckpoint]:
+        """Yield the readable checkpoints again."""
+        if self._connection is not None and self.count:
+            yield from map(StoredCheckpoint._make, self._connection.execute(_ROWS, (self.count,)))
 
     def check(
         self, removed: RemovedRange, chain: dict[int, bytes], last: int, reported: Iterable[int]
     ) -> Iterator[LogFinding]:
         """Yield the faults; `reported` are the numbers of checkpoints that have a record in the chain."""
         number, previous = removed.last_checkpoint, removed.last_checkpoint_hash
-        for row in self.rows:
+        last_signed = 0
+        for row in self.rows():
+            if row.signature is not None:
+                last_signed = max(last_signed, row.number)
             if row.number != number + 1:
                 message = "removed from the log"
                 yield _finding(FindingKind.CHECKPOINT_MISSING, number + 1, message, row.number - 1)
@@ -76,7 +89,6 @@ class CheckpointVerifier:
             number = row.number
             yield from self._check_row(row, previous, chain, last)
             previous = checkpoint_hash(row.text)
-        last_signed = max((row.number for row in self.rows if row.signature is not None), default=0)
         many = sum(missing > last_signed for missing in self._signature_missing) > ASKED_AT_ONCE
         for missing in self._signature_missing:
             if many or missing < last_signed:
@@ -97,6 +109,13 @@ class CheckpointVerifier:
         yield from self._beside(last_signed)
 
     def _beside(self, last_signed: int) -> Iterator[LogFinding]:
+        signer = self._remembered.key
+        if last_signed and self._key is not None and signer not in (None, self._key):
+            message = (
+                f"the checkpoints are verified with {self._key.hex()}, and the signer's key is {signer.hex()}: the key"
+                " beside the log, or the signer's, was replaced"
+            )
+            yield LogFinding(FindingKind.WRONG_KEY, 0, 0, message)
         for other in self._remembered.others:
             if other.set_aside is None:
                 message = (

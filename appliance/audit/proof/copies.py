@@ -179,6 +179,7 @@ class CopiesVerifier:
         self._others = sorted({copy.log for copy in copies if copy.log != log})
         self._copies = sorted({copy for copy in copies if copy.log == log}, key=lambda copy: copy.number)
         self.sequences = {copy.sequence for copy in self._copies}
+        self.numbers = {copy.number for copy in self._copies}
         self._agreeing: list[SignedCheckpoint] = []
         self.removed: list[int] = []
         """The values of `removed` in copies."""

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import msgspec
 
+from appliance.audit.log.signatures import parse_public_key
 from appliance.base.owner_access import open_named
 from appliance.signing.signed_logs import (
     HASH_BYTES,
@@ -21,7 +22,8 @@ _PUBLIC_KEY = "audit.pub"  # beside the key of a signer that has run
 class SignerMemory(msgspec.Struct, frozen=True):
     """The hashes of the checkpoints that the signer signed, from number `first` on, and the last approved removal.
 
-    `others` are the logs that it signed besides this one. `lost`: the memory, or its beginning, was removed.
+    `others` are the logs that it signed besides this one. `lost`: the memory, or its beginning, was removed. `key` is
+    the signer's public key (raw), if it has one.
     """
 
     first: int = 1
@@ -29,6 +31,7 @@ class SignerMemory(msgspec.Struct, frozen=True):
     removed: int | None = None
     others: list[OtherLog] = []
     lost: bool = False
+    key: bytes | None = None
 
     @property
     def last(self) -> int:
@@ -42,21 +45,23 @@ class SignerMemory(msgspec.Struct, frozen=True):
 def read_signer_memory(directory: Path, log: str) -> SignerMemory | None:
     """Return what the signer remembers of the log; None without the folder, or the right to read it.
 
-    Raises `OSError`, and `ValueError` for a damaged file.
+    Raises `OSError`, and `ValueError` for a damaged file, and `KeyUnreadableError` for one that has no key.
     """
     try:
         logs = remembered_logs(directory, open_named)
         signed, removed = (_remembered(directory / f"{log}.{what}") for what in ("signed", "removed"))
-        has_run = _remembered(directory / _PUBLIC_KEY) is not None
+        pem = _remembered(directory / _PUBLIC_KEY)
     except (FileNotFoundError, PermissionError):
         return None
+    key = None if pem is None else parse_public_key(pem, directory / _PUBLIC_KEY)
     own = next((one for one in logs if one.log == log), None)
     beside = others(logs, log)
     if signed is None:
-        return SignerMemory(others=beside, lost=has_run and (own is None or own.lacks_memory))
+        lost = key is not None and (own is None or own.lacks_memory)
+        return SignerMemory(others=beside, lost=lost, key=key)
     removed_to = None if removed is None else int.from_bytes(removed, "big")
     first = int.from_bytes(signed[:HEADER_BYTES], "big")
-    return SignerMemory(first, signed[HEADER_BYTES:], removed_to, beside, _is_cut(own))
+    return SignerMemory(first, signed[HEADER_BYTES:], removed_to, beside, _is_cut(own), key)
 
 
 def _is_cut(own: RememberedLog | None) -> bool:

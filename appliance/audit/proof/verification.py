@@ -145,14 +145,14 @@ class _Verifier:
             audit.read(self._connection)
         except sqlite3.DatabaseError as error:
             self._structure(f"the checkpoints cannot be read: {error}")
-        sealed = {row.sequence for row in audit.rows} | (copies.sequences if copies else set())
+        sealed = audit.sequences | (copies.sequences if copies else set())
         self._sealed = dict.fromkeys(sealed, b"")
         self._walk(removed)
         chain = {sequence: digest for sequence, digest in self._sealed.items() if digest}
         last = self.last - self._shift
         self._findings += audit.check(removed, chain, last, self._reported)
         if copies is not None:
-            texts = {row.number: row.text for row in audit.rows}
+            texts = {row.number: row.text for row in audit.rows() if row.number in copies.numbers}
             if removed.last_sequence:
                 chain[removed.last_sequence] = bytes.fromhex(removed.last_hash)
             self._findings += copies.check(chain, removed.last_sequence, last, texts)
@@ -162,7 +162,7 @@ class _Verifier:
             self._findings.append(self._further)
         return Verification(
             ok=not self._findings, log=self._log, records=self.records, first=self.first, last=self.last,
-            removed=removed.last_sequence, checkpoints=len(audit.rows),
+            removed=removed.last_sequence, checkpoints=audit.count,
             signed_checkpoints=audit.signed, signed_through=audit.signed_through,
             unsealed=max(0, self.last - audit.signed_through), key=self._key.hex() if self._key else None,
             findings=self._findings, elsewhere=copies.result() if copies else None, removal=removal,

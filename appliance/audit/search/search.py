@@ -7,7 +7,7 @@ import functools
 import ipaddress
 import sqlite3
 from collections.abc import Callable, Collection, Iterator
-from contextlib import closing
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
@@ -89,28 +89,49 @@ def export(path: Path, wanted: Filter, page: int = 1000, *, newest_first: bool =
             return
 
 
-def of_events(path: Path, events: Collection[str], page: int = 500) -> Iterator[LogEntry]:
-    """Yield the records of some events, oldest first, from one snapshot of the log. Raises `LogUnreadableError`.
+class LogSnapshot:
+    """A log as it is now, for a report that reads few of its records, and reads them in several steps.
 
-    A year's log has ten million records, and some thousands of them are wanted: only these are read.
+    Its methods raise `LogUnreadableError`.
     """
-    marks = ", ".join("?" * len(events))
-    with reading(path) as connection:
-        connection.execute("BEGIN")
-        found = connection.execute(
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._opened = ExitStack()
+        self._connection = self._opened.enter_context(reading(path))
+        self._connection.execute("BEGIN").execute(
+            "SELECT count(*) FROM sqlite_schema"
+        )  # the log as it is now
+
+    def close(self) -> None:
+        self._opened.close()
+
+    def of_events(self, events: Collection[str], page: int = 500) -> Iterator[LogEntry]:
+        """Yield the records of some events, oldest first.
+
+        Their sequences come from an index, so a year's ten million other records are not read.
+        """
+        marks = ", ".join("?" * len(events))
+        found = self._connection.execute(
             f"SELECT sequence FROM record INDEXED BY record_event WHERE event IN ({marks}) ORDER BY sequence",  # noqa: S608  question marks
             tuple(events),
         )
         while sequences := [sequence for (sequence,) in found.fetchmany(page)]:
             places = ", ".join("?" * len(sequences))
-            try:
-                yield from _fetch(
-                    connection, f"WHERE sequence IN ({places}) ORDER BY sequence", tuple(sequences)
-                )
-            except (ValueError, TypeError, RecursionError, MemoryError) as error:
-                raise LogUnreadableError(
-                    f"{path}: cannot be read: {error}; run 'rosrv audit verify'"
-                ) from error
+            yield from self._read(f"WHERE sequence IN ({places}) ORDER BY sequence", *sequences)
+
+    def following(self, event: str, sequence: int) -> Iterator[LogEntry]:
+        """Yield the records of an event after this sequence; the next one is read when it is wanted."""
+        tail = "INDEXED BY record_event WHERE event = ? AND sequence > ? ORDER BY sequence"
+        return self._read(tail, event, sequence)
+
+    def _read(self, tail: str, *values: object) -> Iterator[LogEntry]:
+        try:
+            yield from _rows(self._connection, tail, values)
+        except (sqlite3.Error, ValueError, TypeError, RecursionError, MemoryError) as error:
+            raise LogUnreadableError(
+                f"{self._path}: cannot be read: {error}; run 'rosrv audit verify'"
+            ) from error
 
 
 def last_sequence(path: Path) -> int:
@@ -316,6 +337,13 @@ def _values(found: list[Condition]) -> tuple[object, ...]:
 def _fetch(
     connection: sqlite3.Connection, tail: str, values: tuple[object, ...], table: str = "record"
 ) -> list[LogEntry]:
+    return list(_rows(connection, tail, values, table))
+
+
+def _rows(
+    connection: sqlite3.Connection, tail: str, values: tuple[object, ...], table: str = "record"
+) -> Iterator[LogEntry]:
     rows = connection.execute(f"SELECT {COLUMNS} FROM {table} {tail}", values)  # noqa: S608  fixed names
-    stored = (StoredColumns(*row) for row in rows)
-    return [LogEntry(columns.sequence, from_columns(columns)) for columns in stored]
+    for row in rows:
+        columns = StoredColumns(*row)
+        yield LogEntry(columns.sequence, from_columns(columns))

@@ -2,7 +2,7 @@
 
 import os
 import threading
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -16,11 +16,11 @@ from appliance.audit.search.denial_summary import DenialSummary, summary_of_log
 from appliance.audit.search.query import Filter
 from appliance.audit.search.search import (
     Follower,
+    LogSnapshot,
     RecordInContext,
     SearchPage,
     export,
     last_sequence,
-    of_events,
     search,
     show,
 )
@@ -62,9 +62,8 @@ class FileLog:
     def export(self, wanted: Filter) -> Iterator[LogEntry]:
         return export(self.path, wanted)
 
-    def of_events(self, events: Collection[str]) -> Iterator[LogEntry]:
-        """Yield the records of some events, oldest first."""
-        return of_events(self.path, events)
+    def snapshot(self) -> LogSnapshot:
+        return LogSnapshot(self.path)
 
     def evidence(self, wanted: Filter) -> Iterator[tuple[int, str]]:
         found, robot = evidence(self.path, wanted), self._robot()

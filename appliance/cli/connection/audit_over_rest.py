@@ -21,6 +21,7 @@ from appliance.cli.connection.rest_session import RestClient
 
 _PATH = "/v1/audit"
 _PAGE = 1000
+_FOLLOWING = 50
 _VERIFY_SECONDS = 3600.0
 _SILENCE_SECONDS = 60.0  # a stream sends at least a comment every 15 s
 _AGAIN_SECONDS = 1.0
@@ -70,9 +71,8 @@ class RestLog:
                 if line:
                     yield entry_of(json.loads(line))
 
-    def of_events(self, events: Collection[str]) -> Iterator[LogEntry]:
-        found = [entry for event in events for entry in self.export(Filter(event=event))]
-        return iter(sorted(found, key=lambda entry: entry.sequence))
+    def snapshot(self) -> "RestSnapshot":
+        return RestSnapshot(self)
 
     def evidence(self, wanted: Filter) -> Iterator[tuple[int, str]]:
         with self._lines("/export", _parameters(wanted), _SILENCE_SECONDS) as lines:
@@ -163,6 +163,26 @@ class RestLog:
                 yield entry_of(json.loads(value))
             elif name == "data" and event == "end":
                 raise _EndedError(f"{self._client.url}: {json.loads(value)['reason']}")
+
+
+class RestSnapshot:
+    """The methods of `LogSnapshot` over REST: of the log as it is at each step."""
+
+    def __init__(self, log: RestLog) -> None:
+        self._log = log
+
+    def close(self) -> None:
+        """Do nothing: each step is a request of its own."""
+
+    def of_events(self, events: Collection[str]) -> Iterator[LogEntry]:
+        found = [entry for event in events for entry in self._log.export(Filter(event=event))]
+        return iter(sorted(found, key=lambda entry: entry.sequence))
+
+    def following(self, event: str, sequence: int) -> Iterator[LogEntry]:
+        cursor: str | None = str(sequence)
+        while cursor is not None:
+            entries, cursor = self._log.search(Filter(event=event), cursor, _FOLLOWING, newest_first=False)
+            yield from entries
 
 
 class _NothingThereError(Exception):

@@ -6,7 +6,7 @@ from typing import Any
 from appliance.base.counted import counted
 from appliance.channel.answers.policy_answers import PolicyInForce
 from appliance.channel.answers.token_answers import Tokens
-from appliance.features.logbook.machine_report import MachineInterface, MachineRight
+from appliance.formats.machine_report import MachineInterface, MachineRight, Reading
 from appliance.policy.model import Category
 from appliance.policy.policy import Policy
 
@@ -19,9 +19,9 @@ _ALSO_STOPS = {
 
 
 def interfaces(
-    status: Mapping[str, Any], policy: PolicyInForce, tokens: Tokens
+    status: Mapping[str, Any], policy: PolicyInForce, tokens: Tokens, records: Reading
 ) -> Iterator[MachineInterface]:
-    """Yield the ways in. `status` is the answer of `rosrv status --json`."""
+    """Yield the ways in. `status` is the answer of `rosrv status --json`; the records have the places of doors."""
     rules = f"policy revision {policy.revision} decides each call by the sender's address"
     lenient = status["policy"]["audit_only"]
     if lenient:
@@ -45,7 +45,7 @@ def interfaces(
     )
     yield MachineInterface(
         name="REST and console", where="api of appliance.yaml", commands="orders of the token's or person's role",
-        protection=f"TLS; tokens: {by_role}; single sign-on, where it is configured",
+        protection=f"TLS; tokens: {by_role}; single sign-on: {_sign_on(records).get('issuer', 'off')}",
     )  # fmt: skip
     yield MachineInterface(
         name="admin socket", where="the appliance's machine", commands="all orders",
@@ -53,7 +53,7 @@ def interfaces(
     )  # fmt: skip
     for door in (status.get("doors") or {}).get("doors", ()):
         yield MachineInterface(
-            name=f"door {door['name']}", where="its port, or /door/ of the console's port",
+            name=f"door {door['name']}", where=records.places.get(door["name"], "see `rosrv door list`"),
             commands="what the policy grants its name", protection="a ticket; the policy; monitors of its topics",
         )  # fmt: skip
     tunnels = status["ipsec"]
@@ -69,7 +69,9 @@ def interfaces(
         )  # fmt: skip
 
 
-def rights(policy: Policy, in_force: PolicyInForce, tokens: Tokens) -> Iterator[MachineRight]:
+def rights(
+    policy: Policy, in_force: PolicyInForce, tokens: Tokens, records: Reading
+) -> Iterator[MachineRight]:
     """Yield each right to act on the machine, or to change its safety settings."""
     usable = [token for token in tokens.tokens if token.valid and token.revoked is None]
     admins, operators = (
@@ -86,6 +88,10 @@ def rights(policy: Policy, in_force: PolicyInForce, tokens: Tokens) -> Iterator[
         what="load policies and guards that exist already, set guards' values, switch monitors, approve", who=operators,
         by="token, role operator",
     )  # fmt: skip
+    sign_on = _sign_on(records)
+    if "roles" in sign_on:
+        claim = f"the claim {sign_on.get('roles_claim', '')} of {sign_on.get('issuer', '')}"
+        yield MachineRight(what="the same, by role", who=f"people with {sign_on['roles']}", by=claim)
     yield MachineRight(
         what=f"{_STOP}: block a host, whose motions guards then stop", who=f"{admins}; {operators}",
         by="token, role admin or operator",
@@ -104,3 +110,8 @@ def _ends(policy: Policy) -> Iterator[MachineRight]:
     for rule in policy.rules(Category.COMMAND):
         if rule.key is None or rule.key.text == "shutdown":
             yield MachineRight(what=f"{_STOP}: end a node", who=rule.shown, by=rule.place)
+
+
+def _sign_on(records: Reading) -> Mapping[str, str]:
+    """Return the settings of single sign-on; empty if it is off, or if an earlier version wrote the log."""
+    return records.settings.get("sso", {})

@@ -1,6 +1,8 @@
 """Read interventions, gaps and their origins from the audit logs of an appliance, or of a pair."""
 
-from collections.abc import Iterable
+import itertools
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Annotated
 
@@ -8,12 +10,13 @@ import msgspec
 import typer
 
 from appliance.audit.log.record_format import LogEntry
-from appliance.audit.search.query import Filter
+from appliance.audit.search.search import LogSnapshot
 from appliance.base.actors import DISK, OPERATOR, UNCONFIRMED
 from appliance.cli.connection.audit_file import FileLog
-from appliance.cli.connection.audit_over_rest import RestLog
+from appliance.cli.connection.audit_over_rest import RestLog, RestSnapshot
 from appliance.cli.output import usage_error
-from appliance.features.logbook.interventions import Intervention
+from appliance.formats.interventions import Intervention
+from appliance.formats.machine_report import NamedEntry, merged
 
 _ORIGIN_SECONDS = 60
 _ORIGIN_RECORDS = 50
@@ -53,16 +56,30 @@ def logs_of(own: Log, other: Path | None, verb: str) -> dict[str, Log]:
 
 def _name_in(log: FileLog) -> str:
     """Return the name of the appliance that wrote a log, or an empty string if it never took over."""
-    taken = next(iter(log.of_events(("took over", "handed over"))), None)
+    with closing(log.snapshot()) as snapshot:
+        taken = next(snapshot.of_events(("took over", "handed over")), None)
     return "" if taken is None else str(taken.record.detail.get("appliance", ""))
 
 
-def with_origin(log: Log, row: Intervention) -> Intervention:
-    """Return the row with the address of its REST call, if the log leaves no doubt."""
-    if row.who in _LOCAL:
-        return row
-    calls = log.search(Filter(event="rest call"), str(row.sequence), _ORIGIN_RECORDS, newest_first=False)
-    return msgspec.structs.replace(row, origin=origin_of(row, calls.entries))
+class OpenedLogs(ExitStack):
+    """The logs as they are now, each by the name of its appliance."""
+
+    def __init__(self, logs: Mapping[str, Log]) -> None:
+        super().__init__()
+        self._logs: dict[str, LogSnapshot | RestSnapshot] = {}
+        for name, log in logs.items():
+            self._logs[name] = snapshot = log.snapshot()
+            self.callback(snapshot.close)
+
+    def of_events(self, events: Collection[str]) -> Iterator[NamedEntry]:
+        return merged({name: log.of_events(events) for name, log in self._logs.items()})
+
+    def with_origin(self, row: Intervention) -> Intervention:
+        """Return the row with the address of its REST call, if the log leaves no doubt."""
+        if row.who in _LOCAL:
+            return row
+        calls = self._logs[row.appliance].following("rest call", row.sequence)
+        return msgspec.structs.replace(row, origin=origin_of(row, itertools.islice(calls, _ORIGIN_RECORDS)))
 
 
 def origin_of(row: Intervention, calls: Iterable[LogEntry]) -> str:
@@ -70,11 +87,15 @@ def origin_of(row: Intervention, calls: Iterable[LogEntry]) -> str:
 
     If its author's changes in that time came from several addresses, it may be any of them, and none is returned.
     """
-    hosts = {
-        entry.record.host or ""
-        for entry in calls
-        if 0 <= entry.record.time - row.time <= _ORIGIN_SECONDS * 1_000_000_000
-        and entry.record.detail.get("who") == row.who
-        and entry.record.detail.get("method") not in _READS
-    }
+    hosts = set()
+    for entry in calls:
+        if entry.record.time - row.time > _ORIGIN_SECONDS * 1_000_000_000:
+            break
+        detail = entry.record.detail
+        if (
+            entry.record.time >= row.time
+            and detail.get("who") == row.who
+            and detail.get("method") not in _READS
+        ):
+            hosts.add(entry.record.host or "")
     return hosts.pop() if len(hosts) == 1 else ""

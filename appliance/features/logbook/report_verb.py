@@ -22,19 +22,19 @@ from appliance.cli.connection.audit_file import FileLog
 from appliance.cli.connection.target import Appliance, speaks_with
 from appliance.cli.output import say_json, usage_error, write_new
 from appliance.features.logbook import live_facts
-from appliance.features.logbook.interventions import READ
-from appliance.features.logbook.log_source import Log, Other, logs_of, with_origin
-from appliance.features.logbook.machine_report import (
+from appliance.features.logbook.log_source import Log, OpenedLogs, Other, logs_of
+from appliance.formats.interventions import READ
+from appliance.formats.machine_report import (
     MachineInterface,
     MachineReport,
     MachineRight,
     Period,
+    Reading,
     ReportedLog,
     VerificationResult,
-    merged,
     read_records,
 )
-from appliance.features.logbook.report_words import page, report_lines
+from appliance.formats.report_words import page, report_lines
 from appliance.policy.judgement import PolicyContext
 from appliance.policy.model import address_of
 from appliance.policy.policy_findings import PolicyError
@@ -97,16 +97,15 @@ def _report(appliance: Appliance, since: int | None, end: int, other: Path | Non
     if since is None:
         since = parse_timestamp(begins, end) if begins else end
     period = Period(since, end)
-    read = read_records(
-        merged({name: log.of_events(READ) for name, log in logs.items()}),
-        period,
-        lambda row: with_origin(logs[row.appliance], row),
-    )
-    facts = _Live.of(appliance)
+    with OpenedLogs(logs) as opened:
+        read = read_records(opened.of_events(READ), period, opened.with_origin)
+    facts = _Live.of(appliance, read)
     return MachineReport(
         robot=facts.robot, logs=sources, since_utc=rfc3339(period.since), until_utc=rfc3339(end),
         made_utc=rfc3339(clock.wall_ns()), version=__version__, verify=_VERIFY if other is None else _VERIFY_BOTH,
-        interfaces=facts.interfaces, rights=facts.rights, live_reason=facts.reason, **msgspec.structs.asdict(read),
+        interfaces=facts.interfaces, rights=facts.rights, live_reason=facts.reason,
+        interventions=read.interventions, switched_off=read.switched_off, blocks=read.blocks, software=read.software,
+        drivers=read.drivers, gaps=read.gaps,
     )  # fmt: skip
 
 
@@ -117,7 +116,7 @@ class _Live(msgspec.Struct):
     reason: str = ""
 
     @classmethod
-    def of(cls, appliance: Appliance) -> "_Live":
+    def of(cls, appliance: Appliance, records: Reading) -> "_Live":
         try:
             status, policy, tokens = (
                 appliance.ask(request) for request in (StatusWanted(), PolicyWanted(), TokenList())
@@ -141,8 +140,8 @@ class _Live(msgspec.Struct):
             )
         return cls(
             str(state["name"]),
-            list(live_facts.interfaces(state, text, made)),
-            list(live_facts.rights(compiled, text, made)),
+            list(live_facts.interfaces(state, text, made, records)),
+            list(live_facts.rights(compiled, text, made, records)),
         )
 
 

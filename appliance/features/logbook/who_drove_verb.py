@@ -11,9 +11,9 @@ from appliance.base.timestamps import parse_timestamp
 from appliance.cli.audit.audit_errors import Errors
 from appliance.cli.connection.target import Appliance, speaks_with
 from appliance.cli.output import say_json, usage_error
-from appliance.features.logbook.log_source import Other, logs_of
-from appliance.features.logbook.machine_report import ENDS_OF_DRIVING, Period, merged, read_records
-from appliance.features.logbook.report_words import host_words
+from appliance.features.logbook.log_source import OpenedLogs, Other, logs_of
+from appliance.formats.machine_report import ENDS_OF_DRIVING, Period, read_records
+from appliance.formats.report_words import host_words
 from rosmop.tool.terminal import say
 
 _VERB = "rosrv who-drove"
@@ -49,9 +49,8 @@ def who_drove(
         if begin > end:
             raise usage_error(f"--between: {first} is after {last}", verb=_VERB)
         logs = logs_of(appliance.audit(), other, _VERB)
-        read = read_records(
-            merged({name: log.of_events(_EVENTS) for name, log in logs.items()}), Period(begin, end + 1)
-        )
+        with OpenedLogs(logs) as opened:
+            read = read_records(opened.of_events(_EVENTS), Period(begin, end + 1))
         # A span that ends at that very moment does not include it.
         rows = [row for row in read.drivers if row.until_utc != rfc3339(begin)]
     for row in rows:

@@ -10,6 +10,7 @@ import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from appliance.audit.log.log import AuditLog
+from appliance.audit.log.signatures import write_public_key
 from appliance.audit.proof.chain_findings import FindingKind, Verification
 from appliance.audit.proof.verification import verify
 from appliance.audit.search.query import Filter
@@ -33,7 +34,7 @@ class Machine:
         self.path.parent.mkdir(parents=True)
         self.signer.mkdir()
         self.key = Ed25519PrivateKey.generate()
-        (self.signer / "audit.pub").write_bytes(b"a signer that has run")
+        write_public_key(self.signer / "audit.pub", self.key.public_key().public_bytes_raw())
 
     def run(self, records: int = 10, *, others: bool = True) -> AuditLog:
         sync_index(self.signer)

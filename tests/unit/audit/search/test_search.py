@@ -1,4 +1,5 @@
 import itertools
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +9,7 @@ from appliance.audit.log.log import AuditLog
 from appliance.audit.log.log_database import LogUnreadableError
 from appliance.audit.log.record import AuditRecord, RuleReference, Severity
 from appliance.audit.search.query import Filter, FilterError
-from appliance.audit.search.search import Follower, export, search, show
+from appliance.audit.search.search import Follower, LogSnapshot, export, search, show
 from tests.support.audit import decision, settle
 from tests.unit.audit.conftest import MakeLog
 
@@ -297,3 +298,35 @@ def test_records_are_found_by_token_name(log: AuditLog, path: Path) -> None:
         log.record(decision(log, resource="/v1/x", detail=detail))
     assert settle(log) is None
     assert [len(sequences(path, Filter(who=who))) for who in ("alice", "*", "a*", "eve")] == [1, 2, 1, 0]
+
+
+@pytest.mark.parametrize(
+    "wanted",
+    [
+        Filter(event="decision"), Filter(host="10.0.0.1"), Filter(host="10.0.0.1", event="decision"),
+        Filter(resource="/cmd_1", since=_BEGIN + 30 * _SECOND), Filter(event="node lost"), Filter(text="Float64"),
+        Filter(event="decision", text="Float64"), Filter(host="10.66.0.1", decision=("deny",)),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("newest_first", [True, False])
+def test_a_frequent_name_finds_the_same_records(
+    log: AuditLog, monkeypatch: pytest.MonkeyPatch, wanted: Filter, *, newest_first: bool
+) -> None:
+    """Beyond a number of records of a name, a search walks the name's index in the order of the log."""
+    usual = [sequences(log.path, wanted, limit=limit, newest_first=newest_first) for limit in (3, 200)]
+    monkeypatch.setattr("appliance.audit.search.search._SELECTIVE", 1)
+    assert usual == [
+        sequences(log.path, wanted, limit=limit, newest_first=newest_first) for limit in (3, 200)
+    ]
+
+
+def test_a_snapshot_has_the_log_of_its_begin(log: AuditLog) -> None:
+    with closing(LogSnapshot(log.path)) as snapshot:
+        log.record(decision(log, event="node lost"))
+        assert settle(log) is None
+        lost = [entry.sequence for entry in snapshot.of_events(("node lost", "log begun"), page=1)]
+        assert lost == [1, 104]
+        following = snapshot.following("decision", 60)
+        assert [next(following).sequence for _ in range(3)] == [61, 62, 63]
+    with pytest.raises(LogUnreadableError, match="no audit log yet"):
+        LogSnapshot(log.path.with_name("none.db"))

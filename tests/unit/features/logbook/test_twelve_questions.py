@@ -12,7 +12,7 @@ from appliance.base.timestamps import parse_timestamp
 from appliance.channel.answers.policy_answers import PolicyInForce
 from appliance.channel.answers.token_answers import Token, Tokens
 from appliance.features.logbook import live_facts
-from appliance.features.logbook.machine_report import (
+from appliance.formats.machine_report import (
     MachineReport,
     Period,
     ReportedLog,
@@ -20,7 +20,7 @@ from appliance.features.logbook.machine_report import (
     merged,
     read_records,
 )
-from appliance.features.logbook.report_words import page
+from appliance.formats.report_words import page
 from appliance.policy.policy_compiler import compile_policy
 
 POLICY = """[Groups]
@@ -49,9 +49,13 @@ STATUS: dict[str, Any] = {
 }  # fmt: skip
 
 FREE = {"earlier": "nobody"}
+SIGN_ON = {"settings": {"sso": {"issuer": "https://id.example.org", "roles": "{'admin': ['it']}"}}}
 HISTORY: tuple[tuple[str, str, str, dict[str, Any]], ...] = (
-    ("2026-02-20 08:00:00", "appliance started", "", {"version": "0.4.0", "configuration": {"sso": "1"}, "off": {}}),
+    ("2026-02-20 08:00:00", "appliance started", "", {
+        "version": "0.4.0", "configuration": {"sso": "1"}, "off": {}, "settings": {},
+    }),
     ("2026-02-20 08:00:05", "host enrolled", "", {"name": "tablet", "address": "10.77.0.5"}),
+    ("2026-02-20 08:00:06", "door added", "agent", {"address": "10.78.0.1", "port": 9091, "source": "10.0.0.20"}),
     ("2026-03-02 09:00:00", "monitor set", "limit", {"who": "ann", "before": {"vMax": 1.5}, "values": {"vMax": 0.5}}),
     ("2026-03-04 10:00:00", "monitor disabled", "limit", {"who": "bob", "earlier": "enabled"}),
     ("2026-03-04 10:20:00", "monitor enabled", "limit", {"who": "ann", "earlier": "disabled"}),
@@ -67,7 +71,9 @@ HISTORY: tuple[tuple[str, str, str, dict[str, Any]], ...] = (
     }),
     ("2026-03-09 17:00:00", "clock set back", "", {}),
     ("2026-04-30 12:00:00", "appliance stopped", "", {}),
-    ("2026-04-30 12:05:00", "appliance started", "", {"version": "0.5.0", "configuration": {"sso": "2"}, "off": {}}),
+    ("2026-04-30 12:05:00", "appliance started", "", {
+        "version": "0.5.0", "configuration": {"sso": "2"}, "off": {}, **SIGN_ON,
+    }),
 )  # fmt: skip
 
 
@@ -145,18 +151,18 @@ def found() -> Page:
     period = Period(moment("2026-03-01 00:00:00"), moment("2026-05-04 00:00:00"))
     read = read_records(merged({"": entries()}), period)
     result = VerificationResult(
-        time_utc="2026-05-03T04:00:00.000000000Z", complete=True, records=13, text="", log="ab", through=13
+        time_utc="2026-05-03T04:00:00.000000000Z", complete=True, records=14, text="", log="ab", through=14
     )
     log = ReportedLog(
-        name="", id="ab", begins_utc="2026-02-20T08:00:00.000000000Z", last=13, verification=result
+        name="", id="ab", begins_utc="2026-02-20T08:00:00.000000000Z", last=14, verification=result
     )
     made = MachineReport(
         robot="arm7", logs=[log], since_utc="2026-03-01T00:00:00.000000000Z",
         until_utc="2026-05-04T00:00:00.000000000Z",
         made_utc="2026-05-04T08:00:00.000000000Z", version="0.5.0", verify="rosrv audit verify",
         interventions=read.interventions, switched_off=read.switched_off, blocks=read.blocks, software=read.software,
-        drivers=read.drivers, interfaces=list(live_facts.interfaces(STATUS, in_force, tokens)),
-        rights=list(live_facts.rights(policy, in_force, tokens)), live_reason="", gaps=read.gaps,
+        drivers=read.drivers, interfaces=list(live_facts.interfaces(STATUS, in_force, tokens, read)),
+        rights=list(live_facts.rights(policy, in_force, tokens, read)), live_reason="", gaps=read.gaps,
     )  # fmt: skip
     return Page(page(made))
 
@@ -202,6 +208,8 @@ def test_the_page_says_which_interfaces_take_commands_and_what_protects_each(fou
         "IPsec tunnels",
     }
     assert all(row[3] for row in rows)
+    (door,) = (row for row in rows if row[0] == "door agent")
+    assert door[1] == "address 10.78.0.1, port 9091, from 10.0.0.20"
 
 
 def test_the_page_says_who_drove_at_14_03(found: Page) -> None:
@@ -230,6 +238,10 @@ def test_the_page_says_are_there_gaps_and_why(found: Page) -> None:
 def test_the_page_says_who_can_change_policies(found: Page) -> None:
     (row,) = (row for row in found.rows("Rights on the machine now") if row[0].startswith("change policies"))
     assert row[1:] == ["root", "token, role admin"]
+    assert any(
+        "people with {'admin': ['it']}" in who for _what, who, _by in found.rows("Rights on the machine now")
+    )
+    assert "+sso.roles: {'admin': ['it']}" in found.text("Software")
     assert "-/cmd_vel = robot\n+/cmd_vel = joystick" in found.text("Policy")
 
 

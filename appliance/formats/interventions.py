@@ -198,12 +198,14 @@ class ReadRow(NamedTuple):
     """An intervention, and what its record says about others.
 
     `off` are all monitors that are not in force from then on, with their states; None if the record does not list them.
-    `loaded` are all monitors; None if the record does not list them.
+    `loaded` are all monitors; None if the record does not list them. `settings` are those of `appliance.yaml` that
+    a start lists, by section and name.
     """
 
     row: Intervention
     off: Mapping[str, str] | None
     loaded: frozenset[str] | None
+    settings: Mapping[str, Mapping[str, str]] | None
 
 
 class Interventions:
@@ -242,7 +244,11 @@ class Interventions:
             diff=[*map(str, detail.get("diff") or ()), *self._changed_settings(detail, appliance)],
             names={address: self.hosts[address] for address in sorted(addresses)},
         )  # fmt: skip
-        return ReadRow(row, _mapping(detail.get("off")), _names(detail))
+        settings = detail.get("settings")
+        sections: dict[str, Mapping[str, str]] | None = None
+        if isinstance(settings, Mapping):
+            sections = {name: _mapping(values) or {} for name, values in settings.items()}
+        return ReadRow(row, _mapping(detail.get("off")), _names(detail), sections)
 
     def _earlier(self, key: tuple[str, str], before: str, after: str) -> str:
         """Return the state before, which records of earlier versions lack, and keep the state after."""

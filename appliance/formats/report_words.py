@@ -4,9 +4,9 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 from appliance.base.counted import counted
-from appliance.features.logbook.interventions import SUBJECTS, Intervention
-from appliance.features.logbook.machine_report import Gap, LastingState, MachineReport, ReportedLog
-from appliance.formats.html_page import Cells, head, lines, section, text
+from appliance.formats.html_page import Cells, Unbroken, head, lines, section, text
+from appliance.formats.interventions import SUBJECTS, Intervention
+from appliance.formats.machine_report import Gap, LastingState, MachineReport, ReportedLog
 
 _TITLE = "Interventions in the safety settings of a machine"
 _TAMPERING = (
@@ -18,6 +18,8 @@ _TAMPERING = (
 )
 _SPAN = ("what", "state", "from (UTC)", "to (UTC)", "by", "ended by", "reason")
 _ROW = ("time (UTC)", "event", "what", "before", "after", "who", "reason", "record")
+_MOST_NAMED = 6
+_LONGEST_UNBROKEN = 24
 InWords = Callable[[str], str]
 
 
@@ -40,25 +42,26 @@ class ReportPage:
     def text(self) -> str:
         sections = list(self._sections())
         numbers = {one.title: number for number, one in enumerate(sections, start=1)}
+        answers = [(*row, numbers.get(title, "none")) for *row, title in self._answers()]
         parts = [head(_TITLE), f"<h1>{_TITLE}</h1>\n"]
         parts += section("About this report", (), _facts(self._report, _time))
-        parts += section(
-            "Answers",
-            ("question", "answer", "in"),
-            [(*row, f"{numbers[title]}") for *row, title in self._answers()],
-        )
+        parts += section("Answers", ("question", "answer", "section"), answers)
         for one in sections:
             parts += section(f"{numbers[one.title]}. {one.title}", one.columns, one.rows, one.empty)
             parts.append(one.below)
         return "".join(parts)
 
     def _sections(self) -> Iterator[_Section]:
-        report = self._report
+        report, without = self._report, []
         for subject in SUBJECTS:
             rows = [row for row in report.interventions if row.subject == subject]
+            if not rows:
+                without.append(subject)
+                continue
             below = "".join(map(self._diff, rows))
-            cells = [self._row(row) for row in rows]
-            yield _Section(_title(subject), self._columns(_ROW), cells, "No record.", below)
+            yield _Section(_title(subject), self._columns(_ROW), [self._row(row) for row in rows], "", below)
+        if without:
+            yield _Section("No record in this period", (), [(", ".join(without),)], "")
         for title, spans, empty in _spans(report):
             yield _Section(title, self._columns(_SPAN), [self._span(span) for span in spans], empty)
         ways = [(row.name, row.where, row.commands, row.protection) for row in report.interfaces]
@@ -95,9 +98,9 @@ class ReportPage:
         )
         yield "Who changed a guard's value, from what to what?", _last(values), _title("guards and monitors")
         yield "Who changed the policy?", _last(loads), _title("policy")
-        yield "Was a guard off, when, by whose order?", _states(report.switched_off), _OFF
-        yield "Who drove, and when?", _states(report.drivers), _DRIVERS
-        yield "Which hosts were blocked?", _states(report.blocks), _BLOCKED
+        yield "Was a guard off, when, by whose order?", _states(report.switched_off, self._in_words), _OFF
+        yield "Who drove, and when?", _states(report.drivers, self._in_words), _DRIVERS
+        yield "Which hosts were blocked?", _states(report.blocks, self._in_words), _BLOCKED
         yield (
             "Who approved calls of agents?",
             _last([row for row in rows if row.event == "approval given"]),
@@ -122,22 +125,30 @@ class ReportPage:
     def _row(self, row: Intervention) -> Cells:
         before, after = (_value(row, which, self._in_words) for which in ("before", "after"))
         return (
-            *self._name(row.appliance), _time(row.time_utc), row.event, _host(row.what, row.names, self._in_words),
+            *self._name(row.appliance), _cell(row.time_utc), row.event,
+            _short(_host(row.what, row.names, self._in_words)),
             before, after, _author(row, self._in_words), row.reason, f"{row.sequence}",
         )  # fmt: skip
 
     def _diff(self, row: Intervention) -> str:
-        if not row.diff:
+        """Return the hashes and the changed lines of a text, which do not fit into a cell."""
+        if not (row.diff or row.sha256_after):
             return ""
         name = f"{row.appliance}, " if row.appliance else ""
-        title = f"Changed lines of record {name}{row.sequence} ({row.event}, {_time(row.time_utc)}):"
-        return f"<p>{text(title)}</p>\n<pre>{lines(chr(10).join(row.diff))}</pre>\n"
+        hashes = (
+            f" SHA-256 before: {row.sha256_before or 'unknown'}; after: {row.sha256_after}."
+            if row.sha256_after
+            else ""
+        )
+        title = f"Record {name}{row.sequence} ({row.event}, {_time(row.time_utc)}).{hashes}"
+        changed = f"<pre>{lines(chr(10).join(row.diff))}</pre>\n" if row.diff else ""
+        return f"<p>{text(title)}</p>\n{changed}"
 
     def _span(self, span: LastingState) -> Cells:
         return (
             *self._name(span.appliance), _host(span.what, span.names, self._in_words),
-            _host(span.state, span.names, self._in_words), _time(span.since_utc),
-            _time(span.until_utc) if span.until_utc else "lasts", span.by, span.ended_by, span.reason,
+            _host(span.state, span.names, self._in_words), _cell(span.since_utc),
+            _cell(span.until_utc) if span.until_utc else "lasts", span.by, span.ended_by, span.reason,
         )  # fmt: skip
 
 
@@ -189,7 +200,7 @@ def report_lines(report: MachineReport, in_words: InWords = str) -> Iterator[str
         )
 
 
-def host_words(address: str, names: Mapping[str, str], in_words: InWords) -> str:
+def host_words(address: str, names: Mapping[str, str], in_words: InWords = str) -> str:
     """Return a host by the name that the records give it, or by its address and its name in the policy of now."""
     if address in names:
         return f"{names[address]} ({address})"
@@ -236,9 +247,17 @@ def _time(utc: str) -> str:
     return f"{utc[:10]} {utc[11:19]}" if utc[10:11] == "T" else utc
 
 
+def _cell(utc: str) -> Unbroken:
+    return Unbroken(_time(utc))
+
+
+def _short(words: str) -> str:
+    return Unbroken(words) if len(words) <= _LONGEST_UNBROKEN else words
+
+
 def _value(row: Intervention, which: str, in_words: InWords) -> str:
     words, digest = (row.before, row.sha256_before) if which == "before" else (row.after, row.sha256_after)
-    parts = (_host(words, row.names, in_words) if words else "", digest and f"SHA-256 {digest}")
+    parts = (_host(words, row.names, in_words) if words else "", digest and f"SHA-256 {digest[:12]}…")
     return ", ".join(filter(None, parts))
 
 
@@ -263,17 +282,29 @@ def _last(rows: Sequence[Intervention]) -> str:
     if not rows:
         return "no record in this period"
     row = rows[-1]
-    change = f": {row.what} {row.before} → {row.after}" if row.before and row.after else f": {row.reason}"
+    change = (
+        f": {row.what} {row.before} → {row.after}"
+        if row.before and row.after
+        else row.reason and f": {row.reason}"
+    )
     times = f"{counted(len(rows), 'record')}, the last at" if len(rows) > 1 else "at"
     return f"{times} {_time(row.time_utc)} by {row.who or 'the appliance'}{change}"
 
 
-def _states(spans: Sequence[LastingState]) -> str:
+def _states(spans: Sequence[LastingState], in_words: InWords) -> str:
     if not spans:
         return "none in this period"
-    names = ", ".join(dict.fromkeys(span.what for span in spans))
-    last = sum(not span.until_utc for span in spans)
-    return f"{counted(len(spans), 'time')} ({names}); {last} of them last"
+    words = [" ".join(_host(one, span.names, in_words) for one in (span.what, span.state)) for span in spans]
+    lasting = [name for name, span in zip(words, spans, strict=True) if not span.until_utc]
+    last = f"lasting: {_few(lasting)}" if lasting else "none lasts"
+    return f"{counted(len(spans), 'time')}: {_few(words)}; {last}"
+
+
+def _few(words: Iterable[str]) -> str:
+    """Return different words, and the number of those that are too many for an answer."""
+    found = list(dict.fromkeys(words))
+    more = f" and {len(found) - _MOST_NAMED} more" if len(found) > _MOST_NAMED else ""
+    return f"{', '.join(found[:_MOST_NAMED])}{more}"
 
 
 def _gap_words(gaps: Sequence[Gap]) -> str:

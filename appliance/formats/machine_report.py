@@ -12,7 +12,7 @@ from typing import NamedTuple
 import msgspec
 
 from appliance.audit.log.record_format import LogEntry, rfc3339
-from appliance.features.logbook.interventions import GAPS, Intervention, Interventions, ReadRow
+from appliance.formats.interventions import GAPS, Intervention, Interventions, ReadRow
 
 _SECOND = 1_000_000_000
 
@@ -312,8 +312,14 @@ def _timed(name: str, entries: Iterable[LogEntry]) -> Iterator[tuple[int, str, L
 
 
 class Reading(msgspec.Struct, kw_only=True):
-    """The records of a machine, read for a period."""
+    """The records of a machine, read for a period.
 
+    `places` are the address and port of each door at the end of the log; `settings` are those of the last start that
+    listed them, by section and name.
+    """
+
+    places: dict[str, str] = {}
+    settings: Mapping[str, Mapping[str, str]] = {}
     interventions: list[Intervention] = []
     switched_off: list[LastingState] = []
     blocks: list[LastingState] = []
@@ -339,6 +345,12 @@ def read_records(
         read = interventions.read(entry, name)
         for one in (off, blocks, software, drivers, stops):
             one.add(read)
+        if read.row.event == "door added":
+            found.places[read.row.what] = read.row.after
+        elif read.row.event == "door removed":
+            found.places.pop(read.row.what, None)
+        if read.settings is not None:
+            found.settings = read.settings
         if period.has(read.row.time):
             found.interventions.append(_with_name(with_origin(read.row), interventions.hosts))
     found.switched_off, found.blocks, found.software, found.drivers = (

@@ -1,0 +1,144 @@
+"""The commands that read the index: `rosrv-fleet search`, `report interventions` and `who-drove`."""
+
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+import typer
+
+from appliance import __version__
+from appliance.audit.log.record_format import printable
+from appliance.audit.search.filter_options import FILTER, Since, Until
+from appliance.base import clock
+from appliance.base.timestamps import parse_timestamp
+from appliance.formats.machine_report import MachineReport
+from appliance.formats.report_words import host_words, page, report_lines
+from rosrv_fleet.collector import make_collector
+from rosrv_fleet.config import load_config
+from rosrv_fleet.database import IndexDatabase
+from rosrv_fleet.interventions import fleet_report
+from rosrv_fleet.options import DEFAULT_CONFIG, Config, Json
+from rosrv_fleet.search import LARGEST_FLEET_PAGE, search_fleet
+from rosrv_fleet.search_sql import FleetFilter
+
+report_app = typer.Typer(no_args_is_help=True, help="Print the robots' logbooks.")
+_MOST_WAITING = 1000
+_REPORT_SECONDS = 600.0
+
+
+@report_app.callback()
+def report() -> None:
+    """Print the robots' logbooks."""
+
+
+def search(
+    context: typer.Context,
+    robot: Annotated[str | None, typer.Option("--robot", help="Name of the robot; a glob")] = None,
+    limit: Annotated[
+        int, typer.Option("--limit", min=1, max=LARGEST_FLEET_PAGE, help="Largest number of records")
+    ] = 100,
+    cursor: Annotated[str | None, typer.Option("--cursor", help="Continue where a search ended")] = None,
+    config: Config = DEFAULT_CONFIG,
+    *,
+    as_json: Json = False,
+) -> None:
+    """Find records of all robots, newest first.
+
+    Example: rosrv-fleet search --deny --since 1h --topic '/cmd_*' --robot 'arm*'
+    """
+    wanted = FILTER.value(context.params)
+    collector = make_collector(load_config(config))
+    waiting = collector.store.waiting(_MOST_WAITING)
+    database = collector.searches.database
+    database.open()
+    try:
+        page = search_fleet(database, FleetFilter(robot, wanted), cursor, limit, waiting)
+    finally:
+        database.close()
+    for record in page.records:
+        typer.echo(json.dumps(record, separators=(",", ":")) if as_json else _line(record))
+    if page.waiting:
+        _note(f"{page.waiting} stored segments are not indexed yet: this search misses them")
+    if page.cursor is not None:
+        _note(f"more records match: --cursor {page.cursor}, or a larger --limit")
+
+
+def _line(record: dict[str, Any]) -> str:
+    names = ("robot", "time", "severity", "decision", "event", "host", "caller_id", "resource", "reason")
+    return "  ".join(printable(str(record[name])) for name in names if record.get(name))
+
+
+@report_app.command("interventions")
+def report_interventions(
+    robot: Annotated[str | None, typer.Option("--robot", help="Name of the robot; a glob")] = None,
+    since: Since = None,
+    until: Until = None,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "--output", "-o", metavar="FILE", help="Write one HTML page without scripts; must not exist"
+        ),
+    ] = None,
+    config: Config = DEFAULT_CONFIG,
+    *,
+    as_json: Json = False,
+) -> None:
+    """Report who changed which safety setting of the robots, from what to what, as `rosrv report interventions` does.
+
+    A robot and its standby are one machine. The index has a record up to a minute after its robot wrote it.
+
+    Example: rosrv-fleet report interventions --since 2026-03-01 --robot 'arm*' --output march.html
+    """
+    now = clock.wall_ns()
+    begin = None if since is None else parse_timestamp(since, now)
+    report = _report(config, robot, begin, now if until is None else parse_timestamp(until, now))
+    if output is not None:
+        with output.open("x", encoding="utf-8") as file:
+            file.write(page(report))
+        _note(f"written to {output}")
+    if as_json:
+        typer.echo(msgspec.json.encode(report).decode())
+    elif output is None:
+        for line in report_lines(report):
+            typer.echo(printable(line))
+
+
+def who_drove(
+    at: Annotated[str, typer.Option("--at", metavar="TIME", help="At this time: 5m (ago), 14:03, a date")],
+    robot: Annotated[str | None, typer.Option("--robot", help="Name of the robot; a glob")] = None,
+    config: Config = DEFAULT_CONFIG,
+    *,
+    as_json: Json = False,
+) -> None:
+    """List the hosts that held a group of [Authority] of each robot at a time. Exit status 1 if no host did.
+
+    Example: rosrv-fleet who-drove --at 14:03 --robot arm7
+    """
+    moment = parse_timestamp(at, clock.wall_ns())
+    rows = _report(config, robot, moment, moment + 1).drivers
+    for row in rows:
+        if as_json:
+            typer.echo(msgspec.json.encode(row).decode())
+            continue
+        until = f"until {row.until_utc} ({row.ended_by})" if row.until_utc else "and holds it now"
+        host = host_words(row.state, row.names)
+        typer.echo(
+            printable(f"{row.appliance}  {row.what}: {host} since {row.since_utc}, {until}: {row.reason}")
+        )
+    raise typer.Exit(0 if rows else 1)
+
+
+def _report(config: Path, robot: str | None, since: int | None, until: int) -> MachineReport:
+    collector = make_collector(load_config(config))
+    database = IndexDatabase(collector.config.database, connections=1, statement_seconds=_REPORT_SECONDS)
+    database.open()
+    try:
+        waiting = collector.store.waiting(_MOST_WAITING)
+        return fleet_report(database, robot, since, until, waiting=waiting, version=__version__)
+    finally:
+        database.close()
+
+
+def _note(text: str) -> None:
+    typer.echo(f"rosrv-fleet: {text}", err=True)
