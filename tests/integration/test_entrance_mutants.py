@@ -28,6 +28,7 @@ def test_a_missing_rule_is_seen(change: dict[str, str]) -> None:
         capture_output=True,
         text=True,
         check=False,
+        timeout=120,  # a test that hangs does not count as red
     )
     assert ran.returncode == 1, ran.stdout + ran.stderr
     assert "failed" in ran.stdout, ran.stdout

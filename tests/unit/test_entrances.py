@@ -134,17 +134,15 @@ def test_the_tests_of_the_cells_exist(entrance: str) -> None:
             assert name in functions, f"{entrance}, {rule}: {file} has no {name}"
 
 
-def test_each_rule_of_these_entrances_is_taken_out_once() -> None:
+def test_each_rule_of_each_entrance_is_taken_out_once() -> None:
     table = tomllib.loads((ROOT / "tests/support/entrance_mutants.toml").read_text(encoding="utf-8"))
-    taken_out = {(one["entrance"], one["rule"]) for one in table["without"]}
-    cells = {
+    taken_out = sorted((one["entrance"], one["rule"]) for one in table["without"])
+    assert taken_out == sorted(
         (entrance, rule)
-        for entrance in table["whole"]
-        for rule, cell in CELLS[entrance].items()
+        for entrance, row in CELLS.items()
+        for rule, cell in row.items()
         if _named_tests(cell)
-    }
-    assert cells <= taken_out
-    assert all(_named_tests(CELLS[entrance][rule]) for entrance, rule in taken_out)
+    )
     for one in table["without"]:
         count = (ROOT / one["file"]).read_text(encoding="utf-8").count(one["old"])
         assert count == 1, f"{one['entrance']}, {one['rule']}: {one['file']} has {count} times {one['old']!r}"

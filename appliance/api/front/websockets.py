@@ -2,7 +2,7 @@
 
 1. Only the name of the door follows the request further: neither the door nor a log gets the ticket.
 2. Neither side is read while the other one does not read, so a client that stalls costs two small buffers.
-3. A peer that shows wrong tickets must wait, as with wrong tokens.
+3. A peer that shows wrong tickets must wait, as with wrong tokens (`shown_tickets.py`).
 """
 
 import asyncio
@@ -16,6 +16,7 @@ from appliance.api.front.access import TokenAuthenticator
 from appliance.api.front.control import ControlAwayError, ControlLink
 from appliance.api.front.problems import ProblemError
 from appliance.api.front.request_gate import RequestGate
+from appliance.api.front.shown_tickets import ShownTickets
 from appliance.base import clock
 
 PREFIX = b"/door/"
@@ -101,18 +102,21 @@ class WebSocketHandover:
         self._control = control
         self._doorkeeper = doorkeeper
         self._gate = gate
+        self._tickets = ShownTickets(doorkeeper)
 
     async def pass_on(self, passage: WebSocketPassage, head: bytes) -> None:
         """Pass a WebSocket on, or answer with the reason of the refusal."""
         host = passage.peer
         try:
             self._gate.admit_websocket(host, PREFIX.decode())
-            self._doorkeeper.require_patience(host)
             name, ticket = _entry_of(passage.target)
+            self._tickets.require(host, name, ticket)
             here, there = socket.socketpair()
             with there:
                 try:
                     status, reason = await self._control.hand_over(name, ticket, host, there.fileno())
+                    if status in (101, 401):
+                        self._tickets.answered(host, name, ticket, valid=status == 101)
                     if reason:
                         raise ProblemError(status, "not-recognised", reason)
                     here.setblocking(False)
@@ -121,14 +125,11 @@ class WebSocketHandover:
                     here.close()
                     raise
         except ProblemError as problem:
-            if problem.status == 401:
-                self._doorkeeper.noted(host, valid=False)
             passage.refuse(f"{problem.status} Refused", problem.detail)
             return
         except ControlAwayError as error:
             passage.refuse("503 Service Unavailable", str(error))
             return
-        self._doorkeeper.noted(host, valid=True)
         passage.note = partial(self._doorkeeper.noted, host, valid=True)
         passage.begin(_without_ticket(head, name))
 
